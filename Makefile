@@ -102,17 +102,17 @@ sbom: install
 install: $(VENV)/.installed
 
 # what the main job needs
-$(VENV)/.running: pyproject.toml clients/python/pyproject.toml hatch_build.py .ci/install-torch
+$(VENV)/.running: pyproject.toml clients/python/pyproject.toml hatch_build.py
 	@echo "installing into $(VENV): one to two minutes"
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, this is " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
-	.ci/install-torch $(BIN)/python
 	$(BIN)/python -m pip install --disable-pip-version-check --no-compile -e clients/python -e '.[sim,ingest]'
 	@touch $@
 
 # and what tests it
-$(VENV)/.installed: $(VENV)/.running
+$(VENV)/.installed: $(VENV)/.running .ci/install-torch
 	@echo "installing what the tests need into $(VENV): 2 GB, one to two minutes"
+	.ci/install-torch $(BIN)/python
 	$(BIN)/python -m pip install --disable-pip-version-check -e clients/python -e '.[all,dev,docs,publish]'
 	@touch $@
 

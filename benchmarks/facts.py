@@ -10,10 +10,9 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import torch
 from threadpoolctl import threadpool_limits
 
-_PACKAGES = ("lipserve", "numpy", "torch", "numba", "uvicorn", "uvloop", "websockets", "pin", "gpytorch")
+_PACKAGES = ("lipserve", "numpy", "scipy", "numba", "uvicorn", "uvloop", "websockets", "pin", "gpytorch")
 _CPU = Path("/proc/cpuinfo")
 
 
@@ -57,13 +56,8 @@ def deviation(manifest: Mapping[str, Any]) -> float:
 @contextmanager
 def one_thread() -> Iterator[str]:
     """Let this process's linear algebra use one thread, as a control loop would; say what was done."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1):
-            yield "1 thread"
-    finally:
-        torch.set_num_threads(before)
+    with threadpool_limits(1):
+        yield "1 thread"
 
 
 def _processor() -> str:

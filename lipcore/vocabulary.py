@@ -14,6 +14,9 @@ TORQUE_CONVENTIONS: tuple[TorqueConvention, ...] = get_args(TorqueConvention)
 EffortMeaning = Literal["measured", "commanded", "current", "unknown"]
 """Measured torque, gravity included; commanded torque, what is added to gravity compensation; motor current, A."""
 
+Place = Literal["cpu", "cuda"]
+"""What computes."""
+
 ComponentName = Literal[
     "inertia_matrix",
     "coriolis",

@@ -10,7 +10,6 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Samples
@@ -57,7 +56,7 @@ def _of_arm(arm: Arm) -> None:
     """What a training on another recording might take besides: other arms or none, and the energies."""
     friction = np.zeros((arm.n_joints, 4 if arm.stribeck else 3))
     one = Alternative(arm.geometry, arm.parameters, np.zeros(arm.n_joints), friction, 0.5)
-    zeros = torch.zeros((1, arm.n_joints), dtype=torch.float64)
+    zeros = np.zeros((1, arm.n_joints))
     motion = Motion(zeros, zeros, zeros)
     for kernel in (ArmKernel(replace(arm, alternatives=others)) for others in ((), (one, one))):
         kernel.features(motion)

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
-import torch
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from lipcore.data.metrics import evaluate
@@ -23,7 +23,7 @@ STREAMS = [(Stream(speed=SPEEDS[k % 4], noise=NOISE, motion="full"), 100 + k) fo
 
 def main() -> None:
     """Simulate, train, evaluate, save."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     robot = load_robot("panda")
     samples = lipcore.Samples.concatenate([simulate(robot, stream, seed) for stream, seed in STREAMS])
 

@@ -7,7 +7,6 @@ import sys
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 
-import torch
 from anyio import CapacityLimiter, to_thread
 from fastapi import FastAPI
 from fastapi_offline import FastAPIOffline
@@ -74,7 +73,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         lock = hold_home(settings.home)
-        torch.set_num_threads(settings.serving_threads)  # here, for this thread and those that come later
         storage, jobs, learners = await to_thread.run_sync(_open, settings)
         threadpool_limits(settings.serving_threads)  # of BLAS, whose libraries the models have brought in
         _share(app, storage, jobs, learners)

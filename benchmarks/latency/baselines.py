@@ -45,7 +45,7 @@ def exact_posterior(workload: Workload) -> ExactPosterior:
     """The exact Gaussian process with the model's hyperparameters, on the samples that the model stands on."""
     samples, model = workload.samples, workload.model
     assert samples is not None
-    motion, tau = samples.motion(), samples.torque()
+    motion, tau = samples.motion(), samples.tau
     rows = spread_out(motion, int(workload.manifest["options"]["posterior_samples"]))
     factor = model.calibration.function_std_factor
     return ExactPosterior.fit(model.estimator.kernel, model.posterior.params, motion[rows], tau[rows], factor)
@@ -55,8 +55,8 @@ def deviation(workload: Workload, exact: ExactPosterior) -> tuple[float, str]:
     """How far the model's answers to the queries lie from those of the exact posterior: at most, and in words."""
     q, dq, ddq = (np.ascontiguousarray(workload.queries[:, part]) for part in range(3))
     answer, expected = workload.model.predict(q, dq, ddq), exact.predict(Motion.from_arrays(q, dq, ddq))
-    unit = expected.std.numpy()
-    mean, std = (answer.tau - expected.mean.numpy()) / unit, answer.tau_std / unit - 1
+    unit = expected.std
+    mean, std = (answer.tau - expected.mean) / unit, answer.tau_std / unit - 1
     largest = float(max(np.abs(mean).max(), np.abs(std).max()))
     return largest, (
         f"on the {len(q)} queries, an unseen trajectory, the model's mean deviates from the exact GP's by "
@@ -67,7 +67,7 @@ def deviation(workload: Workload, exact: ExactPosterior) -> tuple[float, str]:
 
 def exact(posterior: ExactPosterior, queries: Array) -> Ask:
     """The exact posterior, one query with standard deviation."""
-    motions = [Motion(*(torch.from_numpy(part[None].copy()) for part in query)) for query in queries]
+    motions = [Motion(*(part[None].copy() for part in query)) for query in queries]
 
     def ask(number: int) -> object:
         answer = posterior.predict(motions[number % len(motions)])
@@ -83,7 +83,7 @@ class GPyTorch:
         import gpytorch  # noqa: PLC0415 - of the extra `bench`
 
         self._settings = gpytorch.settings
-        inputs, targets = _inputs(samples.motion()), samples.torque().T.contiguous()
+        inputs, targets = _inputs(samples.motion()), torch.from_numpy(np.ascontiguousarray(samples.tau.T))
         n = samples.n_joints
         variance = torch.from_numpy(noise_std)[:, None] ** 2
         above = gpytorch.constraints.GreaterThan(0.5 * float(variance.min()))  # small joints have less than its 1e-4
@@ -126,4 +126,4 @@ class GPyTorch:
 
 
 def _inputs(motion: Motion) -> Tensor:
-    return torch.cat([motion.q, motion.dq, motion.ddq], dim=1)
+    return torch.from_numpy(np.concatenate([motion.q, motion.dq, motion.ddq], axis=1))

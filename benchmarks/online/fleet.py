@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import reduce
 
-import torch
+import numpy as np
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.data.samples import Samples
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compact import CompactPosterior
@@ -24,14 +24,14 @@ def merged_difference(model: TorqueModel, parts: Sequence[Samples], queries: Mot
 
     def collected(samples: Samples) -> Statistics:
         motion = samples.motion()
-        return collect(posterior.basis, noise, motion, samples.torque() - kernel.mean(motion))
+        return collect(posterior.basis, noise, motion, samples.tau - kernel.mean(motion))
 
-    def answers(statistics: Statistics) -> tuple[torch.Tensor, torch.Tensor]:
+    def answers(statistics: Statistics) -> tuple[Array, Array]:
         built = CompactPosterior.build(kernel, posterior.basis, statistics, noise, posterior.std_factor)
         found = built.predict(queries)
         return found.mean, found.std
 
     apart = answers(reduce(merge, map(collected, parts)))
     together = answers(collected(Samples.concatenate(list(parts))))
-    largest = max(float((one - other).abs().max()) for one, other in zip(apart, together, strict=True))
-    return largest / float(together[0].abs().max())
+    largest = max(float(np.abs(one - other).max()) for one, other in zip(apart, together, strict=True))
+    return largest / float(np.abs(together[0]).max())

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from lipcore.data.samples import Array
@@ -46,12 +45,12 @@ class FourierModel:
         """Before any row, with the hyperparameters of a fitted `se` estimator."""
         params, n = fitted.posterior.params, fitted.n_joints
         normal = np.random.default_rng(seed).standard_normal((n, 3 * n, features // 2))
-        lengthscales = torch.exp(params["se.log_lengthscales"]).numpy()
+        lengthscales = np.exp(params["se.log_lengthscales"])
         size = 2 * (features // 2) + len(FRICTION_TERMS)
         return cls(
             normal / lengthscales[:, :, None],
-            torch.exp(0.5 * params["se.log_scale"]).numpy(),
-            torch.exp(params["friction.log_std"]).numpy(),
+            np.exp(0.5 * params["se.log_scale"]),
+            np.exp(params["friction.log_std"]),
             fitted.noise_std,
             forgetting_s,
             np.zeros((n, size, size)),
@@ -87,7 +86,7 @@ class FourierModel:
     def _features(self, q: Array, dq: Array, ddq: Array) -> list[Array]:
         """φ of every joint, (N, P) each."""
         state = np.concatenate([q, dq, ddq], axis=1)
-        friction = friction_features(torch.from_numpy(dq)).numpy()  # (3, N, n)
+        friction = friction_features(dq)  # (3, N, n)
         found = []
         for joint, frequencies in enumerate(self.frequencies):
             phase = state @ frequencies

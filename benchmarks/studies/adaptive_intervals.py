@@ -19,7 +19,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-import torch
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from benchmarks.studies.dirty_arms import prepared
@@ -256,7 +256,7 @@ def judged(method: Callable[[int], Tracker], score: Array, stream: Array) -> Fig
 
 def main() -> None:
     """Play the streams and print a Markdown table."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     kind, arms = sys.argv[1], sys.argv[2:] or STREAMS[sys.argv[1]]
     names = [(*arm.split(":"), dirty, learning) for arm in arms for dirty in (0, 1) for learning in (0, 1)]
     parts = [played(arm, int(seed), bool(dirty), bool(learning)) for arm, seed, dirty, learning in names]

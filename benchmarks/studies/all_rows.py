@@ -13,7 +13,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-import torch
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from benchmarks.online.scene import Scene
@@ -43,7 +43,7 @@ def judge(model: lipcore.TorqueModel, scenes: list[Scene]) -> str:
 
 def main() -> None:
     """Print a Markdown table: nMSE (coverage) of each way to count."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     print("| robot, speed | rows | worth | chosen | all, by their time | all, in full |\n| " + "--- | " * 6)
     for robot in sys.argv[1:] or ("panda", "ur5"):
         for speed in SPEEDS:

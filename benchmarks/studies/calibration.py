@@ -11,7 +11,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-import torch
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from lipcore.robots.library import Robot, load_robot, pinocchio
@@ -44,7 +44,7 @@ def _bodies(name: str, robot: Robot, estimator: str) -> RigidBody | None:
 
 def collect(path: str, estimator: str, names: list[str]) -> None:
     """Train on every arm, seed, speed and size; store residuals and standard deviations, calibration taken out."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     rows = []
     for name in names:
         for seed in SEEDS:

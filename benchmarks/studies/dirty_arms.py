@@ -13,7 +13,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-import torch
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from lipcore.data.metrics import LEVEL, evaluate, quantile
@@ -59,7 +59,7 @@ def prepared(samples: Samples) -> Samples:
 
 def main() -> None:
     """Print a Markdown table, a row for each arm, duration and case; last the worst cell."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     estimator, seeds, names = sys.argv[1], int(sys.argv[2]), sys.argv[3:] or ARMS
     print("| arm | s | unseen motion | coverage, joint by joint, % | lowest | width |\n|" + " --- |" * 6)
     every: dict[tuple[int, str], list[np.ndarray]] = {(seconds, case): [] for seconds in SECONDS for case in CASES}

@@ -17,7 +17,7 @@ import sys
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from benchmarks.studies.dirty_arms import prepared
@@ -161,7 +161,7 @@ def followed(base: TorqueModel, parts: list[Part], way: dict[str, float]) -> Fou
 
 def main() -> None:
     """Print a Markdown table, a row for each case and way."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     seeds = [int(each) for each in sys.argv[1].split(",")]
     names = sys.argv[2].split(";") if len(sys.argv) > 2 and sys.argv[2] else list(CASES)
     robot = sys.argv[3] if len(sys.argv) > 3 else "panda"

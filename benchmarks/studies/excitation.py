@@ -15,7 +15,7 @@ import sys
 import time
 
 import numpy as np
-import torch
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from lipcore.excitation import Belief, Limits, PlanOptions, plan
@@ -81,7 +81,7 @@ def score(robot: Robot, model: lipcore.TorqueModel, tests: list[Motion]) -> np.n
 
 def main(seeds: list[int]) -> None:
     """Train and test for each seed, then print ratios planned / random of each pair."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     robot, limits = load_robot("panda"), Limits.of_profile(profile("panda")).within(RANGE, SCALE)
     tests = {
         "sinusoids": [random(robot, 1.0, 100, seed) for seed in TESTS],

@@ -11,7 +11,7 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-import torch
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from benchmarks.online.scene import Scene, rows_of
@@ -36,7 +36,7 @@ def judge(scene: Scene, online: OnlineModel, at: float) -> str:
 
 def main() -> None:
     """Learn with each number of independent rows a second and print a Markdown table."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     print("| speed | independent rows/s | 30 s, before the payload | 5 s after | 30 s after |\n| " + "--- | " * 5)
     for speed in map(float, sys.argv[1:] or ("2", "5", "10")):
         scene = Scene(speed=speed)

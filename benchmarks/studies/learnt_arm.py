@@ -19,7 +19,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-import torch
 from threadpoolctl import threadpool_limits
 
 import lipcore
@@ -70,7 +69,7 @@ def true_geometry(robot: Robot) -> Geometry:
 
 def best_known(robot: Robot, samples: Samples, options: FitOptions) -> float:
     """Evidence that the true geometry leads to, nats, on the rows that a training looks at."""
-    rows = spread_out(samples.motion(), options.posterior_samples).numpy()
+    rows = spread_out(samples.motion(), options.posterior_samples)
     order = np.arange(robot.n_joints)
     problem = make_problem(samples.rows(rows), robot.joint_types, order, True, every=samples)
     sigma = np.full(robot.n_joints, NOISE)
@@ -208,7 +207,7 @@ def answer() -> None:
 
 def main() -> None:
     """Run what is asked for."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     fit.known_geometries = auto.known_geometries = lambda types, gravity: ()  # type: ignore[assignment]
     what, numbers = sys.argv[1], [int(each) for each in sys.argv[2:] if each.isdigit()]
     with threadpool_limits(1):

@@ -6,8 +6,8 @@ measurements.
 """
 
 import numpy as np
-import torch
 from calibration import randomised
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from lipcore.data.metrics import evaluate
@@ -20,7 +20,7 @@ SEEDS, TESTS, STRIDE = range(1, 6), range(1001, 1005), 5
 
 def main() -> None:
     """Print median nMSE and mean coverage per joint for both priors and both speeds."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     nominal = load_robot("panda")
     bodies = RigidBody.from_profile("panda", nominal.joint_names, nominal.joint_types)
     for speed in (1.0, FAST):

@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
-from torch import Tensor
 
 from lipcore.arm.posing import make_problem, mode_of, surroundings, with_samples, with_stribeck
 from lipcore.arm.problem import UNIT_WIDTH, Point, Problem, root_of
@@ -55,7 +53,7 @@ class Learnt:
     not expressed; report: for the manifest."""
 
     arm: Arm
-    params: dict[str, Tensor]
+    params: dict[str, Array]
     rows: NDArray[np.int64]
     counts: Array
     misfit: Misfit
@@ -82,7 +80,7 @@ def learn(
         watch = _Watch(task, time.monotonic())
         mode, around = mode_of(task), surroundings(task)
         order = chain(task.robot, samples.n_joints) if around is None else around.order
-        rows = spread_out(samples.motion(), options.posterior_samples).numpy()
+        rows = spread_out(samples.motion(), options.posterior_samples)
         chosen = samples.rows(rows)
         problem = make_problem(chosen, task.joint_types, order, task.gravity, around, samples)
         if task.sibling is not None:
@@ -141,9 +139,9 @@ class _Counting:
     def applied(self, problem: Problem, point: Point, at_rest: bool) -> Problem:
         """The problem whose torques count as a point's residuals say. at_rest: less where friction is unknown, too."""
         misfit, noise = self.misfit(problem, point)
-        misfit = misfit if at_rest else replace(misfit, rest=torch.zeros_like(misfit.rest))
-        variance = misfit.of_row(torch.from_numpy(noise), torch.from_numpy(problem.motions[:, 1]), self.shared)
-        return replace(problem, counts=noise / variance.numpy())
+        misfit = misfit if at_rest else replace(misfit, rest=np.zeros_like(misfit.rest))
+        variance = misfit.of_row(noise, problem.motions[:, 1], self.shared)
+        return replace(problem, counts=noise / variance)
 
     def misfit(self, problem: Problem, point: Point, least: Array | float = 0.0) -> tuple[Misfit, Array]:
         """What `estimate` says of what a point leaves of contiguous samples, base to tip."""
@@ -166,7 +164,7 @@ def _search(
     few = spread_out(samples.motion(), max(SEARCH_ROWS, ROWS_PER_JOINT * len(types)))
     sensor = noise_level([task.signals.tau[part][:, order] for part in task.signals.episodes()])
     seconds = task.options.search_seconds
-    return search(problem.rows(few.numpy()), types, task.gravity, sensor, seconds, seed, known, watch.searching)
+    return search(problem.rows(few), types, task.gravity, sensor, seconds, seed, known, watch.searching)
 
 
 def _refined(
@@ -208,16 +206,16 @@ def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch
 
 def _arm(
     problem: Problem, best: Point, others: Sequence[Point], order: NDArray[np.int64], mode: GeometryMode
-) -> tuple[Arm, dict[str, Tensor]]:
+) -> tuple[Arm, dict[str, Array]]:
     n, place = problem.n_joints, np.argsort(order)
     first = (PARAMETERS + 1) * n
     body = problem.scale[: PARAMETERS * n].reshape(n, PARAMETERS)[place].reshape(-1)
     unit = np.concatenate([body, problem.scale[PARAMETERS * n : first][place]])
     friction = problem.scale[first:].reshape(n, -1)[place]
     params = {
-        "rigid_body.log_scale": torch.zeros(4, dtype=torch.float64),
-        "friction.log_std": torch.from_numpy(np.log(friction)),
-        "noise.log_std": torch.from_numpy(np.log(best.sigma[place])),
+        "rigid_body.log_scale": np.zeros(4),
+        "friction.log_std": np.log(friction),
+        "noise.log_std": np.log(best.sigma[place]),
     }
     expected = problem.expected
     arm = Arm(

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from lipcore.arm.problem import Expected, Problem
@@ -136,7 +135,7 @@ def joint_friction(dq: Array, stribeck: bool = False) -> Array:
     dq: (N, n) rad/s or m/s; stribeck: whether friction has its fourth term.
     """
     size, n = dq.shape
-    features = friction_features(torch.from_numpy(np.ascontiguousarray(dq)), stribeck).numpy()  # (f, N, n)
+    features = friction_features(np.ascontiguousarray(dq), stribeck)  # (f, N, n)
     out = np.zeros((size, n, n, len(features)))
     joints = np.arange(n)
     out[:, joints, joints] = features.transpose(1, 2, 0)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.linalg import LinAlgError
 from scipy.linalg import cho_solve, lapack, solve_triangular
 
+from lipcore.data.motion import Indices
 from lipcore.data.samples import Array
 from lipcore.kernels.compiled.arm import PARAMETERS, arm_masses, arm_shapes
 from lipcore.kernels.geometry import Geometry
@@ -103,7 +104,7 @@ class Problem:
         """Terms of a joint's friction: f = 3, or 4 with more friction at low speed."""
         return int(self.friction.shape[2]) // self.n_joints
 
-    def rows(self, rows: Array) -> Problem:
+    def rows(self, rows: Indices) -> Problem:
         """The same with some of the samples. rows: their indices, or (N,) whether each is kept."""
         kept = {name: getattr(self, name)[rows] for name in ("motions", "tau", "counts", "friction")}
         return replace(self, **kept)

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from lipcore.vocabulary import JOINT_TYPES, JointType
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 def check_joint_types(joint_types: Sequence[str]) -> tuple[JointType, ...]:
@@ -50,40 +49,34 @@ def motion_arrays(q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> tuple[Array, A
 
 @dataclass(frozen=True)
 class Motion:
-    """N instants of motion of n joints, float64 tensors on one device.
+    """N instants of motion of n joints, float64.
 
     q, dq, ddq: (N, n) position, velocity, acceleration in rad, rad/s, rad/s² (prismatic: m, m/s, m/s²).
     """
 
-    q: Tensor
-    dq: Tensor
-    ddq: Tensor
+    q: Array
+    dq: Array
+    ddq: Array
 
     @classmethod
-    def from_arrays(cls, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, device: torch.device | str = "cpu") -> Motion:
-        """Build from arrays of shape (N, n) or (n,); raise ValueError where shapes differ or a value is not finite."""
-        return cls(*(torch.from_numpy(array.copy()).to(device) for array in motion_arrays(q, dq, ddq)))
+    def from_arrays(cls, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Motion:
+        """Build from copies of arrays of shape (N, n) or (n,).
+
+        Raise ValueError where shapes differ or a value is not finite.
+        """
+        return cls(*(array.copy() for array in motion_arrays(q, dq, ddq)))
 
     def __len__(self) -> int:
-        return self.q.shape[0]
+        return len(self.q)
 
-    def __getitem__(self, rows: slice | Tensor) -> Motion:
+    def __getitem__(self, rows: slice | Indices) -> Motion:
         return Motion(self.q[rows], self.dq[rows], self.ddq[rows])
 
     @property
     def n_joints(self) -> int:
         """Number of joints n."""
-        return self.q.shape[1]
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the tensors."""
-        return self.q.device
+        return int(self.q.shape[1])
 
     def arrays(self) -> Array:
         """q, dq and ddq as one C-contiguous array (N, 3, n), which compiled code reads."""
-        return np.ascontiguousarray(np.stack([part.cpu().numpy() for part in (self.q, self.dq, self.ddq)], axis=1))
-
-    def to(self, device: torch.device | str) -> Motion:
-        """Return the same motion on `device`."""
-        return Motion(self.q.to(device), self.dq.to(device), self.ddq.to(device))
+        return np.stack([self.q, self.dq, self.ddq], axis=1)

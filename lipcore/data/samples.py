@@ -6,9 +6,7 @@ from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lipcore.data.motion import Motion
 
@@ -56,13 +54,9 @@ class Samples:
         bounds = [0, *edges.tolist(), len(self)]
         return [slice(a, b) for a, b in pairwise(bounds) if b > a]
 
-    def motion(self, device: torch.device | str = "cpu") -> Motion:
-        """Position, velocity and acceleration as tensors, (N, n) each; raise ValueError where one is not finite."""
-        return Motion.from_arrays(self.q, self.dq, self.ddq, device)
-
-    def torque(self, device: torch.device | str = "cpu") -> Tensor:
-        """Measured torque as a tensor, (N, n)."""
-        return torch.from_numpy(self.tau.copy()).to(device)
+    def motion(self) -> Motion:
+        """Position, velocity and acceleration, (N, n) each, copied; raise ValueError where one is not finite."""
+        return Motion.from_arrays(self.q, self.dq, self.ddq)
 
     @staticmethod
     def concatenate(parts: list[Samples]) -> Samples:

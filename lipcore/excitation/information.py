@@ -11,8 +11,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
@@ -25,7 +23,7 @@ from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.base import Params, TorqueKernel
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compact import CompactPosterior
-from lipcore.posterior.linalg import cholesky
+from lipcore.posterior.linalg import cholesky, solve_lower
 from lipcore.robots.library import Robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
@@ -53,7 +51,7 @@ class Belief:
 
     kernel: TorqueKernel
     params: Params
-    noise_variance: Tensor
+    noise_variance: Array
     posterior: CompactPosterior | None = None
 
     @classmethod
@@ -81,33 +79,33 @@ class Belief:
         """
         estimator = estimator or ("lip-chain" if bodies is None else "rigid-body")
         motion = draw(limits, PRIOR_MOTIONS, seed)
-        tau = inverse_dynamics(robot, motion.q.numpy(), motion.dq.numpy(), motion.ddq.numpy())
+        tau = inverse_dynamics(robot, motion.q, motion.dq, motion.ddq)
         std = NOISE_SHARE * tau.std(0) if noise_std is None else np.broadcast_to(noise_std, tau.shape[1:])
         if not (np.isfinite(std).all() and (std > 0).all()):
             raise ValueError(f"noise_std is {noise_std}, expected positive numbers, one or one a joint")
         tau += std * np.random.default_rng(seed).standard_normal(tau.shape)
         t, apart = np.arange(len(motion), dtype=np.float64), np.arange(len(motion), dtype=np.int64)
-        samples = Samples(robot.joint_names, t, apart, motion.q.numpy(), motion.dq.numpy(), motion.ddq.numpy(), tau)
+        samples = Samples(robot.joint_names, t, apart, motion.q, motion.dq, motion.ddq, tau)
         kernel = make_estimator(
             estimator, robot.joint_types, arm=None if bodies is None else arm_of_robot(bodies, mode="calibrate")
         ).kernel
-        return cls(kernel, fit(kernel, samples, PRIOR_FIT).params, torch.from_numpy(np.square(std)))
+        return cls(kernel, fit(kernel, samples, PRIOR_FIT).params, np.square(std))
 
     @property
-    def floor(self) -> Tensor:
+    def floor(self) -> Array:
         """Variance that the model's answers never fall below, (n,) (N·m)²."""
-        return torch.zeros_like(self.noise_variance) if self.posterior is None else self.posterior.floor
+        return np.zeros_like(self.noise_variance) if self.posterior is None else self.posterior.floor
 
-    def cross(self, motion: Motion) -> Tensor:
+    def cross(self, motion: Motion) -> Array:
         """Prior covariance of what the model is made of with all torques of N motions, (M, N n); M = 0 for a prior."""
         if self.posterior is None:
-            return torch.zeros((0, len(motion) * self.kernel.n_joints), dtype=torch.float64)
+            return np.zeros((0, len(motion) * self.kernel.n_joints))
         return self.posterior.cross(self.kernel, motion)
 
     @property
-    def root(self) -> Tensor:
+    def root(self) -> Array:
         """Q, (M, M): Q c, of a cross covariance c, has as its square what the model has learnt of those torques."""
-        return torch.zeros((0, 0), dtype=torch.float64) if self.posterior is None else self.posterior.learnt
+        return np.zeros((0, 0)) if self.posterior is None else self.posterior.learnt
 
 
 @dataclass(frozen=True)
@@ -120,19 +118,19 @@ class Information:
 
     belief: Belief
     reference: Motion
-    learnt: Tensor
-    now: Tensor
-    floor: Tensor
+    learnt: Array
+    now: Array
+    floor: Array
 
     @classmethod
     def about(cls, belief: Belief, reference: Motion) -> Information:
         """Of a belief about `reference`."""
         learnt = belief.root @ belief.cross(reference)
-        prior = belief.kernel.variance(belief.params, reference).diagonal(dim1=1, dim2=2)
-        now = torch.maximum(prior - learnt.square().sum(0).reshape(prior.shape), belief.floor)
+        prior = belief.kernel.variance(belief.params, reference).diagonal(axis1=1, axis2=2)
+        now = np.maximum(prior - np.square(learnt).sum(0).reshape(prior.shape), belief.floor)
         return cls(belief, reference, learnt, now, belief.floor)
 
-    def left(self, motion: Motion, repeats: float = 1.0) -> Tensor:
+    def left(self, motion: Motion, repeats: float = 1.0) -> Array:
         """Share of the variance at a reference that is left after measuring a motion of N samples, (n,).
 
         Geometric mean over the references. repeats: how many samples each of the N stands for.
@@ -153,16 +151,16 @@ class Information:
         solved, explained = self._explained(own, other, learnt, repeats)
         after = self._after(explained)
         moves = after == self.now - explained  # a variance that has reached its floor stays there
-        weight = -torch.where(moves, 1 / after, 0.0).reshape(-1) / after.numel()
+        weight = -np.where(moves, 1 / after, 0.0).reshape(-1) / after.size
         by_other = 2 * solved * weight
         by_own = -(solved * weight) @ solved.T
         by_cross = belief.root.T @ (-2 * learnt @ by_own - self.learnt @ by_other.T)
         size, n = motion.q.shape
         parts = {"q": motion.q, "dq": motion.dq, "ddq": motion.ddq}
-        slopes = {name: torch.empty_like(part) for name, part in parts.items()}
+        slopes = {name: np.empty_like(part) for name, part in parts.items()}
         for name, part in parts.items():
             for joint in range(n):
-                moved = part.clone()
+                moved = part.copy()
                 moved[:, joint] += STEP
                 near = Motion(**{**parts, name: moved})
                 # a sample moves both its row and its column
@@ -170,23 +168,23 @@ class Information:
                 total += (by_other * (self._with_reference(near) - other)).sum(1)
                 total += (by_cross * (belief.cross(near) - cross)).sum(0)
                 slopes[name][:, joint] = total.reshape(size, n).sum(1) / STEP
-        return float(self._share(after).log().mean()), Motion(**slopes)
+        return float(np.log(self._share(after)).mean()), Motion(**slopes)
 
-    def _with_reference(self, motion: Motion) -> Tensor:
+    def _with_reference(self, motion: Motion) -> Array:
         """Prior covariance of the motion's torques with those at the references, (N n, R n)."""
         return self.belief.kernel.gram(self.belief.params, motion, self.reference)
 
-    def _explained(self, own: Tensor, other: Tensor, learnt: Tensor, repeats: float) -> tuple[Tensor, Tensor]:
+    def _explained(self, own: Array, other: Array, learnt: Array, repeats: float) -> tuple[Array, Array]:
         """S⁻¹ D, (N n, R n), and the variance that the motion would take away, (R, n), from prior covariances."""
-        noise = (self.belief.noise_variance / repeats).repeat(len(own) // len(self.floor))
-        factor = cholesky(own - learnt.T @ learnt + torch.diag(noise))
+        noise = np.tile(self.belief.noise_variance / repeats, len(own) // len(self.floor))
+        factor = cholesky(own - learnt.T @ learnt + np.diag(noise))
         whitened = factor.whiten(other - learnt.T @ self.learnt)
-        solved = torch.linalg.solve_triangular(factor.lower.T, whitened, upper=True)
-        return solved, whitened.square().sum(0).reshape(self.now.shape)
+        solved = solve_lower(factor.lower, whitened, transposed=True)
+        return solved, np.square(whitened).sum(0).reshape(self.now.shape)
 
-    def _after(self, explained: Tensor) -> Tensor:
-        return torch.maximum(torch.maximum(self.now - explained, self.floor), LEAST * self.now)
+    def _after(self, explained: Array) -> Array:
+        return np.maximum(np.maximum(self.now - explained, self.floor), LEAST * self.now)
 
-    def _share(self, after: Tensor) -> Tensor:
+    def _share(self, after: Array) -> Array:
         """Geometric mean over the references: what is left of the largest variances alone would tell of extremes."""
-        return (after / self.now).log().mean(0).exp()
+        return np.asarray(np.exp(np.log(after / self.now).mean(0)))

@@ -8,10 +8,9 @@ largest magnitude at m > 2 K even instants of a period (Ehlich & Zeller, 1964).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
@@ -30,6 +29,8 @@ SECONDS = 50.0
 """Length of the random motions."""
 PER_MOTION = 5
 """Instants that are taken of each of them."""
+Coefficients = tuple[Array, Array, Array]
+"""Shift (n,), sine and cosine amplitudes (K, n)."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def overshoot(harmonics: int, instants: int) -> float:
 
 @dataclass(frozen=True)
 class Shape:
-    """Maps a matrix x (2 K + 1, n) to a motion of n joints that keeps its limits, differentiably.
+    """Maps a matrix x (2 K + 1, n) to a motion of n joints that keeps its limits, and derivatives back.
 
     Row 0 shifts the middle, the next K are sine and the last K cosine amplitudes, each in units of what the limits
     allow to that harmonic alone. Two projections bring both ends to rest; each joint is then shrunk towards its middle
@@ -104,9 +105,9 @@ class Shape:
 
     limits: Limits
     seconds: float
-    amplitude: Tensor
-    at_rest: Tensor
-    omega: Tensor
+    amplitude: Array
+    at_rest: Array
+    omega: Array
 
     @classmethod
     def build(cls, limits: Limits, seconds: float, harmonics: int) -> Shape:
@@ -117,7 +118,7 @@ class Shape:
         reach = np.minimum.reduce([limits.half * omega, limits.speed + 0 * omega, limits.acceleration / omega])
         direction = np.stack([reach, reach * omega])
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        return cls(limits, seconds, *(torch.from_numpy(part) for part in (reach, direction, omega[:, 0])))
+        return cls(limits, seconds, *(part for part in (reach, direction, omega[:, 0])))
 
     @property
     def size(self) -> tuple[int, int]:
@@ -125,31 +126,36 @@ class Shape:
         harmonics, n = self.amplitude.shape
         return 2 * harmonics + 1, n
 
-    def coefficients(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def coefficients(self, x: Array) -> Coefficients:
         """Shift from the middle (n,), sine and cosine amplitudes (K, n) within the limits. x: (2 K + 1, n)."""
-        harmonics, half = len(self.omega), torch.from_numpy(self.limits.half)
-        waves = x[1:].reshape(2, harmonics, -1)
-        waves = waves - self.at_rest * (self.at_rest * waves).sum(1, keepdim=True)
-        shift, sine, cosine = x[0] * half, *(waves * self.amplitude)
-        m = INSTANTS * harmonics
-        motion = self._motion(shift, sine, cosine, torch.arange(m, dtype=torch.float64) / m * self.seconds)
-        speed, acceleration = (torch.from_numpy(part) for part in (self.limits.speed, self.limits.acceleration))
-        unit = torch.stack([half, speed, acceleration])[:, None] / overshoot(harmonics, m)
-        shares = (torch.stack(motion) / unit).abs().reshape(-1, len(half))
-        # every joint by the largest share first: powers overflow otherwise
-        largest = shares.detach().amax(0).clamp_min(1.0)
-        powers = (shares / largest).pow(SHARPNESS).sum(0) + largest.pow(-SHARPNESS)
-        shrink = largest * powers.pow(1 / SHARPNESS)
+        shift, sine, cosine = self._free(x)
+        shrink, _ = self._shrink(shift, sine, cosine)
         return shift / shrink, sine / shrink, cosine / shrink
 
-    def motion(self, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Position, velocity and acceleration at times t (N,), each (N, n), differentiable in x."""
+    def motion(self, x: Array, t: Array) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration at times t (N,), each (N, n)."""
         q, dq, ddq = self._motion(*self.coefficients(x), t)
-        return torch.from_numpy(self.limits.middle) + q, dq, ddq
+        return self.limits.middle + q, dq, ddq
+
+    def adjoint(self, x: Array, t: Array, q: Array, dq: Array, ddq: Array) -> Array:
+        """Derivatives by x, (2 K + 1, n), given those by what `motion` makes of it at times t (N,), each (N, n)."""
+        free = self._free(x)
+        shrink, by_shares = self._shrink(*free)
+        slopes = self._motion_adjoint(t, q, dq, ddq)
+        by_shrink = -sum(
+            (slope * part).reshape(-1, len(shrink)).sum(0) for slope, part in zip(slopes, free, strict=True)
+        )
+        watched = by_shares * (by_shrink / shrink**2)
+        more = self._motion_adjoint(self._watched, *watched)
+        shift, sine, cosine = (slope / shrink + other for slope, other in zip(slopes, more, strict=True))
+        out = np.empty_like(x)
+        out[0] = shift * self.limits.half
+        out[1:] = self._rested(np.stack([sine, cosine]) * self.amplitude).reshape(-1, len(shrink))
+        return out
 
     def series(self, x: Array) -> Series:
         """The motion of x (2 K + 1, n) as a series, held to the limits by their strict bound."""
-        shift, sine, cosine = (part.numpy() for part in self.coefficients(torch.from_numpy(x)))
+        shift, sine, cosine = self.coefficients(x)
         series = Series(self.seconds, self.limits.middle + shift, sine, cosine)
         return series.scaled(self.limits.middle, 1 / np.maximum(1.0, series.used(self.limits).max(0)))
 
@@ -164,12 +170,47 @@ class Shape:
         x[1:] *= np.tile(harmonics**-fall, (2, 1))
         return np.asarray(x)
 
-    def _motion(self, shift: Tensor, sine: Tensor, cosine: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        omega = self.omega[:, None]
-        phase = t[:, None] * self.omega
-        sin, cos = torch.sin(phase), torch.cos(phase)
+    def _free(self, x: Array) -> Coefficients:
+        """The coefficients of x with both ends at rest, before limits shrink them."""
+        shift = x[0] * self.limits.half
+        sine, cosine = self._rested(x[1:].reshape(2, *self.amplitude.shape)) * self.amplitude
+        return shift, sine, cosine
+
+    def _rested(self, waves: Array) -> Array:
+        """Waves (2, K, n) without what lies along `at_rest`."""
+        return np.asarray(waves - self.at_rest * (self.at_rest * waves).sum(1, keepdims=True))
+
+    def _shrink(self, shift: Array, sine: Array, cosine: Array) -> tuple[Array, Array]:
+        """By what each joint is shrunk, (n,), and its derivatives by the motion at the watched instants, (3, m, n)."""
+        limits, m = self.limits, len(self._watched)
+        unit = np.stack([limits.half, limits.speed, limits.acceleration])[:, None] / overshoot(len(self.omega), m)
+        motion = np.stack(self._motion(shift, sine, cosine, self._watched))
+        shares = np.abs(motion) / unit
+        # every joint by the largest share first: powers overflow otherwise
+        largest = shares.max((0, 1)).clip(1.0)
+        powers = ((shares / largest) ** SHARPNESS).sum((0, 1)) + largest**-SHARPNESS
+        shrink = largest * powers ** (1 / SHARPNESS)
+        slopes = powers ** (1 / SHARPNESS - 1) * (shares / largest) ** (SHARPNESS - 1)
+        return shrink, slopes * np.sign(motion) / unit
+
+    @cached_property
+    def _watched(self) -> Array:
+        """Instants (m,) at which limits are watched."""
+        m = INSTANTS * len(self.omega)
+        return np.arange(m) / m * self.seconds
+
+    def _motion(self, shift: Array, sine: Array, cosine: Array, t: Array) -> tuple[Array, Array, Array]:
+        omega, phase = self.omega[:, None], t[:, None] * self.omega
+        sin, cos = np.sin(phase), np.cos(phase)
         q = shift + sin @ (sine / omega) - cos @ (cosine / omega)
         return q, cos @ sine + sin @ cosine, -sin @ (sine * omega) + cos @ (cosine * omega)
+
+    def _motion_adjoint(self, t: Array, q: Array, dq: Array, ddq: Array) -> Coefficients:
+        """Derivatives by shift, sine and cosine, given those by `_motion` of them."""
+        omega, phase = self.omega[:, None], t[:, None] * self.omega
+        sin, cos = np.sin(phase).T, np.cos(phase).T
+        sine = (sin @ q) / omega + cos @ dq - omega * (sin @ ddq)
+        return q.sum(0), sine, -(cos @ q) / omega + sin @ dq + omega * (cos @ ddq)
 
 
 def harmonics(limits: Limits, seconds: float) -> int:

@@ -10,8 +10,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
@@ -99,7 +97,7 @@ class Goal:
     shape: Shape
     information: Information
     check: TorqueCheck | None
-    t: Tensor
+    t: Array
     repeats: float
 
     @classmethod
@@ -107,38 +105,34 @@ class Goal:
         """The goal for a motion that is sampled so often; check: of torque limits, None where none are known."""
         count = min(samples, INSTANTS)
         # in the middle of each interval: at the ends of the motion the robot rests
-        t = (torch.arange(count, dtype=torch.float64) + 0.5) / count * shape.seconds
+        t = (np.arange(count) + 0.5) / count * shape.seconds
         return cls(shape, information, check, t, samples / count)
 
     def left(self, series: Series) -> Array:
         """Share of each joint's variance that a series leaves, (n,)."""
-        motion = Motion.from_arrays(*series.at(self.t.numpy()))
+        motion = Motion.from_arrays(*series.at(self.t))
         return np.asarray(self.information.left(motion, self.repeats))
 
     def value(self, x: Array) -> float:
         """What is to be small: the mean log share of variance left, nats, and the penalty. x: (2 K + 1, n)."""
-        with torch.no_grad():
-            motion = Motion(*self.shape.motion(torch.from_numpy(x), self.t))
-            value = float(self.information.left(motion, self.repeats).log().mean())
-        return value + self._over(motion)[0]
+        motion = Motion(*self.shape.motion(x, self.t))
+        return float(np.log(self.information.left(motion, self.repeats)).mean()) + self._over(motion)[0]
 
     def slope(self, x: Array) -> tuple[float, Array]:
         """The value and its derivatives by x."""
-        variable = torch.from_numpy(x.copy()).requires_grad_(True)
-        parts = self.shape.motion(variable, self.t)
-        motion = Motion(*(part.detach() for part in parts))
+        motion = Motion(*self.shape.motion(x, self.t))
         value, slope = self.information.slope(motion, self.repeats)
         over, more = self._over(motion)
-        slopes = [one + other for one, other in zip((slope.q, slope.dq, slope.ddq), more, strict=True)]
-        (gradient,) = torch.autograd.grad(parts, variable, slopes)
-        return value + over, gradient.numpy()
+        slopes = (one + OVER_WEIGHT * other for one, other in zip((slope.q, slope.dq, slope.ddq), more, strict=True))
+        return value + over, self.shape.adjoint(x, self.t, *slopes)
 
-    def _over(self, motion: Motion) -> tuple[float, list[Tensor]]:
-        parts = (motion.q, motion.dq, motion.ddq)
+    def _over(self, motion: Motion) -> tuple[float, tuple[Array, Array, Array]]:
+        """The penalty, and its derivatives over its weight."""
         if self.check is None:
-            return 0.0, [torch.zeros_like(part) for part in parts]
-        value, slopes = self.check.excess(*(part.numpy() for part in parts))
-        return OVER_WEIGHT * value, [OVER_WEIGHT * torch.from_numpy(slope) for slope in slopes]
+            none = np.zeros_like(motion.q)
+            return 0.0, (none, none, none)
+        value, slopes = self.check.excess(motion.q, motion.dq, motion.ddq)
+        return OVER_WEIGHT * value, slopes
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lipcore.data.samples import Array
 from lipcore.files.checks import LARGEST, check_choice, check_keys, check_list, check_numbers, wrong
@@ -129,7 +127,7 @@ def is_of_arm(name: str) -> bool:
     return name in _TENSORS
 
 
-def arm_tensors(arm: Arm) -> dict[str, Tensor]:
+def arm_tensors(arm: Arm) -> dict[str, Array]:
     """All numbers of an arm, float64, by name."""
     parts = {name: getattr(arm.geometry, name) for name in _GEOMETRY_TENSORS} | {
         name: getattr(arm, name) for name in _ARM_TENSORS
@@ -148,7 +146,7 @@ def arm_tensors(arm: Arm) -> dict[str, Tensor]:
             "other/linear": np.stack([np.concatenate([one.rotor[:, None], one.friction], axis=1) for one in each]),
             "other/probability": np.array([one.probability for one in each]),
         }
-    return {f"{PREFIX}{name}": torch.from_numpy(np.array(value, np.float64)) for name, value in parts.items()}
+    return {f"{PREFIX}{name}": np.array(value, np.float64) for name, value in parts.items()}
 
 
 def read_mode(mode: object) -> GeometryMode:
@@ -159,13 +157,13 @@ def read_mode(mode: object) -> GeometryMode:
     return kind
 
 
-def read_arm(tensors: Mapping[str, Tensor], joint_types: Sequence[JointType], mode: GeometryMode) -> Arm:
+def read_arm(tensors: Mapping[str, Array], joint_types: Sequence[JointType], mode: GeometryMode) -> Arm:
     """The arm that `arm_tensors` stored; joint_types: in the order of the data; mode: how its geometry was come by.
 
     Raise ValueError for tensors that are missing or do not fit together.
     """
     try:
-        parts = {name: tensors[f"{PREFIX}{name}"].numpy() for name in (*_GEOMETRY_TENSORS, *_ARM_TENSORS, "order")}
+        parts = {name: tensors[f"{PREFIX}{name}"] for name in (*_GEOMETRY_TENSORS, *_ARM_TENSORS, "order")}
     except KeyError as error:
         raise ValueError(f"tensor {error} is missing: the model is of an earlier release, train it again") from None
     order = parts.pop("order").astype(np.int64)
@@ -174,13 +172,13 @@ def read_arm(tensors: Mapping[str, Tensor], joint_types: Sequence[JointType], mo
     types = tuple(joint_types[joint] for joint in order)
     geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY_TENSORS))
     rotor = tensors.get(f"{PREFIX}rotor")  # nothing is stored where none is expected
-    parts["rotor"] = np.zeros(len(types)) if rotor is None else rotor.numpy()
+    parts["rotor"] = np.zeros(len(types)) if rotor is None else rotor
     stribeck = _stribeck(tensors)
     alternatives = _alternatives(tensors, geometry, len(friction_terms(stribeck)))
     return Arm(geometry, order, mode, stribeck=stribeck, alternatives=alternatives, **parts)
 
 
-def _stribeck(tensors: Mapping[str, Tensor]) -> bool:
+def _stribeck(tensors: Mapping[str, Array]) -> bool:
     """Whether friction has its fourth term: it has not where nothing is stored."""
     if (stored := tensors.get(f"{PREFIX}stribeck")) is None:
         return False
@@ -189,13 +187,13 @@ def _stribeck(tensors: Mapping[str, Tensor]) -> bool:
     return bool(values[0])
 
 
-def _alternatives(tensors: Mapping[str, Tensor], geometry: Geometry, terms: int) -> tuple[Alternative, ...]:
+def _alternatives(tensors: Mapping[str, Array], geometry: Geometry, terms: int) -> tuple[Alternative, ...]:
     """terms: of friction."""
     if f"{PREFIX}other/probability" not in tensors:
         return ()
     try:
         rotation, translation, axis, parameters, linear, probability = (
-            tensors[f"{PREFIX}other/{name}"].numpy() for name in _ALTERNATIVE_TENSORS
+            tensors[f"{PREFIX}other/{name}"] for name in _ALTERNATIVE_TENSORS
         )
     except KeyError as error:
         raise ValueError(f"tensor {error} is missing") from None

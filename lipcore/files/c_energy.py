@@ -42,8 +42,8 @@ class Energy:
         if term is None:
             return None
         assert isinstance(term, ChainKernel)
-        n, count, outputs = term.n_joints, len(basis.outputs), basis.outputs.numpy()
-        shares, scales, weights = (each.detach().numpy() for each in term.hyper(posterior.params))
+        n, count, outputs = term.n_joints, len(basis.outputs), basis.outputs
+        shares, scales, weights = term.hyper(posterior.params)
         used, number = np.unique(outputs // n, return_inverse=True)
         slides = np.array([kind == "prismatic" for kind in term.joint_types])
         rows = read_rows(np.ascontiguousarray(basis.inducing.arrays()[used]), slides)
@@ -58,7 +58,7 @@ class Energy:
             weights,
             padded.reshape(groups, LANES, *rows.shape[1:]).transpose(0, 2, 3, 1),
             places,
-            posterior.weights.numpy()[:count],
-            posterior.root.numpy()[:count, :count],
+            posterior.weights[:count],
+            posterior.root[:count, :count],
             posterior.std_factor,
         )

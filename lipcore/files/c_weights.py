@@ -46,12 +46,12 @@ class Learnt:
         assert isinstance(friction, FrictionKernel)
         if list(posterior.basis.linear) != [arm, friction]:
             raise UnsupportedEstimatorError("the posterior holds more weights than those of rigid bodies and friction")
-        diagonals = [each.covariance(posterior.params).detach().diagonal().numpy() for each in (arm, friction)]
+        diagonals = [each.variances(posterior.params) for each in (arm, friction)]
         prior, centre, first = np.concatenate(diagonals), arm.prior_weights(), len(posterior.basis.outputs)
         assert centre is not None
-        mean = posterior.weights.numpy()[first:] * prior
-        mean[: arm.size] += centre.numpy()
-        rows = posterior.root.numpy()[first:]
+        mean = posterior.weights[first:] * prior
+        mean[: arm.size] += centre
+        rows = posterior.root[first:]
         return cls(arm, friction, mean, rows[:, first:] * prior, rows[:, :first], posterior.std_factor)
 
     def root(self, expand: Array) -> tuple[Array, Array]:

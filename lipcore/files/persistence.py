@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors.torch import save as save_tensors
-from torch import Tensor
+from safetensors.numpy import save as save_tensors
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Indices, Motion
 from lipcore.files.arm import arm_tensors, is_of_arm, read_arm, read_mode
 from lipcore.files.manifest import (
     DEFAULT_LIMITS,
@@ -69,7 +68,7 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
     basis, statistics = model.posterior.basis, model.posterior.statistics
     if statistics is None:
         raise ValueError("the model has learnt online since it was trained, expected one as trained")
-    tensors = {f"{PARAMS}{name}": value for name, value in model.posterior.params.items()}
+    tensors: dict[str, Array | Indices] = {f"{PARAMS}{name}": value for name, value in model.posterior.params.items()}
     tensors |= {name: getattr(basis.inducing, name.rpartition("/")[2]) for name in INDUCING}
     tensors |= {OUTPUTS: basis.outputs, A: pack_symmetric(statistics.a), B: statistics.b}
     if bool((model.posterior.floor > 0).any()):
@@ -79,7 +78,7 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
     if model.arm is not None:
         tensors |= arm_tensors(model.arm)
     parameters = report(model.posterior, model.estimator, model.joint_names)
-    payload = save_tensors({name: value.contiguous() for name, value in tensors.items()})
+    payload = save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()})
     manifest = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -132,7 +131,9 @@ def decode(files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS) -> Torqu
     tensors = read_tensors(_verified(files, TENSORS, manifest["tensors"]), n, limits)
     robot = _robot(files, manifest, limits)
     try:
-        return _restore(manifest, tensors, robot)
+        # what numbers of strangers overflow to is refused by the checks that follow
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _restore(manifest, tensors, robot)
     except ModelFormatError:
         raise
     except Exception as error:  # whatever numerics make of numbers that no training has made
@@ -262,7 +263,7 @@ def _robot(files: Mapping[str, bytes], manifest: Mapping[str, Any], limits: Limi
     return replace(robot, matched=entry["matched"])
 
 
-def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: RigidBody | None) -> TorqueModel:
+def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: RigidBody | None) -> TorqueModel:
     params = {name.removeprefix(PARAMS): value for name, value in tensors.items() if name.startswith(PARAMS)}
     compact = dict(manifest["compact"])
     statistics = Statistics(unpack_symmetric(A, tensors[A]), tensors[B], float(compact.pop("data_samples")))
@@ -275,7 +276,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: Rig
         estimator.kernel,
         params,
         Motion(*(tensors[name] for name in INDUCING)),
-        tensors[OUTPUTS],
+        tensors[OUTPUTS].astype(np.int64),
         statistics,
         float(manifest["fit"].get("jitter", 0.0)),
         calibration.function_std_factor,
@@ -306,7 +307,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Tensor], robot: Rig
     return model
 
 
-def _arm(manifest: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Arm:
+def _arm(manifest: Mapping[str, Any], tensors: Mapping[str, Array]) -> Arm:
     try:
         mode = read_mode(manifest["fit"].get("geometry"))
     except ValueError as error:

@@ -46,6 +46,6 @@ def _motions(model: TorqueModel) -> Array:
     ranges = [model.training_range[name] for name in ("q", "dq", "ddq")]
     low, high = (np.array([each[end] for each in ranges]) for end in ("min", "max"))
     inducing = model.posterior.basis.inducing
-    seen = np.stack([part[:INDUCING].numpy() for part in (inducing.q, inducing.dq, inducing.ddq)])
+    seen = np.stack([part[:INDUCING] for part in (inducing.q, inducing.dq, inducing.ddq)])
     fixed = np.stack([np.zeros_like(low), low, high, 0.5 * (low + high)], axis=1)
     return np.concatenate([fixed, seen], axis=1)

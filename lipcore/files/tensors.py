@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any, NamedTuple
 
-import torch
+import numpy as np
 from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from torch import Tensor
+from safetensors.numpy import load as load_tensors
 
+from lipcore.data.motion import Array
 from lipcore.files import strict_json
 from lipcore.files.arm import is_of_arm
 from lipcore.files.manifest import TENSORS, Limits, ModelFormatError
@@ -38,7 +38,7 @@ class Entry(NamedTuple):
     end: int
 
 
-def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Tensor]:
+def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Array]:
     """Tensors of a model of n joints by name, of the right type and dimensions, finite; raise ModelFormatError.
 
     Sizes are checked against the limits before a number is read: what is computed from them grows with their square.
@@ -46,17 +46,18 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Tensor]:
     entries = _read_header(payload)
     _check_sizes(entries, n, limits)
     try:
-        tensors = load_tensors(payload)
+        # copied: what is loaded may be read-only, which compiled code takes for another type
+        tensors = {name: value.copy() for name, value in load_tensors(payload).items()}
     except (SafetensorError, ValueError, RuntimeError) as error:
         raise _bad(f"{TENSORS} cannot be read: {error}") from None
     for name, value in tensors.items():
-        if name != OUTPUTS and not torch.isfinite(value).all():
+        if name != OUTPUTS and not np.isfinite(value).all():
             raise _bad(f"tensor {name!r} is not made of finite float64 numbers")
     if FLOOR in tensors and bool((tensors[FLOOR] < 0).any()):
         raise _bad(f"tensor {FLOOR!r} has a number below zero, expected variances")
     if MISFIT in tensors:
         rest, slow, lasting, *usual = tensors[MISFIT]
-        variances, motion = torch.stack([rest, lasting]), torch.stack([slow, *usual])
+        variances, motion = np.stack([rest, lasting]), np.stack([slow, *usual])
         if bool((variances < 0).any() or (motion <= 0).any()):
             raise _bad(f"tensor {MISFIT!r} has a number below zero, expected variances, speeds and accelerations")
     return tensors

@@ -12,9 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from torch import Tensor
-
-from lipcore.data.motion import Motion, check_joint_types
+from lipcore.data.motion import Array, Motion, check_joint_types
 from lipcore.fitting.options import FitOptions
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
@@ -52,7 +50,7 @@ class Estimator:
 class _ResidualChainKernel(ChainKernel):
     """Energies for what rigid bodies leave over: the fit starts from a share of the torque, not from all of it."""
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """Those of the chain kernel for RESIDUAL_SHARE of the torque."""
         return super().initial(motion, RESIDUAL_SHARE * tau)
 

@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
@@ -20,6 +18,7 @@ from lipcore.kernels.base import Params, TorqueKernel
 from lipcore.posterior.exact import negative_log_evidence
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.posterior.selection import spread_out
+from lipcore.vocabulary import Place
 
 PRIOR_STD = {"noise.log_std": noise.PRIOR_STD, "logits": 4.0, "log": 3.0}
 """Widths of the Gaussian priors on hyperparameters around their starting values: weak, but for the noise, which a
@@ -87,7 +86,7 @@ Cancelled = Callable[[], bool]
 class Fit:
     """Fitted hyperparameters and the rows of the data that the posterior stands on."""
 
-    params: dict[str, Tensor]
+    params: dict[str, Array]
     rows: NDArray[np.int64]
     report: FitReport
 
@@ -108,15 +107,14 @@ def fit(
     Raise FitCancelledError when `cancelled` answers true, NotPositiveDefiniteError where no hyperparameters give a
     covariance that can be factored.
     """
-    device = options.torch_device()
-    motion, tau = samples.motion(device), samples.torque(device)
-    floor = torch.from_numpy(np.log(noise.floor(samples))).to(device)
+    device, motion, tau = options.place(), samples.motion(), samples.tau
+    floor = np.log(noise.floor(samples))
     start = kernel.initial(motion, tau)
-    start["noise.log_std"] = torch.from_numpy(np.log(noise.start(samples, stretches))).to(device)
-    start |= {name: value.to(device) for name, value in (begin or {}).items()}
+    start["noise.log_std"] = np.log(noise.start(samples, stretches))
+    start |= begin or {}
     stop = cancelled or (lambda: False)
     rows = spread_out(motion, options.hyperparameter_samples)
-    search = _Search(kernel, start, floor, motion[rows], tau[rows], stop)
+    search = _Search(kernel, start, floor, motion[rows], tau[rows], stop, device)
 
     began, iteration = time.monotonic(), 0
 
@@ -132,7 +130,7 @@ def fit(
         report_progress("hyperparameters", float(intermediate_result.fun))
 
     few = spread_out(motion, min(SCREENING_SAMPLES, options.hyperparameter_samples))
-    screening = _Search(kernel, start, floor, motion[few], tau[few], stop)
+    screening = _Search(kernel, start, floor, motion[few], tau[few], stop, device)
     chosen, origin = _best_start(screening, options.starts)
     result = search.run(origin, options.max_iterations, callback)
     seconds = time.monotonic() - began
@@ -140,7 +138,7 @@ def fit(
 
     used = spread_out(motion, options.posterior_samples)
     # evenly among those of the posterior: spread-out samples are the odd ones
-    even = used[torch.linspace(0, len(used) - 1, min(len(used), noise.SAMPLES), device=device).round().long()]
+    even = used[np.linspace(0, len(used) - 1, min(len(used), noise.SAMPLES)).round().astype(np.int64)]
     params = search.unpack(result.x)
     params = noise.refine(kernel, params, motion[even], tau[even], start["noise.log_std"], floor)
     report = FitReport(
@@ -154,9 +152,9 @@ def fit(
         samples_hyperparameters=len(rows),
         samples_posterior=len(used),
         seconds=seconds,
-        device=device.type,
+        device=device,
     )
-    return Fit({name: value.cpu() for name, value in params.items()}, used.cpu().numpy(), report)
+    return Fit(params, used, report)
 
 
 def _best_start(screening: _Search, starts: int) -> tuple[int, Array]:
@@ -186,11 +184,18 @@ class _Search:
     """Penalised negative log evidence as a function of one flat vector, for scipy."""
 
     def __init__(
-        self, kernel: TorqueKernel, start: Params, floor: Tensor, motion: Motion, tau: Tensor, cancelled: Cancelled
+        self,
+        kernel: TorqueKernel,
+        start: Params,
+        floor: Array,
+        motion: Motion,
+        tau: Array,
+        cancelled: Cancelled,
+        device: Place,
     ) -> None:
         self.kernel, self.start, self.floor, self.motion, self.tau = kernel, start, floor, motion, tau
         self.widths = {name: prior_std(name) for name in start} | kernel.prior_std()
-        self.cancelled = cancelled
+        self.cancelled, self.device = cancelled, device
         self.evaluations = self.rejected = 0
         self.best = np.inf
 
@@ -200,7 +205,9 @@ class _Search:
         self.evaluations += 1
         params = self.unpack(flat)
         try:
-            evidence = negative_log_evidence(self.kernel, params, self.motion, self.tau)
+            # a line search may step to where exponentials overflow: that covariance is not finite, and is refused
+            with np.errstate(over="ignore", invalid="ignore"):
+                evidence = negative_log_evidence(self.kernel, params, self.motion, self.tau, self.device)
         except NotPositiveDefiniteError:
             if not np.isfinite(self.best):
                 raise  # not even the starting point is well posed
@@ -210,7 +217,7 @@ class _Search:
         for name, centre in self.start.items():
             width = self.widths[name]
             deviation = (params[name] - centre) / width
-            value += float(0.5 * deviation.square().sum())
+            value += float(0.5 * np.square(deviation).sum())
             gradient[name] = gradient[name] + deviation / width
         self.best = min(self.best, value)
         return value, self.pack(gradient)
@@ -219,7 +226,7 @@ class _Search:
         """Minimise by L-BFGS-B from `begin`; scipy's result. The noise stays above its floor."""
         from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
 
-        free = {name: torch.full_like(value, -np.inf) for name, value in self.start.items()}
+        free = {name: np.full_like(value, -np.inf) for name, value in self.start.items()}
         lower = self.pack({**free, "noise.log_std": self.floor})
         return minimize(
             self,
@@ -231,19 +238,19 @@ class _Search:
             options={"maxiter": iterations, "maxcor": MEMORY, "ftol": TOLERANCE},
         )
 
-    def width_tensors(self) -> dict[str, Tensor]:
+    def width_tensors(self) -> dict[str, Array]:
         """Width of the prior of every hyperparameter."""
-        return {name: torch.full_like(value, self.widths[name]) for name, value in self.start.items()}
+        return {name: np.full_like(value, self.widths[name]) for name, value in self.start.items()}
 
     def pack(self, params: Params) -> Array:
-        return np.concatenate([params[name].detach().cpu().numpy().ravel() for name in self.start])
+        return np.concatenate([params[name].ravel() for name in self.start])
 
-    def unpack(self, flat: Array) -> dict[str, Tensor]:
+    def unpack(self, flat: Array) -> dict[str, Array]:
         params, at = {}, 0
         for name, like in self.start.items():
-            part = torch.from_numpy(flat[at : at + like.numel()].copy())
-            params[name] = part.reshape(like.shape).to(like.device)
-            at += like.numel()
+            part = flat[at : at + like.size].copy()
+            params[name] = part.reshape(like.shape)
+            at += like.size
         return params
 
 

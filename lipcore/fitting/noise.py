@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
 from lipcore.kernels.base import Params, TorqueKernel
-from lipcore.posterior.linalg import cholesky
+from lipcore.posterior.linalg import add_diagonal, cholesky
 
 START_SHARE = 0.01
 """Smallest noise std that a fit starts from, relative to the joint's torque spread: what no model explains is noise
@@ -49,8 +47,8 @@ def floor(samples: Samples) -> Array:
 
 
 def refine(
-    kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor, centre: Tensor, lowest: Tensor
-) -> dict[str, Tensor]:
+    kernel: TorqueKernel, params: Params, motion: Motion, tau: Array, centre: Array, lowest: Array
+) -> dict[str, Array]:
     """What up to SAMPLES samples say of the noise, all else held: two steps, returned as new hyperparameters.
 
     First the penalised evidence is maximised over the noise by Newton steps on log σ_j. With K = k(X, X) + R and
@@ -67,38 +65,40 @@ def refine(
     log_std = params["noise.log_std"]
     for _ in range(NEWTON_STEPS):
         inverse, alpha = _inverse(gram, log_std, y)
-        variance = torch.exp(2 * log_std)
+        variance = np.exp(2 * log_std)
         free = variance * inverse.diagonal().reshape(-1, n).sum(0)
-        explained = variance * alpha.reshape(-1, n).square().sum(0)
+        explained = variance * np.square(alpha.reshape(-1, n)).sum(0)
         slope = explained - free - (log_std - centre) / PRIOR_STD**2
-        step = (slope / (2 * free + 1 / PRIOR_STD**2)).clamp(-LARGEST_STEP, LARGEST_STEP)
-        before, log_std = log_std, torch.maximum(log_std + step, lowest)
-        if bool(((log_std - before).abs() < SMALLEST_STEP).all()):
+        step = (slope / (2 * free + 1 / PRIOR_STD**2)).clip(-LARGEST_STEP, LARGEST_STEP)
+        before, log_std = log_std, np.maximum(log_std + step, lowest)
+        if (np.abs(log_std - before) < SMALLEST_STEP).all():
             break
     for _ in range(WIDENINGS):
         excess = _left_out(*_inverse(gram, log_std, y), n)
-        if bool((excess <= TOLERATED).all()):
+        if (excess <= TOLERATED).all():
             break
-        log_std = log_std + torch.where(excess > TOLERATED, 0.5 * torch.log(excess), 0.0).clamp_max(LARGEST_STEP)
+        log_std = log_std + np.where(excess > TOLERATED, 0.5 * np.log(excess.clip(TOLERATED)), 0.0).clip(
+            max=LARGEST_STEP
+        )
     return {**params, "noise.log_std": log_std}
 
 
-def _inverse(gram: Tensor, log_std: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+def _inverse(gram: Array, log_std: Array, y: Array) -> tuple[Array, Array]:
     """K⁻¹ and α = K⁻¹y."""
-    noisy = gram.clone()
-    noisy.diagonal().add_(torch.exp(2 * log_std).repeat(len(y) // len(log_std)))
+    noisy = gram.copy()
+    add_diagonal(noisy, np.tile(np.exp(2 * log_std), len(y) // len(log_std)))
     factor = cholesky(noisy)
-    return torch.cholesky_inverse(factor.lower), factor.solve(y)
+    return factor.inverse(), factor.solve(y)
 
 
-def _left_out(inverse: Tensor, alpha: Tensor, n: int) -> Tensor:
+def _left_out(inverse: Array, alpha: Array, n: int) -> Array:
     """Mean squared error over predicted variance of each joint, stretch by stretch predicted from all others: (n,).
 
     Leaving out block B, the error is [K⁻¹]_BB⁻¹ α_B and its covariance [K⁻¹]_BB⁻¹ (Rasmussen & Williams, eq. 5.12).
     """
     ratios = []
-    for block in torch.arange(len(alpha), device=alpha.device).reshape(-1, n).tensor_split(STRETCHES):
+    for block in np.array_split(np.arange(len(alpha)).reshape(-1, n), STRETCHES):
         rows = block.reshape(-1)
-        covariance = torch.linalg.inv(inverse[rows][:, rows])
-        ratios.append(((covariance @ alpha[rows]).square() / covariance.diagonal()).reshape(-1, n))
-    return torch.cat(ratios).mean(0)
+        covariance = np.linalg.inv(inverse[np.ix_(rows, rows)])
+        ratios.append((np.square(covariance @ alpha[rows]) / covariance.diagonal()).reshape(-1, n))
+    return np.asarray(np.concatenate(ratios).mean(0))

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from importlib.util import find_spec
+from typing import Literal, get_args
 
-from lipcore.vocabulary import GEOMETRY_MODES, PRIORS, Prior
-
-if TYPE_CHECKING:
-    import torch
+from lipcore.vocabulary import GEOMETRY_MODES, PRIORS, Place, Prior
 
 Standing = Literal["auto", "all", "chosen"]
 GeometryOption = Literal["auto", "learn", "calibrate", "fixed"]
@@ -72,10 +71,25 @@ class FitOptions:
         if self.prior not in PRIORS:
             raise ValueError(f"prior is {self.prior!r}, expected one of {', '.join(PRIORS)}")
 
-    def torch_device(self) -> torch.device:
-        """The device to fit on; raise ValueError for `cuda` where there is none."""
-        import torch  # noqa: PLC0415 - seconds, which who only names options does without
+    def place(self) -> Place:
+        """The device to fit on; raise ValueError for `cuda` where there is none, or where torch is not installed."""
+        if self.device == "cpu":
+            return "cpu"
+        if _cuda():
+            return "cuda"
+        if self.device == "cuda":
+            raise ValueError("device is 'cuda', but torch sees no CUDA device")
+        return "cpu"
 
-        if self.device == "cuda" and not torch.cuda.is_available():
-            raise ValueError("device is 'cuda', but no CUDA device is available")
-        return torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
+
+def _cuda() -> bool:
+    """Whether torch can compute on a GPU. It is imported only where there is a driver: it takes seconds."""
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    if find_spec("torch") is None:
+        return False
+    import torch  # noqa: PLC0415 - see above
+
+    return torch.cuda.is_available()

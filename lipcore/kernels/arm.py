@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
@@ -40,14 +38,14 @@ class ArmKernel(LinearKernel):
     def __init__(self, arm: Arm) -> None:
         self.arm, self.n_joints = arm, arm.n_joints
         kinds = np.concatenate([np.tile(KINDS, arm.n_joints), np.full(arm.n_joints, SCALES - 1)])
-        self._kinds = torch.from_numpy(kinds)
-        self._unit = torch.from_numpy(arm.unit)
+        self._kinds = kinds
+        self._unit = arm.unit
         self.others = MixtureKernel(arm.alternatives, arm.order) if arm.alternatives else None
         mixed = None if self.others is None else self.others.prior_weights()
-        others = np.zeros(0) if mixed is None else mixed.numpy()
-        self._rest = torch.from_numpy(np.concatenate([arm.widths, np.ones(len(others))]))
-        self._mean = torch.from_numpy(np.concatenate([_in_data(arm), arm.rotor, arm.expected, others]))
-        self._recent: tuple[tuple[Motion, Tensor], ...] = ()
+        others = np.zeros(0) if mixed is None else mixed
+        self._rest = np.concatenate([arm.widths, np.ones(len(others))])
+        self._mean = np.concatenate([_in_data(arm), arm.rotor, arm.expected, others])
+        self._recent: tuple[tuple[Motion, Array], ...] = ()
 
     @property
     def size(self) -> int:
@@ -70,9 +68,9 @@ class ArmKernel(LinearKernel):
         bodies = np.ascontiguousarray(weights[: PARAMETERS * n].reshape(n, PARAMETERS)[self.arm.order])
         out = np.zeros((len(motion), n))
         arm_torques(geometry.constants, geometry.gravity, bodies, self.arm.order, motion.arrays(), out)
-        return np.asarray(out + weights[PARAMETERS * n : (PARAMETERS + 1) * n] * motion.ddq.numpy())
+        return np.asarray(out + weights[PARAMETERS * n : (PARAMETERS + 1) * n] * motion.ddq)
 
-    def features(self, x: Motion) -> Tensor:
+    def features(self, x: Motion) -> Array:
         """Φ at each sample: (N, n, p)."""
         for seen, features in self._recent:
             if seen.q is x.q and seen.dq is x.dq and seen.ddq is x.ddq:
@@ -83,7 +81,7 @@ class ArmKernel(LinearKernel):
         arm_features(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, rows)
         if self.others is not None:
             rows = np.concatenate([rows, self.others.rows(motions)], axis=1)
-        features = torch.from_numpy(np.ascontiguousarray(rows.transpose(0, 2, 1))).to(x.device)
+        features = np.ascontiguousarray(rows.transpose(0, 2, 1))
         self._recent = ((x, features), *self._recent[: REMEMBERED - 1])
         return features
 
@@ -91,27 +89,31 @@ class ArmKernel(LinearKernel):
         """The same features of one query, for serving."""
         return ArmRegressor(self)
 
-    def covariance(self, params: Params) -> Tensor:
-        """Prior variances of the weights on the diagonal: (p, p)."""
-        log_scale = params["rigid_body.log_scale"]
-        device = log_scale.device
-        std = self._unit.to(device) * torch.exp(log_scale[self._kinds.to(device)])
-        return torch.diag(torch.cat([std, self._rest.to(device)]).square())
+    def variances(self, params: Params) -> Array:
+        """Prior variances of the weights: (p,)."""
+        std = self._unit * np.exp(params["rigid_body.log_scale"][self._kinds])
+        return np.square(np.concatenate([std, self._rest]))
 
-    def prior_weights(self) -> Tensor | None:
+    def variances_adjoint(self, params: Params, slopes: Array) -> dict[str, Array]:
+        """Derivatives by the scales, given those by the variances, (p,)."""
+        count = len(self._kinds)
+        scaled = 2 * self.variances(params)[:count] * slopes[:count]
+        return {"rigid_body.log_scale": np.bincount(self._kinds, scaled, SCALES).astype(np.float64)}
+
+    def prior_weights(self) -> Array | None:
         """Prior mean of the weights, (p,)."""
         return self._mean
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """The arm's own scales: (4,)."""
-        return {"rigid_body.log_scale": torch.zeros(SCALES, dtype=torch.float64).to(tau.device)}
+        return {"rigid_body.log_scale": np.zeros(SCALES)}
 
-    def energy_features(self, x: Motion) -> Tensor:
+    def energy_features(self, x: Motion) -> Array:
         """Kinetic and potential energy per unit of each weight: (N, 2, p) J; of alternative arms none is counted."""
         out, arm = np.empty((len(x), 2, self.steps.stop)), self.arm
         arm_energies(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, x.arrays(), out)
         none = np.zeros((len(x), 2, self.size - self.steps.stop))
-        return torch.from_numpy(np.concatenate([out, none], axis=2)).to(x.device)
+        return np.concatenate([out, none], axis=2)
 
 
 class ArmRegressor(Regressor):

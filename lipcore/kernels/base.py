@@ -7,14 +7,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
+from array_api_compat import array_namespace, device
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
+from lipcore.extras import need
 
-Array = NDArray[np.float64]
-Params = Mapping[str, Tensor]
+Params = Mapping[str, Array]
 """Unconstrained hyperparameters by name: logarithms of positive numbers, logits of shares."""
 
 PAIRS_PER_CHUNK = 4096
@@ -76,9 +74,9 @@ class State:
     q, v, a: (n, *batch) position, velocity, acceleration; the batches of two arguments broadcast.
     """
 
-    q: Tensor
-    v: Tensor
-    a: Tensor
+    q: Array
+    v: Array
+    a: Array
 
     @classmethod
     def rows(cls, motion: Motion) -> State:
@@ -109,120 +107,117 @@ class TorqueKernel(ABC):
     n_joints: int
 
     @abstractmethod
-    def gram(self, params: Params, x: Motion, y: Motion) -> Tensor:
+    def gram(self, params: Params, x: Motion, y: Motion) -> Array:
         """Covariance of all torques of x (N samples) with all of y (M): (N n, M n), (N·m)²."""
 
     @abstractmethod
-    def symmetric_gram(self, params: Params, x: Motion) -> Tensor:
+    def symmetric_gram(self, params: Params, x: Motion) -> Array:
         """Covariance of all torques of x with each other, (N n, N n), exactly symmetric."""
 
     @abstractmethod
-    def variance(self, params: Params, x: Motion) -> Tensor:
+    def variance(self, params: Params, x: Motion) -> Array:
         """Prior covariance of the torques at each sample: (N, n, n)."""
 
     @abstractmethod
-    def gradient(self, params: Params, x: Motion, weight: Tensor) -> dict[str, Tensor]:
+    def gradient(self, params: Params, x: Motion, weight: Array) -> dict[str, Array]:
         """Derivative of Σ weight ∘ gram(x, x) by each of the kernel's hyperparameters; weight symmetric, (N n, N n)."""
 
     @abstractmethod
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """Hyperparameters to start a fit from, scaled to the data. motion: N samples, tau: (N, n)."""
 
     def names(self) -> list[str]:
         """Names of the kernel's hyperparameters."""
         return list(self.shapes())
 
-    def shapes(self) -> dict[str, torch.Size]:
+    def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shapes of the kernel's hyperparameters by name."""
-        one = torch.ones((2, self.n_joints), dtype=torch.float64)
+        one = np.ones((2, self.n_joints))
         return {name: value.shape for name, value in self.initial(Motion(one, one, one), one).items()}
 
     def prior_std(self) -> dict[str, float]:
         """Width of the Gaussian prior around the start, for hyperparameters whose width is not the usual one."""
         return {}
 
-    def mean(self, x: Motion) -> Tensor:
+    def mean(self, x: Motion) -> Array:
         """Prior mean of the torques, (N, n) N·m."""
-        return torch.zeros_like(x.q)
+        return np.zeros_like(x.q)
 
 
 class PairKernel(TorqueKernel):
-    """A kernel given as a formula for one pair of samples; PyTorch does the rest, gradients by differentiation."""
+    """A kernel given as a formula for one pair of samples.
+
+    Formulas are written in the Python array API standard: NumPy computes them, and PyTorch, which is imported there
+    alone, differentiates them, or computes them on a GPU. Then all arguments are its tensors.
+    """
 
     @abstractmethod
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+    def blocks(self, params: Params, x: State, y: State) -> Array:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
 
     def cross(self, params: Params, inducing: Motion) -> Cross:
-        """Covariance of one query with the inducing samples and itself, for serving; on the CPU."""
-        return _TorchCross(self, params, inducing.to("cpu"))
+        """Covariance of one query with the inducing samples and itself, for serving."""
+        return _FormulaCross(self, params, inducing)
 
-    def variance(self, params: Params, x: Motion) -> Tensor:
+    def variance(self, params: Params, x: Motion) -> Array:
         """Prior covariance of the torques at each sample: (N, n, n)."""
         state = State.paired(x)
-        return self.blocks(params, state, state).permute(2, 0, 1)
+        return array_namespace(x.q).permute_dims(self.blocks(params, state, state), (2, 0, 1))
 
-    def gram(self, params: Params, x: Motion, y: Motion) -> Tensor:
+    def gram(self, params: Params, x: Motion, y: Motion) -> Array:
         """Covariance of all torques of x with all of y: (N n, M n)."""
-        n, columns = self.n_joints, State.columns(y)
-        out = torch.empty((len(x), n, len(y), n), dtype=torch.float64, device=x.device)
+        xp, n, columns = array_namespace(x.q), self.n_joints, State.columns(y)
+        out = xp.empty((len(x), n, len(y), n), dtype=x.q.dtype, device=device(x.q))
         for rows in row_chunks(len(x), len(y)):
-            out[rows] = self.blocks(params, State.rows(x[rows]), columns).permute(2, 0, 3, 1)
+            block = self.blocks(params, State.rows(x[rows]), columns)
+            out[rows] = xp.permute_dims(block, (2, 0, 3, 1))
         return out.reshape(len(x) * n, len(y) * n)
 
-    def symmetric_gram(self, params: Params, x: Motion) -> Tensor:
+    def symmetric_gram(self, params: Params, x: Motion) -> Array:
         """Covariance of all torques of x with each other, (N n, N n): half the work of `gram`, exactly symmetric."""
-        n, size = self.n_joints, len(x)
-        out = torch.empty((size, n, size, n), dtype=torch.float64, device=x.device)
+        xp, n, size = array_namespace(x.q), self.n_joints, len(x)
+        out = xp.empty((size, n, size, n), dtype=x.q.dtype, device=device(x.q))
         for rows in row_chunks(size, size):
-            block = self.blocks(params, State.rows(x[rows]), State.columns(x[rows.start :])).permute(2, 0, 3, 1)
-            out[rows, :, rows.start :] = block
-            out[rows.start :, :, rows] = block.permute(2, 3, 0, 1)
+            block = self.blocks(params, State.rows(x[rows]), State.columns(x[rows.start :]))
+            out[rows, :, rows.start :] = xp.permute_dims(block, (2, 0, 3, 1))
+            out[rows.start :, :, rows] = xp.permute_dims(block, (3, 1, 2, 0))
         gram = out.reshape(size * n, size * n)
         # pairs inside a diagonal block were computed both ways, equal only to rounding
         return 0.5 * (gram + gram.T)
 
-    def gradient(self, params: Params, x: Motion, weight: Tensor) -> dict[str, Tensor]:
-        """Derivative of Σ weight ∘ gram(x, x), by automatic differentiation over small chunks of pairs.
+    def gradient(self, params: Params, x: Motion, weight: Array) -> dict[str, Array]:
+        """Derivative of Σ weight ∘ gram(x, x), by PyTorch's automatic differentiation."""
+        need("torch", "train")
+        from lipcore.kernels.differentiation import gradient  # noqa: PLC0415 - it imports torch
 
-        Memory stays that of one Gram matrix: no derivative of it is ever stored.
-        """
-        n, size = self.n_joints, len(x)
-        leaves = {name: params[name].detach().clone().requires_grad_(True) for name in self.names()}
-        by_sample = weight.reshape(size, n, size, n)
-        for rows in row_chunks(size, size):
-            # pairs below the chunk's diagonal block are the transposes of those above it, counted by the factor two
-            columns = slice(rows.start, size)
-            blocks = self.blocks(leaves, State.rows(x[rows]), State.columns(x[columns]))
-            part = 2.0 * by_sample[rows, :, columns].permute(1, 3, 0, 2)
-            part[..., : rows.stop - rows.start] *= 0.5
-            torch.autograd.backward((part * blocks).sum())
-        return {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
+        return gradient(self, params, x, weight)
 
 
-class _TorchCross(Cross):
-    """`Cross` of any pair kernel, by its `blocks`: every query waits for PyTorch, about a tenth of a millisecond."""
+class _FormulaCross(Cross):
+    """`Cross` of any pair kernel, by its `blocks`: a query takes a fraction of a millisecond."""
 
     def __init__(self, kernel: PairKernel, params: Params, inducing: Motion) -> None:
         self.size, self.n_joints = len(inducing), kernel.n_joints
         self._blocks, self._anchors = kernel.blocks, State.paired(inducing)
-        self._params = {name: value.detach().cpu().clone() for name, value in params.items()}
+        self._params = {name: value.copy() for name, value in params.items()}
 
-    @torch.no_grad()
     def fill(self, motion: Array, out: Array) -> None:
         """Write the covariances of one query; see `Cross.fill`."""
-        query = torch.tensor(motion)[:, :, None]
+        query = motion[:, :, None]
         anchors = (self._anchors.q, self._anchors.v, self._anchors.a)
-        rows = State(*(torch.cat(pair, dim=1) for pair in zip(anchors, query, strict=True)))
-        out[:] = self._blocks(self._params, rows, State(*query)).permute(2, 0, 1).numpy()
+        rows = State(*(np.concatenate(pair, axis=1) for pair in zip(anchors, query, strict=True)))
+        out[:] = self._blocks(self._params, rows, State(*query)).transpose(2, 0, 1)
         out[-1] = 0.5 * (out[-1] + out[-1].T)
 
 
 class LinearKernel(TorqueKernel):
-    """A torque that is linear in unknown weights with a Gaussian prior: tau = Φ(q, dq, ddq) w."""
+    """A torque that is linear in unknown weights with a Gaussian prior: tau = Φ(q, dq, ddq) w.
+
+    The weights are independent beforehand: their covariance Λ is diagonal.
+    """
 
     @abstractmethod
-    def features(self, x: Motion) -> Tensor:
+    def features(self, x: Motion) -> Array:
         """Φ at each sample: (N, n, p)."""
 
     @abstractmethod
@@ -230,41 +225,44 @@ class LinearKernel(TorqueKernel):
         """Φ of one query, for serving."""
 
     @abstractmethod
-    def covariance(self, params: Params) -> Tensor:
-        """Prior covariance of the weights, (p, p), differentiable in params."""
+    def variances(self, params: Params) -> Array:
+        """Prior variances of the weights, the diagonal of Λ: (p,)."""
 
-    def prior_weights(self) -> Tensor | None:
+    def variances_adjoint(self, params: Params, slopes: Array) -> dict[str, Array]:
+        """Derivatives by each hyperparameter, given those by the `variances`, (p,); none where there are none."""
+        return {}
+
+    def prior_weights(self) -> Array | None:
         """Prior mean of the weights, (p,); None for zero."""
         return None
 
-    def mean(self, x: Motion) -> Tensor:
+    def mean(self, x: Motion) -> Array:
         """Prior mean of the torques, (N, n) N·m."""
         weights = self.prior_weights()
-        return torch.zeros_like(x.q) if weights is None else self.features(x) @ weights.to(x.device)
+        return np.zeros_like(x.q) if weights is None else self.features(x) @ weights
 
-    def gram(self, params: Params, x: Motion, y: Motion) -> Tensor:
+    def gram(self, params: Params, x: Motion, y: Motion) -> Array:
         """Φ(x) Λ Φ(y)ᵀ: (N n, M n)."""
-        return self._rows(x) @ self.covariance(params) @ self._rows(y).T
+        return (self.flat_features(x) * self.variances(params)) @ self.flat_features(y).T
 
-    def symmetric_gram(self, params: Params, x: Motion) -> Tensor:
+    def symmetric_gram(self, params: Params, x: Motion) -> Array:
         """Φ(x) Λ Φ(x)ᵀ, exactly symmetric: (N n, N n)."""
-        rows = self._rows(x)
-        gram = rows @ self.covariance(params) @ rows.T
+        rows = self.flat_features(x)
+        gram = (rows * self.variances(params)) @ rows.T
         return 0.5 * (gram + gram.T)
 
-    def variance(self, params: Params, x: Motion) -> Tensor:
+    def variance(self, params: Params, x: Motion) -> Array:
         """Prior covariance of the torques at each sample: (N, n, n)."""
         features = self.features(x)
-        return features @ self.covariance(params) @ features.mT
+        return (features * self.variances(params)) @ features.mT
 
-    def gradient(self, params: Params, x: Motion, weight: Tensor) -> dict[str, Tensor]:
-        """Derivative of Σ weight ∘ Φ Λ Φᵀ = Σ Λ ∘ Φᵀ weight Φ."""
-        rows = self._rows(x)
-        leaves = {name: params[name].detach().clone().requires_grad_(True) for name in self.names()}
-        ((rows.T @ weight @ rows) * self.covariance(leaves)).sum().backward()  # type: ignore[no-untyped-call]
-        return {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
+    def gradient(self, params: Params, x: Motion, weight: Array) -> dict[str, Array]:
+        """Derivative of Σ weight ∘ Φ Λ Φᵀ = Σ_k Λ_kk (Φᵀ weight Φ)_kk."""
+        rows = self.flat_features(x)
+        return self.variances_adjoint(params, np.einsum("ik,ik->k", rows, weight @ rows))
 
-    def _rows(self, x: Motion) -> Tensor:
+    def flat_features(self, x: Motion) -> Array:
+        """Φ of all torques, sample by sample: (N n, p)."""
         features = self.features(x)
         return features.reshape(-1, features.shape[-1])
 
@@ -279,23 +277,23 @@ class SumKernel(TorqueKernel):
         self.terms = terms
         self.n_joints = terms[0].n_joints
 
-    def gram(self, params: Params, x: Motion, y: Motion) -> Tensor:
+    def gram(self, params: Params, x: Motion, y: Motion) -> Array:
         """Sum of the terms' Gram matrices."""
         return _total([term.gram(params, x, y) for term in self.terms])
 
-    def symmetric_gram(self, params: Params, x: Motion) -> Tensor:
+    def symmetric_gram(self, params: Params, x: Motion) -> Array:
         """Sum of the terms' Gram matrices, exactly symmetric."""
         return _total([term.symmetric_gram(params, x) for term in self.terms])
 
-    def variance(self, params: Params, x: Motion) -> Tensor:
+    def variance(self, params: Params, x: Motion) -> Array:
         """Sum of the terms' prior covariances at each sample: (N, n, n)."""
         return _total([term.variance(params, x) for term in self.terms])
 
-    def gradient(self, params: Params, x: Motion, weight: Tensor) -> dict[str, Tensor]:
+    def gradient(self, params: Params, x: Motion, weight: Array) -> dict[str, Array]:
         """Each term's derivatives: no hyperparameter belongs to two terms."""
         return {name: value for term in self.terms for name, value in term.gradient(params, x, weight).items()}
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """Union of the terms' hyperparameters."""
         return {name: value for term in self.terms for name, value in term.initial(motion, tau).items()}
 
@@ -303,7 +301,7 @@ class SumKernel(TorqueKernel):
         """Union of the terms' widths."""
         return {name: value for term in self.terms for name, value in term.prior_std().items()}
 
-    def mean(self, x: Motion) -> Tensor:
+    def mean(self, x: Motion) -> Array:
         """Sum of the terms' prior means."""
         return _total([term.mean(x) for term in self.terms])
 
@@ -315,8 +313,21 @@ def row_chunks(n_rows: int, n_columns: int) -> Iterator[slice]:
         yield slice(start, min(start + step, n_rows))
 
 
-def _total(parts: list[Tensor]) -> Tensor:
+def _total(parts: list[Array]) -> Array:
     total = parts[0]
     for part in parts[1:]:
         total = total + part
     return total
+
+
+def on_diagonal(values: Array) -> Array:
+    """Blocks with these on the diagonal and zero elsewhere: (n, *batch) to (n, n, *batch)."""
+    n = values.shape[0]
+    unit = array_namespace(values).eye(n, dtype=values.dtype, device=device(values))
+    return unit.reshape((n, n) + (1,) * (values.ndim - 1)) * values
+
+
+def on_last_diagonal(values: Array) -> Array:
+    """The same with joints last: (*batch, n) to (*batch, n, n)."""
+    xp = array_namespace(values)
+    return values[..., None] * xp.eye(values.shape[-1], dtype=values.dtype, device=device(values))

@@ -15,15 +15,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
+from array_api_compat import array_namespace, device
+from numpy.typing import NDArray
 
-from lipcore.data.motion import Motion, check_joint_types
-from lipcore.kernels.base import Params, State
+from lipcore.data.motion import Array, Motion, check_joint_types
+from lipcore.kernels.base import Params, State, on_last_diagonal
 from lipcore.kernels.compiled.chain import chain_cross, chain_gradient, chain_gram, chain_size
 from lipcore.kernels.compiled.kernel import CompiledKernel, Driver
+from lipcore.kernels.compiled.pairs import Hyper
 from lipcore.kernels.energy import PRIOR_STD as WEIGHTS_PRIOR_STD
-from lipcore.kernels.energy import initial_weights, potential_blocks, potential_energy_torque, velocity_weights
+from lipcore.kernels.energy import (
+    initial_weights,
+    potential_blocks,
+    potential_energy_torque,
+    velocity_adjoint,
+    velocity_weights,
+)
 from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, chain_sum
 from lipcore.vocabulary import JointType
 
@@ -48,57 +56,75 @@ class ChainKernel(CompiledKernel):
         self.joint_types: tuple[JointType, ...] = check_joint_types(joint_types)
         self.n_joints = len(self.joint_types)
 
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+    def blocks(self, params: Params, x: State, y: State) -> Array:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
         chain = _Chain.build(self._base(params["chain.logits"], x, y), self.weights(params), x, y)
-        return potential_blocks(self.potential(params, x, y)) + chain.blocks().movedim((-2, -1), (0, 1))
+        kinetic = array_namespace(x.q).moveaxis(chain.blocks(), (-2, -1), (0, 1))
+        return potential_blocks(self.potential(params, x, y)) + kinetic
 
-    def hyper(self, params: Params) -> tuple[Tensor, Tensor, Tensor]:
+    def hyper(self, params: Params) -> Hyper:
         """Shares (1, n, 3) of the base kernels, scales of the potentials (n,) and velocity weights (n, n)."""
         shares = self._shares(params["chain.logits"])
-        return shares[None], torch.exp(params["potential.log_scales"]), self.weights(params)
+        return Hyper(shares[None], np.exp(params["potential.log_scales"]), self.weights(params))
+
+    def hyper_adjoint(self, hyper: Hyper, slopes: Hyper) -> dict[str, Array]:
+        """Derivatives by the hyperparameters, given those by what `hyper` makes of them."""
+        alpha, (sigma, along, across) = hyper.shares[0, :, 1], slopes.shares[0].T
+        share = along - sigma + np.where(self._revolute(), across, 0.0)
+        return {
+            "chain.logits": share * alpha * (1 - alpha),
+            "potential.log_scales": hyper.scales * slopes.scales,
+            **velocity_adjoint(hyper.weights, slopes.weights),
+        }
 
     def potential(self, params: Params, x: State, y: State) -> Derivatives:
         """Kernel of the potential energy V and its derivatives."""
-        return chain_sum(self._base(params["chain.logits"], x, y), torch.exp(params["potential.log_scales"]))
+        scales = params["potential.log_scales"]
+        return chain_sum(self._base(params["chain.logits"], x, y), array_namespace(scales).exp(scales))
 
-    def energies(self, params: Params, x: State, y: State) -> Tensor:
+    def energies(self, params: Params, x: State, y: State) -> Array:
         """Covariance of the kinetic and the potential energy at x with torque j at y: (2, n, *batch), J·N·m."""
         potential = potential_energy_torque(self.potential(params, x, y))
         chain = _Chain.build(self._base(params["chain.logits"], x, y), self.weights(params), x, y)
-        return torch.stack([chain.energy_torque().movedim(-1, 0), potential])
+        xp = array_namespace(potential)
+        return xp.stack([xp.moveaxis(chain.energy_torque(), -1, 0), potential])
 
-    def energy_covariance(self, params: Params, x: State, y: State) -> Tensor:
+    def energy_covariance(self, params: Params, x: State, y: State) -> Array:
         """Covariance of the kinetic energies at x and y, Σ_l h_l², and of the potential ones: (2, *batch), J²."""
         chain = _Chain.build(self._base(params["chain.logits"], x, y), self.weights(params), x, y)
         h = (chain.weights * chain.r * (chain.v * chain.v2)[..., None, :]).sum(-1)
-        return torch.stack([h.square().sum(-1), self.potential(params, x, y).value])
+        return array_namespace(h).stack([(h * h).sum(-1), self.potential(params, x, y).value])
 
-    def weights(self, params: Params) -> Tensor:
+    def weights(self, params: Params) -> Array:
         """Velocity weights w_{l,a} as a lower triangular matrix (n, n)."""
         return velocity_weights(params, self.n_joints)
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """Potential torques as large as the measured ones; inertia as arms have it that weigh as much."""
-        power = tau.square().mean(0).clamp_min(1e-12)
+        power = np.square(tau).mean(0).clip(1e-12)
         # variance of the gravity torque at joint i: α_i Σ_{l≥i} s_l
-        moved = power.flip(0).cummax(0).values.flip(0) / SHARE
-        scales = torch.maximum(moved - torch.cat([moved[1:], moved.new_zeros(1)]), 0.1 * moved)
-        logits = torch.full_like(power, SHARE).logit()
-        logits[0] = (SHARE * power[0] / power.max()).clamp_min(1e-6).logit()  # mostly a vertical axis
-        return {"chain.logits": logits, "potential.log_scales": torch.log(scales), **initial_weights(tau)}
+        moved = np.maximum.accumulate(power[::-1])[::-1] / SHARE
+        scales = np.maximum(moved - np.append(moved[1:], 0.0), 0.1 * moved)
+        share = np.full_like(power, SHARE)
+        share[0] = max(SHARE * power[0] / power.max(), 1e-6)  # mostly a vertical axis
+        logits = np.log(share / (1 - share))
+        return {"chain.logits": logits, "potential.log_scales": np.log(scales), **initial_weights(tau)}
 
     def prior_std(self) -> dict[str, float]:
         """How far the weights may stray from their pattern, and the pattern from its start."""
         return dict(PRIOR_STD)
 
-    def _base(self, logits: Tensor, x: State, y: State) -> BaseKernels:
+    def _base(self, logits: Array, x: State, y: State) -> BaseKernels:
         return base_kernels(self._shares(logits), self.joint_types, x.q, y.q)
 
-    def _shares(self, logits: Tensor) -> Tensor:
-        alpha = torch.sigmoid(logits)
-        revolute = torch.tensor([kind == "revolute" for kind in self.joint_types], device=logits.device)
-        return torch.stack([1 - alpha, alpha, torch.where(revolute, alpha, 0.0)], dim=1)
+    def _shares(self, logits: Array) -> Array:
+        xp = array_namespace(logits)
+        alpha = 1 / (1 + xp.exp(-logits))
+        revolute = xp.asarray(self._revolute(), device=device(logits))
+        return xp.stack([1 - alpha, alpha, xp.where(revolute, alpha, xp.zeros_like(alpha))], axis=1)
+
+    def _revolute(self) -> NDArray[np.bool_]:
+        return np.array([kind == "revolute" for kind in self.joint_types])
 
 
 @dataclass(frozen=True)
@@ -109,31 +135,32 @@ class _Chain:
     along both. m, m1, m2: the products between two joints, M_{i,a} = Π_{a<b<i} p_b, likewise.
     """
 
-    v: Tensor
-    a: Tensor
-    v2: Tensor
-    a2: Tensor
-    left: Tensor
-    right: Tensor
-    mixed: Tensor
-    weights: Tensor
-    r: Tensor
-    r1: Tensor
-    r2: Tensor
-    r12: Tensor
-    m: Tensor
-    m1: Tensor
-    m2: Tensor
+    v: Array
+    a: Array
+    v2: Array
+    a2: Array
+    left: Array
+    right: Array
+    mixed: Array
+    weights: Array
+    r: Array
+    r1: Array
+    r2: Array
+    r12: Array
+    m: Array
+    m1: Array
+    m2: Array
 
     @classmethod
-    def build(cls, base: BaseKernels, weights: Tensor, x: State, y: State) -> _Chain:
+    def build(cls, base: BaseKernels, weights: Array, x: State, y: State) -> _Chain:
         """Products of the base kernels along the chain, link by link."""
+        xp = array_namespace(base.value)
         p, left, right, mixed = base.value, base.left, base.right, base.mixed
-        v, a, v2, a2 = (part.expand_as(p) for part in (x.v, x.a, y.v, y.a))
+        v, a, v2, a2 = (xp.broadcast_to(part, p.shape) for part in (x.v, x.a, y.v, y.a))
         p1, p2, p12 = left * v, right * v2, mixed * v * v2
-        n, one, zero = p.shape[0], torch.ones_like(p[:1]), torch.zeros_like(p)
+        n, one, zero = p.shape[0], xp.ones_like(p[:1]), xp.zeros_like(p)
         row = [one, zero[:1], zero[:1], zero[:1]]
-        rows = [[torch.cat([part, zero[1:]]) for part in row]]
+        rows = [[xp.concat([part, zero[1:]]) for part in row]]
         for b in range(1, n):
             r, r1, r2, r12 = row
             grown = [
@@ -142,14 +169,14 @@ class _Chain:
                 r2 * p[b] + r * p2[b],
                 r12 * p[b] + r1 * p2[b] + r2 * p1[b] + r * p12[b],
             ]
-            row = [torch.cat([part, new]) for part, new in zip(grown, (one, *[zero[:1]] * 3), strict=True)]
-            rows.append([torch.cat([part, zero[b + 1 :]]) for part in row])
-        full = [torch.stack([link[k] for link in rows]).movedim((0, 1), (-2, -1)) for k in range(4)]
-        between = [torch.cat([torch.zeros_like(part[..., :1, :]), part[..., :-1, :]], dim=-2) for part in full[:3]]
-        v, a, v2, a2, left, right, mixed = (part.movedim(0, -1) for part in (v, a, v2, a2, left, right, mixed))
+            row = [xp.concat([part, new]) for part, new in zip(grown, (one, *[zero[:1]] * 3), strict=True)]
+            rows.append([xp.concat([part, zero[b + 1 :]]) for part in row])
+        full = [xp.moveaxis(xp.stack([link[k] for link in rows]), (0, 1), (-2, -1)) for k in range(4)]
+        between = [xp.concat([xp.zeros_like(part[..., :1, :]), part[..., :-1, :]], axis=-2) for part in full[:3]]
+        v, a, v2, a2, left, right, mixed = (xp.moveaxis(part, 0, -1) for part in (v, a, v2, a2, left, right, mixed))
         return cls(v, a, v2, a2, left, right, mixed, weights, *full, *between)
 
-    def blocks(self) -> Tensor:
+    def blocks(self) -> Array:
         """T'_j T_i Σ_l h_l², with T_i = d/dt ∂/∂v_i − ∂/∂q_i: (*batch, n, n).
 
         For one link, with e_i = T_i h, f_j = T'_j h, u_i = ∂h/∂v_i and dots and primes for time derivatives along the
@@ -157,7 +184,7 @@ class _Chain:
 
             2 [e fᵀ + e' (∂'_v h)ᵀ + u ḟᵀ + u' (∂'_v ḣ)ᵀ + h T'e + h' ∂'_v e + ḣ T'u + ḣ' ∂'_v u]
         """
-        w, r, r1, r2 = self.weights, self.r, self.r1, self.r2
+        xp, w, r, r1, r2 = array_namespace(self.r), self.weights, self.r, self.r1, self.r2
         v, a, v2, a2 = (part[..., None, :] for part in (self.v, self.a, self.v2, self.a2))
         g, g1, g2, g12 = w * r, w * r1, w * r2, w * self.r12
         gv, gv2 = g * v, g * v2
@@ -172,10 +199,10 @@ class _Chain:
         f = g2 * v - right * r * before
         e2 = g1 * a2 + g12 * v2 - (mixed * v2 * r + left * r2) * before - left * r * before2
         f1 = g2 * a + g12 * v - (mixed * v * r + right * r1) * before - right * r * before1
-        rank_one = torch.cat([e, e2, gv2, ga_v2], dim=-2).mT @ torch.cat([f, gv, f1, ga_v], dim=-2)
+        rank_one = xp.concat([e, e2, gv2, ga_v2], axis=-2).mT @ xp.concat([f, gv, f1, ga_v], axis=-2)
 
         # sums over links of the parts of T'e, ∂'_v e and T'u off the diagonal: joint i of R, joint j of w
-        hr, hw = h[..., None] * r, w.expand_as(r)
+        hr, hw = h[..., None] * r, xp.broadcast_to(w, r.shape)
         rw, cross = hr.mT @ hw, hr.mT @ before
         lower = (h[..., None] * r2 + dh2[..., None] * r).mT @ hw
         upper = (h[..., None] * r1 + dh[..., None] * r).mT @ hw
@@ -189,10 +216,10 @@ class _Chain:
         )
         diagonal = (h[..., None] * g12 + dh2[..., None] * g1 + dh[..., None] * g2 + ddh[..., None] * g).sum(
             -2
-        ) + self.mixed * cross.diagonal(dim1=-2, dim2=-1)
-        return 2 * (rank_one + below + above.mT + torch.diag_embed(diagonal))
+        ) + self.mixed * xp.linalg.diagonal(cross)
+        return 2 * (rank_one + below + above.mT + on_last_diagonal(diagonal))
 
-    def energy_torque(self) -> Tensor:
+    def energy_torque(self) -> Array:
         """T'_j Σ_l h_l²: covariance of the kinetic energy at x with torque j at y, (*batch, n)."""
         v, v2, a2 = (part[..., None, :] for part in (self.v, self.v2, self.a2))
         g, g2 = self.weights * self.r, self.weights * self.r2
@@ -200,7 +227,7 @@ class _Chain:
         h, dh2 = (g * v * v2).sum(-1), ((g * a2 + g2 * v2) * v).sum(-1)
         return 2 * (dh2[..., None] * g * v + h[..., None] * f).sum(-2)
 
-    def _before(self) -> tuple[Tensor, Tensor, Tensor]:
+    def _before(self) -> tuple[Array, Array, Array]:
         """∂h_l/∂p_i over R_{l,i}: Σ_{a<i} w_{l,a} v_a v'_a M_{i,a}, (*batch, l, i), and its time derivatives."""
         w = self.weights
         vv, av, va = ((s * t)[..., None, :] for s, t in ((self.v, self.v2), (self.a, self.v2), (self.v, self.a2)))

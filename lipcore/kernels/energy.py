@@ -7,19 +7,21 @@ energies, pooled so that little data cannot overfit them.
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+import numpy as np
+from array_api_compat import array_namespace, device
+from numpy.typing import NDArray
 
-from lipcore.kernels.base import Params, State
+from lipcore.data.motion import Array
+from lipcore.kernels.base import Params, State, on_diagonal
 from lipcore.kernels.polynomial import Derivatives
 
 
-def potential_blocks(position: Derivatives) -> Tensor:
+def potential_blocks(position: Derivatives) -> Array:
     """Torque covariance of V with kernel K(q, q'): ∂²K/∂q_i∂q'_j, (n, n, *batch)."""
     return position.mixed
 
 
-def kinetic_blocks(position: Derivatives, weights: Tensor, x: State, y: State) -> Tensor:
+def kinetic_blocks(position: Derivatives, weights: Array, x: State, y: State) -> Array:
     """Torque covariance of T with kernel K(q, q') h², h = Σ_a w_a v_a v'_a: (n, n, *batch).
 
     Primes mark the second argument. With A = Σ ∂_iK v_i, B = Σ ∂'_jK v'_j, C = vᵀHv' (each carries the factor K),
@@ -32,7 +34,7 @@ def kinetic_blocks(position: Derivatives, weights: Tensor, x: State, y: State) -
     ∂K and H instead of the logarithmic derivatives ∂K / K, so that K may be zero.
     """
     n = weights.shape[0]
-    w = weights.reshape((n,) + (1,) * (x.q.dim() - 1))
+    w = weights.reshape((n,) + (1,) * (x.q.ndim - 1))
     k, left, right, mixed = position.value, position.left, position.right, position.mixed
     wv, wa, wv2, wa2 = w * x.v, w * x.a, w * y.v, w * y.a
     h, dh = (wv * y.v).sum(0), (wa * y.v).sum(0)
@@ -46,17 +48,17 @@ def kinetic_blocks(position: Derivatives, weights: Tensor, x: State, y: State) -
     block = block - (h2 * left + h * mixed_y)[:, None] * (2 * wv)
     block = block + (h * h) * mixed
     diagonal = (2 * w) * (k * dh2 + a * h2 + b * dh + c * h)
-    return block + torch.diag_embed(diagonal.movedim(0, -1)).movedim((-2, -1), (0, 1))
+    return block + on_diagonal(diagonal)
 
 
-def potential_energy_torque(position: Derivatives) -> Tensor:
+def potential_energy_torque(position: Derivatives) -> Array:
     """Covariance of V at x with its torque j at y: ∂K/∂q'_j, (n, *batch)."""
     return position.right
 
 
-def kinetic_energy_torque(position: Derivatives, weights: Tensor, x: State, y: State) -> Tensor:
+def kinetic_energy_torque(position: Derivatives, weights: Array, x: State, y: State) -> Array:
     """Covariance of T at x with its torque j at y: 2 (B h + K h') w v − h² ∂'K, (n, *batch)."""
-    w = weights.reshape((weights.shape[0],) + (1,) * (x.q.dim() - 1))
+    w = weights.reshape((weights.shape[0],) + (1,) * (x.q.ndim - 1))
     wv = w * x.v
     h, h2 = (wv * y.v).sum(0), (wv * y.a).sum(0)
     b = (position.right * y.v).sum(0)
@@ -76,7 +78,7 @@ PRIOR_STD = {
 and within a link by little."""
 
 
-def velocity_weights(params: Params, n: int) -> Tensor:
+def velocity_weights(params: Params, n: int) -> Array:
     """Lower triangular (n, n) matrix of w_{l,a} with log w_{l,a} = s + s_l + u_a + g_{l−a} + δ_{l,a}.
 
     `kinetic.log_scale` (), `kinetic.log_link` (n,), `kinetic.log_joint` (n,), `kinetic.log_gap` (n,): how levers grow
@@ -84,26 +86,40 @@ def velocity_weights(params: Params, n: int) -> Tensor:
     weight that the data say little of is guessed from its neighbours instead of fitted to zero, which would make the
     model too sure of itself.
     """
-    scale = params["kinetic.log_scale"]
-    link, joint = torch.tril_indices(n, n, device=scale.device)
-    log_weights = (
-        scale
-        + params["kinetic.log_link"][link]
-        + params["kinetic.log_joint"][joint]
-        + params["kinetic.log_gap"][link - joint]
-        + params["kinetic.log_deviation"]
-    )
-    return torch.zeros((n, n), dtype=scale.dtype, device=scale.device).index_put((link, joint), torch.exp(log_weights))
+    scale, gap, deviation = (params[f"kinetic.log_{name}"] for name in ("scale", "gap", "deviation"))
+    xp, place = array_namespace(scale), device(scale)
+    lower, between, number = (xp.asarray(each, device=place) for each in _triangle(n))
+    pattern = params["kinetic.log_link"][:, None] + params["kinetic.log_joint"] + scale
+    log_weights = pattern + (xp.take(gap, between) + xp.take(deviation, number)).reshape((n, n))
+    return xp.where(lower, xp.exp(log_weights), xp.zeros_like(log_weights))
 
 
-def initial_weights(tau: Tensor) -> dict[str, Tensor]:
-    """Inertia as arms have it that need as much torque, shared out between the links. tau: (N, n)."""
-    n, torque = tau.shape[1], tau.square().mean(0).clamp_min(1e-12).sqrt()
-    zeros = torch.zeros(n, dtype=tau.dtype, device=tau.device)
+def velocity_adjoint(weights: Array, slopes: Array) -> dict[str, Array]:
+    """Derivatives by the hyperparameters of `velocity_weights`, given those by the weights; both (n, n)."""
+    n = len(weights)
+    logs = np.tril(weights * slopes)
     return {
-        "kinetic.log_scale": torch.log(INERTIA_PER_TORQUE * torque.max() / n),
-        "kinetic.log_link": zeros,
-        "kinetic.log_joint": zeros,
-        "kinetic.log_gap": zeros,
-        "kinetic.log_deviation": zeros.new_zeros(n * (n + 1) // 2),
+        "kinetic.log_scale": np.asarray(logs.sum()),
+        "kinetic.log_link": logs.sum(1),
+        "kinetic.log_joint": logs.sum(0),
+        "kinetic.log_gap": np.array([np.trace(logs, -apart) for apart in range(n)]),
+        "kinetic.log_deviation": logs[np.tril_indices(n)],
+    }
+
+
+def _triangle(n: int) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """Whether l ≥ a, (n, n), and flat, (n²,): |l − a|, and the number of (l, a) among those with l ≥ a, 0 elsewhere."""
+    link, joint = np.indices((n, n))
+    number = np.zeros((n, n), np.int64)
+    number[np.tril_indices(n)] = np.arange(n * (n + 1) // 2)
+    return link >= joint, np.abs(link - joint).reshape(-1), number.reshape(-1)
+
+
+def initial_weights(tau: Array) -> dict[str, Array]:
+    """Inertia as arms have it that need as much torque, shared out between the links. tau: (N, n)."""
+    n, torque = tau.shape[1], np.sqrt(np.square(tau).mean(0).clip(1e-12))
+    return {
+        "kinetic.log_scale": np.asarray(np.log(INERTIA_PER_TORQUE * torque.max() / n)),
+        **{f"kinetic.log_{name}": np.zeros(n) for name in ("link", "joint", "gap")},
+        "kinetic.log_deviation": np.zeros(n * (n + 1) // 2),
     }

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from lipcore.data.motion import Motion
-from lipcore.kernels.base import Array, LinearKernel, Params, Regressor
+from lipcore.data.motion import Array, Motion
+from lipcore.kernels.base import LinearKernel, Params, Regressor
 from lipcore.kernels.compiled.compile import brief, compiled
 
 SIGN_WIDTH = 0.02
@@ -24,11 +22,11 @@ def friction_terms(stribeck: bool) -> tuple[str, ...]:
     return (*FRICTION_TERMS, STRIBECK) if stribeck else FRICTION_TERMS
 
 
-def friction_features(dq: Tensor, stribeck: bool = False) -> Tensor:
+def friction_features(dq: Array, stribeck: bool = False) -> Array:
     """[dq, sign(dq) smoothed, 1], with `stribeck` also that sign times exp(−(dq / STRIBECK_SPEED)²): (3 or 4, *)."""
-    sign = torch.tanh(dq / SIGN_WIDTH)
-    slow = [sign * torch.exp(-((dq / STRIBECK_SPEED) ** 2))] if stribeck else []
-    return torch.stack([dq, sign, torch.ones_like(dq), *slow])
+    sign = np.tanh(dq / SIGN_WIDTH)
+    slow = [sign * np.exp(-((dq / STRIBECK_SPEED) ** 2))] if stribeck else []
+    return np.stack([dq, sign, np.ones_like(dq), *slow])
 
 
 class FrictionKernel(LinearKernel):
@@ -42,12 +40,11 @@ class FrictionKernel(LinearKernel):
         self.n_joints, self.stribeck = n_joints, stribeck
         self.terms = friction_terms(stribeck)
 
-    def features(self, x: Motion) -> Tensor:
+    def features(self, x: Motion) -> Array:
         """Each joint's features in its own row: (N, n, f n)."""
         n = self.n_joints
-        features = friction_features(x.dq, self.stribeck).permute(1, 2, 0)  # (N, n, f)
-        out = torch.zeros((len(x), n, n, len(self.terms)), dtype=x.dq.dtype, device=x.device)
-        joints = torch.arange(n, device=x.device)
+        features = friction_features(x.dq, self.stribeck).transpose(1, 2, 0)  # (N, n, f)
+        out, joints = np.zeros((len(x), n, n, len(self.terms))), np.arange(n)
         out[:, joints, joints] = features
         return out.reshape(len(x), n, -1)
 
@@ -55,15 +52,20 @@ class FrictionKernel(LinearKernel):
         """The same features of one query, for serving."""
         return FrictionRegressor(self.n_joints, len(self.terms))
 
-    def covariance(self, params: Params) -> Tensor:
-        """Prior variances on the diagonal: (f n, f n)."""
-        return torch.diag(torch.exp(2 * params["friction.log_std"]).reshape(-1))
+    def variances(self, params: Params) -> Array:
+        """Prior variances of the weights: (f n,)."""
+        return np.exp(2 * params["friction.log_std"]).reshape(-1)
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def variances_adjoint(self, params: Params, slopes: Array) -> dict[str, Array]:
+        """Derivatives by the standard deviations' logarithms, given those by the variances, (f n,)."""
+        log_std = params["friction.log_std"]
+        return {"friction.log_std": 2 * np.exp(2 * log_std) * slopes.reshape(log_std.shape)}
+
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """A tenth of each joint's torque for every feature at the joint's usual speed: log std (n, f)."""
-        usual = tau.square().mean(0).sqrt().clamp_min(1e-6) * 0.1
-        speed = motion.dq.square().mean(0).sqrt().clamp_min(1e-3)
-        return {"friction.log_std": torch.log(torch.stack([usual / speed, *[usual] * (len(self.terms) - 1)], dim=1))}
+        usual, speed = (np.sqrt(np.square(each).mean(0)) for each in (tau, motion.dq))
+        usual, speed = 0.1 * usual.clip(1e-6), speed.clip(1e-3)
+        return {"friction.log_std": np.log(np.stack([usual / speed, *[usual] * (len(self.terms) - 1)], axis=1))}
 
 
 class FrictionRegressor(Regressor):

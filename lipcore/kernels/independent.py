@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
-from torch import Tensor
+import numpy as np
+from array_api_compat import array_namespace
 
-from lipcore.data.motion import Motion, check_joint_types
-from lipcore.kernels.base import PairKernel, Params, State
+from lipcore.data.motion import Array, Motion, check_joint_types
+from lipcore.kernels.base import PairKernel, Params, State, on_diagonal
 from lipcore.vocabulary import JointType
 
 SPREAD_SHARE = 0.1
@@ -40,28 +40,27 @@ class SquaredExponentialKernel(PairKernel):
     def __init__(self, n_joints: int) -> None:
         self.n_joints = n_joints
 
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+    def blocks(self, params: Params, x: State, y: State) -> Array:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)², zero for i ≠ j."""
-        squares = torch.cat([x.q - y.q, x.v - y.v, x.a - y.a]).square()
-        exponent = torch.tensordot(torch.exp(-2 * params["se.log_lengthscales"]), squares, dims=1)
-        return independent_blocks(torch.exp(per_joint(params["se.log_scale"], exponent) - 0.5 * exponent))
+        xp = array_namespace(x.q)
+        squares = xp.square(xp.concat([x.q - y.q, x.v - y.v, x.a - y.a]))
+        exponent = xp.tensordot(xp.exp(-2 * params["se.log_lengthscales"]), squares, axes=1)
+        return on_diagonal(xp.exp(per_joint(params["se.log_scale"], exponent) - 0.5 * exponent))
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """The measured power; every input's spread, times √(3 n) since squared distances add up over 3 n inputs.
 
         Those of dq and ddq have a floor that is lower for a joint that bears no weight: its torque is small already at
         the accelerations seen.
         """
-        n, rms = self.n_joints, power(tau).sqrt()
-        lengthscales = torch.cat([spread(motion.q), spread(motion.dq), spread(motion.ddq)]) * (3 * n) ** 0.5
-        weight = (rms / (WEIGHTLESS_SHARE * largest_behind(rms))).clamp_max(1.0)
-        factors = torch.stack([torch.ones_like(weight), weight.sqrt(), weight], dim=1)
-        least = (factors * torch.tensor(LEAST_LENGTHSCALES, dtype=tau.dtype, device=tau.device)).repeat_interleave(
-            n, dim=1
-        )
+        n, rms = self.n_joints, np.sqrt(power(tau))
+        lengthscales = np.concatenate([spread(motion.q), spread(motion.dq), spread(motion.ddq)]) * (3 * n) ** 0.5
+        weight = np.minimum(rms / (WEIGHTLESS_SHARE * largest_behind(rms)), 1.0)
+        factors = np.stack([np.ones_like(weight), np.sqrt(weight), weight], axis=1)
+        least = np.repeat(factors * LEAST_LENGTHSCALES, n, axis=1)
         return {
-            "se.log_scale": torch.log(power(tau)),
-            "se.log_lengthscales": torch.log(torch.maximum(lengthscales, least)),
+            "se.log_scale": np.log(power(tau)),
+            "se.log_lengthscales": np.log(np.maximum(lengthscales, least)),
         }
 
     def prior_std(self) -> dict[str, float]:
@@ -69,30 +68,25 @@ class SquaredExponentialKernel(PairKernel):
         return dict(SE_PRIOR_STD)
 
 
-def independent_blocks(diagonal: Tensor) -> Tensor:
-    """Blocks of joints that share nothing: (n, *batch) on the diagonal of (n, n, *batch)."""
-    return torch.diag_embed(diagonal.movedim(0, -1)).movedim((-2, -1), (0, 1))
-
-
-def per_joint(values: Tensor, like: Tensor) -> Tensor:
+def per_joint(values: Array, like: Array) -> Array:
     """One number a joint, (n,), shaped to broadcast with `like`, (n, *batch)."""
-    return values.reshape((-1,) + (1,) * (like.dim() - 1))
+    return values.reshape((-1,) + (1,) * (like.ndim - 1))
 
 
-def spread(values: Tensor) -> Tensor:
+def spread(values: Array) -> Array:
     """Standard deviation of each joint's values, (N, n) to (n,), floored for joints that stand still."""
-    std = values.std(0, correction=0)
-    return torch.maximum(std, SPREAD_SHARE * std.max()).clamp_min(SPREAD_FLOOR)
+    std = values.std(0)
+    return np.maximum(std, max(SPREAD_SHARE * std.max(), SPREAD_FLOOR))
 
 
-def power(tau: Tensor) -> Tensor:
+def power(tau: Array) -> Array:
     """Mean square torque of each joint, (N, n) to (n,), (N·m)², kept above zero."""
-    return tau.square().mean(0).clamp_min(1e-12)
+    return np.square(tau).mean(0).clip(1e-12)
 
 
-def largest_behind(values: Tensor) -> Tensor:
+def largest_behind(values: Array) -> Array:
     """Largest value of each joint and those after it, (n,): what they carry, it must carry too."""
-    return values.flip(0).cummax(0).values.flip(0)
+    return np.maximum.accumulate(values[::-1])[::-1]
 
 
 FACTOR_LOGITS = (0.0, -4.0)
@@ -135,27 +129,28 @@ class GeometricallyInspiredKernel(PairKernel):
         self.joint_types: tuple[JointType, ...] = check_joint_types(joint_types)
         self.n_joints = len(self.joint_types)
 
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+    def blocks(self, params: Params, x: State, y: State) -> Array:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)², zero for i ≠ j."""
         log_w, log_u = self._log_weights(params)
-        acceleration = torch.tensordot(torch.exp(log_w), x.a * y.a, dims=1)
-        velocity = torch.tensordot(torch.exp(log_u), x.v * y.v, dims=1)
-        constant = per_joint(torch.exp(params["gip.log_constant"]), velocity)
-        dynamic = constant + acceleration + velocity.square()
+        xp = array_namespace(x.q)
+        acceleration = xp.tensordot(xp.exp(log_w), x.a * y.a, axes=1)
+        velocity = xp.tensordot(xp.exp(log_u), x.v * y.v, axes=1)
+        constant = per_joint(xp.exp(params["gip.log_constant"]), velocity)
+        dynamic = constant + acceleration + xp.square(velocity)
         logits = params["gip.logits"] + params["gip.logits_deviation"]
-        return independent_blocks(dynamic * self._position(logits, x.q, y.q))
+        return on_diagonal(dynamic * self._position(logits, x.q, y.q))
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """The measured power from the constant; inertia as arms have it that need as much torque."""
-        n, zeros = self.n_joints, tau.new_zeros
-        logits = zeros((n, DEGREE, 2)) + torch.tensor(FACTOR_LOGITS, dtype=tau.dtype, device=tau.device)[:, None]
-        position = self._position(logits.expand(n, n, DEGREE, 2), motion.q.T, motion.q.T).mean(1)
+        n, zeros = self.n_joints, np.zeros
+        logits = zeros((n, DEGREE, 2)) + np.array(FACTOR_LOGITS)[:, None]
+        position = self._position(np.broadcast_to(logits, (n, n, DEGREE, 2)), motion.q.T, motion.q.T).mean(1)
         # w is the square of an inertia, half of its logarithm from either joint
-        half = 0.5 * torch.log(INERTIA_PER_TORQUE * largest_behind(power(tau).sqrt()))
+        half = 0.5 * np.log(INERTIA_PER_TORQUE * largest_behind(np.sqrt(power(tau))))
         return {
-            "gip.log_constant": torch.log(power(tau) / position),
+            "gip.log_constant": np.log(power(tau) / position),
             "gip.log_row": half,
-            "gip.log_column": half.clone(),
+            "gip.log_column": half.copy(),
             "gip.log_acceleration": zeros((n, n)),
             "gip.log_speed": zeros(n),
             "gip.log_velocity": zeros((n, n)),
@@ -167,25 +162,29 @@ class GeometricallyInspiredKernel(PairKernel):
         """How far the weights and shares may stray from their pattern, and the pattern from its start."""
         return dict(GIP_PRIOR_STD)
 
-    def _log_weights(self, params: Params) -> tuple[Tensor, Tensor]:
+    def _log_weights(self, params: Params) -> tuple[Array, Array]:
         """log w and log u, each (n, n), joint i × joint a."""
         pattern = params["gip.log_row"][:, None] + params["gip.log_column"]
         log_w = 2 * pattern + params["gip.log_acceleration"]
         return log_w, 0.5 * log_w + params["gip.log_speed"][:, None] + params["gip.log_velocity"]
 
-    def _position(self, logits: Tensor, q: Tensor, q2: Tensor) -> Tensor:
+    def _position(self, logits: Array, q: Array, q2: Array) -> Array:
         """Π_b p_{i,b,1} p_{i,b,2} of every joint i: (n, *batch)."""
-        first, second = torch.cos(q) * torch.cos(q2), torch.sin(q) * torch.sin(q2)
+        xp = array_namespace(q)
+        first, second = xp.cos(q) * xp.cos(q2), xp.sin(q) * xp.sin(q2)
         shares = _position_shares(logits)
-        total = torch.ones_like(first)
+        total = xp.ones_like(first)
         for b, kind in enumerate(self.joint_types):
-            one, two = (first[b], second[b]) if kind == "revolute" else (q[b] * q2[b], torch.ones_like(first[b]))
+            one, two = (first[b], second[b]) if kind == "revolute" else (q[b] * q2[b], xp.ones_like(first[b]))
             for factor in range(DEGREE):
-                sigma, alpha, beta = (per_joint(share, first) for share in shares[:, b, factor].unbind(1))
+                sigma, alpha, beta = (per_joint(shares[:, b, factor, each], first) for each in range(3))
                 total = total * (sigma + alpha * one + beta * two)
         return total
 
 
-def _position_shares(logits: Tensor) -> Tensor:
+def _position_shares(logits: Array) -> Array:
     """Shares (σ, α, β) from the logits of α and β: (..., 2) to (..., 3)."""
-    return torch.softmax(torch.cat([torch.zeros_like(logits[..., :1]), logits], dim=-1), dim=-1)
+    xp = array_namespace(logits)
+    every = xp.concat([xp.zeros_like(logits[..., :1]), logits], axis=-1)
+    powers = xp.exp(every - xp.max(every, axis=-1, keepdims=True))
+    return powers / xp.sum(powers, axis=-1, keepdims=True)

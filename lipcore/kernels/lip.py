@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
-from torch import Tensor
+import numpy as np
+from array_api_compat import array_namespace
 
-from lipcore.data.motion import Motion, check_joint_types
+from lipcore.data.motion import Array, Motion, check_joint_types
 from lipcore.kernels.base import Params, State
 from lipcore.kernels.compiled.kernel import CompiledKernel, Driver
 from lipcore.kernels.compiled.lip import lip_cross, lip_gradient, lip_gram, lip_size
+from lipcore.kernels.compiled.pairs import Hyper
 from lipcore.kernels.energy import (
     PRIOR_STD,
     initial_weights,
@@ -18,6 +19,7 @@ from lipcore.kernels.energy import (
     kinetic_energy_torque,
     potential_blocks,
     potential_energy_torque,
+    velocity_adjoint,
     velocity_weights,
 )
 from lipcore.kernels.polynomial import Derivatives, base_kernels, product
@@ -40,7 +42,7 @@ class LipKernel(CompiledKernel):
         self.n_joints = len(self.joint_types)
         self.tied = tied
 
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+    def blocks(self, params: Params, x: State, y: State) -> Array:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
         total = potential_blocks(self.potential(params, x, y))
         for link in range(1, self.n_joints + 1):
@@ -53,78 +55,99 @@ class LipKernel(CompiledKernel):
             total[:link, :link] += kinetic  # a link's kinetic energy loads only the joints before it
         return total
 
-    def hyper(self, params: Params) -> tuple[Tensor, Tensor, Tensor]:
+    def hyper(self, params: Params) -> Hyper:
         """Shares of the kinetic energies, link by link or one for all, then the potential's: (n + 1 or 2, n, 3).
 
         Scales (n,), of which a product over all joints has the last alone; velocity weights (n, n).
         """
         potential, n = params["potential.logits"], self.n_joints
-        if self.tied:
-            logits = torch.stack([params["kinetic.logits"], potential])
-        else:
-            links = [params[f"kinetic.{link}.logits"] for link in range(1, n + 1)]
-            logits = torch.stack(
-                [torch.nn.functional.pad(each, (0, 0, 0, n - len(each))) for each in (*links, potential)]
-            )
-        scale = torch.exp(params["potential.log_scale"])
-        scales = torch.nn.functional.pad(scale[None], (n - 1, 0))
-        return shares(logits.reshape(-1, 2)).reshape(len(logits), n, 3), scales, self.weights(params)
+        links = [params[name] for name in self._kinetic_logits()]
+        logits = np.zeros((len(links) + 1, n, 2))
+        for row, each in zip(logits, (*links, potential), strict=True):
+            row[: len(each)] = each
+        scales = np.zeros(n)
+        scales[-1] = np.exp(params["potential.log_scale"])
+        return Hyper(shares(logits.reshape(-1, 2)).reshape(len(logits), n, 3), scales, self.weights(params))
+
+    def hyper_adjoint(self, hyper: Hyper, slopes: Hyper) -> dict[str, Array]:
+        """Derivatives by the hyperparameters, given those by what `hyper` makes of them."""
+        sizes = {**self._kinetic_logits(), "potential.logits": self.n_joints}
+        logits = shares_adjoint(hyper.shares, slopes.shares)
+        return {
+            "potential.log_scale": np.asarray(hyper.scales[-1] * slopes.scales[-1]),
+            **{name: each[:size] for (name, size), each in zip(sizes.items(), logits, strict=True)},
+            **velocity_adjoint(hyper.weights, slopes.weights),
+        }
 
     def potential(self, params: Params, x: State, y: State) -> Derivatives:
         """Kernel of the potential energy V and its derivatives."""
         base = base_kernels(shares(params["potential.logits"]), self.joint_types, x.q, y.q)
-        return product(base, torch.exp(params["potential.log_scale"]))
+        scale = params["potential.log_scale"]
+        return product(base, array_namespace(scale).exp(scale))
 
     def kinetic(self, params: Params, link: int, x: State, y: State) -> Derivatives:
         """Position factor of the kinetic energy kernel of `link` (1-based) and its derivatives."""
         logits = params["kinetic.logits"][:link] if self.tied else params[f"kinetic.{link}.logits"]
         base = base_kernels(shares(logits), self.joint_types[:link], x.q[:link], y.q[:link])
-        return product(base.squared(), logits.new_ones(()))
+        return product(base.squared(), array_namespace(logits).ones_like(logits[0, 0]))
 
-    def energies(self, params: Params, x: State, y: State) -> Tensor:
+    def energies(self, params: Params, x: State, y: State) -> Array:
         """Covariance of the kinetic and the potential energy at x with torque j at y: (2, n, *batch), J·N·m."""
         potential = potential_energy_torque(self.potential(params, x, y))
-        kinetic = torch.zeros_like(potential)
+        xp = array_namespace(potential)
+        kinetic = xp.zeros_like(potential)
         for link in range(1, self.n_joints + 1):
             weights = self.weights(params)[link - 1, :link]
             position = self.kinetic(params, link, x, y)
             kinetic[:link] += kinetic_energy_torque(position, weights, x.first(link), y.first(link))
-        return torch.stack([kinetic, potential])
+        return xp.stack([kinetic, potential])
 
-    def energy_covariance(self, params: Params, x: State, y: State) -> Tensor:
+    def energy_covariance(self, params: Params, x: State, y: State) -> Array:
         """Covariance of the kinetic energies at x and y, Σ_l K_l h_l², and of the potential ones: (2, *batch), J²."""
         potential = self.potential(params, x, y).value
-        kinetic = torch.zeros_like(potential)
+        xp = array_namespace(potential)
+        kinetic = xp.zeros_like(potential)
         for link in range(1, self.n_joints + 1):
-            weights = self.weights(params)[link - 1, :link].reshape((-1,) + (1,) * (x.q.dim() - 1))
+            weights = self.weights(params)[link - 1, :link].reshape((-1,) + (1,) * (x.q.ndim - 1))
             h = (weights * x.v[:link] * y.v[:link]).sum(0)
             kinetic = kinetic + self.kinetic(params, link, x, y).value * h * h
-        return torch.stack([kinetic, potential])
+        return xp.stack([kinetic, potential])
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """Potential torques as large as the measured ones; inertia as arms have it that weigh as much."""
-        n = self.n_joints
-        power = tau.square().mean(0).clamp_min(1e-12)
+        power = np.square(tau).mean(0).clip(1e-12)
         # a joint's potential torque grows with its share α or β: start them at the ratio of the torques
-        ratio = torch.log((power / power.max()).clamp_min(1e-6))
-        kinetic = {"kinetic.logits": n} if self.tied else {f"kinetic.{link}.logits": link for link in range(1, n + 1)}
+        ratio = np.log((power / power.max()).clip(1e-6))
         return {
-            "potential.log_scale": torch.log(power.max() * 3),
-            "potential.logits": torch.stack([ratio, ratio], dim=1),
-            **{name: torch.zeros((size, 2), dtype=tau.dtype, device=tau.device) for name, size in kinetic.items()},
+            "potential.log_scale": np.asarray(np.log(power.max() * 3)),
+            "potential.logits": np.stack([ratio, ratio], axis=1),
+            **{name: np.zeros((size, 2)) for name, size in self._kinetic_logits().items()},
             **initial_weights(tau),
         }
 
-    def weights(self, params: Params) -> Tensor:
+    def weights(self, params: Params) -> Array:
         """Velocity weights w_{l,a} as a lower triangular matrix (n, n)."""
         return velocity_weights(params, self.n_joints)
+
+    def _kinetic_logits(self) -> dict[str, int]:
+        """Names of the kinetic energies' logits, and how many joints each has."""
+        n = self.n_joints
+        return {"kinetic.logits": n} if self.tied else {f"kinetic.{link}.logits": link for link in range(1, n + 1)}
 
     def prior_std(self) -> dict[str, float]:
         """Weights are pooled between links and joints; a share may stray far from its start."""
         return dict(PRIOR_STD)
 
 
-def shares(logits: Tensor) -> Tensor:
+def shares(logits: Array) -> Array:
     """Softmax of (0, logits): (n, 2) to the shares (σ, α, β) of each joint, (n, 3)."""
-    zero = torch.zeros_like(logits[:, :1])
-    return torch.softmax(torch.cat([zero, logits], dim=1), dim=1)
+    xp = array_namespace(logits)
+    every = xp.concat([xp.zeros_like(logits[:, :1]), logits], axis=1)
+    powers = xp.exp(every - xp.max(every, axis=1, keepdims=True))
+    return powers / xp.sum(powers, axis=1, keepdims=True)
+
+
+def shares_adjoint(share: Array, slopes: Array) -> Array:
+    """Derivatives by the logits, (…, 2), given the shares and the derivatives by them, (…, 3)."""
+    logits: Array = share * (slopes - (share * slopes).sum(-1, keepdims=True))
+    return logits[..., 1:]

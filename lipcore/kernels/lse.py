@@ -20,12 +20,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
-from torch import Tensor
+import numpy as np
+from array_api_compat import array_namespace, device
+from numpy.typing import NDArray
 
-from lipcore.data.motion import Motion, check_joint_types
-from lipcore.kernels.base import PairKernel, Params, State
-from lipcore.kernels.independent import independent_blocks, per_joint, power, spread
+from lipcore.data.motion import Array, Motion, check_joint_types
+from lipcore.kernels.base import PairKernel, Params, State, on_diagonal
+from lipcore.kernels.independent import per_joint, power, spread
 from lipcore.vocabulary import JointType
 
 
@@ -40,13 +41,14 @@ class LagrangianSEKernel(PairKernel):
         self.joint_types: tuple[JointType, ...] = check_joint_types(joint_types)
         self.n_joints = len(self.joint_types)
 
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+    def blocks(self, params: Params, x: State, y: State) -> Array:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
+        xp = array_namespace(x.q)
         log_k, e, d = self._position(params["lse.log_position_lengthscales"], x.q, y.q)
-        c = per_joint(torch.exp(-2 * params["lse.log_velocity_lengthscales"]), x.v)
+        c = per_joint(xp.exp(-2 * params["lse.log_velocity_lengthscales"]), x.v)
         u = x.v - y.v
         g, b, b2 = -c * u, c * x.a, c * y.a
-        k = torch.exp(params["lse.log_scale"] + (log_k + 0.5 * g * u).sum(0))
+        k = xp.exp(params["lse.log_scale"] + (log_k + 0.5 * g * u).sum(0))
         rate, rate2 = (e * x.v + g * x.a).sum(0), (e * y.v + g * y.a).sum(0)
         both = rate * rate2
         omega = (d * x.v * y.v - b * y.a).sum(0)
@@ -57,37 +59,36 @@ class LagrangianSEKernel(PairKernel):
         block = block + (k * right)[:, None] * left
         block = block + kg[:, None] * ((omega - both) * g + d * x.v)
         block = block - (d * y.v)[:, None] * kg
-        return block - independent_blocks(k * ((omega + both) * c + d))
+        return block - on_diagonal(k * ((omega + both) * c + d))
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """Every input's spread, times √(2 n) as distances add up; the scale that gives all torques their power."""
-        revolute = self._revolute(tau.device)
-        circle = spread(torch.cos(motion.q)).square() + spread(torch.sin(motion.q)).square()
-        position = torch.where(revolute, circle.sqrt(), spread(motion.q))
+        circle = np.hypot(spread(np.cos(motion.q)), spread(np.sin(motion.q)))
+        position = np.where(self._revolute(), circle, spread(motion.q))
         inputs = (2 * self.n_joints) ** 0.5
         params = {
-            "lse.log_scale": torch.zeros((), dtype=tau.dtype, device=tau.device),
-            "lse.log_position_lengthscales": torch.log(position * inputs),
-            "lse.log_velocity_lengthscales": torch.log(spread(motion.dq) * inputs),
+            "lse.log_scale": np.zeros(()),
+            "lse.log_position_lengthscales": np.log(position * inputs),
+            "lse.log_velocity_lengthscales": np.log(spread(motion.dq) * inputs),
         }
-        unit = self.variance(params, motion).diagonal(dim1=1, dim2=2).mean(0)
-        params["lse.log_scale"] = torch.log(power(tau).sum() / unit.sum())
+        unit = np.einsum("kii->i", self.variance(params, motion)) / len(motion)
+        params["lse.log_scale"] = np.asarray(np.log(power(tau).sum() / unit.sum()))
         return params
 
-    def _position(self, log_lengthscales: Tensor, q: Tensor, q2: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _position(self, log_lengthscales: Array, q: Array, q2: Array) -> tuple[Array, Array, Array]:
         """log κ and its first and second derivative by q, each (n, *batch)."""
-        z = q - q2
-        c = per_joint(torch.exp(-2 * log_lengthscales), z)
-        sin, cos = torch.sin(z), torch.cos(z)
+        xp, z = array_namespace(q), q - q2
+        c = per_joint(xp.exp(-2 * log_lengthscales), z)
+        sin, cos = xp.sin(z), xp.cos(z)
         # cos z − 1 without cancellation
-        log_k, e, d = -2 * torch.sin(0.5 * z).square(), -sin, -cos
+        log_k, e, d = -2 * xp.square(xp.sin(0.5 * z)), -sin, -cos
         if "prismatic" in self.joint_types:
-            revolute = per_joint(self._revolute(z.device), z)
-            log_k = torch.where(revolute, log_k, -0.5 * z.square())
-            e = torch.where(revolute, e, -z)
-            d = torch.where(revolute, d, -torch.ones_like(z))
+            revolute = xp.asarray(self._revolute().reshape((-1,) + (1,) * (z.ndim - 1)), device=device(z))
+            log_k = xp.where(revolute, log_k, -0.5 * xp.square(z))
+            e = xp.where(revolute, e, -z)
+            d = xp.where(revolute, d, -xp.ones_like(z))
         return c * log_k, c * e, c * d
 
-    def _revolute(self, device: torch.device) -> Tensor:
+    def _revolute(self) -> NDArray[np.bool_]:
         """Which joints are revolute, (n,)."""
-        return torch.tensor([kind == "revolute" for kind in self.joint_types], device=device)
+        return np.array([kind == "revolute" for kind in self.joint_types])

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
@@ -34,7 +32,7 @@ class MixtureKernel(LinearKernel):
         self._order = order.astype(np.int64)
         shares = np.array([each.probability for each in arms[1:]])
         self.mixing = np.ascontiguousarray(np.linalg.cholesky(np.diag(shares) - np.outer(shares, shares)))
-        self._mean = torch.from_numpy(np.linalg.solve(self.mixing, shares))
+        self._mean = np.linalg.solve(self.mixing, shares)
         self._arms = (
             self.mixing,
             np.stack([each.geometry.constants for each in arms]),
@@ -51,23 +49,23 @@ class MixtureKernel(LinearKernel):
         arm_differences(*self._arms, self._order, motions, linear, out)
         return out
 
-    def features(self, x: Motion) -> Tensor:
+    def features(self, x: Motion) -> Array:
         """Φ at each sample: (N, n, K)."""
-        return torch.from_numpy(np.ascontiguousarray(self.rows(x.arrays()).transpose(0, 2, 1))).to(x.device)
+        return np.ascontiguousarray(self.rows(x.arrays()).transpose(0, 2, 1))
 
     def regressor(self) -> Regressor:
         """The same features of one query, for serving."""
         return MixtureRegressor(self)
 
-    def covariance(self, params: Params) -> Tensor:
-        """Prior variances of the weights on the diagonal: (K, K)."""
-        return self._variance * torch.eye(self.size, dtype=torch.float64)
+    def variances(self, params: Params) -> Array:
+        """Prior variances of the weights: (K,)."""
+        return np.full(self.size, self._variance)
 
-    def prior_weights(self) -> Tensor:
+    def prior_weights(self) -> Array:
         """Prior mean of the weights, (K,)."""
         return self._mean
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """No hyperparameters."""
         return {}
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
@@ -38,26 +36,26 @@ class PayloadKernel(LinearKernel):
         self.regressor().fill_many(motions, out, 0)
         return out
 
-    def features(self, x: Motion) -> Tensor:
+    def features(self, x: Motion) -> Array:
         """Φ at each sample: (N, n, 10)."""
-        return torch.from_numpy(np.ascontiguousarray(self.rows(x.arrays()).transpose(0, 2, 1)))
+        return np.ascontiguousarray(self.rows(x.arrays()).transpose(0, 2, 1))
 
-    def energy_features(self, x: Motion) -> Tensor:
+    def energy_features(self, x: Motion) -> Array:
         """Kinetic and potential energy per unit of each weight: (N, 2, 10) J."""
         none = np.zeros((self.n_joints, PARAMETERS))
         out = np.empty((len(x), 2, (PARAMETERS + 1) * self.n_joints))
         arm_energies(self.constants, self.gravity, none, self.order, x.arrays(), out)
-        return torch.from_numpy(np.ascontiguousarray(out[..., self._last]))
+        return np.ascontiguousarray(out[..., self._last])
 
     def regressor(self) -> Regressor:
         """The same features of one query, for serving."""
         return PayloadRegressor(self)
 
-    def covariance(self, params: Params) -> Tensor:
-        """Prior variances of the weights on the diagonal: (10, 10)."""
-        return torch.diag(torch.from_numpy(self._room))
+    def variances(self, params: Params) -> Array:
+        """Prior variances of the weights: (10,)."""
+        return self._room
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """No hyperparameters."""
         return {}
 

@@ -10,9 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
+from array_api_compat import array_namespace, device
 
+from lipcore.data.motion import Array
 from lipcore.vocabulary import JointType
 
 
@@ -23,20 +24,20 @@ class Derivatives:
     value: (*batch); left: ∂K/∂q_i, right: ∂K/∂q'_j, both (n, *batch); mixed: ∂²K/∂q_i∂q'_j, (n, n, *batch).
     """
 
-    value: Tensor
-    left: Tensor
-    right: Tensor
-    mixed: Tensor
+    value: Array
+    left: Array
+    right: Array
+    mixed: Array
 
 
 @dataclass(frozen=True)
 class BaseKernels:
     """One base kernel p_b(q_b, q'_b) a joint with p, ∂p/∂q, ∂p/∂q', ∂²p/∂q∂q', each (n, *batch)."""
 
-    value: Tensor
-    left: Tensor
-    right: Tensor
-    mixed: Tensor
+    value: Array
+    left: Array
+    right: Array
+    mixed: Array
 
     def squared(self) -> BaseKernels:
         """p², for the kinetic energy: degree two in each joint's cosine and sine."""
@@ -44,58 +45,62 @@ class BaseKernels:
         return BaseKernels(p * p, 2 * p * self.left, 2 * p * self.right, 2 * (p * self.mixed + self.left * self.right))
 
 
-def base_kernels(shares: Tensor, joint_types: Sequence[JointType], q: Tensor, q2: Tensor) -> BaseKernels:
+def base_kernels(shares: Array, joint_types: Sequence[JointType], q: Array, q2: Array) -> BaseKernels:
     """Base kernels of all joints of the paper, TR2023-063.
 
     revolute: p = σ + α cos q cos q' + β sin q sin q'; prismatic: p = (σ + β) + α q q'.
     shares: (n, 3) with columns σ, α, β; q, q2: (n, *batch), batches broadcast.
     """
-    dims = (-1,) + (1,) * (q.dim() - 1)
-    sigma, alpha, beta = (column.reshape(dims) for column in shares.unbind(1))
+    xp, dims = array_namespace(shares), (-1,) + (1,) * (q.ndim - 1)
+    sigma, alpha, beta = (shares[:, column].reshape(dims) for column in range(3))
     if "prismatic" not in joint_types:
         return _revolute(sigma, alpha, beta, q, q2)
     # computed for every joint, then chosen: robots that mix the two types are small
-    prismatic = torch.tensor([kind == "prismatic" for kind in joint_types], device=q.device).reshape(dims)
+    kinds = np.array([kind == "prismatic" for kind in joint_types]).reshape(dims)
+    prismatic = xp.asarray(kinds, device=device(q))
     straight, round_ = _prismatic(sigma + beta, alpha, q, q2), _revolute(sigma, alpha, beta, q, q2)
     return BaseKernels(
         *(
-            torch.where(prismatic, getattr(straight, name), getattr(round_, name))
+            xp.where(prismatic, getattr(straight, name), getattr(round_, name))
             for name in ("value", "left", "right", "mixed")
         )
     )
 
 
-def _revolute(sigma: Tensor, alpha: Tensor, beta: Tensor, q: Tensor, q2: Tensor) -> BaseKernels:
-    cos, sin, cos2, sin2 = torch.cos(q), torch.sin(q), torch.cos(q2), torch.sin(q2)
+def _revolute(sigma: Array, alpha: Array, beta: Array, q: Array, q2: Array) -> BaseKernels:
+    xp = array_namespace(q)
+    cos, sin, cos2, sin2 = xp.cos(q), xp.sin(q), xp.cos(q2), xp.sin(q2)
     ac, as_, bc, bs = alpha * cos, alpha * sin, beta * cos, beta * sin
     return BaseKernels(
         sigma + ac * cos2 + bs * sin2, bc * sin2 - as_ * cos2, bs * cos2 - ac * sin2, as_ * sin2 + bc * cos2
     )
 
 
-def _prismatic(sigma: Tensor, alpha: Tensor, q: Tensor, q2: Tensor) -> BaseKernels:
-    slope = alpha * torch.ones_like(q * q2)
+def _prismatic(sigma: Array, alpha: Array, q: Array, q2: Array) -> BaseKernels:
+    slope = alpha * array_namespace(q).ones_like(q * q2)
     return BaseKernels(sigma + slope * q * q2, slope * q2, slope * q, slope)
 
 
-def product(base: BaseKernels, scale: Tensor) -> Derivatives:
+def product(base: BaseKernels, scale: Array) -> Derivatives:
     """scale Π_b p_b with derivatives. scale: ()."""
-    return chain_sum(base, torch.cat([scale.new_zeros(len(base.value) - 1), scale[None]]))
+    xp = array_namespace(scale)
+    none = xp.zeros(len(base.value) - 1, dtype=scale.dtype, device=device(scale))
+    return chain_sum(base, xp.concat([none, scale[None]]))
 
 
-def chain_sum(base: BaseKernels, scales: Tensor) -> Derivatives:
+def chain_sum(base: BaseKernels, scales: Array) -> Derivatives:
     """Σ_l s_l Π_{b≤l} p_b with derivatives, from tip to base: K ← p_b (s_b + K). scales: s, (n,)."""
-    last = base.value.shape[0] - 1
+    xp, last = array_namespace(base.value), base.value.shape[0] - 1
     scale = scales[last]
     value = scale * base.value[last]
     left, right, mixed = scale * base.left[last:], scale * base.right[last:], scale * base.mixed[last:, None]
     for b in range(last - 1, -1, -1):
         p, lead, trail, both = base.value[b], base.left[b], base.right[b], base.mixed[b]
         inner = scales[b] + value
-        upper = torch.cat([(inner * both)[None], right * lead], dim=0)
-        lower = torch.cat([(left * trail)[:, None], mixed * p], dim=1)
-        mixed = torch.cat([upper[None], lower], dim=0)
-        left = torch.cat([(inner * lead)[None], left * p], dim=0)
-        right = torch.cat([(inner * trail)[None], right * p], dim=0)
+        upper = xp.concat([(inner * both)[None], right * lead], axis=0)
+        lower = xp.concat([(left * trail)[:, None], mixed * p], axis=1)
+        mixed = xp.concat([upper[None], lower], axis=0)
+        left = xp.concat([(inner * lead)[None], left * p], axis=0)
+        right = xp.concat([(inner * trail)[None], right * p], axis=0)
         value = inner * p
     return Derivatives(value, left, right, mixed)

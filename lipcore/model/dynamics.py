@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.fitting.estimators import Estimator
 from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.model.functionals import (
@@ -56,7 +55,7 @@ def available(estimator: Estimator) -> tuple[ComponentName, ...]:
 
 
 def components(
-    model: TorqueModel, motion: Motion, names: Sequence[str], tau: Tensor | None = None
+    model: TorqueModel, motion: Motion, names: Sequence[str], tau: Array | None = None
 ) -> dict[str, Estimate]:
     """Posterior of components at N queries, by name; friction is in `friction` and `forward_dynamics` alone.
 
@@ -77,9 +76,7 @@ def components(
         estimates |= _torque_parts(posterior, SumKernel(*terms), motion, torques)
     if "friction" in asked:
         friction = model.estimator.terms["friction"]
-        estimates["friction"] = combine_torques(
-            posterior, friction, [motion], torch.eye(model.n_joints, dtype=torch.float64)
-        )
+        estimates["friction"] = combine_torques(posterior, friction, [motion], np.eye(model.n_joints))
     energetic = _energy_terms(model.estimator)
     if "kinetic_energy" in asked:
         estimates["kinetic_energy"] = kinetic_energy(posterior, energetic, motion)
@@ -90,50 +87,51 @@ def components(
     return {name: estimates[name] for name in asked}
 
 
-def reference_posture(model: TorqueModel) -> Tensor:
+def reference_posture(model: TorqueModel) -> Array:
     """Where potential energy counts from, (n,): the middle of each joint's range in the training samples."""
     q = model.training_range["q"]
-    return 0.5 * torch.tensor([q["min"], q["max"]], dtype=torch.float64).sum(0)
+    return np.asarray(0.5 * (np.array(q["min"]) + np.array(q["max"])))
 
 
-def forward_dynamics(model: TorqueModel, motion: Motion, tau: Tensor) -> Estimate:
+def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate:
     """Acceleration under torque tau (N, n) N·m: ddq = M(q)⁻¹ (tau − c − g − f), (N, n) rad/s²; motion.ddq is not read.
 
     Uncertainty to first order: an error ε of the whole torque at (q, dq, ddq) moves ddq by −M⁻¹ ε, M's own error
     included. It holds while the uncertainty of M is small against M. Raise IndefiniteInertiaError where M is not
     positive definite.
     """
-    posterior, zero = model.posterior, torch.zeros_like(motion.q)
+    posterior, zero = model.posterior, np.zeros_like(motion.q)
     inertia = inertia_matrix(posterior, SumKernel(*_dynamics_terms(model.estimator)), motion.q)
-    lower, info = torch.linalg.cholesky_ex(0.5 * (inertia + inertia.mT))
-    if info.any():
-        raise IndefiniteInertiaError(int(info.nonzero()[0]))
+    inertia = 0.5 * (inertia + inertia.mT)
+    lowest = np.linalg.eigvalsh(inertia)[:, 0]
+    if not (lowest > 0).all():
+        raise IndefiniteInertiaError(int(np.argmin(lowest > 0)))
     bias = posterior.mean(Motion(motion.q, motion.dq, zero))
-    ddq = torch.cholesky_solve((tau - bias)[:, :, None], lower)[:, :, 0]
+    ddq = np.asarray(np.linalg.solve(inertia, (tau - bias)[:, :, None])[:, :, 0], np.float64)
     covariance = posterior.predict(Motion(motion.q, motion.dq, ddq)).covariance
-    half = torch.cholesky_solve(covariance, lower)  # M⁻¹ Σ
-    variance = torch.cholesky_solve(half.mT, lower).diagonal(dim1=1, dim2=2)
-    return Estimate(ddq, variance.clamp_min(0.0).sqrt())
+    half = np.linalg.solve(inertia, covariance)  # M⁻¹ Σ
+    variance = np.linalg.solve(inertia, half.mT).diagonal(axis1=1, axis2=2)
+    return Estimate(ddq, np.sqrt(variance.clip(0.0)))
 
 
-def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, q: Tensor) -> Tensor:
+def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, q: Array) -> Array:
     """Posterior mean of M(q), (N, n, n), kg·m² where both joints are revolute.
 
     dynamics: the kernel's terms but friction; q: (N, n) rad or m. Column j is the torque per unit acceleration of joint
     j, f(q, 0, e_j) − f(q, 0, 0): exact, since torque is affine in ddq.
     """
     n = q.shape[1]
-    zero = torch.zeros_like(q)
+    zero = np.zeros_like(q)
     rest = posterior.mean(Motion(q, zero, zero), dynamics)
     pushes = [_push(q, joint) for joint in range(n)]
-    return torch.stack([posterior.mean(push, dynamics) - rest for push in pushes], dim=2)
+    return np.stack([posterior.mean(push, dynamics) - rest for push in pushes], axis=2)
 
 
 def _torque_parts(
     posterior: Posterior, kernel: TorqueKernel, motion: Motion, names: Sequence[ComponentName]
 ) -> dict[str, Estimate]:
     """The components of `_TORQUES` and the inertia matrix, from one joint posterior."""
-    n, zero = motion.n_joints, torch.zeros_like(motion.q)
+    n, zero = motion.n_joints, np.zeros_like(motion.q)
     moves = {"rest": Motion(motion.q, zero, zero)}
     if "coriolis" in names:
         moves["moving"] = Motion(motion.q, motion.dq, zero)
@@ -143,46 +141,47 @@ def _torque_parts(
         moves |= {f"push {joint}": _push(motion.q, joint) for joint in range(n)}
     at = {move: index for index, move in enumerate(moves)}
     blocks = [_inertia_rows(at, n) if name == "inertia_matrix" else _vector_rows(name, at, n) for name in names]
-    every = combine_torques(posterior, kernel, list(moves.values()), torch.cat(blocks).reshape(-1, len(moves) * n))
+    every = combine_torques(posterior, kernel, list(moves.values()), np.concatenate(blocks).reshape(-1, len(moves) * n))
     sizes = [len(block) for block in blocks]
-    parts = zip(names, torch.split(every.mean, sizes, dim=1), torch.split(every.std, sizes, dim=1), strict=True)
+    ends = np.cumsum(sizes)[:-1]
+    parts = zip(names, np.split(every.mean, ends, axis=1), np.split(every.std, ends, axis=1), strict=True)
     return {
         name: Estimate(_symmetric(mean, n), _symmetric(std, n)) if name == "inertia_matrix" else Estimate(mean, std)
         for name, mean, std in parts
     }
 
 
-def _vector_rows(name: ComponentName, at: dict[str, int], n: int) -> Tensor:
+def _vector_rows(name: ComponentName, at: dict[str, int], n: int) -> Array:
     """Coefficients (n, S, n) of a component of `_TORQUES`."""
-    rows = torch.zeros((n, len(at), n), dtype=torch.float64)
+    rows = np.zeros((n, len(at), n))
     for move, sign in _TORQUES[name].items():
-        rows[:, at[move]] = sign * torch.eye(n, dtype=torch.float64)
+        rows[:, at[move]] = sign * np.eye(n)
     return rows
 
 
-def _inertia_rows(at: dict[str, int], n: int) -> Tensor:
+def _inertia_rows(at: dict[str, int], n: int) -> Array:
     """Coefficients (n (n+1) / 2, S, n) of ½ (M_ij + M_ji) for i ≤ j; column j of M is f(q, 0, e_j) − f(q, 0, 0)."""
-    i, j = torch.triu_indices(n, n)
-    entry, first_push, rest = torch.arange(len(i)), at["push 0"], at["rest"]
-    rows = torch.zeros((len(i), len(at), n), dtype=torch.float64)
+    i, j = np.triu_indices(n)
+    entry, first_push, rest = np.arange(len(i)), at["push 0"], at["rest"]
+    rows = np.zeros((len(i), len(at), n))
     for row, column in ((i, j), (j, i)):
         rows[entry, first_push + column, row] += 0.5
         rows[entry, rest, row] -= 0.5
     return rows
 
 
-def _symmetric(upper: Tensor, n: int) -> Tensor:
+def _symmetric(upper: Array, n: int) -> Array:
     """Entries i ≤ j, (N, n (n+1) / 2), as symmetric matrices (N, n, n)."""
-    i, j = torch.triu_indices(n, n)
-    full = torch.empty((len(upper), n, n), dtype=upper.dtype)
+    i, j = np.triu_indices(n)
+    full = np.empty((len(upper), n, n), dtype=upper.dtype)
     full[:, i, j] = full[:, j, i] = upper
     return full
 
 
-def _push(q: Tensor, joint: int) -> Motion:
+def _push(q: Array, joint: int) -> Motion:
     """Unit acceleration of one joint from standstill."""
-    zero = torch.zeros_like(q)
-    push = zero.clone()
+    zero = np.zeros_like(q)
+    push = zero.copy()
     push[:, joint] = 1.0
     return Motion(q, zero, push)
 
@@ -195,7 +194,7 @@ def _energy_terms(estimator: Estimator) -> list[EnergyKernel]:
     return [term for term in _dynamics_terms(estimator) if isinstance(term, EnergyKernel)]
 
 
-def _check(model: TorqueModel, motion: Motion, names: Sequence[str], tau: Tensor | None) -> list[ComponentName]:
+def _check(model: TorqueModel, motion: Motion, names: Sequence[str], tau: Array | None) -> list[ComponentName]:
     offered = available(model.estimator)
     for name in names:
         if name not in offered:
@@ -209,5 +208,5 @@ def _check(model: TorqueModel, motion: Motion, names: Sequence[str], tau: Tensor
         expected = "a torque for forward_dynamics" if tau is None else "None without forward_dynamics"
         raise ValueError(f"tau is {'None' if tau is None else 'given'}, expected {expected}")
     if tau is not None and tau.shape != motion.q.shape:
-        raise ValueError(f"tau has shape {tuple(tau.shape)}, expected {tuple(motion.q.shape)} as q has")
+        raise ValueError(f"tau has shape {tau.shape}, expected {motion.q.shape} as q has")
     return [name for name in COMPONENTS if name in names]

@@ -9,10 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import Params, State, TorqueKernel, row_chunks
 from lipcore.kernels.chain import ChainKernel
@@ -33,22 +32,22 @@ COLUMNS_PER_CHUNK = 512
 class Estimate:
     """Posterior mean and standard deviation of a quantity at N queries, both (N, ...), noise excluded."""
 
-    mean: Tensor
-    std: Tensor
+    mean: Array
+    std: Array
 
 
-def condition(posterior: Posterior, prior_mean: Tensor, prior_variance: Tensor, cross: Tensor) -> Estimate:
+def condition(posterior: Posterior, prior_mean: Array, prior_variance: Array, cross: Array) -> Estimate:
     """Posterior of K quantities from their covariance with the posterior's anchors (see `Posterior`).
 
     prior_mean, prior_variance: (K,); cross: (M, K).
     """
-    explained = posterior.whiten(cross).square().sum(0)
-    std = (prior_variance - explained).clamp_min(0.0).sqrt()  # rounding may end below zero where all is known
+    explained = np.square(posterior.whiten(cross)).sum(0)
+    std = np.sqrt((prior_variance - explained).clip(0.0))  # rounding may end below zero where all is known
     return Estimate(prior_mean + posterior.weights @ cross, posterior.std_factor * std)
 
 
 def combine_torques(
-    posterior: Posterior, kernel: TorqueKernel, motions: Sequence[Motion], coefficients: Tensor
+    posterior: Posterior, kernel: TorqueKernel, motions: Sequence[Motion], coefficients: Array
 ) -> Estimate:
     """Posterior of F linear combinations of a kernel's torques at S motions a query, (N, F).
 
@@ -56,7 +55,7 @@ def combine_torques(
     motions: S motions of N queries each; coefficients: (F, S n), motion by motion.
     """
     n, size, count = kernel.n_joints, len(motions), len(motions[0])
-    stacked = [torch.stack([getattr(m, name) for m in motions], dim=1) for name in ("q", "dq", "ddq")]  # (N, S, n)
+    stacked = [np.stack([getattr(m, name) for m in motions], axis=1) for name in ("q", "dq", "ddq")]  # (N, S, n)
     step = max(1, COLUMNS_PER_CHUNK // (size * n))
     means, stds = [], []
     for start in range(0, count, step):
@@ -65,14 +64,14 @@ def combine_torques(
         cross = posterior.cross(kernel, stack)  # (M, queries S n)
         cross = cross.reshape(-1, size * n) @ coefficients.T
         grams = [kernel.symmetric_gram(posterior.params, stack[k * size : (k + 1) * size]) for k in range(queries)]
-        variance = torch.stack([(coefficients @ gram * coefficients).sum(1) for gram in grams])
+        variance = np.stack([(coefficients @ gram * coefficients).sum(1) for gram in grams])
         mean = kernel.mean(stack).reshape(queries, -1) @ coefficients.T
         estimate = condition(
             posterior, mean.reshape(-1), variance.reshape(-1), cross.reshape(len(posterior.weights), -1)
         )
         means.append(estimate.mean.reshape(queries, -1))
         stds.append(estimate.std.reshape(queries, -1))
-    return Estimate(torch.cat(means), torch.cat(stds))
+    return Estimate(np.concatenate(means), np.concatenate(stds))
 
 
 def kinetic_energy(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Estimate:
@@ -83,13 +82,13 @@ def kinetic_energy(posterior: Posterior, kernels: Sequence[EnergyKernel], query:
 
 
 def potential_energy(
-    posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion, reference: Tensor
+    posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion, reference: Array
 ) -> Estimate:
     """Posterior of V(q) − V(reference) at N queries, summed over the kernels: (N,) J. reference: (n,).
 
     Torques do not tell the constant of V: only a difference has a useful uncertainty.
     """
-    params, zero = posterior.params, torch.zeros_like(reference)[None]
+    params, zero = posterior.params, np.zeros_like(reference)[None]
     origin = Motion(reference[None], zero, zero)
     variance = (
         covariance(params, kernels, query, query)
@@ -101,49 +100,49 @@ def potential_energy(
     return condition(posterior, mean[POTENTIAL], variance[POTENTIAL], cross[POTENTIAL])
 
 
-def prior_mean(kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
+def prior_mean(kernels: Sequence[EnergyKernel], query: Motion) -> Array:
     """Prior means of the kinetic and the potential energy at N queries, summed over the kernels: (2, N) J."""
-    total = torch.zeros((2, len(query)), dtype=torch.float64)
+    total = np.zeros((2, len(query)))
     for kernel in kernels:
         if isinstance(kernel, RigidKernel) and (weights := kernel.prior_weights()) is not None:
             total += (kernel.energy_features(query) @ weights).T
     return total
 
 
-def covariance(params: Params, kernels: Sequence[EnergyKernel], x: Motion, y: Motion) -> Tensor:
+def covariance(params: Params, kernels: Sequence[EnergyKernel], x: Motion, y: Motion) -> Array:
     """Prior covariance of each energy at sample k of x with the same energy at sample k of y: (2, N) J².
 
     x, y: N samples each; y may be a single one, which then is that of every k.
     """
-    total = torch.zeros((2, len(x)), dtype=torch.float64)
+    total = np.zeros((2, len(x)))
     for kernel in kernels:
         if isinstance(kernel, RigidKernel):
-            scaled = kernel.energy_features(x) @ kernel.covariance(params)
+            scaled = kernel.energy_features(x) * kernel.variances(params)
             total += (scaled * kernel.energy_features(y)).sum(2).T
         else:
             total += kernel.energy_covariance(params, State.paired(x), State.paired(y))
     return total
 
 
-def with_anchors(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Tensor:
+def with_anchors(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Array:
     """Prior covariance of both energies at N queries with the M anchors of the posterior: (2, M, N) (eq. 2)."""
-    total = torch.zeros((2, len(posterior.weights), len(query)), dtype=torch.float64)
+    total = np.zeros((2, len(posterior.weights), len(query)))
     for kernel in kernels:
         if isinstance(kernel, RigidKernel):
-            scaled = kernel.energy_features(query) @ kernel.covariance(posterior.params)  # (N, 2, p)
+            scaled = kernel.energy_features(query) * kernel.variances(posterior.params)  # (N, 2, p)
             parts = [posterior.with_weights(kernel, scaled[:, energy].T) for energy in (KINETIC, POTENTIAL)]
         else:
             anchors = posterior.with_torques(kernel, partial(_with_torques, kernel, posterior.params, query))
-            parts = list(anchors.reshape(len(anchors), 2, -1).unbind(1))
-        total += torch.stack(parts)
+            parts = list(anchors.reshape(len(anchors), 2, -1).transpose(1, 0, 2))
+        total += np.stack(parts)
     return total
 
 
-def _with_torques(kernel: LipKernel | ChainKernel, params: Params, query: Motion, motion: Motion) -> Tensor:
+def _with_torques(kernel: LipKernel | ChainKernel, params: Params, query: Motion, motion: Motion) -> Array:
     """Covariance of all torques of S samples with both energies at N queries: (S n, 2 N)."""
     n, size, columns = kernel.n_joints, len(motion), State.columns(motion)
-    out = torch.empty((size, n, 2, len(query)), dtype=torch.float64)
+    out = np.empty((size, n, 2, len(query)))
     for rows in row_chunks(len(query), size):
         cross = kernel.energies(params, State.rows(query[rows]), columns)  # (2, n, rows, S)
-        out[..., rows] = cross.permute(3, 1, 0, 2)
+        out[..., rows] = cross.transpose(3, 1, 0, 2)
     return out.reshape(size * n, -1)

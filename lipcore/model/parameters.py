@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lipcore.data.samples import Array
 from lipcore.fitting.estimators import Estimator
@@ -88,14 +86,14 @@ def weight_posterior(posterior: Posterior, term: LinearKernel) -> WeightPosterio
 
     term: one of the posterior's kernel. The covariance carries the posterior's calibration.
     """
-    prior = term.covariance(posterior.params).detach()
-    cross = posterior.with_weights(term, prior)  # (M, p)
+    prior = term.variances(posterior.params)
+    cross = posterior.with_weights(term, np.diag(prior))  # (M, p)
     white = posterior.whiten(cross)
     mean = cross.T @ posterior.weights
     if (centre := term.prior_weights()) is not None:
-        mean = mean + centre.to(mean.device)
-    covariance = posterior.std_factor**2 * (prior - white.T @ white)
-    return WeightPosterior(_numpy(mean), _numpy(0.5 * (covariance + covariance.T)), _numpy(prior.diagonal().sqrt()))
+        mean = mean + centre
+    covariance = posterior.std_factor**2 * (np.diag(prior) - white.T @ white)
+    return WeightPosterior(mean, 0.5 * (covariance + covariance.T), np.sqrt(prior))
 
 
 def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Friction:
@@ -139,7 +137,7 @@ def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> In
     if term.arm.steps:
         options.append(nearest_plausible(weights.mean, weights.scale, metric, term.n_joints, start))
     asked = checks(posterior.basis.inducing, 0)
-    torque = posterior.predict(asked, term).mean.numpy()
+    torque = posterior.predict(asked, term).mean
     errors = [np.sqrt(np.mean((term.torque(option, asked) - torque) ** 2, axis=0)) for option in options]
     best = int(np.argmin([np.mean(error / np.maximum(torque.std(0), 1e-12)) for error in errors]))
     plausible = options[best][:size].reshape(-1, PARAMETERS)
@@ -153,7 +151,7 @@ def precision(posterior: CompactPosterior, term: LinearKernel) -> Array:
     """
     rows = posterior.basis.rows(term)
     if posterior.statistics is not None:
-        return _numpy(posterior.statistics.a[rows, rows]) + np.eye(rows.stop - rows.start)
+        return posterior.statistics.a[rows, rows] + np.eye(rows.stop - rows.start)
     weights = weight_posterior(posterior, term)
     scaled = weights.covariance / np.outer(weights.scale, weights.scale)
     values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
@@ -250,8 +248,3 @@ def _open(std: Array, scale: Array) -> list[str]:
 
 def _body(values: Array) -> dict[str, Any]:
     return {"mass": float(values[0]), "first_moment": values[1:4].tolist(), "inertia": values[4:].tolist()}
-
-
-def _numpy(values: Tensor) -> Array:
-    out: Array = values.to(torch.float64).cpu().numpy()
-    return out

@@ -16,8 +16,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lipcore.data.metrics import quantile
 from lipcore.data.motion import Motion
@@ -33,6 +31,7 @@ from lipcore.model.memory import SEED, SHARE, Memory
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.linalg import block_diagonal
 from lipcore.posterior.statistics import known
 from lipcore.robots.urdf import PARAMETERS
 
@@ -88,7 +87,7 @@ class Carrier:
         """Whether another revision of the version knows the same: rows that are kept out of learning teach nothing."""
         one, two = self.model.posterior, other.model.posterior
         return self is other or (
-            one.basis is two.basis and torch.equal(one.weights, two.weights) and torch.equal(one.root, two.root)
+            one.basis is two.basis and np.array_equal(one.weights, two.weights) and np.array_equal(one.root, two.root)
         )
 
     @property
@@ -107,12 +106,12 @@ class Carrier:
     def mean(self) -> Array:
         """Mean ŵ of the whitened variables, (M,)."""
         posterior = self.model.posterior
-        return np.asarray((posterior.basis.root.T @ posterior.weights).numpy())
+        return np.asarray(posterior.basis.root.T @ posterior.weights)
 
     @cached_property
     def covariance(self) -> Array:
         """Covariance Σ of the whitened variables, (M, M)."""
-        covariance = self.model.posterior.covariance.numpy()
+        covariance = self.model.posterior.covariance
         values, vectors = np.linalg.eigh(covariance)
         if values[0] >= LEAST:
             return np.asarray(covariance)
@@ -139,7 +138,7 @@ class Carrier:
         q, dq, ddq = (draw(limits[name]["min"], limits[name]["max"], (count, n)) for name in ("q", "dq", "ddq"))
         motion, posterior = Motion.from_arrays(q, dq, ddq), self.model.posterior
         features, base = Linearised(self, self.known(np.zeros(PARAMETERS))).rows(motion)
-        variance = (posterior.noise_variance + posterior.misfit.variance(motion)).numpy()
+        variance = posterior.noise_variance + posterior.misfit.variance(motion)
         return Memory.of(motion.arrays(), base, features[:-PARAMETERS], self.rows, self.mean, self.covariance, variance)
 
     @cached_property
@@ -166,12 +165,12 @@ class Carrier:
     def weights(self, mean: Array) -> Array:
         """Weights of the arm, (p,), of variables of this mean, (M,)."""
         centre = self.term.prior_weights()
-        return np.asarray(self.root[self.rows] * mean[self.rows] + (0.0 if centre is None else centre.numpy()))
+        return np.asarray(self.root[self.rows] * mean[self.rows] + (0.0 if centre is None else centre))
 
     @cached_property
     def root(self) -> Array:
         """Prior standard deviations of the weights, the diagonal of the basis' root, (M,)."""
-        return np.asarray(self.model.posterior.basis.root.diagonal().numpy())
+        return np.asarray(self.model.posterior.basis.root.diagonal())
 
     def rest(self, motion: Motion) -> tuple[Array, Array]:
         """Of N instants: features of w, (M, N, n), zero where they are the arm's; what other terms expect, (N, n)."""
@@ -180,16 +179,16 @@ class Carrier:
         for kernel in posterior.basis.linear:
             if kernel is self.term:
                 continue
-            features, weights = kernel.features(motion).numpy(), kernel.prior_weights()
+            features, weights = kernel.features(motion), kernel.prior_weights()
             places = posterior.basis.rows(kernel)
             out[places] = features.transpose(2, 0, 1) * self.root[places][:, None, None]
             if weights is not None:
-                base += features @ weights.numpy()
+                base += features @ weights
         if posterior.basis.term is not None:
             # of the nonlinear term, whose torques are whitened by a root that is not diagonal
             whitened, _ = posterior.basis.features_and_uncovered(motion)
             count = len(posterior.basis.outputs)
-            out[:count] = whitened[:count].reshape(-1, *base.shape).numpy()
+            out[:count] = whitened[:count].reshape(-1, *base.shape)
         return out, base
 
     def known(self, body: Array, spread: Array | None = None) -> Load:
@@ -212,7 +211,7 @@ class Carrier:
         solved = CompactPosterior.solved(
             around.estimator.kernel,
             around.basis,
-            known(torch.from_numpy(mean), torch.from_numpy(covariance), len(around.basis.outputs)),
+            known(mean, covariance, len(around.basis.outputs)),
             posterior.noise_variance,
             posterior.std_factor,
             posterior.floor,
@@ -240,26 +239,25 @@ class Linearised:
     def basis(self) -> Basis:
         """Its variables: w, π over the root of its room, and those of other arms."""
         basis = self.carrier.model.posterior.basis
-        own = self._payload.covariance(basis.params).diagonal().sqrt().diag()
+        own = np.diag(np.sqrt(self._payload.variances(basis.params)))
         linear = [self._arm if each is self.carrier.term else each for each in basis.linear]
         linear, roots = [*linear, self._payload], [basis.root, own]
         if self._others is not None:
             linear.append(self._others)
-            roots.append(self._others.covariance(basis.params).sqrt())
-        root: Tensor = torch.block_diag(*roots)  # type: ignore[no-untyped-call]
-        return replace(basis, linear=tuple(linear), root=root)
+            roots.append(np.diag(np.sqrt(self._others.variances(basis.params))))
+        return replace(basis, linear=tuple(linear), root=block_diagonal(roots))
 
     def rows(self, motion: Motion, rest: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
         """Of N instants: features of (w, π), (M + 10, N, n), and the torque where both are zero, (N, n) N·m. rest: what
         `Carrier.rest` has for the same instants, where that is at hand."""
         features, base = self.carrier.rest(motion) if rest is None else rest
         places, centre = self.carrier.rows, self._arm.prior_weights()
-        of_arm = self._arm.features(motion).numpy()
+        of_arm = self._arm.features(motion)
         out = np.empty((len(features) + PARAMETERS, *base.shape))
         out[: places.start], out[places.stop : -PARAMETERS] = features[: places.start], features[places.stop :]
         out[places] = of_arm.transpose(2, 0, 1) * self.carrier.root[places][:, None, None]
         out[-PARAMETERS:] = self._payload.rows(motion.arrays()).transpose(1, 0, 2)
-        return out, base if centre is None else base + of_arm @ centre.numpy()
+        return out, base if centre is None else base + of_arm @ centre
 
     @cached_property
     def _arm(self) -> ArmKernel:
@@ -283,9 +281,9 @@ class Linearised:
         mean = base + np.tensordot(self.load.mean, features, axes=1)
         if self._others is None:
             return features, mean
-        more, centre = self._others.features(motion).numpy(), self._others.prior_weights()
+        more, centre = self._others.features(motion), self._others.prior_weights()
         known = np.split(features, [len(features) - PARAMETERS])
-        return np.concatenate([known[0], more.transpose(2, 0, 1), known[1]]), mean + more @ centre.numpy()
+        return np.concatenate([known[0], more.transpose(2, 0, 1), known[1]]), mean + more @ centre
 
     @cached_property
     def covariance(self) -> Array:
@@ -297,7 +295,7 @@ class Linearised:
         places = np.concatenate([np.arange(size), size + count + np.arange(PARAMETERS)])
         out = np.zeros((len(known) + count,) * 2)
         out[np.ix_(places, places)] = known
-        out[size : size + count, size : size + count] = self._others.covariance(self.basis.params).numpy()
+        out[size : size + count, size : size + count] = np.diag(self._others.variances(self.basis.params))
         return out
 
     @cached_property

@@ -54,7 +54,7 @@ TrainingRange = dict[str, dict[str, list[float]]]
 def training_range(motion: Motion) -> TrainingRange:
     """Smallest and largest q, dq and ddq of N instants, SI units."""
     return {
-        name: {"min": values.min(0).values.tolist(), "max": values.max(0).values.tolist()}
+        name: {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
         for name, values in (("q", motion.q), ("dq", motion.dq), ("ddq", motion.ddq))
     }
 
@@ -99,8 +99,7 @@ class TorqueModel:
     @property
     def noise_std(self) -> Array:
         """Standard deviation of the measured torque around the function, (n,) N·m, jitter included."""
-        std: Array = self.posterior.noise_variance.sqrt().numpy()
-        return std
+        return np.asarray(np.sqrt(self.posterior.noise_variance))
 
     @property
     def scale(self) -> Array:
@@ -148,11 +147,11 @@ class TorqueModel:
             basis.term,
             posterior.params,
             None if basis.term is None else basis.inducing,
-            basis.outputs.numpy(),
+            basis.outputs,
             basis.linear,
-            posterior.weights.numpy(),
-            posterior.root.numpy(),
+            posterior.weights,
+            posterior.root,
             posterior.std_factor,
-            posterior.floor.numpy(),
-            posterior.misfit.packed().numpy(),
+            posterior.floor,
+            posterior.misfit.packed(),
         )

@@ -50,8 +50,8 @@ def linearisation_error(model: TorqueModel) -> Array | None:
     centre[: PARAMETERS * n], centre[term.steps] = arm.parameters[arm.place].reshape(-1), 0.0
     step = known.mean - centre
     weights = centre + step - known.covariance @ (step / known.scale**2) / posterior.std_factor**2
-    linear = term.features(motion).numpy()[:, :, :used] @ weights[:used]
-    std = model.evaluator.many(motion.q.numpy(), motion.dq.numpy(), motion.ddq.numpy())[1]
+    linear = term.features(motion)[:, :, :used] @ weights[:used]
+    std = model.evaluator.many(motion.q, motion.dq, motion.ddq)[1]
     error = term.torque(weights, motion) - linear
     return np.asarray(np.sqrt(np.mean(error**2 / (std**2 + model.noise_std**2), axis=0)))
 
@@ -106,7 +106,7 @@ def _alternatives(model: TorqueModel) -> str:
     fastest = np.abs([model.training_range["dq"][end] for end in ("min", "max")]).max(0)
     for joint, name in enumerate(model.joint_names):
         length = "m" if model.joint_types[joint] == "prismatic" else "rad"
-        q, dq, ddq = (each.clone() for each in (motion.q, motion.dq, motion.ddq))
+        q, dq, ddq = (each.copy() for each in (motion.q, motion.dq, motion.ddq))
         middle = 0.5 * (low[joint] + high[joint])
         q[:, joint] = middle + FARTHER * (q[:, joint] - middle)
         dq[:, joint] *= FARTHER
@@ -129,5 +129,5 @@ def _alternatives(model: TorqueModel) -> str:
 
 def _spread(term: ArmKernel, motion: Motion) -> Array:
     """Standard deviation of the mixture of alternative arms, root mean square over motions: (n,)."""
-    features = term.features(motion).numpy()[:, :, term.steps.stop :]
+    features = term.features(motion)[:, :, term.steps.stop :]
     return np.asarray(np.sqrt(np.mean(np.square(features).sum(2), axis=0)))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.model.payload import Carrier
 from lipcore.online.batch import Rows
+from lipcore.posterior.linalg import solve_lower
 
 LIKE = 0.3, 0.3
 """See `likeness`. Chosen on the dirty Panda of seed 50 among three pairs."""
@@ -21,9 +21,9 @@ def noise_parts(carrier: Carrier, motion: Motion) -> tuple[Array, Array, Array]:
     are, and those of faster motion, (N, n); and that of joints at rest, (N, n), which may break away at any time."""
     posterior = carrier.model.posterior
     noise, misfit = posterior.noise_variance, posterior.misfit
-    white = torch.maximum(noise - misfit.lasting, LEAST_WHITE * noise)
+    white = np.maximum(noise - misfit.lasting, LEAST_WHITE * noise)
     rest = misfit.at_rest(motion.dq)
-    return white.numpy(), (misfit.lasting + misfit.variance(motion) - rest).numpy(), rest.numpy()
+    return white, (misfit.lasting + misfit.variance(motion) - rest), rest
 
 
 def likeness(carrier: Carrier, q: Array, dq: Array, speed: float, pose: float) -> Array:
@@ -33,7 +33,7 @@ def likeness(carrier: Carrier, q: Array, dq: Array, speed: float, pose: float) -
     alike, whether just before or long ago. q, dq: (N, n); speed, pose: differences over which they become others, of
     the joint's velocity in units of its usual one, and of the pose, root mean square over joints, rad (m).
     """
-    faster = np.abs(dq[:, None] - dq[None]) / carrier.model.posterior.misfit.speed.numpy()
+    faster = np.abs(dq[:, None] - dq[None]) / carrier.model.posterior.misfit.speed
     apart = np.sqrt(((q[:, None] - q[None]) ** 2).mean(axis=-1, keepdims=True))
     return np.asarray(np.exp(-faster / speed - apart / pose).transpose(2, 0, 1))
 
@@ -50,8 +50,6 @@ def correlation_roots(carrier: Carrier, rows: Rows) -> Array:
 def whitened(roots: Array, features: Array, residual: Array) -> tuple[Array, Array]:
     """Features (M + 10, N n) and residuals (N n,) whose errors are independent, of variance one."""
     both = np.concatenate([features, residual[None]]).transpose(2, 1, 0)
-    solved = torch.linalg.solve_triangular(
-        torch.from_numpy(roots), torch.from_numpy(np.ascontiguousarray(both)), upper=False
-    )
-    flat = solved.numpy().reshape(-1, both.shape[2]).T
+    solved = np.stack([solve_lower(root, np.ascontiguousarray(each)) for root, each in zip(roots, both, strict=True)])
+    flat = solved.reshape(-1, both.shape[2]).T
     return flat[:-1], flat[-1]

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
@@ -164,7 +163,7 @@ class OnlineModel:
             self.now.solve(self.walk, len(posterior.basis.outputs)),
             posterior.noise_variance,
             posterior.std_factor,
-            None if floor is None else torch.from_numpy(np.array(floor, np.float64)),
+            None if floor is None else np.array(floor, np.float64),
             posterior.misfit,
         )
         return replace(self.base, posterior=updated)
@@ -213,13 +212,13 @@ class OnlineModel:
     def _summed(self, statistics: Statistics, rows: Rows, sign: float, novel: Novel | None) -> Statistics:
         """These statistics, overwritten, with the rows added (sign 1) or taken back (−1)."""
         posterior, motion = self.base.posterior, rows.motion()
-        weights = torch.from_numpy(rows.weight)
+        weights = rows.weight
         if self.forgetting_s is not None:
-            weights = weights * torch.from_numpy(np.exp((rows.time - self.reference) / self.forgetting_s))
-        residual = torch.from_numpy(rows.tau) - posterior.kernel.mean(motion)
+            weights = weights * np.exp((rows.time - self.reference) / self.forgetting_s)
+        residual = rows.tau - posterior.kernel.mean(motion)
         features, open_ = posterior.basis.features_and_uncovered(motion)
         if novel is not None:
-            novel((open_ > posterior.noise_variance).any(1).numpy())
+            novel(np.any(open_ > posterior.noise_variance, axis=1))
         return add_to(statistics, features, posterior.row_variance(motion) + open_, residual, weights, sign)
 
     def _aged(self, reference: float, since: float) -> OnlineModel:
@@ -237,7 +236,7 @@ def uncovered(base: TorqueModel, rows: Rows) -> NDArray[np.bool_]:
     """Which rows lie beyond a version's basis: it leaves more variance of a torque open than its noise has, (N,)."""
     basis, motion = base.posterior.basis, rows.motion()
     open_ = basis.uncovered(motion, basis.features(motion))
-    novel: NDArray[np.bool_] = (open_ > base.posterior.noise_variance).any(1).numpy()
+    novel = np.asarray((open_ > base.posterior.noise_variance).any(1))
     return novel
 
 

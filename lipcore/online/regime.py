@@ -6,15 +6,14 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lipcore.data.samples import Array
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.drift import Drift
-from lipcore.posterior.statistics import Solution, Statistics, copied, decay, empty, mirror, solve
+from lipcore.posterior.linalg import mirror
+from lipcore.posterior.statistics import Solution, Statistics, copied, decay, empty, solve
 
 SHARE = 0.3
 """Of its size, by which a coefficient of friction changes in one time constant of its walk: standard deviation."""
@@ -54,10 +53,10 @@ class Walk:
         term = next((each for each in basis.linear if isinstance(each, FrictionKernel)), None)
         if term is None:
             raise ValueError(f"estimator {base.estimator.name!r} has no friction that could drift")
-        places = torch.arange(len(basis))[basis.rows(term)]
+        places = np.arange(len(basis))[basis.rows(term)]
         # whitened, a coefficient is in units of its prior deviation, and B is diagonal for it
-        size = (basis.root.diagonal() * base.posterior.weights)[places].abs().clamp_min(FLOOR)
-        return cls(time_s, since, Drift(places, ((SHARE * size).square() / EPOCHS).clamp_max(1.0)))
+        size = np.abs((basis.root.diagonal() * base.posterior.weights)[places]).clip(FLOOR)
+        return cls(time_s, since, Drift(places, np.minimum(np.square(SHARE * size) / EPOCHS, 1.0)))
 
     def number(self, time: Array) -> NDArray[np.int64]:
         """Epochs of event times, (N,): those before the first belong to it."""
@@ -89,7 +88,7 @@ class Regime:
     """
 
     begins: float
-    centre: Tensor
+    centre: Array
     statistics: Statistics
     at: int = -1
     epochs: tuple[Epoch, ...] = ()
@@ -115,8 +114,9 @@ class Regime:
             first = regime.epochs[0]
             past = walk.drift.ahead(regime.statistics, regime.centre, first.number - regime.at)
             # sums of rows that come are added to one triangle, see `add_to`
-            past.a.add_(first.statistics.a)
-            past = Statistics(past.a, past.b + first.statistics.b, past.samples + first.statistics.samples)
+            past = Statistics(
+                past.a + first.statistics.a, past.b + first.statistics.b, past.samples + first.statistics.samples
+            )
             regime = replace(regime, statistics=past, at=first.number, epochs=regime.epochs[1:], shared=False)
         return regime
 
@@ -164,7 +164,7 @@ class Regime:
     def symmetrise(self) -> None:
         """Make both triangles of the sums equal, once rows were added; those that others have are so already."""
         if not self.shared:
-            mirror(self.statistics)
+            mirror(self.statistics.a)
         for each in self.epochs:
             if not each.shared:
-                mirror(each.statistics)
+                mirror(each.statistics.a)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
-from torch import Tensor
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
 
 from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
@@ -45,7 +43,7 @@ def consolidate(online: OnlineModel, floor: Array | None = None) -> TorqueModel:
         base.misfit,
     )
     if floor is not None:
-        posterior = replace(posterior, floor=torch.from_numpy(floor.copy()))
+        posterior = replace(posterior, floor=floor.copy())
     return replace(online.base, posterior=posterior)
 
 
@@ -65,19 +63,18 @@ class Revision:
     def of(cls, model: TorqueModel) -> Revision:
         """The arrays of a model that has learnt."""
         posterior = model.posterior
-        arrays = posterior.weights.numpy(), posterior.root.numpy(), model.evaluator.packed, posterior.floor.numpy()
+        arrays = posterior.weights, posterior.root, model.evaluator.packed, posterior.floor
         return cls(*(np.ascontiguousarray(each) for each in arrays))
 
     def apply(self, base: TorqueModel) -> TorqueModel:
         """Return the model of the same basis that answers so; raise ValueError where shapes do not fit.
 
-        No linear algebra, and nothing is copied: the arrays may be memory-mapped, copy-on-write because torch takes
-        writable memory only. They must not change any more.
+        No linear algebra, and nothing is copied: the arrays may be memory-mapped. They must not change any more.
         """
         for name, like in (("weights", base.posterior.weights), ("root", base.posterior.root)):
             if getattr(self, name).shape != tuple(like.shape):
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {tuple(like.shape)}")
-        weights, root, floor = (torch.from_numpy(each) for each in (self.weights, self.root, self.floor))
+        weights, root, floor = (each for each in (self.weights, self.root, self.floor))
         posterior = replace(base.posterior, weights=weights, root=root, floor=floor, statistics=None)
         model = replace(base, posterior=posterior)
         # the cached property, filled without laying anything out again
@@ -91,15 +88,15 @@ def dump(online: OnlineModel) -> bytes:
     Its size does not grow with what was learnt.
     """
     numbers = [ABSENT if each is None else each for each in (online.forgetting_s, online.since, online.reference)]
-    tensors = {"numbers": torch.tensor(numbers, dtype=torch.float64), "base": _trained(online.base)}
+    tensors = {"numbers": np.array(numbers), "base": _trained(online.base)}
     if online.walk is not None:
         since = ABSENT if online.walk.since is None else online.walk.since
-        tensors["walk"] = torch.tensor([online.walk.time_s, since], dtype=torch.float64)
+        tensors["walk"] = np.array([online.walk.time_s, since])
     for name in REGIMES:
         regime = getattr(online, name)
         if regime is not None:
             tensors |= {f"{name}/{part}": value for part, value in _parts(regime).items()}
-    return save_tensors({name: value.clone().contiguous() for name, value in tensors.items()})
+    return save_tensors({name: np.asarray(value, order="C") for name, value in tensors.items()})
 
 
 def load(base: TorqueModel, payload: bytes) -> OnlineModel:
@@ -108,9 +105,9 @@ def load(base: TorqueModel, payload: bytes) -> OnlineModel:
     Raise ValueError for bytes that are no such state, or one of another version.
     """
     try:
-        tensors = load_tensors(payload)
+        tensors = {name: value.copy() for name, value in load_tensors(payload).items()}
         # weights: written by earlier releases; they are solved for, and to the last bit with as many threads only
-        same = any(torch.equal(tensors["base"], each) for each in (_trained(base), base.posterior.weights))
+        same = any(np.array_equal(tensors["base"], each) for each in (_trained(base), base.posterior.weights))
         forgetting_s, since, reference = tensors["numbers"].tolist()
         regimes = {name: _regime(tensors, name) for name in REGIMES if f"{name}/numbers" in tensors}
         walk_s, walk_since = tensors["walk"].tolist() if "walk" in tensors else (ABSENT, ABSENT)
@@ -129,28 +126,28 @@ def load(base: TorqueModel, payload: bytes) -> OnlineModel:
     )
 
 
-def _trained(base: TorqueModel) -> Tensor:
+def _trained(base: TorqueModel) -> Array:
     """What tells a version from another: read from its files, so that it is the same in every process."""
     statistics = base.posterior.statistics
     return base.posterior.weights if statistics is None else statistics.b
 
 
-def _parts(regime: Regime) -> dict[str, Tensor]:
-    numbers = torch.tensor([regime.begins, regime.statistics.samples, regime.at], dtype=torch.float64)
+def _parts(regime: Regime) -> dict[str, Array]:
+    numbers = np.array([regime.begins, regime.statistics.samples, regime.at], np.float64)
     parts = {"numbers": numbers, "centre": regime.centre} | _sums(regime.statistics)
     if regime.epochs:
         every = [[each.number, each.statistics.samples] for each in regime.epochs]
-        parts["epochs"] = torch.tensor(every, dtype=torch.float64)
+        parts["epochs"] = np.array(every, np.float64)
         for place, each in enumerate(regime.epochs):
             parts |= {f"{place}/{part}": value for part, value in _sums(each.statistics).items()}
     return parts
 
 
-def _sums(statistics: Statistics) -> dict[str, Tensor]:
+def _sums(statistics: Statistics) -> dict[str, Array]:
     return {"a": pack_symmetric(statistics.a), "b": statistics.b}
 
 
-def _regime(tensors: dict[str, Tensor], name: str) -> Regime:
+def _regime(tensors: dict[str, Array], name: str) -> Regime:
     begins, samples, *at = tensors[f"{name}/numbers"].tolist()
     epochs = tensors[f"{name}/epochs"].tolist() if f"{name}/epochs" in tensors else []
     return Regime(
@@ -165,7 +162,7 @@ def _regime(tensors: dict[str, Tensor], name: str) -> Regime:
     )
 
 
-def _statistics(tensors: dict[str, Tensor], name: str, samples: float) -> Statistics:
+def _statistics(tensors: dict[str, Array], name: str, samples: float) -> Statistics:
     return Statistics(unpack_symmetric(f"{name}/a", tensors[f"{name}/a"]), tensors[f"{name}/b"], samples)
 
 

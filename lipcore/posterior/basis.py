@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Indices, Motion
 from lipcore.kernels.base import Cross, LinearKernel, PairKernel, Params, SumKernel, TorqueKernel
-from lipcore.posterior.linalg import cholesky
+from lipcore.posterior.linalg import block_diagonal, cholesky, solve_lower
 
 
 @dataclass(frozen=True)
@@ -30,11 +28,11 @@ class Basis:
     linear: tuple[LinearKernel, ...]
     params: Params
     inducing: Motion
-    outputs: Tensor
-    root: Tensor
+    outputs: Indices
+    root: Array
 
     @classmethod
-    def build(cls, kernel: TorqueKernel, params: Params, inducing: Motion, outputs: Tensor) -> Basis:
+    def build(cls, kernel: TorqueKernel, params: Params, inducing: Motion, outputs: Indices) -> Basis:
         """Basis of a kernel's terms.
 
         params: hyperparameters; inducing: S samples, whose torques `outputs` (m,) counts as sample · n + joint. Raise
@@ -42,16 +40,15 @@ class Basis:
         """
         term, linear = split(kernel)
         places = len(inducing) * kernel.n_joints
-        if outputs.dim() != 1 or len(set(outputs.tolist())) != len(outputs) or (term is None and len(outputs)):
-            raise ValueError(f"outputs has shape {tuple(outputs.shape)}, expected distinct places of torques")
+        if outputs.ndim != 1 or len(np.unique(outputs)) != len(outputs) or (term is None and len(outputs)):
+            raise ValueError(f"outputs has shape {outputs.shape}, expected distinct places of torques")
         if len(outputs) and not (int(outputs.min()) >= 0 and int(outputs.max()) < places):
             raise ValueError(f"outputs reaches from {outputs.min()} to {outputs.max()}, expected 0 to {places - 1}")
-        roots = [cholesky(each.covariance(params).detach()).lower for each in linear]
+        roots = [np.diag(np.sqrt(each.variances(params))) for each in linear]
         if term is not None:
             gram = term.symmetric_gram(params, inducing)
-            roots.insert(0, cholesky(gram[outputs][:, outputs]).lower)
-        root: Tensor = torch.block_diag(*roots)  # type: ignore[no-untyped-call]
-        return cls(term, linear, params, inducing, outputs, root)
+            roots.insert(0, cholesky(gram[np.ix_(outputs, outputs)]).lower)
+        return cls(term, linear, params, inducing, outputs, block_diagonal(roots))
 
     def __len__(self) -> int:
         return len(self.root)
@@ -60,66 +57,66 @@ class Basis:
         """Places of a linear term's weights among the variables."""
         start = len(self.outputs)
         for each in self.linear:
-            size = each.covariance(self.params).shape[0]
+            size = len(each.variances(self.params))
             if each is linear:
                 return slice(start, start + size)
             start += size
         raise ValueError("the linear term is none of this basis")
 
-    def features(self, query: Motion) -> Tensor:
+    def features(self, query: Motion) -> Array:
         """φ(x) = B⁻¹ cov(u, f(x)) for the torques of N queries (eq. 24 of docs/method.md): (M, N n)."""
         gram = None if self.term is None else self.term.gram(self.params, self.inducing, query)[self.outputs]
         return self._whitened(gram, query)
 
-    def uncovered(self, query: Motion, features: Tensor) -> Tensor:
+    def uncovered(self, query: Motion, features: Array) -> Array:
         """Variance k(x, x) − φᵀφ that the basis leaves open at N queries, (N, n). features: φ(x), (M, N n)."""
         if self.term is None:
-            return torch.zeros_like(query.q)
-        return self._open(self.term.variance(self.params, query).diagonal(dim1=1, dim2=2), features)
+            return np.zeros_like(query.q)
+        return self._open(self.term.variance(self.params, query).diagonal(axis1=1, axis2=2), features)
 
-    def features_and_uncovered(self, query: Motion) -> tuple[Tensor, Tensor]:
+    def features_and_uncovered(self, query: Motion) -> tuple[Array, Array]:
         """`features` (M, N n) and `uncovered` (N, n) of N queries, for few of them at a time: compiled, on the CPU."""
         if self._cross is None:
             features = self.features(query)
             return features, self.uncovered(query, features)
         n, size = query.n_joints, self._cross.size
-        blocks = torch.empty((len(query), size + 1, n, n), dtype=torch.float64)
-        motions = np.stack([query.q.numpy(), query.dq.numpy(), query.ddq.numpy()], axis=1)
-        self._cross.fill_many(motions, blocks.numpy())
-        gram = blocks[:, :size].permute(1, 2, 0, 3).reshape(size * n, len(query) * n)[self.outputs]
+        blocks = np.empty((len(query), size + 1, n, n))
+        self._cross.fill_many(query.arrays(), blocks)
+        gram = blocks[:, :size].transpose(1, 2, 0, 3).reshape(size * n, len(query) * n)[self.outputs]
         features = self._whitened(gram, query)
-        return features, self._open(blocks[:, size].diagonal(dim1=1, dim2=2), features)
+        return features, self._open(blocks[:, size].diagonal(axis1=1, axis2=2), features)
 
     @cached_property
     def _cross(self) -> Cross | None:
         return None if self.term is None else self.term.cross(self.params, self.inducing)
 
-    def _whitened(self, gram: Tensor | None, query: Motion) -> Tensor:
+    def _whitened(self, gram: Array | None, query: Motion) -> Array:
         """φ of N queries, (M, N n). gram: covariance of the chosen torques with theirs, (m, N n)."""
-        out = torch.empty((len(self), len(query) * query.n_joints), dtype=torch.float64, device=self.root.device)
+        out = np.empty((len(self), len(query) * query.n_joints))
         first = len(self.outputs)
         if gram is not None:
-            out[:first] = torch.linalg.solve_triangular(self.root[:first, :first], gram, upper=False)
+            out[:first] = solve_lower(self.root[:first, :first], gram)
         for each in self.linear:
-            rows = _rows(each, query).T
+            rows = each.flat_features(query).T
             last = first + len(rows)
-            torch.mul(rows, self._scales[first:last, None], out=out[first:last])
+            np.multiply(rows, self.scales[first:last, None], out=out[first:last])
             first = last
         return out
 
     @cached_property
-    def _scales(self) -> Tensor:
+    def scales(self) -> Array:
         """What B⁻¹ Λ makes of each linear weight's features, as both are diagonal there: (M,), 0 for the torques."""
-        scales = torch.zeros(len(self), dtype=torch.float64, device=self.root.device)
+        scales = np.zeros(len(self))
         for each in self.linear:
-            rows, covariance = self.rows(each), each.covariance(self.params).detach()
-            scales[rows] = covariance.diagonal() / self.root.diagonal()[rows]
+            rows = self.rows(each)
+            scales[rows] = each.variances(self.params) / self.root.diagonal()[rows]
         return scales
 
-    def _open(self, prior: Tensor, features: Tensor) -> Tensor:
+    def _open(self, prior: Array, features: Array) -> Array:
         # the linear terms' own features leave nothing open
-        explained = features[: len(self.outputs)].square().sum(0).reshape(prior.shape)
-        return (prior - explained).clamp_min(0.0)
+        chosen = features[: len(self.outputs)]
+        explained = np.einsum("mk,mk->k", chosen, chosen).reshape(prior.shape)
+        return np.asarray(np.maximum(prior - explained, 0.0))
 
 
 def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, ...]]:
@@ -131,8 +128,3 @@ def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, 
         names = ", ".join(type(each).__name__ for each in terms)
         raise ValueError(f"the kernel's terms are {names}, expected at most one pair kernel beside linear ones")
     return (nonlinear[0] if nonlinear else None), linear
-
-
-def _rows(kernel: LinearKernel, query: Motion) -> Tensor:
-    features = kernel.features(query)
-    return features.reshape(-1, features.shape[-1])

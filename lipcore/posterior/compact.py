@@ -6,13 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from lipcore.data.motion import Motion
-from lipcore.kernels.base import LinearKernel, Params, TorqueKernel
+from lipcore.data.motion import Array, Indices, Motion
+from lipcore.kernels.base import LinearKernel, Params, TorqueKernel, on_last_diagonal
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.exact import Posterior, Prediction
+from lipcore.posterior.linalg import solve_lower, solve_lower_right
 from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.statistics import Solution, Statistics, learnt_root, solve
 
@@ -36,9 +36,9 @@ class CompactPosterior(Posterior):
     """
 
     basis: Basis
-    noise_variance: Tensor
-    root: Tensor
-    floor: Tensor
+    noise_variance: Array
+    root: Array
+    floor: Array
     misfit: Misfit
     statistics: Statistics | None = None
 
@@ -48,7 +48,7 @@ class CompactPosterior(Posterior):
         kernel: TorqueKernel,
         basis: Basis,
         statistics: Statistics,
-        noise_variance: Tensor,
+        noise_variance: Array,
         std_factor: float = 1.0,
         misfit: Misfit | None = None,
     ) -> CompactPosterior:
@@ -68,7 +68,7 @@ class CompactPosterior(Posterior):
         kernel: TorqueKernel,
         params: Params,
         inducing: Motion,
-        outputs: Tensor,
+        outputs: Indices,
         statistics: Statistics,
         jitter: float = 0.0,
         std_factor: float = 1.0,
@@ -79,20 +79,19 @@ class CompactPosterior(Posterior):
         jitter: (N·m)², what the fit has added to the noise's variance.
         Raise ValueError naming what is missing, unknown or of the wrong shape.
         """
-        expected = {**kernel.shapes(), "noise.log_std": torch.Size([kernel.n_joints])}
+        expected = {**kernel.shapes(), "noise.log_std": (kernel.n_joints,)}
         for name in expected.keys() | params.keys():
-            shape = tuple(params[name].shape) if name in params else None
-            right = tuple(expected[name]) if name in expected else None
-            if shape != right:
-                raise ValueError(f"hyperparameter {name!r} has shape {shape}, expected {right}")
+            shape = params[name].shape if name in params else None
+            if shape != expected.get(name):
+                raise ValueError(f"hyperparameter {name!r} has shape {shape}, expected {expected.get(name)}")
         basis = Basis.build(kernel, params, inducing, outputs)
         size = len(basis)
         if statistics.a.shape != (size, size) or statistics.b.shape != (size,):
             raise ValueError(
-                f"statistics have shapes {tuple(statistics.a.shape)} and {tuple(statistics.b.shape)}, "
+                f"statistics have shapes {statistics.a.shape} and {statistics.b.shape}, "
                 f"expected {(size, size)} and {(size,)}"
             )
-        noise_variance = torch.exp(2 * params["noise.log_std"]) + jitter
+        noise_variance = np.exp(2 * params["noise.log_std"]) + jitter
         return cls.build(kernel, basis, statistics, noise_variance, std_factor, misfit)
 
     @classmethod
@@ -101,9 +100,9 @@ class CompactPosterior(Posterior):
         kernel: TorqueKernel,
         basis: Basis,
         solution: Solution,
-        noise_variance: Tensor,
+        noise_variance: Array,
         std_factor: float = 1.0,
-        floor: Tensor | None = None,
+        floor: Array | None = None,
         misfit: Misfit | None = None,
     ) -> CompactPosterior:
         """Posterior of the torques, given that of the whitened variables.
@@ -112,14 +111,14 @@ class CompactPosterior(Posterior):
         where None.
         """
         assert solution.first == len(basis.outputs)
-        weights = torch.linalg.solve_triangular(basis.root.T, solution.mean[:, None], upper=True)[:, 0]
+        weights = solve_lower(basis.root, solution.mean, transposed=True)
         # and not from QᵀQ itself: B⁻¹ is badly conditioned
-        root = torch.linalg.solve_triangular(basis.root, solution.root, upper=False, left=False)
-        floor = torch.zeros_like(noise_variance) if floor is None else floor
+        root = solve_lower_right(solution.root, basis.root)
+        floor = np.zeros_like(noise_variance) if floor is None else floor
         misfit = Misfit.none(len(noise_variance)) if misfit is None else misfit
         return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor, misfit)
 
-    def row_variance(self, motion: Motion) -> Tensor:
+    def row_variance(self, motion: Motion) -> Array:
         """Variance R with which each of N rows teaches, as far as the basis reaches: (N, n) (N·m)²."""
         return self.misfit.of_row(self.noise_variance, motion.dq)
 
@@ -131,27 +130,25 @@ class CompactPosterior(Posterior):
         prediction = super().predict(query, component)
         if component is not None:
             return prediction
-        variance = prediction.covariance.diagonal(dim1=1, dim2=2)
-        more = torch.maximum(self.misfit.variance(query), self.floor - variance)
-        return Prediction(prediction.mean, prediction.covariance + torch.diag_embed(more))
+        variance = prediction.covariance.diagonal(axis1=1, axis2=2)
+        more = np.maximum(self.misfit.variance(query), self.floor - variance)
+        return Prediction(prediction.mean, prediction.covariance + on_last_diagonal(more))
 
     @cached_property
-    def covariance(self) -> Tensor:
+    def covariance(self) -> Array:
         """Σ of the whitened variables, (M, M)."""
         return Solution(self.weights, self.root @ self.basis.root, len(self.basis.outputs)).covariance
 
     @cached_property
-    def learnt(self) -> Tensor:
+    def learnt(self) -> Array:
         """What samples explain of any quantity: (M, M) lower triangular, whose square is B⁻ᵀ (I − Σ) B⁻¹."""
-        root = learnt_root(self.covariance)
-        out: Tensor = torch.linalg.solve_triangular(self.basis.root, root, upper=False, left=False)
-        return out
+        return solve_lower_right(learnt_root(self.covariance), self.basis.root)
 
-    def whiten(self, cross: Tensor) -> Tensor:
+    def whiten(self, cross: Array) -> Array:
         """Columns whose square is explained, (M, K). cross: covariance of the variables with K quantities, (M, K)."""
         return self.learnt @ cross
 
-    def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Tensor]) -> Tensor:
+    def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Array]) -> Array:
         """Covariance of the variables with K quantities of the nonlinear term, zero for linear weights: (M, K).
 
         covariance: that of the term's torques at N motions with the quantities, (N n, K). Raise ValueError for another
@@ -160,13 +157,13 @@ class CompactPosterior(Posterior):
         if term is not self.basis.term:
             raise ValueError("the term is none of this posterior")
         inducing = covariance(self.basis.inducing)[self.basis.outputs]
-        return torch.cat([inducing, inducing.new_zeros((len(self.basis) - len(inducing), inducing.shape[1]))])
+        return np.concatenate([inducing, np.zeros((len(self.basis) - len(inducing), inducing.shape[1]))])
 
-    def with_weights(self, term: LinearKernel, covariance: Tensor) -> Tensor:
+    def with_weights(self, term: LinearKernel, covariance: Array) -> Array:
         """Covariance of the variables with K quantities of a linear term, zero for all other variables: (M, K).
 
         covariance: cov(w, s), (p, K).
         """
-        out = covariance.new_zeros((len(self.basis), covariance.shape[1]))
+        out = np.zeros((len(self.basis), covariance.shape[1]))
         out[self.basis.rows(term)] = covariance
         return out

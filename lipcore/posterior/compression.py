@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.data.samples import Samples
 from lipcore.kernels.base import Params, SumKernel, TorqueKernel
 from lipcore.posterior.basis import Basis, split
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.exact import ExactPosterior, Prediction
-from lipcore.posterior.linalg import cholesky
+from lipcore.posterior.linalg import cholesky, solve_lower
 from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.selection import Pivots, pivots, spread_out
 from lipcore.posterior.statistics import collect
@@ -28,6 +27,8 @@ STORED = 32
 """Instants that are kept of the motion where no inducing outputs keep any."""
 RESIDUAL = 1e-6
 """Variance, in units of the noise's, below which no more outputs are offered."""
+NONE = np.empty(0, np.int64)
+"""No inducing outputs."""
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,12 @@ class Deviation:
     queries: int
 
     @classmethod
-    def between(cls, exact: Prediction, mean: Tensor, std: Tensor, noise_std: Tensor) -> Deviation:
+    def between(cls, exact: Prediction, mean: Array, std: Array, noise_std: Array) -> Deviation:
         """Compare means and standard deviations, (N, n), with the exact prediction. noise_std: (n,)."""
-        unit = torch.maximum(exact.std, NEGLIGIBLE * noise_std)
+        unit = np.maximum(exact.std, NEGLIGIBLE * noise_std)
         off, ratio = (mean - exact.mean) / unit, (std - exact.std) / unit
-        return cls(float(off.square().mean().sqrt()), float(off.abs().max()), float(ratio.abs().max()), len(mean))
+        rms = float(np.sqrt(np.square(off).mean()))
+        return cls(rms, float(np.abs(off).max()), float(np.abs(ratio).max()), len(mean))
 
     def within(self, tolerance: float) -> bool:
         """Whether mean and standard deviation deviate by no more than `tolerance` anywhere."""
@@ -84,11 +86,11 @@ def compressed(
     tolerance, most: as in `compress`; std_factor: calibration of the function's deviation.
     Raise NotPositiveDefiniteError where the exact posterior cannot be computed.
     """
-    exact = ExactPosterior.fit(kernel, params, samples.motion(), samples.torque(), std_factor)
-    return compress(exact, samples.torque(), tolerance, most), exact.factor.jitter
+    exact = ExactPosterior.fit(kernel, params, samples.motion(), samples.tau, std_factor)
+    return compress(exact, samples.tau, tolerance, most), exact.factor.jitter
 
 
-def compress(exact: ExactPosterior, tau: Tensor, tolerance: float, most: int, seed: int = 0) -> Compression:
+def compress(exact: ExactPosterior, tau: Array, tolerance: float, most: int, seed: int = 0) -> Compression:
     """Smallest compact posterior within `tolerance` of the exact one, or the best with `most` inducing outputs.
 
     tau: the (N, n) torques that the exact posterior is conditioned on.
@@ -97,19 +99,19 @@ def compress(exact: ExactPosterior, tau: Tensor, tolerance: float, most: int, se
     check = checks(exact.motion, seed)
     calibration, exact = exact.std_factor, replace(exact, std_factor=1.0)
     expected = exact.predict(check)
-    noise = torch.exp(2 * exact.params["noise.log_std"]) + exact.factor.jitter
+    noise = np.exp(2 * exact.params["noise.log_std"]) + exact.factor.jitter
     candidates = _Candidates.build(exact, tau, noise, check, most)
     sizes = _ladder(candidates.most)
     low, high = 0, len(sizes) - 1
     while low < high:
         middle = (low + high) // 2
-        if Deviation.between(expected, *candidates.predict(sizes[middle]), noise.sqrt()).within(tolerance):
+        if Deviation.between(expected, *candidates.predict(sizes[middle]), np.sqrt(noise)).within(tolerance):
             high = middle
         else:
             low = middle + 1
     posterior = candidates.posterior(sizes[high], tau)
     answer = posterior.predict(check)
-    deviation = Deviation.between(expected, answer.mean, answer.std, noise.sqrt())
+    deviation = Deviation.between(expected, answer.mean, answer.std, np.sqrt(noise))
     return Compression(replace(posterior, std_factor=calibration), deviation, tolerance, deviation.within(tolerance))
 
 
@@ -117,7 +119,7 @@ def linear(
     kernel: TorqueKernel,
     params: Params,
     samples: Samples,
-    variance: Tensor,
+    variance: Array,
     tolerance: float,
     std_factor: float,
     misfit: Misfit,
@@ -129,9 +131,9 @@ def linear(
     """
     motion = samples.motion()
     kept = motion[spread_out(motion, STORED)]
-    basis = Basis.build(kernel, params, kept, torch.empty(0, dtype=torch.int64))
-    noise = torch.exp(2 * params["noise.log_std"])
-    statistics = collect(basis, variance, motion, samples.torque() - kernel.mean(motion))
+    basis = Basis.build(kernel, params, kept, NONE)
+    noise = np.exp(2 * params["noise.log_std"])
+    statistics = collect(basis, variance, motion, samples.tau - kernel.mean(motion))
     posterior = CompactPosterior.build(kernel, basis, statistics, noise, std_factor, misfit)
     return Compression(posterior, Deviation(0.0, 0.0, 0.0, 0), tolerance, True)
 
@@ -142,12 +144,11 @@ def checks(motion: Motion, seed: int, queries: int = QUERIES) -> Motion:
     A recombined motion takes position, velocity and acceleration from three samples: it lies where the robot has been,
     but was never seen.
     """
-    generator = torch.Generator().manual_seed(seed)
-    size = len(motion)
-    seen = torch.randperm(size, generator=generator)[: queries // 2]
-    rows = torch.randint(size, (3, queries - len(seen)), generator=generator)
+    draw, size = np.random.default_rng(seed), len(motion)
+    seen = draw.permutation(size)[: queries // 2]
+    rows = draw.integers(size, size=(3, queries - len(seen)))
     parts = ((motion.q, rows[0]), (motion.dq, rows[1]), (motion.ddq, rows[2]))
-    return Motion(*(torch.cat([values[seen], values[each]]) for values, each in parts))
+    return Motion(*(np.concatenate([values[seen], values[each]]) for values, each in parts))
 
 
 @dataclass(frozen=True)
@@ -159,54 +160,56 @@ class _Candidates:
     """
 
     exact: ExactPosterior
-    noise: Tensor
+    noise: Array
     order: Pivots
-    a: Tensor
-    b: Tensor
-    features: Tensor
-    variance: Tensor
-    mean: Tensor
+    a: Array
+    b: Array
+    features: Array
+    variance: Array
+    mean: Array
 
     @classmethod
-    def build(cls, exact: ExactPosterior, tau: Tensor, noise: Tensor, check: Motion, most: int) -> _Candidates:
+    def build(cls, exact: ExactPosterior, tau: Array, noise: Array, check: Motion, most: int) -> _Candidates:
         kernel, params, motion = exact.kernel, exact.params, exact.motion
         term, linear = split(kernel)
-        precision = noise.rsqrt().repeat(len(motion))
-        weights_only = Basis.build(SumKernel(*linear), params, motion[:0], torch.empty(0, dtype=torch.int64))
+        precision = np.tile(1 / np.sqrt(noise), len(motion))
+        weights_only = Basis.build(SumKernel(*linear), params, motion[:0], NONE)
         trained, asked = weights_only.features(motion) * precision, weights_only.features(check)
-        order = Pivots(torch.empty(0, dtype=torch.int64), trained.new_zeros((len(precision), 0)), trained.new_zeros(0))
+        order = Pivots(NONE, np.zeros((len(precision), 0)), np.zeros(0))
         if term is not None:
-            gram = term.symmetric_gram(params, motion).mul_(precision).mul_(precision[:, None])
+            gram = term.symmetric_gram(params, motion)
+            gram *= precision
+            gram *= precision[:, None]
             order = pivots(gram, kernel.n_joints, most, RESIDUAL)
             del gram
             outputs = order.outputs
-            samples, places = torch.unique(outputs // kernel.n_joints, return_inverse=True)
+            samples, places = np.unique(outputs // kernel.n_joints, return_inverse=True)
             cross = term.gram(params, motion[samples], check)[places * kernel.n_joints + outputs % kernel.n_joints]
             root = order.lower[outputs]  # Cholesky factor of the chosen outputs' covariance in units of the noise
-            whitened = torch.linalg.solve_triangular(root, cross * precision[outputs][:, None], upper=False)
-            trained, asked = torch.cat([trained, order.lower.T]), torch.cat([asked, whitened])
+            whitened = solve_lower(root, cross * precision[outputs][:, None])
+            trained, asked = np.concatenate([trained, order.lower.T]), np.concatenate([asked, whitened])
         residual = (tau - kernel.mean(motion)).reshape(-1) * precision
-        variance = kernel.variance(params, check).diagonal(dim1=1, dim2=2)
+        variance = kernel.variance(params, check).diagonal(axis1=1, axis2=2)
         return cls(exact, noise, order, trained @ trained.T, trained @ residual, asked, variance, kernel.mean(check))
 
     @property
     def most(self) -> int:
         return len(self.order)
 
-    def predict(self, count: int) -> tuple[Tensor, Tensor]:
+    def predict(self, count: int) -> tuple[Array, Array]:
         """Mean and standard deviation at the checks with the first `count` pivots, both (Q, n)."""
         used = len(self.a) - self.most + count
         features = self.features[:used]
-        factor = cholesky(torch.eye(used, dtype=torch.float64) + self.a[:used, :used])
+        factor = cholesky(np.eye(used) + self.a[:used, :used])
         mean = self.mean + (factor.solve(self.b[:used]) @ features).reshape(self.mean.shape)
-        explained = features.square().sum(0) - factor.whiten(features).square().sum(0)
+        explained = np.square(features).sum(0) - np.square(factor.whiten(features)).sum(0)
         variance = self.variance - explained.reshape(self.variance.shape)
-        return mean, variance.clamp_min(0.0).sqrt()
+        return mean, np.sqrt(variance.clip(0.0))
 
-    def posterior(self, count: int, tau: Tensor) -> CompactPosterior:
+    def posterior(self, count: int, tau: Array) -> CompactPosterior:
         exact, n = self.exact, self.exact.kernel.n_joints
         outputs = self.order.outputs[:count]
-        samples, places = torch.unique(outputs // n, return_inverse=True)
+        samples, places = np.unique(outputs // n, return_inverse=True)
         basis = Basis.build(exact.kernel, exact.params, exact.motion[samples], places * n + outputs % n)
         residual = tau - exact.kernel.mean(exact.motion)
         statistics = collect(basis, self.noise, exact.motion, residual)

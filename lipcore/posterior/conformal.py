@@ -9,9 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lipcore.data.metrics import LEVEL, blocks, quantile
 from lipcore.data.samples import Array, Samples
@@ -45,7 +43,7 @@ class Conformal:
             raise ValueError(f"blocks is {self.blocks}, expected at least 1")
 
 
-def conform(posterior: CompactPosterior, samples: Samples, variance: Tensor) -> Conformal:
+def conform(posterior: CompactPosterior, samples: Samples, variance: Array) -> Conformal:
     """The factor that the samples behind a posterior prove, in blocks of a second or whole episodes.
 
     samples: N, in any order; variance: (N, n) (N·m)², with which each torque of them has taught, beside what the basis
@@ -54,12 +52,12 @@ def conform(posterior: CompactPosterior, samples: Samples, variance: Tensor) -> 
     order = np.lexsort((samples.t, samples.episode))
     ordered = samples.rows(order)
     starts = blocks(ordered)
-    score = scores(posterior, ordered, variance[torch.from_numpy(order)], starts)
+    score = scores(posterior, ordered, variance[order], starts)
     scale, guaranteed = _quantile(score, np.diff(starts, append=len(score)))
     return Conformal(scale, guaranteed, len(starts))
 
 
-def scores(posterior: CompactPosterior, samples: Samples, variance: Tensor, starts: NDArray[np.int64]) -> Array:
+def scores(posterior: CompactPosterior, samples: Samples, variance: Array, starts: NDArray[np.int64]) -> Array:
     """|error| over half the width of the 95 % interval, (N, n), of a posterior without the row's block and GUARD_S of
     its episode on both sides.
 
@@ -75,9 +73,9 @@ def scores(posterior: CompactPosterior, samples: Samples, variance: Tensor, star
     basis, motion, n = posterior.basis, samples.motion(), samples.n_joints
     features = basis.features(motion)
     beyond = basis.uncovered(motion, features)
-    root = (variance + beyond).sqrt().reshape(-1)
-    known = cholesky(posterior.statistics.a + torch.eye(len(basis), dtype=torch.float64))
-    error = (samples.torque() - posterior.kernel.mean(motion)).reshape(-1)
+    root = np.sqrt(variance + beyond).reshape(-1)
+    known = cholesky(posterior.statistics.a + np.eye(len(basis)))
+    error = (samples.tau - posterior.kernel.mean(motion)).reshape(-1)
     error = (error - known.solve(posterior.statistics.b) @ features) / root
     whitened = known.whiten(features) / root
     stated = posterior.noise_variance + posterior.misfit.variance(motion)
@@ -86,12 +84,12 @@ def scores(posterior: CompactPosterior, samples: Samples, variance: Tensor, star
         rows = _guarded(samples, int(first), int(last))
         torques = slice(rows.start * n, rows.stop * n)
         share = whitened[:, torques].T @ whitened[:, torques]
-        rest = cholesky(torch.eye(len(share), dtype=torch.float64) - share)
+        rest = cholesky(np.eye(len(share)) - share)
         left = rest.solve(share).diagonal() * root[torques] ** 2
         function = posterior.std_factor**2 * (left.reshape(-1, n) + beyond[rows])
-        half = quantile(LEVEL) * (stated[rows] + function).sqrt()
-        missed = (rest.solve(error[torques]) * root[torques]).reshape(-1, n).abs() / half
-        out[first:last] = missed[first - rows.start : last - rows.start].numpy()
+        half = quantile(LEVEL) * np.sqrt(stated[rows] + function)
+        missed = np.abs(rest.solve(error[torques]) * root[torques]).reshape(-1, n) / half
+        out[first:last] = missed[first - rows.start : last - rows.start]
     return out
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from lipcore.posterior.linalg import cholesky
-from lipcore.posterior.statistics import Statistics, mirror
+from lipcore.data.motion import Array, Indices
+from lipcore.posterior.linalg import add_diagonal, cholesky, mirror
+from lipcore.posterior.statistics import Statistics
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,10 @@ class Drift:
     was possible at first. places: (f,) of the variables; step: (f,) s, from 0, which stands still, to 1.
     """
 
-    places: Tensor
-    step: Tensor
+    places: Indices
+    step: Array
 
-    def ahead(self, statistics: Statistics, centre: Tensor, steps: int) -> Statistics:
+    def ahead(self, statistics: Statistics, centre: Array, steps: int) -> Statistics:
         """Sums that say of the variables `steps` later what these say of them now: earlier ones are integrated out.
 
         With D = diag(√(1 − s)^steps), or 1 for what stands still, G the columns of the identity at `places`, Q the
@@ -37,20 +37,20 @@ class Drift:
         and h alike. centre: (M,) of the prior. A is read from its lower triangle. Raise NotPositiveDefiniteError for
         statistics that no samples have.
         """
-        sums = Statistics(statistics.a.clone(), statistics.b, statistics.samples)
-        mirror(sums)
+        sums = Statistics(statistics.a.copy(), statistics.b, statistics.samples)
+        mirror(sums.a)
         kept = (1 - self.step) ** steps
-        root, scale = (1 - kept).sqrt(), torch.ones_like(centre)
-        scale[self.places] = kept.sqrt()
+        root, scale = np.sqrt(1 - kept), np.ones_like(centre)
+        scale[self.places] = np.sqrt(kept)
         rows = root[:, None] * sums.a[self.places]
         inner = root * rows[:, self.places]
-        inner.diagonal().add_(1.0)
+        add_diagonal(inner, 1.0)
         factor = cholesky(inner)
         deviation = sums.b - sums.a @ centre
         explained = factor.whiten(rows)
-        right = factor.whiten((root * deviation[self.places])[:, None])[:, 0]
-        sums.a.addmm_(explained.T, explained, alpha=-1.0)
-        sums.a.mul_(scale[:, None]).mul_(scale)
-        mirror(sums)
+        right = factor.whiten(root * deviation[self.places])
+        sums.a[:] -= explained.T @ explained
+        sums.a[:] *= scale[:, None] * scale
+        mirror(sums.a)
         deviation = scale * (deviation - explained.T @ right)
         return Statistics(sums.a, deviation + sums.a @ centre, sums.samples)

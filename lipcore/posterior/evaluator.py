@@ -86,7 +86,7 @@ class Evaluator:
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
         if self._floor.shape != (n,):
             raise ValueError(f"floor has shape {self._floor.shape}, expected ({n},)")
-        nothing = Misfit.none(n).packed().numpy()
+        nothing = Misfit.none(n).packed()
         self._misfit = nothing if misfit is None else np.array(misfit, np.float64)
         if self._misfit.shape != nothing.shape:
             raise ValueError(f"misfit has shape {self._misfit.shape}, expected {nothing.shape}")
@@ -190,18 +190,11 @@ class Evaluator:
 
 
 def _linear_prior(linear: Sequence[LinearKernel], params: Params) -> tuple[Array, Array]:
-    """Prior means and variances of all linear weights, term after term, (P,) each.
-
-    Raises ValueError for weights that are correlated beforehand, which no kernel's are.
-    """
+    """Prior means and variances of all linear weights, term after term, (P,) each."""
     means, variances = [np.zeros(0)], [np.zeros(0)]
     for term in linear:
-        covariance = term.covariance(params).detach().cpu().numpy()
-        variance = np.diagonal(covariance).copy()
-        if np.any(covariance != np.diag(variance)):
-            raise ValueError(f"{type(term).__name__}: prior covariance of the weights, expected a diagonal matrix")
-        mean = term.prior_weights()
-        means.append(np.zeros(len(variance)) if mean is None else mean.detach().cpu().numpy())
+        variance, mean = term.variances(params), term.prior_weights()
+        means.append(np.zeros(len(variance)) if mean is None else mean)
         variances.append(variance)
     return np.concatenate(means), np.concatenate(variances)
 

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import log, pi
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.kernels.base import LinearKernel, Params, SumKernel, TorqueKernel
-from lipcore.posterior.linalg import Factor, cholesky
+from lipcore.posterior.linalg import Factor, add_diagonal, cholesky
+from lipcore.vocabulary import Place
 
 QUERIES_PER_CHUNK = 128
 
@@ -21,13 +21,13 @@ QUERIES_PER_CHUNK = 128
 class Prediction:
     """Torque of a function f(q, dq, ddq), noise excluded. mean: (N, n) N·m; covariance: (N, n, n) (N·m)²."""
 
-    mean: Tensor
-    covariance: Tensor
+    mean: Array
+    covariance: Array
 
     @property
-    def std(self) -> Tensor:
+    def std(self) -> Array:
         """Standard deviation of the function, (N, n) N·m."""
-        return self.covariance.diagonal(dim1=1, dim2=2).clamp_min(0.0).sqrt()
+        return np.asarray(np.sqrt(self.covariance.diagonal(axis1=1, axis2=2).clip(0.0)))
 
 
 @dataclass(frozen=True)
@@ -44,42 +44,40 @@ class Posterior(ABC):
     kernel: TorqueKernel
     params: Params
     std_factor: float
-    weights: Tensor
+    weights: Array
 
     @abstractmethod
-    def whiten(self, cross: Tensor) -> Tensor:
+    def whiten(self, cross: Array) -> Array:
         """Columns whose squared length is what the data explain: (M, K) to (r, K)."""
 
     @abstractmethod
-    def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Tensor]) -> Tensor:
+    def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Array]) -> Array:
         """Covariance of the anchors with K quantities that belong to one term of the kernel: (M, K).
 
         covariance: that of the term's torques at N motions with the quantities, (N n, K).
         """
 
     @abstractmethod
-    def with_weights(self, term: LinearKernel, covariance: Tensor) -> Tensor:
+    def with_weights(self, term: LinearKernel, covariance: Array) -> Array:
         """Covariance of the anchors with K quantities, from that of a linear term's weights with them.
 
         term: with p weights; covariance: cov(w, s), (p, K). Return cov(u, s), (M, K).
         """
 
-    def cross(self, kernel: TorqueKernel, query: Motion) -> Tensor:
+    def cross(self, kernel: TorqueKernel, query: Motion) -> Array:
         """Covariance of the anchors with all torques of N queries, or with one term's share of them: (M, N n).
 
         kernel: the posterior's own, or a term of it.
         """
-        total = torch.zeros((len(self.weights), len(query) * kernel.n_joints), dtype=torch.float64)
+        total = np.zeros((len(self.weights), len(query) * kernel.n_joints))
         for term in kernel.terms if isinstance(kernel, SumKernel) else (kernel,):
             if isinstance(term, LinearKernel):
-                features = term.features(query)
-                scaled = term.covariance(self.params) @ features.reshape(-1, features.shape[-1]).T
-                total += self.with_weights(term, scaled)
+                total += self.with_weights(term, term.variances(self.params)[:, None] * term.flat_features(query).T)
             else:
                 total += self.with_torques(term, lambda anchor, k=term: k.gram(self.params, anchor, query))  # type: ignore[misc]
         return total
 
-    def mean(self, query: Motion, component: TorqueKernel | None = None) -> Tensor:
+    def mean(self, query: Motion, component: TorqueKernel | None = None) -> Array:
         """Posterior mean torque, (N, n) N·m.
 
         query: N instants; component: a term of the kernel, whose share of the mean is asked for.
@@ -99,10 +97,10 @@ class Posterior(ABC):
             part = query[start : start + QUERIES_PER_CHUNK]
             cross = self.cross(kernel, part)
             means.append(kernel.mean(part) + (self.weights @ cross).reshape(-1, n))
-            white = self.whiten(cross).reshape(-1, len(part), n)
-            explained = torch.einsum("kmi,kmj->mij", white, white)
+            white = np.ascontiguousarray(self.whiten(cross).reshape(-1, len(part), n).transpose(1, 2, 0))  # (N, n, r)
+            explained = white @ white.mT
             covariances.append(self.std_factor**2 * (kernel.variance(self.params, part) - explained))
-        return Prediction(torch.cat(means), torch.cat(covariances))
+        return Prediction(np.concatenate(means), np.concatenate(covariances))
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,7 @@ class ExactPosterior(Posterior):
 
     @classmethod
     def fit(
-        cls, kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor, std_factor: float = 1.0
+        cls, kernel: TorqueKernel, params: Params, motion: Motion, tau: Array, std_factor: float = 1.0
     ) -> ExactPosterior:
         """Condition the prior on measured torques.
 
@@ -129,27 +127,26 @@ class ExactPosterior(Posterior):
         weights = factor.solve((tau - kernel.mean(motion)).reshape(-1))
         return cls(kernel, params, std_factor, weights, motion, factor)
 
-    def whiten(self, cross: Tensor) -> Tensor:
+    def whiten(self, cross: Array) -> Array:
         """L⁻¹ c with K = L Lᵀ."""
         return self.factor.whiten(cross)
 
-    def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Tensor]) -> Tensor:
+    def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Array]) -> Array:
         """Covariance of the training torques with K quantities, from that of a term's torques: (N n, K)."""
         return covariance(self.motion)
 
-    def with_weights(self, term: LinearKernel, covariance: Tensor) -> Tensor:
+    def with_weights(self, term: LinearKernel, covariance: Array) -> Array:
         """Φ(X) cov(w, s), (N n, K). covariance: cov(w, s), (p, K)."""
-        features = term.features(self.motion)
-        return features.reshape(-1, features.shape[-1]) @ covariance
+        return term.flat_features(self.motion) @ covariance
 
 
-def noisy_gram(kernel: TorqueKernel, params: Params, motion: Motion) -> Tensor:
+def noisy_gram(kernel: TorqueKernel, params: Params, motion: Motion) -> Array:
     """K = k(X, X) + R: (N n, N n), exactly symmetric, sample by sample.
 
     params: hyperparameters, `noise.log_std` among them; motion: N samples.
     """
     gram = kernel.symmetric_gram(params, motion)
-    gram.diagonal().add_(torch.exp(2 * params["noise.log_std"]).repeat(len(motion)))
+    add_diagonal(gram, np.tile(np.exp(2 * params["noise.log_std"]), len(motion)))
     return gram
 
 
@@ -158,24 +155,30 @@ class Evidence:
     """value: −log p(tau | hyperparameters) in nats; gradient: its derivative by each hyperparameter."""
 
     value: float
-    gradient: dict[str, Tensor]
+    gradient: dict[str, Array]
 
 
-def negative_log_evidence(kernel: TorqueKernel, params: Params, motion: Motion, tau: Tensor) -> Evidence:
+def negative_log_evidence(
+    kernel: TorqueKernel, params: Params, motion: Motion, tau: Array, device: Place = "cpu"
+) -> Evidence:
     """½ yᵀK⁻¹y + ½ log det K + ½ N n log 2π with K = k(X, X) + R, and its gradient.
 
     The gradient is the sum of W ∘ ∂K with W = ½ (K⁻¹ − ααᵀ), α = K⁻¹y (Rasmussen & Williams, eq. 5.9); y is what the
     prior mean leaves. W is a constant once K is factored, so each kernel differentiates Σ W ∘ K in its own way.
 
-    motion: N samples; tau: (N, n). Raise NotPositiveDefiniteError where K cannot be factored.
+    motion: N samples; tau: (N, n); device: to compute on. Raise NotPositiveDefiniteError where K cannot be factored.
     """
+    if device != "cpu":
+        from lipcore.posterior.on_device import evidence_on  # noqa: PLC0415 - it imports torch
+
+        return Evidence(*evidence_on(kernel, params, motion, tau, device))
     n, size = kernel.n_joints, len(motion)
     factor = cholesky(noisy_gram(kernel, params, motion))
     y = (tau - kernel.mean(motion)).reshape(-1)
     alpha = factor.solve(y)
     value = 0.5 * (y @ alpha) + 0.5 * factor.log_determinant() + 0.5 * len(y) * log(2 * pi)
-    weight = 0.5 * (torch.cholesky_inverse(factor.lower) - torch.outer(alpha, alpha))
+    weight = 0.5 * (factor.inverse() - np.outer(alpha, alpha))
     gradient = kernel.gradient(params, motion, weight)
-    noise = torch.exp(2 * params["noise.log_std"])
+    noise = np.exp(2 * params["noise.log_std"])
     gradient["noise.log_std"] = 2 * noise * weight.diagonal().reshape(size, n).sum(0)
     return Evidence(float(value), gradient)

@@ -1,15 +1,23 @@
-"""Cholesky factors, the project's only jitter policy, and symmetric matrices stored as triangles."""
+"""Triangular linear algebra, the project's only jitter policy, and symmetric matrices stored as triangles.
+
+LAPACK and BLAS of SciPy read arrays in Fortran's order. A lower triangular L in C's order is, as it lies in memory, the
+upper triangular Lᵀ in Fortran's: every routine is asked for that one, and nothing is copied into another order.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, cast
 
-import torch
-from torch import Tensor
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from lipcore.data.motion import Array
 
 JITTERS = (0.0, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8)
 """Diagonal added, relative to the mean diagonal, tried in this order."""
+_blas, _lapack = cast(Any, blas), cast(Any, lapack)  # made by f2py, without types
 
 
 class NotPositiveDefiniteError(ArithmeticError):
@@ -20,61 +28,145 @@ class NotPositiveDefiniteError(ArithmeticError):
 class Factor:
     """Lower Cholesky factor L of K + jitter·I: `lower` (m, m) and the absolute jitter that it took."""
 
-    lower: Tensor
+    lower: Array
     jitter: float
 
-    def solve(self, right: Tensor) -> Tensor:
+    def solve(self, right: Array) -> Array:
         """K⁻¹ right for right of shape (m,) or (m, k)."""
-        columns = right[:, None] if right.dim() == 1 else right
-        solved: Tensor = torch.cholesky_solve(columns, self.lower)
-        return solved.reshape(right.shape)
+        return solve_factored(self.lower, right)
 
-    def whiten(self, right: Tensor) -> Tensor:
-        """L⁻¹ right for right of shape (m, k)."""
-        solved: Tensor = torch.linalg.solve_triangular(self.lower, right, upper=False)
-        return solved
+    def whiten(self, right: Array) -> Array:
+        """L⁻¹ right for right of shape (m,) or (m, k)."""
+        return solve_lower(self.lower, right)
 
-    def log_determinant(self) -> Tensor:
+    def inverse(self) -> Array:
+        """K⁻¹, (m, m), exactly symmetric."""
+        return inverse_factored(self.lower)
+
+    def log_determinant(self) -> float:
         """log det K."""
-        return self.lower.diagonal().log().sum().mul(2)
+        return 2 * float(np.log(self.lower.diagonal()).sum())
 
 
-def cholesky(matrix: Tensor) -> Factor:
+def cholesky(matrix: Array) -> Factor:
     """Factor a symmetric positive definite matrix; raise NotPositiveDefiniteError where the jitter policy fails."""
-    if not torch.isfinite(matrix).all():
+    if not np.isfinite(matrix).all():
         raise NotPositiveDefiniteError("the covariance matrix holds a value that is not finite")
-    scale = matrix.diagonal().mean()
+    scale = float(matrix.diagonal().mean()) if len(matrix) else 0.0
     for relative in JITTERS:
-        jitter = relative * float(scale)
-        shifted = (
-            matrix
-            if relative == 0.0
-            else matrix + jitter * torch.eye(matrix.shape[0], dtype=matrix.dtype, device=matrix.device)
-        )
-        lower, info = torch.linalg.cholesky_ex(shifted)
-        if int(info) == 0:
-            return Factor(lower, jitter)
+        lower = lower_root(matrix, relative * scale)
+        if lower is not None:
+            return Factor(lower, relative * scale)
     raise NotPositiveDefiniteError(
-        f"covariance matrix of size {matrix.shape[0]} is not positive definite: "
-        f"a jitter of {JITTERS[-1]:g} times its mean diagonal {float(scale):.3g} did not help"
+        f"covariance matrix of size {len(matrix)} is not positive definite: "
+        f"a jitter of {JITTERS[-1]:g} times its mean diagonal {scale:.3g} did not help"
     )
 
 
-def pack_symmetric(symmetric: Tensor) -> Tensor:
+def lower_root(matrix: Array, added: float = 0.0) -> Array | None:
+    """L, (m, m) lower triangular, with L Lᵀ = matrix + added·I; None where that is not positive definite.
+
+    The matrix is read from its lower triangle.
+    """
+    own = np.array(matrix, order="C")
+    if not len(own):
+        return own
+    add_diagonal(own, added)
+    upper, failed = _lapack.dpotrf(own.T, lower=0, clean=1, overwrite_a=1)
+    return None if failed else upper.T
+
+
+def solve_lower(lower: Array, right: Array, transposed: bool = False) -> Array:
+    """L⁻¹ right, or L⁻ᵀ right; lower: (m, m) in C's order; right: (m,) or (m, k)."""
+    if not right.size:
+        return right.copy()
+    if right.ndim == 1:
+        return np.asarray(_blas.dtrsv(lower.T, right, lower=0, trans=0 if transposed else 1))
+    # the transpose is asked for: Xᵀ = Bᵀ L⁻ᵀ
+    solved = _blas.dtrsm(1.0, lower.T, right.T, side=1, lower=0, trans_a=1 if transposed else 0)
+    return np.asarray(solved.T)
+
+
+def solve_lower_right(left: Array, lower: Array) -> Array:
+    """left L⁻¹; left: (k, m); lower: (m, m)."""
+    return solve_lower(lower, left.T, transposed=True).T
+
+
+def whiten_rows(lower: Array, rows: Array) -> None:
+    """Overwrite rows, (K, m), each a right-hand side x, by L⁻¹ x. rows: in C's order."""
+    if not rows.flags.c_contiguous:
+        raise ValueError("rows are not C-contiguous, expected an array that BLAS can write to in place")
+    if rows.size:
+        _blas.dtrsm(1.0, lower.T, rows.T, side=0, lower=0, trans_a=1, overwrite_b=1)
+
+
+def solve_factored(lower: Array, right: Array) -> Array:
+    """(L Lᵀ)⁻¹ right; lower: (m, m); right: (m,) or (m, k)."""
+    return solve_lower(lower, solve_lower(lower, right), transposed=True)
+
+
+def inverse_factored(lower: Array) -> Array:
+    """(L Lᵀ)⁻¹, (m, m), exactly symmetric."""
+    if not len(lower):
+        return lower.copy()
+    upper, failed = _lapack.dpotri(lower.T, lower=0)
+    if failed:
+        raise NotPositiveDefiniteError("a Cholesky factor has a zero on its diagonal")
+    inverse = np.asarray(upper.T)
+    mirror(inverse)
+    return inverse
+
+
+def add_diagonal(matrix: Array, values: Array | float) -> None:
+    """Add to the diagonal of a square matrix, in place. values: (m,), or one for all."""
+    np.einsum("ii->i", matrix)[:] += values
+
+
+def add_square(a: Array, features: Array, sign: float = 1.0) -> None:
+    """Add sign F Fᵀ to the lower triangle of A, in place. a: (M, M); features: F, (M, K); both in C's order."""
+    if not (a.flags.c_contiguous and features.flags.c_contiguous):
+        raise ValueError("a and features are not both C-contiguous, expected arrays that BLAS can write to in place")
+    if features.size:
+        _blas.dsyrk(sign, features.T, beta=1.0, c=a.T, trans=1, lower=0, overwrite_c=1)
+
+
+def add_square_of_rows(a: Array, rows: Array) -> None:
+    """Add RᵀR to the upper triangle of A, in place. a: (M, M); rows: R, (K, M); both in C's order."""
+    if not (a.flags.c_contiguous and rows.flags.c_contiguous):
+        raise ValueError("a and rows are not both C-contiguous, expected arrays that BLAS can write to in place")
+    if rows.size:
+        _blas.dsyrk(1.0, rows.T, beta=1.0, c=a.T, trans=0, lower=1, overwrite_c=1)
+
+
+def mirror(a: Array) -> None:
+    """Make the upper triangle of a square matrix equal to the lower one, in place."""
+    np.copyto(a, a.T, where=np.tri(len(a), k=-1, dtype=bool).T)
+
+
+def block_diagonal(blocks: list[Array]) -> Array:
+    """Square matrices along the diagonal of one that is zero elsewhere."""
+    size = sum(map(len, blocks))
+    out, at = np.zeros((size, size)), 0
+    for block in blocks:
+        out[at : at + len(block), at : at + len(block)] = block
+        at += len(block)
+    return out
+
+
+def pack_symmetric(symmetric: Array) -> Array:
     """Upper triangle of a symmetric matrix (M, M), row by row: (M (M + 1) / 2,)."""
-    rows, columns = torch.triu_indices(*symmetric.shape)
-    return symmetric[rows, columns]
+    return np.asarray(symmetric[np.triu_indices(len(symmetric))])
 
 
-def unpack_symmetric(name: str, packed: Tensor) -> Tensor:
+def unpack_symmetric(name: str, packed: Array) -> Array:
     """The symmetric matrix (M, M) of `pack_symmetric`; name: of the tensor, for the message.
 
     Raise ValueError for a length that no triangle has.
     """
-    size = math.isqrt(2 * packed.numel())
-    if packed.dim() != 1 or size * (size + 1) // 2 != len(packed):
-        raise ValueError(f"{name} has shape {tuple(packed.shape)}, expected M (M + 1) / 2 numbers")
-    rows, columns = torch.triu_indices(size, size)
-    full = torch.empty((size, size), dtype=packed.dtype)
+    size = math.isqrt(2 * packed.size)
+    if packed.ndim != 1 or size * (size + 1) // 2 != len(packed):
+        raise ValueError(f"{name} has shape {packed.shape}, expected M (M + 1) / 2 numbers")
+    rows, columns = np.triu_indices(size)
+    full = np.empty((size, size))
     full[rows, columns] = full[columns, rows] = packed
     return full

@@ -6,9 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from lipcore.data.independence import INDEPENDENT_HZ, recording_weights
 from lipcore.data.motion import Motion
@@ -51,40 +49,40 @@ class Misfit:
     training.
     """
 
-    rest: Tensor
-    slow: Tensor
-    lasting: Tensor
-    speed: Tensor
-    acceleration: Tensor
+    rest: Array
+    slow: Array
+    lasting: Array
+    speed: Array
+    acceleration: Array
 
     @classmethod
     def none(cls, n: int) -> Misfit:
         """No such variance, for n joints."""
-        zero, one = torch.zeros(n, dtype=torch.float64), torch.ones(n, dtype=torch.float64)
+        zero, one = np.zeros(n), np.ones(n)
         return cls(zero, one, zero, one, one)
 
     @classmethod
-    def unpacked(cls, values: Tensor) -> Misfit:
+    def unpacked(cls, values: Array) -> Misfit:
         """From what `packed` returns, (5, n), or its first four rows, as earlier releases have stored."""
-        known = [*values, torch.full_like(values[0], NEVER)]
+        known = [*values, np.full_like(values[0], NEVER)]
         return cls(*known[:5])
 
-    def packed(self) -> Tensor:
+    def packed(self) -> Array:
         """Its fields one below the other, (5, n)."""
-        return torch.stack([self.rest, self.slow, self.lasting, self.speed, self.acceleration])
+        return np.stack([self.rest, self.slow, self.lasting, self.speed, self.acceleration])
 
     def of_joints(self, joints: NDArray[np.int64]) -> Misfit:
         """The same with the joints in another order. joints: (n,), their places in this one."""
-        return Misfit.unpacked(self.packed()[:, torch.from_numpy(joints)])
+        return Misfit.unpacked(self.packed()[:, joints])
 
     def with_friction(self, coulomb: Array) -> Misfit:
         """The same with at least AT_REST of the squares of Coulomb torques, (n,) N·m, at rest, moved or not so far."""
-        return replace(self, rest=torch.maximum(self.rest, torch.from_numpy(AT_REST * coulomb**2)))
+        return replace(self, rest=np.maximum(self.rest, AT_REST * coulomb**2))
 
     def with_rest(self, other: Misfit) -> Misfit:
         """The same with the variance at rest, and its speed, of another where that is larger."""
         larger = other.rest > self.rest
-        rest, slow = torch.where(larger, other.rest, self.rest), torch.where(larger, other.slow, self.slow)
+        rest, slow = np.where(larger, other.rest, self.rest), np.where(larger, other.slow, self.slow)
         return replace(self, rest=rest, slow=slow)
 
     @property
@@ -92,18 +90,18 @@ class Misfit:
         """Whether there is any."""
         return bool((self.rest > 0).any() or (self.lasting > 0).any())
 
-    def at_rest(self, dq: Tensor) -> Tensor:
+    def at_rest(self, dq: Array) -> Array:
         """Variance of friction at low speed, (N, n) (N·m)². dq: (N, n)."""
-        return self.rest * torch.exp(-((dq / self.slow) ** 2))
+        return np.asarray(self.rest * np.exp(-((dq / self.slow) ** 2)))
 
-    def variance(self, motion: Motion) -> Tensor:
+    def variance(self, motion: Motion) -> Array:
         """Variance of the torques at N instants, (N, n) (N·m)²."""
-        speed = ((motion.dq / self.speed) ** 2).mean(dim=-1, keepdim=True) - 1
-        acceleration = ((motion.ddq / self.acceleration) ** 2).mean(dim=-1, keepdim=True) - 1
-        faster = speed.clamp_min(0.0) + ACCELERATED * acceleration.clamp_min(0.0)
-        return self.at_rest(motion.dq) + self.lasting * faster
+        speed = ((motion.dq / self.speed) ** 2).mean(axis=-1, keepdims=True) - 1
+        acceleration = ((motion.ddq / self.acceleration) ** 2).mean(axis=-1, keepdims=True) - 1
+        faster = speed.clip(0.0) + ACCELERATED * acceleration.clip(0.0)
+        return np.asarray(self.at_rest(motion.dq) + self.lasting * faster)
 
-    def of_row(self, noise: Tensor, dq: Tensor, rows: float = ROWS) -> Tensor:
+    def of_row(self, noise: Array, dq: Array, rows: float = ROWS) -> Array:
         """Variance R with which each of N rows teaches, (N, n) (N·m)²: white noise is new in every row, an error that
         lasts is that of `rows` rows, which count together as one.
 
@@ -134,7 +132,7 @@ def estimate(
     white = np.minimum(*(noise_level([each[part] for part in episodes]) for each in (residual, tau)))
     lasting = np.maximum(noise - CHANCE * white**2, 0.0)
     usual = np.maximum(np.sqrt(np.mean(motion**2, axis=1)), SIGN_WIDTH)
-    return Misfit(*(torch.from_numpy(each) for each in (rest, slow, lasting, *usual))), noise
+    return Misfit(rest, slow, lasting, *usual), noise
 
 
 def low_speed_variance(residual: Array, dq: Array) -> tuple[Array, Array, Array]:

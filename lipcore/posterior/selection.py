@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Indices, Motion
 from lipcore.kernels.friction import friction_features
 
 PREFERENCE = 10.0
@@ -20,7 +19,7 @@ ROUNDING = 1e-13
 """Residuals below this share of the largest variance are rounding."""
 
 
-def spread_out(motion: Motion, count: int) -> Tensor:
+def spread_out(motion: Motion, count: int) -> Indices:
     """Indices of `count` samples that lie far from each other, sorted; all where there are no more.
 
     Farthest-point selection on (cos q, sin q, q − mean, dq, sign dq, ddq), each scaled to the motion's spread:
@@ -28,26 +27,29 @@ def spread_out(motion: Motion, count: int) -> Tensor:
     """
     size = len(motion)
     if size <= count:
-        return torch.arange(size, device=motion.device)
-    angle = (motion.q - motion.q.mean(0)) / motion.q.std(0).clamp_min(1.0)
-    features = torch.cat(
+        return np.arange(size)
+    spread = [each.std(0, ddof=1) for each in (motion.q, motion.dq, motion.ddq)]
+    angle = (motion.q - motion.q.mean(0)) / spread[0].clip(1.0)
+    features = np.concatenate(
         [
-            torch.cos(motion.q),
-            torch.sin(motion.q),
+            np.cos(motion.q),
+            np.sin(motion.q),
             angle,
-            motion.dq / motion.dq.std(0).clamp_min(1e-6),
+            motion.dq / spread[1].clip(1e-6),
             0.5 * friction_features(motion.dq)[1],
-            motion.ddq / motion.ddq.std(0).clamp_min(1e-6),
+            motion.ddq / spread[2].clip(1e-6),
         ],
-        dim=1,
+        axis=1,
     )
-    chosen = [int((features - features.mean(0)).square().sum(1).argmax())]
-    distance = torch.full((size,), torch.inf, dtype=torch.float64, device=motion.device)
+    features -= features.mean(0)
+    squares = np.einsum("kd,kd->k", features, features)
+    chosen, distance = [int(squares.argmax())], np.full(size, np.inf)
     while len(chosen) < count:
-        distance = torch.minimum(distance, (features - features[chosen[-1]]).square().sum(1))
+        last = chosen[-1]
+        distance = np.minimum(distance, squares + squares[last] - 2 * (features @ features[last]))
         distance[chosen] = -1.0  # a sample that repeats a chosen one is new, a chosen one is not
         chosen.append(int(distance.argmax()))
-    return torch.tensor(sorted(chosen), device=motion.device)
+    return np.array(sorted(chosen))
 
 
 @dataclass(frozen=True)
@@ -57,35 +59,34 @@ class Pivots:
     residual: (m,), largest variance that the outputs chosen before each step leave unexplained.
     """
 
-    outputs: Tensor
-    lower: Tensor
-    residual: Tensor
+    outputs: Indices
+    lower: Array
+    residual: Array
 
     def __len__(self) -> int:
         return len(self.outputs)
 
 
-def pivots(gram: Tensor, per_sample: int, most: int, residual: float) -> Pivots:
+def pivots(gram: Array, per_sample: int, most: int, residual: float) -> Pivots:
     """Choose at most `most` outputs until no residual variance exceeds `residual`.
 
     gram: (M, M), outputs sample by sample, `per_sample` a sample; it is read column by column and not changed.
     """
     size = len(gram)
-    lower = torch.zeros((min(most, size), size), dtype=gram.dtype)  # rows are contiguous: L transposed
-    left = gram.diagonal().clone()
+    lower = np.zeros((min(most, size), size))  # rows are contiguous: L transposed
+    left = gram.diagonal().copy()
     stop = max(residual, ROUNDING * float(left.max()))
-    handicap = torch.full((size,), 1 / PREFERENCE, dtype=gram.dtype)
+    handicap = np.full((size,), 1 / PREFERENCE)
     chosen: list[int] = []
     residuals: list[float] = []
     while len(chosen) < len(lower) and float(left.max()) > stop:
         pivot, step = int((left * handicap).argmax()), len(chosen)
-        row = (gram[pivot] - lower[:step, pivot] @ lower[:step]) / left[pivot].sqrt()
+        row = (gram[pivot] - lower[:step, pivot] @ lower[:step]) / np.sqrt(left[pivot])
         lower[step] = row
         residuals.append(float(left.max()))
         chosen.append(pivot)
-        left = (left - row.square()).clamp_min(0.0)
+        left = (left - np.square(row)).clip(0.0)
         left[pivot] = 0.0
         sample = pivot // per_sample
         handicap[sample * per_sample : (sample + 1) * per_sample] = 1.0
-    order = torch.tensor(chosen, dtype=torch.int64)
-    return Pivots(order, lower[: len(chosen)].T, torch.tensor(residuals, dtype=gram.dtype))
+    return Pivots(np.array(chosen, np.int64), lower[: len(chosen)].T, np.array(residuals))

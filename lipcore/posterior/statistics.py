@@ -8,20 +8,26 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.posterior.basis import Basis
-from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.posterior.linalg import (
+    NotPositiveDefiniteError,
+    add_diagonal,
+    add_square,
+    inverse_factored,
+    lower_root,
+    mirror,
+    solve_factored,
+    solve_lower_right,
+)
 
 ROUNDING = 1e-8
 """Share of the largest eigenvalue of the statistics by which the smallest may lie below zero."""
 BELOW = 1e-5
 """How far below zero the eigenvalues of the statistics may lie by rounding without being looked at: by such a share a
 variance of which samples say nothing may exceed the prior's."""
-BLOCK = 256
-"""Rows below which a product with itself is computed at once."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +39,8 @@ class Statistics:
     independent training conditional of Snelson & Ghahramani, 2006). samples: sum of the weights.
     """
 
-    a: Tensor
-    b: Tensor
+    a: Array
+    b: Array
     samples: float
 
 
@@ -46,26 +52,26 @@ class Solution:
     the others, I − R₁ᵀR₁ = Σ₁₁ − Σ₁₂ Σ₂₂⁻¹ Σ₂₁; the others R₂ are what is left of all: Σ = I₁ − R₁ᵀR₁ + R₂ᵀR₂.
     """
 
-    mean: Tensor
-    root: Tensor
+    mean: Array
+    root: Array
     first: int = 0
 
     @property
-    def covariance(self) -> Tensor:
+    def covariance(self) -> Array:
         """Σ, (M, M)."""
         learnt, left = self.root[: self.first], self.root[self.first :]
         out = left.T @ left - learnt.T @ learnt
-        out.diagonal()[: self.first].add_(1.0)
+        add_diagonal(out[: self.first, : self.first], 1.0)
         return out
 
 
 def empty(size: int) -> Statistics:
     """Statistics of no samples, for M = size variables."""
-    return Statistics(torch.zeros((size, size), dtype=torch.float64), torch.zeros(size, dtype=torch.float64), 0)
+    return Statistics(np.zeros((size, size)), np.zeros(size), 0)
 
 
 def collect(
-    basis: Basis, noise_variance: Tensor, motion: Motion, residual: Tensor, weights: Tensor | None = None
+    basis: Basis, noise_variance: Array, motion: Motion, residual: Array, weights: Array | None = None
 ) -> Statistics:
     """Sums over N samples, A = Σ φ R⁻¹ φᵀ and b = Σ φ R⁻¹ residual (eq. 24 of docs/method.md).
 
@@ -74,19 +80,22 @@ def collect(
     """
     features = basis.features(motion)
     variance = noise_variance + basis.uncovered(motion, features)
-    precision = variance.reciprocal() if weights is None else weights[:, None] / variance
-    features *= precision.sqrt().reshape(-1)
-    b = features @ (residual * precision.sqrt()).reshape(-1)
-    return Statistics(_square(features), b, float(len(motion) if weights is None else weights.sum()))
+    root = np.sqrt((1.0 if weights is None else weights[:, None]) / variance)
+    features *= root.reshape(-1)
+    b = features @ (residual * root).reshape(-1)
+    a = np.zeros((len(features),) * 2)
+    add_square(a, features)
+    mirror(a)
+    return Statistics(a, b, float(len(motion) if weights is None else weights.sum()))
 
 
 def update(
     statistics: Statistics,
     basis: Basis,
-    noise_variance: Tensor,
+    noise_variance: Array,
     motion: Motion,
-    residual: Tensor,
-    weights: Tensor | None = None,
+    residual: Array,
+    weights: Array | None = None,
 ) -> Statistics:
     """Statistics with N more samples, arguments as of `collect`."""
     return merge(statistics, collect(basis, noise_variance, motion, residual, weights))
@@ -103,7 +112,7 @@ def subtract(all_samples: Statistics, some: Statistics) -> Statistics:
 
 
 def add_to(
-    statistics: Statistics, features: Tensor, variance: Tensor, residual: Tensor, weights: Tensor, sign: float = 1.0
+    statistics: Statistics, features: Array, variance: Array, residual: Array, weights: Array, sign: float = 1.0
 ) -> Statistics:
     """Statistics with N samples more, or fewer where sign is −1, that overwrite these: for few samples, often.
 
@@ -111,17 +120,12 @@ def add_to(
     to rounding as to `merge` what `collect` finds. features: φ, (M, N n), overwritten; variance: R, (N, n); residual:
     (N, n); weights: (N,).
     """
-    root = (weights[:, None] / variance).sqrt()
+    root = np.sqrt(weights[:, None] / variance)
     features *= root.reshape(-1)
     b = features @ (residual * root).reshape(-1)
-    _add_square(statistics.a, features, sign)
+    add_square(statistics.a, features, sign)
     samples = statistics.samples + sign * float(weights.sum())
     return Statistics(statistics.a, statistics.b + sign * b, samples)
-
-
-def mirror(statistics: Statistics) -> None:
-    """Make the upper triangle of A equal to the lower one, in place: what follows a run of `add_to`."""
-    statistics.a.copy_(statistics.a.tril() + statistics.a.tril(-1).T)
 
 
 def decay(statistics: Statistics, factor: float, own: bool = False) -> Statistics:
@@ -132,15 +136,15 @@ def decay(statistics: Statistics, factor: float, own: bool = False) -> Statistic
     if not 0.0 <= factor <= 1.0:
         raise ValueError(f"factor is {factor!r}, expected a number from 0 to 1")
     a, b = statistics.a, statistics.b
-    return Statistics(a.mul_(factor) if own else factor * a, factor * b, factor * statistics.samples)
+    return Statistics(np.multiply(a, factor, out=a if own else None), factor * b, factor * statistics.samples)
 
 
 def copied(statistics: Statistics) -> Statistics:
     """The same statistics in memory of their own."""
-    return Statistics(statistics.a.clone(), statistics.b.clone(), statistics.samples)
+    return Statistics(statistics.a.copy(), statistics.b.copy(), statistics.samples)
 
 
-def solve(statistics: Statistics, centre: Tensor | None = None, first: int = 0) -> Solution:
+def solve(statistics: Statistics, centre: Array | None = None, first: int = 0) -> Solution:
     """Posterior of the whitened variables given the statistics, with the prior N(centre, I).
 
     Mean (I + A)⁻¹ (centre + b), covariance Σ = (I + A)⁻¹ = L⁻ᵀ L⁻¹. centre: (M,), zero where None; first: see
@@ -150,13 +154,12 @@ def solve(statistics: Statistics, centre: Tensor | None = None, first: int = 0) 
     factor = _by_cholesky(statistics.a)
     if factor is None:
         factor = _by_eigenvalues(statistics.a)
-    mean = torch.cholesky_solve(right[:, None], factor)[:, 0]
-    unit = torch.eye(len(factor), dtype=factor.dtype)
-    left = torch.linalg.solve_triangular(factor.T, unit[:, first:], upper=True).T
-    return Solution(mean, _stacked(torch.cholesky_inverse(factor[:first, :first]), left), first)
+    mean = solve_factored(factor, right)
+    left = solve_lower_right(np.eye(len(factor))[first:], factor)
+    return Solution(mean, _stacked(inverse_factored(np.ascontiguousarray(factor[:first, :first])), left), first)
 
 
-def known(mean: Tensor, covariance: Tensor, first: int = 0) -> Solution:
+def known(mean: Array, covariance: Array, first: int = 0) -> Solution:
     """The posterior N(mean, Σ) of whitened variables, (M,) and (M, M), as it stands; Σ is nowhere above the prior's I.
 
     Raise NotPositiveDefiniteError where it is.
@@ -167,92 +170,62 @@ def known(mean: Tensor, covariance: Tensor, first: int = 0) -> Solution:
     return Solution(mean, _stacked(given.T @ given, left[first:]), first)
 
 
-def learnt_root(covariance: Tensor) -> Tensor:
+def learnt_root(covariance: Array) -> Array:
     """Q, (M, M) lower triangular, with QᵀQ = I − Σ: what is learnt of whitened variables of covariance Σ.
 
     Raise NotPositiveDefiniteError where Σ exceeds the prior's I.
     """
     explained = -covariance
-    explained.diagonal().add_(1.0)
+    add_diagonal(explained, 1.0)
     return _lower_root(explained)
 
 
-def _stacked(given: Tensor, left: Tensor) -> Tensor:
+def _stacked(given: Array, left: Array) -> Array:
     """R of `Solution`. given: Σ₁₁ − Σ₁₂ Σ₂₂⁻¹ Σ₂₁; left: R₂."""
     first = len(given)
     if not first:
-        return left.contiguous()
-    out = torch.zeros((first + len(left),) * 2, dtype=left.dtype)
+        return np.ascontiguousarray(left)
+    out = np.zeros((first + len(left),) * 2)
     out[:first, :first], out[first:] = learnt_root(given), left
     return out
 
 
-def _lower_root(matrix: Tensor) -> Tensor:
+def _lower_root(matrix: Array) -> Array:
     """Q, lower triangular, with QᵀQ a symmetric matrix; raise NotPositiveDefiniteError for one that is no square."""
     some = matrix.diagonal() != 0
     if not some.all():  # of others nothing is learnt, or all is known
-        out = torch.zeros_like(matrix)
-        out[torch.outer(some, some)] = _lower_root(matrix[some][:, some]).reshape(-1)
+        out = np.zeros_like(matrix)
+        out[np.ix_(some, some)] = _lower_root(matrix[np.ix_(some, some)])
         return out
-    # with the variables in reverse order it is Uᵀ U: the factor that is sought is the lower triangular one
-    upper, failed = torch.linalg.cholesky_ex(matrix.flip(0, 1), upper=True)
-    if not failed:
-        lower: Tensor = upper.flip(0, 1)
-        return lower
-    values, vectors = torch.linalg.eigh(matrix)
+    # with the variables in reverse order it is L Lᵀ: the factor that is sought is Lᵀ, reversed
+    root = lower_root(matrix[::-1, ::-1])
+    if root is not None:
+        return np.ascontiguousarray(root.T[::-1, ::-1])
+    values, vectors = np.linalg.eigh(matrix)
     if not float(values[0]) >= -BELOW:
         raise NotPositiveDefiniteError(f"a covariance is {-float(values[0]):.3g} above the prior's or below zero")
-    root = values.clamp_min(0.0).sqrt()[:, None] * vectors.T
-    lower = torch.linalg.qr(root.flip(1), mode="r").R.flip(0, 1)
-    return lower
+    root = np.sqrt(values.clip(0.0))[:, None] * vectors.T
+    return np.ascontiguousarray(_upper(root[:, ::-1])[::-1, ::-1])
 
 
-def _by_cholesky(a: Tensor) -> Tensor | None:
+def _by_cholesky(a: Array) -> Array | None:
     """L, lower triangular, with L Lᵀ = I + A; None where A is not one that samples have, to BELOW."""
-    total = a.clone()
-    total.diagonal().add_(BELOW)
-    if torch.linalg.cholesky_ex(total).info:
-        return None
-    total.copy_(a).diagonal().add_(1.0)
-    factor, failed = torch.linalg.cholesky_ex(total)
-    return None if failed else factor
+    return None if lower_root(a, BELOW) is None else lower_root(a, 1.0)
 
 
-def _by_eigenvalues(a: Tensor) -> Tensor:
+def _by_eigenvalues(a: Array) -> Array:
     """The same from any statistics, at three times the cost; raise NotPositiveDefiniteError for impossible ones."""
-    values, vectors = torch.linalg.eigh(a)
+    values, vectors = np.linalg.eigh(a)
     if not float(values[0]) >= -ROUNDING * max(float(values[-1]), 1.0):
         raise NotPositiveDefiniteError(
             f"statistics of size {len(values)} have the eigenvalue {float(values[0]):.3g}, expected none below zero"
         )
-    root = (1 + values.clamp_min(0.0)).sqrt()[:, None] * vectors.T
-    upper: Tensor = torch.linalg.qr(root, mode="r").R
+    root = np.sqrt(1 + values.clip(0.0))[:, None] * vectors.T
+    upper = _upper(root)
     # the Cholesky factor has a positive diagonal
-    return (upper * upper.diagonal().sign()[:, None]).T
+    return np.ascontiguousarray((upper * np.sign(upper.diagonal())[:, None]).T)
 
 
-def _square(features: Tensor) -> Tensor:
-    """F Fᵀ of (M, K), exactly symmetric: only one of each pair of off-diagonal blocks is computed."""
-    size = len(features)
-    if size <= BLOCK:
-        product = features @ features.T
-        return 0.5 * (product + product.T)
-    out = features.new_empty((size, size))
-    half = size // 2
-    upper, lower = features[:half], features[half:]
-    out[:half, :half], out[half:, half:] = _square(upper), _square(lower)
-    out[half:, :half] = lower @ upper.T
-    out[:half, half:] = out[half:, :half].T
-    return out
-
-
-def _add_square(a: Tensor, features: Tensor, sign: float) -> None:
-    """Add sign F Fᵀ of (M, K) to the lower triangle of A, in place; of the upper one, blocks on the diagonal change."""
-    if len(a) <= BLOCK:
-        a.addmm_(features, features.T, alpha=sign)
-        return
-    half = len(a) // 2
-    upper, lower = features[:half], features[half:]
-    _add_square(a[:half, :half], upper, sign)
-    _add_square(a[half:, half:], lower, sign)
-    a[half:, :half].addmm_(lower, upper.T, alpha=sign)
+def _upper(matrix: Array) -> Array:
+    """R of the QR decomposition."""
+    return np.asarray(np.linalg.qr(matrix, mode="r"))

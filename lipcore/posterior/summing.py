@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
@@ -20,7 +20,12 @@ from lipcore.kernels.base import PairKernel, Params, TorqueKernel
 from lipcore.kernels.compiled.compile import compiled
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.linalg import add_square_of_rows, pack_symmetric, whiten_rows
 from lipcore.posterior.misfit import Misfit
+from lipcore.vocabulary import Place
+
+if TYPE_CHECKING:
+    from lipcore.posterior.on_device import DeviceBasis
 
 CHUNK = 1024
 """Samples whose product is computed together: the more, the less often the sum is read and written."""
@@ -30,7 +35,7 @@ PIECE = 256
 
 @dataclass
 class Total:
-    """A sum that grows: the lower triangle of A, (M, M) in Fortran's order, and b, (M,)."""
+    """A sum that grows: the upper triangle of A, (M, M), and b, (M,)."""
 
     a: Array
     b: Array
@@ -38,60 +43,50 @@ class Total:
     @classmethod
     def empty(cls, size: int) -> Total:
         """The sum of no samples, for M = size variables."""
-        return cls(torch.zeros((size, size), dtype=torch.float64).numpy().T, np.zeros(size))
+        return cls(np.zeros((size, size)), np.zeros(size))
 
     def packed(self) -> Array:
         """Upper triangle of A row by row, (M (M + 1) / 2,)."""
-        rows, columns = np.triu_indices(len(self.a))
-        packed: Array = self.a[columns, rows]
-        return packed
+        return pack_symmetric(self.a)
 
 
 @dataclass(frozen=True)
 class Summing:
     """How samples are summed up for a posterior: its kernel, basis, noise and misfit.
 
-    On a device other than the CPU, torch does all but the sum.
+    device: what computes all but the sum.
     """
 
     kernel: TorqueKernel
     basis: Basis
-    noise_variance: Tensor
+    noise_variance: Array
     misfit: Misfit
-    device: torch.device
+    device: Place
     prior: Callable[[Motion], Array] = field(repr=False)
 
     @classmethod
-    def of(cls, posterior: CompactPosterior, device: torch.device | str = "cpu") -> Summing:
+    def of(cls, posterior: CompactPosterior, device: Place = "cpu") -> Summing:
         """For a posterior, on a device."""
-        basis, place = posterior.basis, torch.device(device)
+        basis = posterior.basis
         prior = _nothing if basis.term is None else _prior(basis.term, basis.params, basis.inducing)
-        if place.type != "cpu":
-            basis = _moved(basis, place)
-        misfit = Misfit.unpacked(posterior.misfit.packed().to(place))
-        return cls(posterior.kernel, basis, posterior.noise_variance.to(place), misfit, place, prior)
+        return cls(posterior.kernel, basis, posterior.noise_variance, posterior.misfit, device, prior)
 
     def add(self, total: Total, samples: Samples, weights: Array | None = None) -> None:
         """Add samples to a total. weights: (N,), one for each, all equal where None."""
-        from scipy.linalg.blas import dsyrk  # noqa: PLC0415 - serving does without it
-
         scale = np.ones(len(samples)) if weights is None else np.ascontiguousarray(weights, np.float64)
-        features = (
-            self._on_cpu(total, samples, scale) if self.device.type == "cpu" else self._elsewhere(total, samples, scale)
-        )
-        # in place: `a` is in Fortran's order, and so are the features' transpose
-        dsyrk(1.0, features.T, beta=1.0, c=total.a, lower=1, overwrite_c=1)
+        on_cpu = self.device == "cpu"
+        features = self._on_cpu(total, samples, scale) if on_cpu else self._elsewhere(total, samples, scale)
+        add_square_of_rows(total.a, features)
 
     def _on_cpu(self, total: Total, samples: Samples, weights: Array) -> Array:
         """Weighed features of the torques of N samples, (N n, M), piece by piece: a piece stays in the cache."""
         n, first = samples.n_joints, len(self.basis.outputs)
-        # memory of torch: BLAS rounds in another order where memory is aligned otherwise, as that of NumPy may be
-        out = torch.empty((len(samples) * n, len(self.basis)), dtype=torch.float64).numpy()
+        out = np.empty((len(samples) * n, len(self.basis)))
         for start in range(0, len(samples), PIECE):
             part = slice(start, start + PIECE)
-            motion = Motion(*(torch.from_numpy(each[part]) for each in (samples.q, samples.dq, samples.ddq)))
-            residual = np.ascontiguousarray(samples.tau[part] - self.kernel.mean(motion).numpy())
-            noise = self.misfit.of_row(self.noise_variance, motion.dq).numpy()
+            motion = Motion(*(each[part] for each in (samples.q, samples.dq, samples.ddq)))
+            residual = np.ascontiguousarray(samples.tau[part] - self.kernel.mean(motion))
+            noise = self.misfit.of_row(self.noise_variance, motion.dq)
             piece = out[start * n : (start + len(motion)) * n]
             self._features(motion, piece)
             weigh(piece, first, self.prior(motion), noise, weights[part], residual, total.b)
@@ -101,25 +96,27 @@ class Summing:
         """Write φ of the torques of N samples, (N n, M)."""
         basis, first = self.basis, len(self.basis.outputs)
         if basis.term is not None:
-            gram = basis.term.gram(basis.params, motion, basis.inducing).numpy()
-            np.take(gram, basis.outputs.numpy(), axis=1, out=out[:, :first], mode="clip")
+            gram = basis.term.gram(basis.params, motion, basis.inducing)
+            np.take(gram, basis.outputs, axis=1, out=out[:, :first], mode="clip")
         for each in basis.linear:
-            features, covariance = each.features(motion).clone(), each.covariance(basis.params)
-            columns = slice(first, first + len(covariance))
-            out[:, columns] = (features.reshape(-1, features.shape[-1]) @ covariance).numpy()
+            rows, variances = each.flat_features(motion), each.variances(basis.params)
+            columns = slice(first, first + len(variances))
+            np.multiply(rows, variances, out=out[:, columns])
             first = columns.stop
-        solved = torch.from_numpy(out).T
-        torch.linalg.solve_triangular(basis.root, solved, upper=False, out=solved)
+        whiten_rows(basis.root, out)
 
     def _elsewhere(self, total: Total, samples: Samples, weights: Array) -> Array:
-        motion, scale = samples.motion(self.device), torch.from_numpy(weights.copy()).to(self.device)
-        residual = samples.torque(self.device) - self.kernel.mean(motion)
-        features = self.basis.features(motion)
-        variance = self.misfit.of_row(self.noise_variance, motion.dq) + self.basis.uncovered(motion, features)
-        root = (scale[:, None] / variance).sqrt()
-        features *= root.reshape(-1)
-        total.b += (features @ (residual * root).reshape(-1)).cpu().numpy()
-        return np.ascontiguousarray(features.T.cpu().numpy())
+        motion = samples.motion()
+        noise = self.misfit.of_row(self.noise_variance, motion.dq)
+        features, more = self._moved.weighed(motion, samples.tau - self.kernel.mean(motion), noise, weights)
+        total.b += more
+        return features
+
+    @cached_property
+    def _moved(self) -> DeviceBasis:
+        from lipcore.posterior.on_device import DeviceBasis  # noqa: PLC0415 - it imports torch
+
+        return DeviceBasis(self.basis, self.device)
 
 
 def _prior(term: PairKernel, params: Params, inducing: Motion) -> Callable[[Motion], Array]:
@@ -127,9 +124,8 @@ def _prior(term: PairKernel, params: Params, inducing: Motion) -> Callable[[Moti
     cross = term.cross(params, inducing[:1])
 
     def variances(motion: Motion) -> Array:
-        motions = np.stack([motion.q.numpy(), motion.dq.numpy(), motion.ddq.numpy()], axis=1)
         blocks = np.empty((len(motion), 2, motion.n_joints, motion.n_joints))
-        cross.fill_many(np.ascontiguousarray(motions), blocks)
+        cross.fill_many(motion.arrays(), blocks)
         return np.ascontiguousarray(blocks[:, 1].diagonal(axis1=1, axis2=2))
 
     return variances
@@ -137,13 +133,7 @@ def _prior(term: PairKernel, params: Params, inducing: Motion) -> Callable[[Moti
 
 def _nothing(motion: Motion) -> Array:
     """The linear terms' own features leave nothing open."""
-    return np.zeros(tuple(motion.q.shape))
-
-
-def _moved(basis: Basis, device: torch.device) -> Basis:
-    params = {name: value.to(device) for name, value in basis.params.items()}
-    inducing, outputs = basis.inducing.to(device), basis.outputs.to(device)
-    return Basis(basis.term, basis.linear, params, inducing, outputs, basis.root.to(device))
+    return np.zeros(motion.q.shape)
 
 
 @compiled

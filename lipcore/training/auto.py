@@ -74,7 +74,7 @@ def _of_all(work: Work, contest: Contest, chosen: str) -> TorqueModel:
         return work.fit(task.samples, chosen, ALL, replace(learnt, report={**learnt.report, **searched}))
     objective = float(model.fit["objective"])
     work.overall.of(chosen, ALL)(FitProgress("posterior", 0, 0, objective, 0.0, 0.0))
-    used = task.samples.rows(spread_out(task.samples.motion(), task.options.posterior_samples).numpy())
+    used = task.samples.rows(spread_out(task.samples.motion(), task.options.posterior_samples))
     rigid = None if contest.learnt is None else contest.learnt.misfit
     compression, stands_on, conformal = compact(task, model.estimator, model.posterior.params, used, rigid)
     counts = {"samples_given": len(task.samples), "samples_posterior": len(used), **stands_on}

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
 from lipcore.data.samples import Array, Samples
 from lipcore.fitting.hyperparameters import FitCancelledError
@@ -84,8 +83,8 @@ def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> To
     Hyperparameters and basis stay.
     """
     posterior = model.posterior
-    a = unpack_symmetric("a", torch.from_numpy(sums.a))
-    statistics = Statistics(a, torch.from_numpy(sums.b), sums.weight)
+    a = unpack_symmetric("a", sums.a)
+    statistics = Statistics(a, sums.b, sums.weight)
     updated = CompactPosterior.build(
         posterior.kernel,
         posterior.basis,

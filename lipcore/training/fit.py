@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
-import torch
 
 from lipcore.arm.learning import Learnt, learn
 from lipcore.arm.search import known_geometries
@@ -58,7 +57,7 @@ def fit_estimator(
     if learnt is not None and name == "rigid-body":
         report = {**learnt.report, "jitter": 0.0}
         used = samples.rows(learnt.rows)
-        variance = torch.exp(2 * learnt.params["noise.log_std"]) / torch.from_numpy(learnt.counts)
+        variance = np.exp(2 * learnt.params["noise.log_std"]) / learnt.counts
         compression = linear(
             estimator.kernel, learnt.params, used, variance, options.compact_tolerance, factor, learnt.misfit
         )
@@ -108,17 +107,17 @@ def compact(
     )
     posterior = compression.posterior
     contiguous = task.contiguous(CONTIGUOUS)
-    residual = contiguous.tau - posterior.mean(contiguous.motion()).numpy()
+    residual = contiguous.tau - posterior.mean(contiguous.motion())
     noise = posterior.noise_variance
     moved = np.stack([contiguous.dq, contiguous.ddq])
-    misfit, _ = estimate(residual, contiguous.tau, moved, contiguous.episodes(), noise.numpy())
+    misfit, _ = estimate(residual, contiguous.tau, moved, contiguous.episodes(), noise)
     misfit = misfit.with_friction(friction_coefficients(posterior, estimator).coulomb)
     misfit = misfit if rigid is None else misfit.with_rest(rigid)
     motion = used.motion()
     variance = misfit.of_row(noise, motion.dq, shared_rows(task.samples, len(used)))
-    statistics = collect(posterior.basis, variance, motion, used.torque() - estimator.kernel.mean(motion))
+    statistics = collect(posterior.basis, variance, motion, used.tau - estimator.kernel.mean(motion))
     counted = CompactPosterior.build(estimator.kernel, posterior.basis, statistics, noise, factor, misfit)
-    independent = float((noise / variance).mean(dim=1).sum())
+    independent = float((noise / variance).mean(axis=1).sum())
     stands_on = {"jitter": jitter, "independent_samples": independent}
     return replace(compression, posterior=counted), stands_on, conform(counted, used, variance)
 

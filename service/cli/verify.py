@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import torch
 import typer
 from rich.markup import escape
 from sqlalchemy import select
 from sqlalchemy.orm import Session, undefer
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from lipcore.files import persistence
@@ -67,7 +67,7 @@ def verify_home(settings: Settings) -> Verified:
     """
     if settings.database_url is None and not (settings.home / FILE).is_file():
         raise FileNotFoundError(f"home is {str(settings.home)!r}, expected a folder with the database of a service")
-    torch.set_num_threads(settings.serving_threads)
+    threadpool_limits(settings.serving_threads)
     database = Database.of(settings, settings.database_timeout_s)
     try:
         with Files.fresh(settings) as files:

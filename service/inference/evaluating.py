@@ -256,8 +256,8 @@ def _components(
         some = samples.rows(slice(first, first + batch))
         estimates = dynamics.components(served.model, Motion.from_arrays(some.q, some.dq, some.ddq), names)
         for name in names:
-            mean[name].append(estimates[name].mean.numpy())
-            std[name].append(estimates[name].std.numpy())
+            mean[name].append(estimates[name].mean)
+            std[name].append(estimates[name].std)
     return {
         name: schema.TraceComponentValues(
             mean=np.concatenate(mean[name]).tolist(), std=np.concatenate(std[name]).tolist()

@@ -8,7 +8,6 @@ from typing import Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
-import torch
 from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
@@ -56,7 +55,7 @@ class Query(NamedTuple):
         """Estimates of parts of the dynamics by name, (N, …) each; raise InvalidRequestError where inertia cannot be
         inverted. Torque is for forward dynamics alone."""
         parts = self.values if "forward_dynamics" in names else self.values[:3]
-        q, dq, ddq, *tau = (torch.from_numpy(each) for each in parts)
+        q, dq, ddq, *tau = parts
         try:
             return dynamics.components(model, Motion(q, dq, ddq), names, *tau)
         except dynamics.IndefiniteInertiaError as error:

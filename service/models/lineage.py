@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
+import scipy
 
 from lipcore.data import metrics
 from lipcore.data.coverage import CoverageInterval, coverage_interval
@@ -39,8 +39,8 @@ def software() -> dict[str, str | int]:
         "lipserve": __version__,
         "model_format": FORMAT_VERSION,
         "python": platform.python_version(),
-        "torch": str(torch.__version__),
         "numpy": np.__version__,
+        "scipy": str(scipy.__version__),
     }
     commit = git_commit(CHECKOUT)
     return versions if commit is None else {**versions, "git_commit": commit}
@@ -85,7 +85,7 @@ def answer_of(model: TorqueModel, samples: Samples) -> Answer:
     """What a model predicts of samples, not by its compiled form: a process that trains and never serves would wait for
     that."""
     answer = model.posterior.predict(samples.motion())
-    return Answer(answer.mean.numpy(), answer.std.numpy(), model.noise_std, model.scale)
+    return Answer(answer.mean, answer.std, model.noise_std, model.scale)
 
 
 def known(interval: CoverageInterval) -> dict[str, list[float]]:

@@ -210,7 +210,7 @@ def compute(served: Served, query: Query, names: frozenset[str]) -> dict[str, Ar
         estimates = query.components(model, sorted({part.component for part in parts.values()}))
         for name, part in parts.items():
             estimate = estimates[part.component]
-            tensors[name] = _rows((estimate.std if part.std else estimate.mean).numpy())
+            tensors[name] = _rows(estimate.std if part.std else estimate.mean)
     return tensors
 
 

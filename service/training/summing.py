@@ -16,7 +16,6 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
-import torch
 
 from lipcore.data import independence
 from lipcore.data.samples import Array, Samples
@@ -26,6 +25,7 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.statistics import empty
 from lipcore.posterior.summing import Summing
 from lipcore.training.conditioning import ShardStatistics, sum_samples, with_statistics
+from lipcore.vocabulary import Place
 from service.compute.executors import placed, sent, shard_executor, summed
 from service.foundation.settings import Settings
 from service.storage.files import PATIENCE_S, Files
@@ -44,7 +44,7 @@ class Context:
     settings: Settings | None
     model: dict[str, bytes]
     joint_names: tuple[str, ...]
-    device: str
+    device: Place
 
 
 def all_rows(
@@ -115,7 +115,7 @@ def packed(model: TorqueModel) -> dict[str, bytes]:
 
 def _summing(context: Context) -> Summing:
     files = {name: zlib.decompress(each) for name, each in context.model.items()}
-    return Summing.of(persistence.decode(files).posterior, torch.device(context.device))
+    return Summing.of(persistence.decode(files).posterior, context.device)
 
 
 _SUMMING: OrderedDict[str, Summing] = OrderedDict()

@@ -109,12 +109,12 @@ def energies(geometry: Geometry, bodies: np.ndarray, step: Tensor, q: Tensor, dq
     return kinetic, potential
 
 
-def lagrangian_torque(geometry: Geometry, bodies: np.ndarray, step: Tensor, motion: np.ndarray) -> Tensor:
+def lagrangian_torque(geometry: Geometry, bodies: np.ndarray, step: Tensor | np.ndarray, motion: np.ndarray) -> Tensor:
     """Euler and Lagrange: d/dt ∂L/∂dq − ∂L/∂q at one motion (3, n), a differentiable function of the step: (n,)."""
     q, dq, ddq = map(tensor, motion)
 
     def lagrangian(at: Tensor, speed: Tensor) -> Tensor:
-        kinetic, potential = energies(geometry, bodies, step, at, speed)
+        kinetic, potential = energies(geometry, bodies, torch.as_tensor(step), at, speed)
         return kinetic - potential
 
     _, change = jvp(grad(lagrangian, argnums=1), (q, dq), (dq, ddq))

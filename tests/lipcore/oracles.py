@@ -11,7 +11,7 @@ from hypothesis.extra.numpy import arrays
 from torch import Tensor
 from torch.func import jacrev
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.data.samples import Samples
 from lipcore.kernels.base import PairKernel, Params, State
 from lipcore.kernels.chain import ChainKernel
@@ -58,8 +58,9 @@ def pooled_weight(params: Mapping[str, Tensor], link: int, joint: int) -> Tensor
     )
 
 
-def lip_energies(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> list[Energy]:
+def lip_energies(joint_types: Sequence[str], params: Mapping[str, Array]) -> list[Energy]:
     """Energies of the paper: the potential over all joints, then one kinetic energy for each link."""
+    params = {name: torch.as_tensor(each) for name, each in params.items()}
     potential_shares = shares_of(params["potential.logits"])
     scale = torch.exp(params["potential.log_scale"])
 
@@ -93,8 +94,9 @@ def chain_base_kernel(kind: str, alpha: Tensor, q: Tensor, q2: Tensor) -> Tensor
     return 1 - alpha + alpha * (torch.cos(q - q2) if kind == "revolute" else q * q2)
 
 
-def chain_energies(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> list[Energy]:
+def chain_energies(joint_types: Sequence[str], params: Mapping[str, Array]) -> list[Energy]:
     """Energies of a serial chain: the potentials of all links added up, then one kinetic energy for each link."""
+    params = {name: torch.as_tensor(each) for name, each in params.items()}
     n, scales = len(joint_types), torch.exp(params["potential.log_scales"])
     alpha = 1 / (1 + torch.exp(-params["chain.logits"]))
 
@@ -163,7 +165,7 @@ def scale_of(energies: Sequence[Energy], x: Instant, y: Instant, terms: Tensor) 
 
 def instant(motion: Motion, row: int) -> Instant:
     """One sample of a motion."""
-    return motion.q[row], motion.dq[row], motion.ddq[row]
+    return torch.from_numpy(motion.q[row]), torch.from_numpy(motion.dq[row]), torch.from_numpy(motion.ddq[row])
 
 
 Shapes = dict[str, tuple[int, ...]]
@@ -174,7 +176,7 @@ class Problem:
     """A kernel with hyperparameters and a motion to evaluate it on."""
 
     kernel: LipKernel | ChainKernel
-    params: dict[str, Tensor]
+    params: dict[str, Array]
     motion: Motion
 
     def energies(self) -> list[Energy]:
@@ -184,16 +186,16 @@ class Problem:
 
 
 class TorchForm(PairKernel):
-    """A compiled kernel as devices other than the CPU have it: blocks in PyTorch, gradients by autograd."""
+    """A compiled kernel as its formula has it, gradients by autograd."""
 
     def __init__(self, kernel: PairKernel) -> None:
         self.kernel, self.n_joints = kernel, kernel.n_joints
 
-    def blocks(self, params: Params, x: State, y: State) -> Tensor:
+    def blocks(self, params: Params, x: State, y: State) -> Array:
         """Blocks of the kernel itself."""
         return self.kernel.blocks(params, x, y)
 
-    def initial(self, motion: Motion, tau: Tensor) -> dict[str, Tensor]:
+    def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
         """Start of the kernel itself."""
         return self.kernel.initial(motion, tau)
 
@@ -229,7 +231,7 @@ def random_problem(joint_types: Sequence[str], samples: int, seed: int, kernel: 
     rng, n = np.random.default_rng(seed), len(joint_types)
     make, shapes = KERNELS[kernel]
     both = shapes(n) | {"noise.log_std": (n,), "friction.log_std": (n, 3)}
-    params = {name: torch.tensor(rng.uniform(*width(name), shape)).double() for name, shape in both.items()}
+    params = {name: np.array(rng.uniform(*width(name), shape)) for name, shape in both.items()}
     params["noise.log_std"] = params["noise.log_std"] - 1.0
     motion = Motion.from_arrays(*rng.uniform(-2.0, 2.0, (3, samples, n)))
     return Problem(make(joint_types), params, motion)
@@ -253,7 +255,7 @@ def problems(
         return draw(arrays(np.float64, shape, elements=st.floats(-bound, bound, allow_subnormal=False)))
 
     bounds = {name: 1.0 if name.startswith("kinetic.log_") else 3.0 for name in shapes(n)}
-    params = {name: torch.from_numpy(array(shape, bounds[name])) for name, shape in shapes(n).items()}
+    params = {name: array(shape, bounds[name]) for name, shape in shapes(n).items()}
     motion = Motion.from_arrays(*(array((samples, n), 4.0) for _ in range(3)))
     return Problem(make(joint_types), params, motion)
 
@@ -271,7 +273,7 @@ def worst_block_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIRS
     for i, j in pairs:
         x, y = instant(motion, i), instant(motion, j)
         terms = torque_terms(energies, x, y)
-        error = float((blocks[:, :, i, j] - terms.sum(0)).abs().max())
+        error = float(np.abs(blocks[:, :, i, j] - terms.sum(0).numpy()).max())
         worst = max(worst, error / scale_of(energies, x, y, terms))
     return worst
 
@@ -290,7 +292,7 @@ def worst_energy_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIR
         scale = scale_of(energies, x, y, terms)
         for found, each in ((torques, terms), (values, alone)):
             expected = torch.stack([each[1:].sum(0), each[0]])
-            worst = max(worst, float((found[..., i, j] - expected).abs().max()) / scale)
+            worst = max(worst, float(np.abs(found[..., i, j] - expected.numpy()).max()) / scale)
     return worst
 
 
@@ -306,7 +308,7 @@ def opposite(kind: str, share: Sequence[float], q: float) -> float:
 def in_full(model: TorqueModel, samples: Samples) -> TorqueModel:
     """The model with every sample counted in full, and nothing besides posterior and noise: the textbook's."""
     posterior, motion = model.posterior, samples.motion()
-    noise, residual = posterior.noise_variance, samples.torque() - posterior.kernel.mean(motion)
+    noise, residual = posterior.noise_variance, samples.tau - posterior.kernel.mean(motion)
     every = collect(posterior.basis, noise, motion, residual)
     built = CompactPosterior.build(posterior.kernel, posterior.basis, every, noise, posterior.std_factor)
     return replace(model, posterior=built)

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-import torch
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save
 from lipcore.data.metrics import evaluate
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.files import persistence
 from lipcore.files.arm import bodies_of, read_geometry
 from lipcore.files.manifest import read_manifest_bytes
@@ -66,7 +65,7 @@ def with_alternatives(model: TorqueModel, samples: Samples, count: int = 1) -> T
     ]
     chosen = make_estimator("rigid-body", model.joint_types, arm=replace(found, alternatives=tuple(others)))
     posterior = model.posterior
-    once = posterior.noise_variance.expand(samples.tau.shape)
+    once = np.broadcast_to(posterior.noise_variance, samples.tau.shape)
     made = linear(chosen.kernel, posterior.params, samples, once, 0.01, 1.0, posterior.misfit)
     return replace(model, estimator=chosen, posterior=made.posterior)
 
@@ -96,25 +95,25 @@ def test_a_saved_arm_comes_back(kind: str, learnt: TorqueModel, samples: Samples
         assert again.arm.order.tolist() == [1, 0]
 
 
-Edit = Callable[[dict[str, torch.Tensor]], object]
+Edit = Callable[[dict[str, Array]], object]
 WRONG: dict[str, tuple[Edit, str]] = {
-    "no rotation": (lambda t: t["arm/rotation"].mul_(2), "no rotation"),
-    "no axis": (lambda t: t["arm/axis"].zero_(), "not of length one"),
+    "no rotation": (lambda t: t["arm/rotation"].__imul__(2), "no rotation"),
+    "no axis": (lambda t: t["arm/axis"].fill(0), "not of length one"),
     "missing": (lambda t: t.pop("arm/unit"), "'arm/unit' is missing"),
-    "order": (lambda t: t["arm/order"].zero_(), "expected each joint once"),
-    "widths": (lambda t: t["arm/widths"].zero_(), "not above zero"),
-    "parameters": (lambda t: t.update({"arm/parameters": t["arm/parameters"][:2].clone()}), "parameters has shape"),
-    "rotor": (lambda t: t.update({"arm/rotor": t["arm/rotation"][0, 0, :2].clone()}), "rotor has shape"),
-    "steps": (lambda t: t.update({"arm/expected": t["arm/expected"][:1].clone()}), "expected has shape"),
-    "not finite": (lambda t: t["arm/translation"].fill_(np.nan), "finite"),
+    "order": (lambda t: t["arm/order"].fill(0), "expected each joint once"),
+    "widths": (lambda t: t["arm/widths"].fill(0), "not above zero"),
+    "parameters": (lambda t: t.update({"arm/parameters": t["arm/parameters"][:2].copy()}), "parameters has shape"),
+    "rotor": (lambda t: t.update({"arm/rotor": t["arm/rotation"][0, 0, :2].copy()}), "rotor has shape"),
+    "steps": (lambda t: t.update({"arm/expected": t["arm/expected"][:1].copy()}), "expected has shape"),
+    "not finite": (lambda t: t["arm/translation"].fill(np.nan), "finite"),
     "coefficients": (
-        lambda t: t.update({"arm/other/linear": t["arm/other/linear"][:, :, :2].clone()}),
+        lambda t: t.update({"arm/other/linear": t["arm/other/linear"][:, :, :2].copy()}),
         r"'arm/other/linear' has shape \(3, 3, 2\), expected \(3, 3, 4\)",
     ),
-    "no probability": (lambda t: t["arm/other/probability"].zero_(), "between 0 and 1"),
-    "improbable": (lambda t: t["arm/other/probability"].fill_(0.9), "positive definite|cholesky"),
-    "none": (lambda t: t.update({"arm/other/probability": torch.zeros(0, dtype=torch.float64)}), "has shape"),
-    "unknown": (lambda t: t.update({"arm/shadow": torch.zeros(1, dtype=torch.float64)}), "does not know"),
+    "no probability": (lambda t: t["arm/other/probability"].fill(0), "between 0 and 1"),
+    "improbable": (lambda t: t["arm/other/probability"].fill(0.9), "positive definite|cholesky"),
+    "none": (lambda t: t.update({"arm/other/probability": np.zeros(0)}), "has shape"),
+    "unknown": (lambda t: t.update({"arm/shadow": np.zeros(1)}), "does not know"),
 }
 
 
@@ -144,7 +143,7 @@ def test_a_choice_of_arms_has_the_moments_of_their_mixture(learnt: TorqueModel, 
     assert found is not None
     asked = motions(3, 4)
     query = Motion.from_arrays(*asked.transpose(1, 0, 2))
-    terms = friction_features(query.dq).numpy().transpose(1, 2, 0)
+    terms = friction_features(query.dq).transpose(1, 2, 0)
     torques = []
     for each in found.alternatives:
         model_of, flat = as_robot(each.geometry, random_bodies(3, 0)).model, each.parameters.reshape(-1)
@@ -155,10 +154,10 @@ def test_a_choice_of_arms_has_the_moments_of_their_mixture(learnt: TorqueModel, 
     mean = np.einsum("k,kni->ni", shares, more)
     spread = np.einsum("k,kni,knj->nij", shares, more - mean, more - mean)
     alone, mixed = ArmKernel(replace(found, alternatives=())), ArmKernel(found)
-    scale = {"rigid_body.log_scale": torch.zeros(4, dtype=torch.float64)}
-    np.testing.assert_allclose((mixed.mean(query) - alone.mean(query)).numpy(), mean, rtol=1e-8, atol=1e-9)
-    added = (mixed.variance(scale, query) - alone.variance(scale, query)).numpy()
-    prior = float(alone.variance(scale, query).abs().max())
+    scale = {"rigid_body.log_scale": np.zeros(4)}
+    np.testing.assert_allclose((mixed.mean(query) - alone.mean(query)), mean, rtol=1e-8, atol=1e-9)
+    added = mixed.variance(scale, query) - alone.variance(scale, query)
+    prior = float(np.abs(alone.variance(scale, query)).max())
     np.testing.assert_allclose(added, spread, rtol=1e-8, atol=1e-12 * prior)
 
 

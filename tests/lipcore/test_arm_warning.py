@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import pytest
-import torch
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save, train
 from lipcore.arm import learning
@@ -77,7 +76,7 @@ def test_another_arm_comes_with_the_motion_that_tells_them_apart(model: TorqueMo
     )
     range_of = model.training_range["dq"]
     assert f"joint2 is faster than {max(-range_of['min'][1], range_of['max'][1]):.2g} rad/s" in text
-    speeds = 2 * model.posterior.basis.inducing.dq[:, 1].numpy()
+    speeds = 2 * model.posterior.basis.inducing.dq[:, 1]
     differ = MORE * np.sqrt(SHARE * (1 - SHARE) * np.mean(speeds**2))
     assert f"they differ by {differ:.2g} N·m in joint2" in text
 
@@ -211,12 +210,12 @@ def test_alternative_arms_have_friction_of_slow_joints_too(rubbing: TorqueModel)
     assert again.stribeck
     np.testing.assert_array_equal(again.alternatives[1].friction, each[1].friction)
     kernel = ArmKernel(again)
-    dq = torch.tensor([[0.05, -0.05, 0.5]]).double()
-    fading = np.tanh(dq.numpy() / 0.02) * np.exp(-((dq.numpy() / 0.1) ** 2))
+    dq = np.array([[0.05, -0.05, 0.5]])
+    fading = np.tanh(dq / 0.02) * np.exp(-((dq / 0.1) ** 2))
     still = Motion(dq * 0, dq, dq * 0)
     less = replace(each[1], friction=each[1].friction * [1, 1, 1, 0])
     other = ArmKernel(replace(both, alternatives=(each[0], less)))
-    differ = (kernel.mean(still) - other.mean(still)).numpy()
+    differ = kernel.mean(still) - other.mean(still)
     np.testing.assert_allclose(differ, 0.3 * fading * each[1].friction[:, 3], rtol=1e-9, atol=1e-12)
 
 
@@ -224,10 +223,10 @@ def test_alternative_arms_have_friction_of_slow_joints_too(rubbing: TorqueModel)
 def test_a_flag_that_is_none_is_refused(rubbing: TorqueModel, values: list[float]) -> None:
     known = rubbing.arm
     assert known is not None
-    tensors = arm_tensors(known) | {"arm/stribeck": torch.tensor(values, dtype=torch.float64)}
+    tensors = arm_tensors(known) | {"arm/stribeck": np.array(values)}
     with pytest.raises(ValueError, match="'arm/stribeck' is"):
         read_arm(tensors, SLOW.joint_types, known.mode)
-    assert not read_arm(tensors | {"arm/stribeck": torch.zeros(1)}, SLOW.joint_types, known.mode).stribeck
+    assert not read_arm(tensors | {"arm/stribeck": np.zeros(1)}, SLOW.joint_types, known.mode).stribeck
 
 
 def test_friction_of_slow_joints_is_learnt_online(rubbing: TorqueModel) -> None:

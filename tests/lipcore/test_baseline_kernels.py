@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.kernels.base import PairKernel, State
 from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lse import LagrangianSEKernel
@@ -53,16 +53,17 @@ def shapes(name: str, n: int) -> dict[str, tuple[int, ...]]:
     }[name]
 
 
-def random_case(name: str, joint_types: Sequence[str], samples: int) -> tuple[PairKernel, dict[str, Tensor], Motion]:
+def random_case(name: str, joint_types: Sequence[str], samples: int) -> tuple[PairKernel, dict[str, Array], Motion]:
     rng, n = np.random.default_rng(len(joint_types)), len(joint_types)
-    params = {key: torch.as_tensor(rng.uniform(-0.5, 1.0, shape)) for key, shape in shapes(name, n).items()}
+    params = {key: np.asarray(rng.uniform(-0.5, 1.0, shape)) for key, shape in shapes(name, n).items()}
     return KERNELS[name](joint_types), params, Motion.from_arrays(*rng.uniform(-2.0, 2.0, (3, samples, n)))
 
 
-def lagrangian(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> Energy:
+def lagrangian(joint_types: Sequence[str], params: Mapping[str, Array]) -> Energy:
     """The prior of L as its definition says it: a squared exponential of (cos q, sin q) or q, and of dq."""
-    position = torch.exp(params["lse.log_position_lengthscales"])
-    velocity = torch.exp(params["lse.log_velocity_lengthscales"])
+    tensors = {name: torch.as_tensor(each) for name, each in params.items()}
+    position = torch.exp(tensors["lse.log_position_lengthscales"])
+    velocity = torch.exp(tensors["lse.log_velocity_lengthscales"])
 
     def kernel(q: Tensor, v: Tensor, q2: Tensor, v2: Tensor) -> Tensor:
         total = (((v - v2) / velocity) ** 2).sum()
@@ -72,19 +73,19 @@ def lagrangian(joint_types: Sequence[str], params: Mapping[str, Tensor]) -> Ener
                 pairs = [(torch.cos(q[b]), torch.cos(q2[b])), (torch.sin(q[b]), torch.sin(q2[b]))]
             for one, other in pairs:
                 total = total + ((one - other) / position[b]) ** 2
-        return torch.exp(params["lse.log_scale"]) * torch.exp(-0.5 * total)
+        return torch.exp(tensors["lse.log_scale"]) * torch.exp(-0.5 * total)
 
     return Energy(kernel, +1)
 
 
-def worst_lse_error(joint_types: Sequence[str], params: Mapping[str, Tensor], motion: Motion) -> float:
+def worst_lse_error(joint_types: Sequence[str], params: Mapping[str, Array], motion: Motion) -> float:
     """Largest error over the pairs (0, 0) and (0, 1), relative to the size that rounding errors have."""
     blocks = LagrangianSEKernel(joint_types).blocks(params, State.rows(motion), State.columns(motion))
     energy, worst = lagrangian(joint_types, params), 0.0
     for i, j in ((0, 0), (0, 1)):
         x, y = instant(motion, i), instant(motion, j)
         terms = torque_terms([energy], x, y)
-        error = float((blocks[:, :, i, j] - terms.sum(0)).abs().max())
+        error = float(np.abs(blocks[:, :, i, j] - terms.sum(0).numpy()).max())
         worst = max(worst, error / scale_of([energy], x, y, terms))
     return worst
 
@@ -138,9 +139,9 @@ def gip_loop(joint_types: Sequence[str], params: Mapping[str, np.ndarray], x: np
 @pytest.mark.parametrize(("name", "loop"), [("se", se_loop), ("gip", gip_loop)], ids=["se", "gip"])
 def test_se_and_gip_equal_plain_loops(name: str, loop: Callable[..., np.ndarray], joint_types: tuple[str, ...]) -> None:
     kernel, params, motion = random_case(name, joint_types, samples=3)
-    blocks = kernel.blocks(params, State.rows(motion), State.columns(motion)).numpy()
-    arrays_ = {key: value.numpy() for key, value in params.items()}
-    states = torch.stack([motion.q, motion.dq, motion.ddq], dim=1).numpy()
+    blocks = kernel.blocks(params, State.rows(motion), State.columns(motion))
+    arrays_ = dict(params)
+    states = np.stack([motion.q, motion.dq, motion.ddq], axis=1)
     for i, x in enumerate(states):
         for j, y in enumerate(states):
             np.testing.assert_allclose(blocks[:, :, i, j], loop(joint_types, arrays_, x, y), rtol=1e-12, atol=1e-14)
@@ -154,13 +155,13 @@ def test_start_is_scaled_to_the_data_even_where_joints_stand_still(name: str, st
     q, dq, ddq = rng.uniform(-1.0, 1.0, (3, 30, 3))
     for joint in still:
         q[:, joint], dq[:, joint], ddq[:, joint] = 0.4, 0.0, 0.0
-    tau = torch.from_numpy(rng.standard_normal((30, 3)) * [20.0, 5.0, 0.5])
+    tau = rng.standard_normal((30, 3)) * [20.0, 5.0, 0.5]
     motion, kernel = Motion.from_arrays(q, dq, ddq), KERNELS[name](joint_types)
     params = kernel.initial(motion, tau)
     assert {key: tuple(value.shape) for key, value in params.items()} == shapes(name, 3)
-    assert all(value.dtype == torch.float64 and bool(value.isfinite().all()) for value in params.values())
+    assert all(value.dtype == np.float64 and np.isfinite(value).all() for value in params.values())
 
-    prior = kernel.variance(params, motion).diagonal(dim1=1, dim2=2).mean(0).sum()
-    assert 0.2 < float(prior / tau.square().mean(0).sum()) < 5.0
-    params["noise.log_std"] = torch.log(0.01 * tau.std(0))
+    prior = kernel.variance(params, motion).diagonal(axis1=1, axis2=2).mean(0).sum()
+    assert 0.2 < float(prior / np.square(tau).mean(0).sum()) < 5.0
+    params["noise.log_std"] = np.log(0.01 * tau.std(0))
     assert math.isfinite(negative_log_evidence(kernel, params, motion, tau).value)

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from lipcore import FitOptions, TorqueModel, load, train
 from lipcore.data.motion import Motion
@@ -85,26 +84,26 @@ def drawn(model: TorqueModel, count: int, seed: int, beyond: float = 1.0) -> np.
 
 
 def exact(model: TorqueModel, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """tau and tau_std of the posterior's own formulas, in fractions; covariances of the energies in PyTorch."""
+    """tau and tau_std of the posterior's own formulas, in fractions; covariances of the energies by their formula."""
     posterior, query = model.posterior, Motion.from_arrays(*motion)
     basis, n = posterior.basis, model.n_joints
-    features = np.concatenate([each.features(query).numpy() for each in basis.linear], axis=2)
-    prior = np.concatenate([each.covariance(posterior.params).detach().diagonal() for each in basis.linear])
+    features = np.concatenate([each.features(query) for each in basis.linear], axis=2)
+    prior = np.concatenate([each.variances(posterior.params) for each in basis.linear])
     rubbing = np.zeros(features.shape[2] - basis.linear[0].size)
-    centre = np.concatenate([basis.linear[0].prior_weights().numpy(), rubbing])
+    centre = np.concatenate([basis.linear[0].prior_weights(), rubbing])
     fraction = np.frompyfunc(Fraction, 1, 1)
     cross, first = fraction(features) * fraction(prior), len(basis.outputs)
     before = np.zeros(query.q.shape)
     if basis.term is not None:
         inducing = PairKernel.gram(basis.term, posterior.params, basis.inducing, query)[basis.outputs]
-        inducing = inducing.reshape(first, len(query), n).permute(1, 2, 0).numpy()
+        inducing = inducing.reshape(first, len(query), n).transpose(1, 2, 0)
         cross = np.concatenate([fraction(inducing), cross], axis=2)
-        before = PairKernel.variance(basis.term, posterior.params, query).diagonal(dim1=1, dim2=2).numpy()
-    tau = (cross @ fraction(posterior.weights.numpy()) + fraction(features) @ fraction(centre)).astype(float)
-    squares = (cross @ fraction(posterior.root.numpy()).T) ** 2
+        before = PairKernel.variance(basis.term, posterior.params, query).diagonal(axis1=1, axis2=2)
+    tau = (cross @ fraction(posterior.weights) + fraction(features) @ fraction(centre)).astype(float)
+    squares = (cross @ fraction(posterior.root).T) ** 2
     variance = fraction(before) - squares[..., :first].sum(2) + squares[..., first:].sum(2)
-    variance = variance.astype(float) * posterior.std_factor**2 + posterior.misfit.variance(query).numpy()
-    return tau, np.sqrt(np.maximum(variance, posterior.floor.numpy()))
+    variance = variance.astype(float) * posterior.std_factor**2 + posterior.misfit.variance(query)
+    return tau, np.sqrt(np.maximum(variance, posterior.floor))
 
 
 def learnt(kinds: str, seed: int, estimator: str = "rigid-body", options: FitOptions = OPTIONS) -> TorqueModel:
@@ -122,8 +121,8 @@ def with_misfit(model: TorqueModel) -> TorqueModel:
     """The same with all that adds to a variance."""
     rng, n = np.random.default_rng(0), model.n_joints
     rows = np.stack([rng.uniform(0.1, 1.0, n), np.full(n, 0.1), *rng.uniform(0.5, 1.0, (3, n))])
-    misfit = Misfit.unpacked(model.posterior.noise_variance.new_tensor(rows))
-    floor = model.posterior.noise_variance.new_tensor([1e-4, 10.0, *[1e-4] * (n - 2)])
+    misfit = Misfit.unpacked(rows)
+    floor = np.array([1e-4, 10.0, *[1e-4] * (n - 2)])
     return replace(model, posterior=replace(model.posterior, misfit=misfit, floor=floor, std_factor=1.3))
 
 
@@ -139,8 +138,8 @@ def with_slow_friction() -> TorqueModel:
     posterior = model.posterior
     estimator = make_estimator("rigid-body", model.joint_types, arm=replace(model.arm, stribeck=True))
     widths = posterior.params["friction.log_std"]
-    params = {**posterior.params, "friction.log_std": torch.cat([widths, widths[:, 1:2]], dim=1)}
-    variance = posterior.noise_variance.expand(samples.tau.shape)
+    params = {**posterior.params, "friction.log_std": np.concatenate([widths, widths[:, 1:2]], axis=1)}
+    variance = np.broadcast_to(posterior.noise_variance, samples.tau.shape)
     made = linear(estimator.kernel, params, samples, variance, 0.01, 1.0, posterior.misfit)
     return replace(model, estimator=estimator, posterior=made.posterior)
 

@@ -8,11 +8,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 import torch
-from torch import Tensor
 from torch.func import jacrev
 
 from lipcore import FitOptions, Samples, TorqueModel, train
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.model import dynamics
@@ -85,9 +84,9 @@ def case(request: pytest.FixtureRequest) -> Case:
         bodies = RigidBody.from_profile(setting.robot, samples.joint_names, robot.joint_types)
     model = in_full(train(samples, robot.joint_types, setting.estimator, options, robot=bodies), samples)
     unseen = simulate(robot, Stream(n_samples=40, n_sinusoids=100, speed=10, noise=0.0), seed=7)
-    tau = torch.from_numpy(unseen.tau)
+    tau = unseen.tau
     found = dynamics.components(model, unseen.motion(), dynamics.COMPONENTS, tau)
-    reference = dynamics.reference_posture(model).numpy()
+    reference = dynamics.reference_posture(model)
     return Case(robot, model, unseen, found, truth_of(robot, unseen, reference, setting.viscous))
 
 
@@ -115,7 +114,7 @@ def truth_of(robot: Robot, unseen: Samples, reference: np.ndarray, viscous: floa
 @pytest.mark.parametrize("name", dynamics.COMPONENTS)
 def test_components_are_those_of_pinocchio(case: Case, name: str) -> None:
     estimate, truth = case.found[name], case.truth[name]
-    error, std = np.abs(estimate.mean.numpy() - truth), estimate.std.numpy()
+    error, std = np.abs(estimate.mean - truth), estimate.std
     size = np.abs(truth).max()
     inside = float((error <= 4 * std + 1e-9 * size).mean())
 
@@ -133,9 +132,9 @@ def test_a_panda_is_learnt_as_the_documentation_says() -> None:
     unseen = simulate(robot, Stream(501, n_sinusoids=100, motion="middle", speed=10, noise=0.0), seed=101)
     found = dynamics.components(model, unseen.motion(), ["inertia_matrix", "gravity"])
     truth = truth_of(robot, unseen, unseen.q[0], 0.0)
-    assert (torch.linalg.eigvalsh(found["inertia_matrix"].mean) > 0).all()
+    assert (np.linalg.eigvalsh(found["inertia_matrix"].mean) > 0).all()
     for name, largest in (("inertia_matrix", 0.025), ("gravity", 0.001)):
-        error = float(np.abs(found[name].mean.numpy() - truth[name]).max() / np.abs(truth[name]).max())
+        error = float(np.abs(found[name].mean - truth[name]).max() / np.abs(truth[name]).max())
         print(f"\n{name}: {error:.1e}")  # noqa: T201
         assert error < largest
 
@@ -143,7 +142,7 @@ def test_a_panda_is_learnt_as_the_documentation_says() -> None:
 def test_parts_sum_to_the_torque(case: Case) -> None:
     total = sum(case.found[name].mean for name in ("inertial", "coriolis", "gravity", "friction"))
     torque = case.model.posterior.mean(case.unseen.motion())
-    assert (total - torque).abs().max() < 1e-9 * max(1.0, float(torque.abs().max()))
+    assert np.abs(total - torque).max() < 1e-9 * max(1.0, float(np.abs(torque).max()))
 
 
 def test_inertia_links_its_kin(case: Case) -> None:
@@ -151,34 +150,34 @@ def test_inertia_links_its_kin(case: Case) -> None:
     inertia, motion = case.found["inertia_matrix"], case.unseen.motion()
     assert (inertia.mean == inertia.mean.mT).all()
     assert (inertia.std == inertia.std.mT).all()
-    assert (torch.linalg.eigvalsh(inertia.mean)[:, 0] > 0).all()
-    kinetic = 0.5 * torch.einsum("ki,kij,kj->k", motion.dq, inertia.mean, motion.dq)
-    assert (case.found["kinetic_energy"].mean - kinetic).abs().max() < 1e-7 * kinetic.abs().max()
-    inertial = torch.einsum("kij,kj->ki", inertia.mean, motion.ddq)
-    assert (case.found["inertial"].mean - inertial).abs().max() < 1e-7 * inertial.abs().max()
+    assert (np.linalg.eigvalsh(inertia.mean)[:, 0] > 0).all()
+    kinetic = 0.5 * np.einsum("ki,kij,kj->k", motion.dq, inertia.mean, motion.dq)
+    assert np.abs(case.found["kinetic_energy"].mean - kinetic).max() < 1e-7 * np.abs(kinetic).max()
+    inertial = np.einsum("kij,kj->ki", inertia.mean, motion.ddq)
+    assert np.abs(case.found["inertial"].mean - inertial).max() < 1e-7 * np.abs(inertial).max()
 
 
 @pytest.mark.parametrize("row", [0, 17])
 def test_uncertainty_of_forward_dynamics_is_that_of_its_linearization(case: Case, row: int) -> None:
     """Through the joint posterior of the torques that make up bias and inertia, and the derivative of the solution."""
     posterior, motion, n = case.model.posterior, case.unseen.motion()[row : row + 1], case.robot.n_joints
-    tau = torch.from_numpy(case.unseen.tau[row])
-    ddq = torch.cat([torch.zeros((1, n), dtype=torch.float64), torch.eye(n, dtype=torch.float64)])
-    stack = Motion(motion.q.repeat(n + 1, 1), motion.dq.repeat(n + 1, 1), ddq)
+    tau = case.unseen.tau[row]
+    ddq = np.concatenate([np.zeros((1, n)), np.eye(n)])
+    stack = Motion(np.tile(motion.q, (n + 1, 1)), np.tile(motion.dq, (n + 1, 1)), ddq)
     white = posterior.whiten(posterior.cross(posterior.kernel, stack))
     prior = posterior.kernel.symmetric_gram(posterior.params, stack)
     covariance = prior - white.T @ white
 
     def solve(torques: torch.Tensor) -> torch.Tensor:
         inertia = (torques[1:] - torques[0]).T
-        return torch.linalg.solve(inertia, tau - torques[0])
+        return torch.linalg.solve(inertia, torch.from_numpy(tau) - torques[0])
 
-    jacobian = jacrev(solve)(posterior.mean(stack)).reshape(n, -1)
+    jacobian = jacrev(solve)(torch.from_numpy(posterior.mean(stack))).reshape(n, -1).numpy()
     expected = (jacobian @ covariance @ jacobian.T).diagonal()
-    found = (case.found["forward_dynamics"].std[row] / posterior.std_factor).square()
+    found = np.square(case.found["forward_dynamics"].std[row] / posterior.std_factor)
     # what is left of a prior that is wider by seven digits has lost as many to rounding, on either way
-    rounding = torch.finfo(torch.float64).eps * (jacobian.abs() @ prior.abs() @ jacobian.T.abs()).diagonal()
-    assert ((found - expected).abs() <= 2e-2 * expected + 100 * rounding).all()
+    rounding = np.finfo(np.float64).eps * (np.abs(jacobian) @ np.abs(prior) @ np.abs(jacobian.T)).diagonal()
+    assert (np.abs(found - expected) <= 2e-2 * expected + 100 * rounding).all()
 
 
 def test_potential_energy_vanishes_at_its_reference_with_certainty(case: Case) -> None:
@@ -192,7 +191,7 @@ def test_rate_of_energy_is_power(case: Case) -> None:
     """d/dt (T + V) = dq · tau of what is learnt without friction, by a central difference of fourth order in time."""
     motion, step, names = case.unseen.motion()[::4], 1e-3, ["kinetic_energy", "potential_energy"]
 
-    def energy(t: float) -> torch.Tensor:
+    def energy(t: float) -> Array:
         moved = Motion(motion.q + t * motion.dq + 0.5 * t**2 * motion.ddq, motion.dq + t * motion.ddq, motion.ddq)
         both = dynamics.components(case.model, moved, names)
         return both["kinetic_energy"].mean + both["potential_energy"].mean
@@ -200,27 +199,27 @@ def test_rate_of_energy_is_power(case: Case) -> None:
     rate = (8 * (energy(step) - energy(-step)) - (energy(2 * step) - energy(-2 * step))) / (12 * step)
     torque = sum(case.found[name].mean for name in ("inertial", "coriolis", "gravity"))[::4]
     power = (motion.dq * torque).sum(1)
-    assert (rate - power).abs().max() < 1e-5 * power.abs().max()
+    assert np.abs(rate - power).max() < 1e-5 * np.abs(power).max()
 
 
 def test_torque_is_affine_in_acceleration_and_its_velocity_terms_are_quadratic(case: Case) -> None:
     motion = case.unseen.motion()[::4]
-    zero = torch.zeros_like(motion.q)
+    zero = np.zeros_like(motion.q)
     terms = [term for name, term in case.model.estimator.terms.items() if name != "friction"]
 
-    def torque(dq: torch.Tensor, ddq: torch.Tensor) -> torch.Tensor:
+    def torque(dq: Array, ddq: Array) -> Array:
         return sum(case.model.posterior.mean(Motion(motion.q, dq, ddq), term) for term in terms)
 
-    rest, size = torque(zero, zero), torque(motion.dq, motion.ddq).abs().max()
-    assert (torque(zero, -3 * motion.ddq) - rest + 3 * (torque(zero, motion.ddq) - rest)).abs().max() < 1e-6 * size
-    assert (torque(-2 * motion.dq, zero) - rest - 4 * (torque(motion.dq, zero) - rest)).abs().max() < 1e-6 * size
+    rest, size = torque(zero, zero), np.abs(torque(motion.dq, motion.ddq)).max()
+    assert np.abs(torque(zero, -3 * motion.ddq) - rest + 3 * (torque(zero, motion.ddq) - rest)).max() < 1e-6 * size
+    assert np.abs(torque(-2 * motion.dq, zero) - rest - 4 * (torque(motion.dq, zero) - rest)).max() < 1e-6 * size
 
 
 def test_what_cannot_be_asked_for(case: Case) -> None:
-    motion, tau = case.unseen.motion()[:2], torch.from_numpy(case.unseen.tau[:2])
+    motion, tau = case.unseen.motion()[:2], case.unseen.tau[:2]
     with pytest.raises(dynamics.UnavailableComponentError, match="component is 'mass', expected one that estimator"):
         dynamics.components(case.model, motion, ["gravity", "mass"])
-    q = torch.zeros((1, 5), dtype=torch.float64)
+    q = np.zeros((1, 5))
     with pytest.raises(ValueError, match="motion has 5 joints, expected"):
         dynamics.components(case.model, Motion(q, q, q), ["gravity"])
     with pytest.raises(ValueError, match="tau is None, expected a torque for forward_dynamics"):
@@ -244,7 +243,7 @@ class Small(NamedTuple):
 
     model: TorqueModel
     motion: Motion
-    tau: Tensor
+    tau: Array
     energies: list[Energy]
     gram: np.ndarray
     query: Motion
@@ -255,20 +254,20 @@ def small(request: pytest.FixtureRequest) -> Small:
     rng = np.random.default_rng(3)
     motion = Motion.from_arrays(*rng.uniform(-1.5, 1.5, (3, SAMPLES, N)))
     query = Motion.from_arrays(*rng.uniform(-1.5, 1.5, (3, QUERIES, N)))
-    tau = torch.from_numpy(rng.normal(size=(SAMPLES, N)))
+    tau = rng.normal(size=(SAMPLES, N))
     like = make_estimator(request.param, TYPES).kernel.initial(motion, tau)
-    params = {name: torch.from_numpy(np.asarray(rng.uniform(-1, 0.5, value.shape))) for name, value in like.items()}
-    params["noise.log_std"] = torch.tensor([-1.5, -2.0], dtype=torch.float64)
-    kernel, outputs = make_estimator(request.param, TYPES).kernel, torch.arange(SAMPLES * N)
+    params = {name: np.asarray(rng.uniform(-1, 0.5, value.shape)) for name, value in like.items()}
+    params["noise.log_std"] = np.array([-1.5, -2.0])
+    kernel, outputs = make_estimator(request.param, TYPES).kernel, np.arange(SAMPLES * N)
     basis = Basis.build(kernel, params, motion, outputs)
-    statistics = collect(basis, torch.exp(2 * params["noise.log_std"]), motion, tau)
+    statistics = collect(basis, np.exp(2 * params["noise.log_std"]), motion, tau)
     estimator = make_estimator(request.param, TYPES)
     posterior = CompactPosterior.restore(estimator.kernel, params, motion, outputs, statistics)
     span = training_range(motion)
     model = TorqueModel(estimator, JOINT_NAMES, TYPES, "gravity_included", {}, {}, posterior, span, {})
     energies = ENERGIES[request.param](TYPES, params)
     data = samples(motion)
-    noise = np.tile(np.exp(2 * params["noise.log_std"].numpy()), SAMPLES)
+    noise = np.tile(np.exp(2 * params["noise.log_std"]), SAMPLES)
     gram = torque_covariance(energies, data, data) + friction_covariance(params, data, data) + np.diag(noise)
     return Small(model, motion, tau, energies, gram, query)
 
@@ -279,11 +278,11 @@ def torque_covariance(energies: list[Energy], xs: Sequence[Instant], ys: Sequenc
     return np.block(blocks)
 
 
-def friction_covariance(params: Mapping[str, Tensor], xs: Sequence[Instant], ys: Sequence[Instant]) -> np.ndarray:
-    variances = torch.exp(2 * params["friction.log_std"]).numpy()
+def friction_covariance(params: Mapping[str, Array], xs: Sequence[Instant], ys: Sequence[Instant]) -> np.ndarray:
+    variances = np.exp(2 * params["friction.log_std"])
 
-    def features(v: Tensor) -> np.ndarray:
-        return np.stack([v.numpy(), np.tanh(v.numpy() / SIGN_WIDTH), np.ones(N)], axis=1)
+    def features(v: Array) -> np.ndarray:
+        return np.stack([v, np.tanh(np.asarray(v) / SIGN_WIDTH), np.ones(N)], axis=1)
 
     return np.block([[np.diag((features(x[1]) * variances * features(y[1])).sum(1)) for y in ys] for x in xs])
 
@@ -295,12 +294,12 @@ def samples(motion: Motion) -> list[Instant]:
 def conditioned(small: Small, prior: np.ndarray, cross: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and standard deviation of quantities with prior covariance (k, k) and covariance (k, m) with the torques."""
     solved = np.linalg.solve(small.gram, cross.T)
-    return solved.T @ small.tau.numpy().ravel(), np.sqrt(np.diag(prior - cross @ solved))
+    return solved.T @ small.tau.ravel(), np.sqrt(np.diag(prior - cross @ solved))
 
 
 def assert_estimate(found: dynamics.Estimate, row: int, mean: np.ndarray, std: np.ndarray) -> None:
-    np.testing.assert_allclose(found.mean[row].numpy().ravel(), mean, rtol=1e-7, atol=1e-10)
-    np.testing.assert_allclose(found.std[row].numpy().ravel(), std, rtol=1e-7, atol=1e-7)
+    np.testing.assert_allclose(found.mean[row].ravel(), mean, rtol=1e-7, atol=1e-10)
+    np.testing.assert_allclose(found.std[row].ravel(), std, rtol=1e-7, atol=1e-7)
 
 
 @pytest.mark.parametrize("row", few(range(QUERIES), lambda row: row == 0))
@@ -309,7 +308,7 @@ def test_energies(small: Small, row: int) -> None:
     found = dynamics.components(small.model, small.query, names)
     x = instant(small.query, row)
     origin = dynamics.reference_posture(small.model)
-    reference = (origin, torch.zeros(N, dtype=torch.float64), torch.zeros(N, dtype=torch.float64))
+    reference = tuple(map(torch.as_tensor, (origin, np.zeros(N), np.zeros(N))))
     data = samples(small.motion)
     torques = np.array([[energy_torque(small.energies, at, y).numpy() for y in data] for at in (x, reference)])
     torques = torques.transpose(0, 2, 1, 3).reshape(2, len(small.energies), -1)  # (at, energy, m)

@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
 
 from lipcore import FitOptions, TorqueModel, train
 from lipcore.data.metrics import LEVEL, blocks, evaluate, quantile
-from lipcore.data.samples import Samples
+from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import GUARD_S
 from lipcore.model.torque_model import TorquePrediction
 from lipcore.posterior.compact import CompactPosterior
@@ -31,33 +30,33 @@ def model(request: pytest.FixtureRequest, samples: Samples) -> TorqueModel:
     return train(samples, TYPES, request.param, QUICK)
 
 
-def taught(model: TorqueModel, samples: Samples, variance: torch.Tensor) -> CompactPosterior:
+def taught(model: TorqueModel, samples: Samples, variance: Array) -> CompactPosterior:
     """The posterior of these samples, each torque with its own variance."""
     old, motion = model.posterior, samples.motion()
-    statistics = collect(old.basis, variance, motion, samples.torque() - old.kernel.mean(motion))
+    statistics = collect(old.basis, variance, motion, samples.tau - old.kernel.mean(motion))
     return CompactPosterior.build(old.kernel, old.basis, statistics, old.noise_variance, 1.5, old.misfit)
 
 
 def test_scores_are_those_of_posteriors_without_the_block(model: TorqueModel, samples: Samples) -> None:
     rng, starts = np.random.default_rng(0), blocks(samples)
     noise = model.posterior.noise_variance
-    variance = noise * torch.from_numpy(rng.uniform(1, 3, samples.tau.shape))
+    variance = noise * rng.uniform(1, 3, samples.tau.shape)
     found = scores(taught(model, samples, variance), samples, variance, starts)
     assert len(starts) == 10
     for first, last in zip(starts, [*starts[1:], len(samples)], strict=True):
         near = np.abs(samples.t[:, None] - samples.t[first:last]).min(axis=1) < GUARD_S
         kept = ~(near & (samples.episode == samples.episode[first]))
         assert 90 >= kept.sum() >= 86
-        without = taught(model, samples.rows(kept), variance[torch.from_numpy(kept)])
+        without = taught(model, samples.rows(kept), variance[kept])
         answer = without.predict(samples.rows(slice(first, last)).motion())
-        half = quantile(LEVEL) * (answer.std**2 + noise).sqrt().numpy()
-        expected = np.abs(samples.tau[first:last] - answer.mean.numpy()) / half
+        half = quantile(LEVEL) * np.sqrt(answer.std**2 + noise)
+        expected = np.abs(samples.tau[first:last] - answer.mean) / half
         np.testing.assert_allclose(found[first:last], expected, rtol=1e-5, atol=1e-8)
 
 
 def test_the_order_of_samples_does_not_matter(model: TorqueModel, samples: Samples) -> None:
     order = np.random.default_rng(1).permutation(len(samples))
-    variance = 2 * model.posterior.noise_variance.expand(samples.tau.shape)
+    variance = 2 * np.broadcast_to(model.posterior.noise_variance, samples.tau.shape)
     posterior = taught(model, samples, variance)
     found, expected = (conform(posterior, each, variance) for each in (samples.rows(order), samples))
     np.testing.assert_allclose(found.scale, expected.scale, rtol=1e-9)
@@ -96,13 +95,13 @@ def test_a_noise_taken_too_small_is_made_up_for(model: TorqueModel, samples: Sam
     posterior = model.posterior
     tenth = posterior.noise_variance / 100
     old, motion = posterior, samples.motion()
-    residual = samples.torque() - old.kernel.mean(motion)
+    residual = samples.tau - old.kernel.mean(motion)
     proud = CompactPosterior.build(old.kernel, old.basis, collect(old.basis, tenth, motion, residual), tenth)
-    found = conform(proud, samples, tenth.expand(samples.tau.shape))
+    found = conform(proud, samples, np.broadcast_to(tenth, samples.tau.shape))
     assert min(found.scale) > 3
     unseen = simulate(load_robot("double-pendulum"), Stream(n_samples=200, rate=10.0, speed=5.0, noise=0.05), 9)
     answer = proud.predict(unseen.motion())
-    given = unseen.tau, answer.mean.numpy(), answer.std.numpy(), tenth.sqrt().numpy()
+    given = unseen.tau, answer.mean, answer.std, np.sqrt(tenth)
     assert (evaluate(*given).coverage < 0.6).all()
     assert (evaluate(*given, np.array(found.scale)).coverage > 0.85).all()
 

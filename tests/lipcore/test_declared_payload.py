@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-import torch
 
 from lipcore import FitOptions, Samples, TorqueModel, train
 from lipcore.data.metrics import evaluate
@@ -20,7 +19,7 @@ from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.choosing import slow
-from tests.lipcore.arm_oracles import arm, as_robot, followed, lagrangian_torque, motions, recorded, tensor
+from tests.lipcore.arm_oracles import arm, as_robot, followed, lagrangian_torque, motions, recorded
 from tests.lipcore.arms import random_bodies
 from tests.lipcore.test_components import truth_of
 
@@ -107,15 +106,15 @@ def test_all_components_are_of_the_arm_with_its_payload(learnt: tuple[Robot, Tor
     robot, without = learnt
     model, heavy = carrying(without, BODY), loaded(robot, BODY)
     asked = moved(heavy, 7, 40, 0.0)
-    parts = dynamics.components(model, asked.motion(), dynamics.COMPONENTS, tensor(asked.tau))
-    middle = dynamics.reference_posture(model).numpy()
+    parts = dynamics.components(model, asked.motion(), dynamics.COMPONENTS, asked.tau)
+    middle = dynamics.reference_posture(model)
     truth, light = (truth_of(each, asked, middle, VISCOUS) for each in (heavy, robot))
     for name, part in parts.items():
-        error, added = np.abs(part.mean.numpy() - truth[name]), np.abs(truth[name] - light[name]).max()
-        inside = error <= 4 * part.std.numpy() + 1e-9 * np.abs(truth[name]).max()
+        error, added = np.abs(part.mean - truth[name]), np.abs(truth[name] - light[name]).max()
+        inside = error <= 4 * part.std + 1e-9 * np.abs(truth[name]).max()
         assert name == "friction" or error.max() < 0.15 * added, name
         assert inside.mean() > 0.9, name
-    total = sum((parts[name].mean for name in ("inertial", "coriolis", "gravity", "friction")), torch.zeros(()))
+    total = sum((parts[name].mean for name in ("inertial", "coriolis", "gravity", "friction")), np.zeros(()))
     np.testing.assert_allclose(total, model.posterior.mean(asked.motion()), rtol=1e-9, atol=1e-9)
 
 
@@ -129,7 +128,7 @@ def test_features_are_those_of_a_body_of_pinocchio(kinds: str) -> None:
     kernel = PayloadKernel(fixed, np.ones(10))
     motion = Motion.from_arrays(*asked[:, :, order.argsort()].swapaxes(0, 1))
     weights = BODY.parameters
-    torque, energy = (of(motion).numpy() @ weights for of in (kernel.features, kernel.energy_features))
+    torque, energy = (of(motion) @ weights for of in (kernel.features, kernel.energy_features))
     for row, (q, dq, ddq) in enumerate(asked):
         with_, less = ((model, model.createData()) for model in (heavy, robot.model))
         expected = pin.rnea(*with_, q, dq, ddq) - pin.rnea(*less, q, dq, ddq)
@@ -160,7 +159,7 @@ def test_features_of_a_learnt_geometry_are_those_of_the_lagrangian(kinds: str) -
     alone[-1] = carried
     for found, motion in zip(rows, asked, strict=True):
         expected = np.empty(n)
-        expected[order] = lagrangian_torque(geometry, alone, torch.from_numpy(step), motion).numpy()
+        expected[order] = lagrangian_torque(geometry, alone, step, motion)
         np.testing.assert_allclose(carried @ found, expected, atol=1e-9 * np.abs(expected).max())
 
 

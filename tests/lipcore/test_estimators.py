@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from numpy.typing import ArrayLike
 
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
@@ -21,6 +20,7 @@ from lipcore.fitting.estimators import (
     make_estimator,
 )
 from lipcore.kernels.arm_prior import Arm, arm_of_robot
+from lipcore.kernels.base import on_last_diagonal
 from lipcore.model import dynamics
 from lipcore.model.parameters import friction_coefficients, inertial_parameters, weight_posterior
 from lipcore.posterior.exact import negative_log_evidence
@@ -120,15 +120,15 @@ def test_awkward_data_end_in_a_model(name: str, data: str) -> None:
 def test_gradient_of_the_evidence_equals_finite_differences(name: str, prior: str, mode: str) -> None:
     samples = recorded().rows(np.arange(7))
     kernel = make_estimator(name, TYPES, arm=arm_of(name, samples, prior, mode)).kernel
-    motion, tau, rng = samples.motion(), samples.torque(), np.random.default_rng(3)
+    motion, tau, rng = samples.motion(), samples.tau, np.random.default_rng(3)
     params = kernel.initial(motion, tau)
-    params = {key: value + 0.3 * torch.tensor(rng.standard_normal(value.shape)) for key, value in params.items()}
-    params["noise.log_std"] = torch.full((2,), -2.0, dtype=torch.float64)
+    params = {key: value + 0.3 * np.array(rng.standard_normal(value.shape)) for key, value in params.items()}
+    params["noise.log_std"] = np.full((2,), -2.0)
     gradient = negative_log_evidence(kernel, params, motion, tau).gradient
     assert gradient.keys() == params.keys()
 
     def value(key: str, index: tuple[int, ...], step: float) -> float:
-        moved = {other: tensor.clone() for other, tensor in params.items()}
+        moved = {other: np.array(tensor) for other, tensor in params.items()}
         moved[key][index] += step
         return negative_log_evidence(kernel, moved, motion, tau).value
 
@@ -220,14 +220,14 @@ def test_predictions(plain: TorqueModel, corrected: TorqueModel, samples: Sample
     one, other = (model.predict(*query, covariance=True) for model in (plain, corrected))
     alike(other.tau, one.tau)
     alike(other.noise_std, one.noise_std)
-    unexpressed = torch.diag_embed(plain.posterior.misfit.variance(Motion.from_arrays(*query))).numpy()
+    unexpressed = on_last_diagonal(plain.posterior.misfit.variance(Motion.from_arrays(*query)))
     alike(other.covariance - unexpressed, FACTOR**2 * (one.covariance - unexpressed))
     alike(other.tau_std**2, other.covariance.diagonal(axis1=1, axis2=2))
     assert (one.tau_std > 0).all()
 
 
 def test_components(plain: TorqueModel, corrected: TorqueModel, samples: Samples) -> None:
-    motion, tau = samples.motion()[10:15], samples.torque()[10:15]
+    motion, tau = samples.motion()[10:15], samples.tau[10:15]
     one, other = (dynamics.components(m, motion, dynamics.COMPONENTS, tau) for m in (plain, corrected))
     for name in dynamics.COMPONENTS:
         alike(other[name].mean, one[name].mean)

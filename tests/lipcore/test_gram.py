@@ -7,11 +7,14 @@ import pytest
 import torch
 from hypothesis import given
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
+from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.compiled.lanes import LANES
 from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED, FrictionKernel
 from lipcore.kernels.lip import LipKernel
+from lipcore.posterior.exact import negative_log_evidence
+from lipcore.posterior.on_device import evidence_on
 from tests.lipcore.oracles import KERNELS, Problem, TorchForm, opposite, problems, random_problem, shares_of
 
 JOINTS = ("revolute", "prismatic", "revolute")
@@ -21,9 +24,9 @@ JOINTS = ("revolute", "prismatic", "revolute")
 def test_gram_is_symmetric_and_positive_semidefinite(problem: Problem) -> None:
     gram = problem.kernel.gram(problem.params, problem.motion, problem.motion)
     symmetric = problem.kernel.symmetric_gram(problem.params, problem.motion)
-    assert torch.equal(symmetric, symmetric.T)
-    assert (symmetric - gram).abs().max() <= 1e-13 * gram.abs().max()
-    values = torch.linalg.eigvalsh(0.5 * (gram + gram.T))
+    assert np.array_equal(symmetric, symmetric.T)
+    assert np.abs(symmetric - gram).max() <= 1e-13 * np.abs(gram).max()
+    values = np.linalg.eigvalsh(0.5 * (gram + gram.T))
     assert values[0] >= -1e-10 * values[-1]
 
 
@@ -32,8 +35,8 @@ def test_variance_is_the_diagonal_of_the_gram(name: str) -> None:
     problem = random_problem(JOINTS, samples=6, seed=2, kernel=name)
     kernel = SumKernel(problem.kernel, FrictionKernel(3))
     gram = kernel.gram(problem.params, problem.motion, problem.motion)
-    blocks = torch.stack([gram[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(6)])
-    assert (kernel.variance(problem.params, problem.motion) - blocks).abs().max() <= 1e-13 * gram.abs().max()
+    blocks = np.stack([gram[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(6)])
+    assert np.abs(kernel.variance(problem.params, problem.motion) - blocks).max() <= 1e-13 * np.abs(gram).max()
 
 
 def test_sum_kernel_adds_its_terms() -> None:
@@ -41,7 +44,7 @@ def test_sum_kernel_adds_its_terms() -> None:
     friction = FrictionKernel(3)
     total = SumKernel(problem.kernel, friction).gram(problem.params, problem.motion, problem.motion)
     parts = [k.gram(problem.params, problem.motion, problem.motion) for k in (problem.kernel, friction)]
-    assert torch.allclose(total, parts[0] + parts[1], rtol=1e-14, atol=0)
+    assert np.allclose(total, parts[0] + parts[1], rtol=1e-14, atol=0)
     initial = SumKernel(problem.kernel, friction).initial(problem.motion, problem.motion.q)
     assert initial.keys() == problem.params.keys() - {"noise.log_std"}
     with pytest.raises(ValueError, match=r"\[2, 3\] joints"):
@@ -56,10 +59,10 @@ def features(speed: float) -> list[float]:
 @pytest.mark.parametrize("terms", [3, 4])
 def test_block_is_the_covariance_of_independent_weights_on_the_features(terms: int) -> None:
     motion = random_problem(("revolute", "prismatic", "revolute"), samples=4, seed=1).motion
-    std = torch.exp(torch.from_numpy(np.random.default_rng(1).normal(size=(3, terms))))
+    std = np.exp(np.random.default_rng(1).normal(size=(3, terms)))
     motion = Motion(motion.q, 0.02 * motion.dq, motion.ddq)  # slow enough for the sign to turn over
     kernel = FrictionKernel(3, terms == 4)
-    gram = kernel.gram({"friction.log_std": torch.log(std)}, motion, motion).reshape(4, 3, 4, 3)
+    gram = kernel.gram({"friction.log_std": np.log(std)}, motion, motion).reshape(4, 3, 4, 3)
     for x in range(4):
         for y in range(4):
             for i in range(3):
@@ -83,10 +86,10 @@ kernels = pytest.mark.parametrize("kernel", KERNELS)
 robots = pytest.mark.parametrize("joint_types", ROBOTS, ids=lambda kinds: "".join(kind[0] for kind in kinds))
 
 
-def agree(actual: torch.Tensor, expected: torch.Tensor, name: str = "") -> None:
+def agree(actual: Array, expected: Array, name: str = "") -> None:
     assert actual.shape == expected.shape
-    if expected.numel():
-        assert float((actual - expected).abs().max()) <= RELATIVE * float(expected.abs().max()), name
+    if expected.size:
+        assert float(np.abs(actual - expected).max()) <= RELATIVE * float(np.abs(expected).max()), name
 
 
 def check(problem: Problem) -> None:
@@ -95,10 +98,10 @@ def check(problem: Problem) -> None:
     form, places = TorchForm(kernel), len(motion) * kernel.n_joints
     agree(kernel.gram(params, motion[:third], motion[third:]), form.gram(params, motion[:third], motion[third:]))
     gram = kernel.symmetric_gram(params, motion)
-    assert torch.equal(gram, gram.T)
+    assert np.array_equal(gram, gram.T)
     agree(gram, form.symmetric_gram(params, motion))
 
-    weight = torch.from_numpy(np.random.default_rng(1).standard_normal((places, places)))
+    weight = np.random.default_rng(1).standard_normal((places, places))
     compiled, reference = (each.gradient(params, motion, weight + weight.T) for each in (kernel, form))
     assert compiled.keys() == reference.keys()
     for name, derivative in reference.items():
@@ -109,7 +112,7 @@ def check(problem: Problem) -> None:
 @kernels
 # part of a block of columns, exactly one, and several
 @pytest.mark.parametrize("samples", [1, 3, LANES - 1, LANES, LANES + 1, 3 * LANES + 2])
-def test_equal_the_formula_in_pytorch(kernel: str, joint_types: tuple[str, ...], samples: int) -> None:
+def test_equal_the_formula(kernel: str, joint_types: tuple[str, ...], samples: int) -> None:
     check(random_problem(joint_types, samples, seed=samples, kernel=kernel))
 
 
@@ -127,17 +130,17 @@ def test_many_joints(kernel: str) -> None:
 def test_base_kernels_of_zero(kernel: str, joint_types: tuple[str, ...], zeros: tuple[int, ...]) -> None:
     """p_b = 0 of one, two or all joints: the derivatives stay exact, as nothing divides by it."""
     problem = random_problem(joint_types, 2, seed=3, kernel=kernel)
-    logits = torch.full((3, 2), 0.7, dtype=torch.float64)  # σ < α, β: p changes sign
+    logits = np.full((3, 2), 0.7)  # σ < α, β: p changes sign
     for name, value in problem.params.items():
         if name.endswith("logits"):
             value[:] = 0.7 if kernel == "chain" else logits[: len(value)]
-    shares = shares_of(logits)
+    shares = shares_of(torch.from_numpy(logits)).numpy()
     if kernel == "chain":
-        alpha = torch.sigmoid(torch.tensor(0.7, dtype=torch.float64))
-        straight = torch.tensor([kind == "prismatic" for kind in joint_types])
-        shares = torch.stack([1 - alpha.expand(3), alpha.expand(3), torch.where(straight, 0.0, alpha)], dim=1)
-    q = problem.motion.q.clone()
-    q[0] = torch.tensor([0.4, 0.9, 1.1])
+        alpha = np.full(3, 1 / (1 + np.exp(-0.7)))
+        straight = np.array([kind == "prismatic" for kind in joint_types])
+        shares = np.stack([1 - alpha, alpha, np.where(straight, 0.0, alpha)], axis=1)
+    q = problem.motion.q.copy()
+    q[0] = np.array([0.4, 0.9, 1.1])
     for joint in zeros:
         q[1, joint] = opposite(joint_types[joint], shares[joint].tolist(), float(q[0, joint]))
     check(Problem(problem.kernel, problem.params, Motion(q, problem.motion.dq, problem.motion.ddq)))
@@ -147,7 +150,7 @@ def test_base_kernels_of_zero(kernel: str, joint_types: tuple[str, ...], zeros: 
 def test_no_samples(kernel: str) -> None:
     problem = random_problem(("revolute",) * 2, 3, seed=0, kernel=kernel)
     assert problem.kernel.gram(problem.params, problem.motion, problem.motion[:0]).shape == (6, 0)
-    nothing = torch.zeros((0, 0), dtype=torch.float64)
+    nothing = np.zeros((0, 0))
     assert not any(
         bool(each.any()) for each in problem.kernel.gradient(problem.params, problem.motion[:0], nothing).values()
     )
@@ -160,12 +163,27 @@ def test_no_samples(kernel: str) -> None:
 def test_cross_equals_the_gram_matrix(kernel: str, joint_types: tuple[str, ...], size: int) -> None:
     problem, n = random_problem(joint_types, size + 3, seed=size, kernel=kernel), len(joint_types)
     asked = problem.motion[size:]
-    queries = np.ascontiguousarray(torch.stack([asked.q, asked.dq, asked.ddq], dim=1).numpy())
+    queries = np.ascontiguousarray(np.stack([asked.q, asked.dq, asked.ddq], axis=1))
     found = np.full((len(asked), size + 1, n, n), np.nan)  # where anything left out would show
     problem.kernel.cross(problem.params, problem.motion[:size]).fill_many(queries, found)
-    gram = problem.kernel.gram(problem.params, problem.motion[:size], asked).numpy()
+    gram = problem.kernel.gram(problem.params, problem.motion[:size], asked)
     expected = gram.reshape(size, n, 3, n).transpose(2, 0, 1, 3)
     np.testing.assert_allclose(found[:, :size], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
-    prior = problem.kernel.variance(problem.params, asked).numpy()
+    prior = problem.kernel.variance(problem.params, asked)
     np.testing.assert_allclose(found[:, size], prior, rtol=0, atol=1e-12 * np.abs(prior).max())
     assert np.array_equal(found[:, size], found[:, size].transpose(0, 2, 1))
+
+
+@pytest.mark.parametrize("estimator", ["lip-chain", "se", "gip"])
+def test_evidence_in_pytorch_is_that_of_numpy(estimator: str) -> None:
+    """What computes on a GPU, here on the CPU: value and every derivative, friction's among them."""
+    problem = random_problem(("revolute", "prismatic", "revolute"), 7, seed=5, kernel="chain")
+    kernel = make_estimator(estimator, ("revolute", "prismatic", "revolute")).kernel
+    tau = np.random.default_rng(6).standard_normal((7, 3))
+    params = {**kernel.initial(problem.motion, tau), "noise.log_std": np.full(3, -1.0)}
+    expected = negative_log_evidence(kernel, params, problem.motion, tau)
+    value, gradient = evidence_on(kernel, params, problem.motion, tau, "cpu")
+    assert value == pytest.approx(expected.value, rel=1e-10)
+    assert gradient.keys() == expected.gradient.keys()
+    for name, derivative in expected.gradient.items():
+        agree(gradient[name], derivative, name)

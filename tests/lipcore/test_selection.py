@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.posterior.linalg import NotPositiveDefiniteError, cholesky
 from lipcore.posterior.selection import PREFERENCE, pivots, spread_out
 
@@ -16,7 +15,7 @@ def random_motion(size: int, seed: int = 0) -> Motion:
 
 
 def test_no_sample_is_taken_twice_where_samples_repeat() -> None:
-    motion = random_motion(3)[torch.arange(60) % 3]  # a robot that holds three postures
+    motion = random_motion(3)[np.arange(60) % 3]  # a robot that holds three postures
     chosen = spread_out(motion, 10)
     assert len(set(chosen.tolist())) == 10
     assert chosen.tolist() == sorted(spread_out(motion, 10).tolist())
@@ -31,70 +30,73 @@ def test_rare_regions_of_position_speed_and_acceleration_are_represented() -> No
     assert {17, 171, 333} <= set(chosen)
 
 
-def gram_of(rows: int, rank: int, seed: int) -> torch.Tensor:
+def gram_of(rows: int, rank: int, seed: int) -> Array:
     rng = np.random.default_rng(seed)
     factor = rng.normal(size=(rows, rank)) * np.logspace(1, -2, rank)
-    return torch.from_numpy(factor @ factor.T)
+    return factor @ factor.T
 
 
 @given(st.integers(1, 8), st.integers(1, 4), st.integers(1, 30), st.integers(1, 40), st.integers(0, 99))
 def test_every_prefix_is_a_cholesky_factor(samples: int, per_sample: int, rank: int, most: int, seed: int) -> None:
     gram = gram_of(samples * per_sample, rank, seed)
-    before = gram.clone()
+    before = gram.copy()
     found = pivots(gram, per_sample, most, 1e-9)
-    assert torch.equal(gram, before)
+    assert np.array_equal(gram, before)
     chosen = found.outputs.tolist()
     assert len(set(chosen)) == len(chosen) <= min(most, len(gram))
     scale = float(gram.diagonal().max())
     for count in {1, len(chosen) // 2, len(chosen)} - {0}:
         picked, lower = found.outputs[:count], found.lower[:, :count]
         square = lower[picked]
-        assert torch.equal(square.triu(1), torch.zeros_like(square)) or square.triu(1).abs().max() < 1e-6 * scale**0.5
-        assert torch.allclose(square @ square.T, gram[picked][:, picked], rtol=0, atol=1e-7 * scale)
-        left = gram.diagonal() - lower.square().sum(1)
+        assert (
+            np.array_equal(np.triu(square, 1), np.zeros_like(square))
+            or np.abs(np.triu(square, 1)).max() < 1e-6 * scale**0.5
+        )
+        assert np.allclose(square @ square.T, gram[picked][:, picked], rtol=0, atol=1e-7 * scale)
+        left = gram.diagonal() - np.square(lower).sum(1)
         assert left.min() > -1e-7 * scale
-    assert (found.residual.diff() <= 1e-9 * scale).all()  # what is left never grows
+    assert (np.diff(found.residual) <= 1e-9 * scale).all()  # what is left never grows
 
 
 def test_outputs_of_samples_in_use_come_first() -> None:
     """Independent outputs: with ten times the variance a new sample wins, with less it does not."""
-    variances = torch.tensor([4.0, 1.0, 1.1, 1.0 * PREFERENCE * 1.5, 3.0, 2.0], dtype=torch.float64)
-    order = pivots(torch.diag(variances), 2, 6, 0.0).outputs.tolist()
+    variances = np.array([4.0, 1.0, 1.1, 1.0 * PREFERENCE * 1.5, 3.0, 2.0])
+    order = pivots(np.diag(variances), 2, 6, 0.0).outputs.tolist()
     assert order[0] == 3  # the largest of all, in the second sample
     assert order[1] == 2  # its neighbour, although others are larger
     assert sorted(order) == list(range(6))
 
 
-def well_conditioned(size: int) -> torch.Tensor:
-    root = torch.randn(size, size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    return root @ root.T + torch.eye(size, dtype=torch.float64)
+def well_conditioned(size: int) -> Array:
+    root = np.random.default_rng(0).standard_normal((size, size))
+    return root @ root.T + np.eye(size)
 
 
 def test_factor_solves_whitens_and_has_the_log_determinant() -> None:
     matrix = well_conditioned(6)
     factor, right = cholesky(matrix), well_conditioned(6)[:, :2]
     assert factor.jitter == 0
-    assert torch.allclose(matrix @ factor.solve(right), right, rtol=0, atol=1e-12)
-    assert torch.allclose(factor.solve(right[:, 0]), factor.solve(right)[:, 0], rtol=0, atol=1e-14)
+    assert np.allclose(matrix @ factor.solve(right), right, rtol=0, atol=1e-12)
+    assert np.allclose(factor.solve(right[:, 0]), factor.solve(right)[:, 0], rtol=0, atol=1e-14)
     white = factor.whiten(right)
-    assert torch.allclose(white.T @ white, right.T @ torch.linalg.inv(matrix) @ right, rtol=1e-10, atol=0)
-    assert torch.allclose(factor.log_determinant(), torch.linalg.slogdet(matrix).logabsdet, rtol=1e-12, atol=0)
+    assert np.allclose(white.T @ white, right.T @ np.linalg.inv(matrix) @ right, rtol=1e-10, atol=0)
+    assert np.allclose(factor.log_determinant(), np.linalg.slogdet(matrix).logabsdet, rtol=1e-12, atol=0)
 
 
 @pytest.mark.parametrize("jitter", [1e-12, 1e-11, 1e-10, 1e-9, 1e-8])
 def test_smallest_jitter_that_works_is_taken_and_reported(jitter: float) -> None:
-    matrix = torch.diag(torch.tensor([2.0, 4.0, 6.0, 0.0]).double())
+    matrix = np.diag(np.array([2.0, 4.0, 6.0, 0.0]))
     # off by half of what this jitter adds, five times what the one before it adds
     matrix[3, 3] = -0.5 * jitter * 3.0
     factor = cholesky(matrix)
     assert factor.jitter == pytest.approx(jitter * 3.0, rel=1e-6)
-    shifted = matrix + factor.jitter * torch.eye(4, dtype=torch.float64)
-    assert torch.allclose(factor.lower @ factor.lower.T, shifted, rtol=1e-12, atol=1e-25)
+    shifted = matrix + factor.jitter * np.eye(4)
+    assert np.allclose(factor.lower @ factor.lower.T, shifted, rtol=1e-12, atol=1e-25)
 
 
 def test_singular_matrix_takes_little_jitter_and_any_other_that_has_no_factor_is_refused() -> None:
-    assert 0 < cholesky(torch.ones(4, 4, dtype=torch.float64)).jitter <= 1e-11
-    matrix = torch.diag(torch.tensor([1.0, 1.0, -1e-6]).double())
+    assert 0 < cholesky(np.ones((4, 4))).jitter <= 1e-11
+    matrix = np.diag(np.array([1.0, 1.0, -1e-6]))
     with pytest.raises(NotPositiveDefiniteError, match="size 3 is not positive definite"):
         cholesky(matrix)
     matrix[2, 1] = float("nan")

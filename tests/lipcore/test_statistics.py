@@ -5,12 +5,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 import lipcore
-from lipcore.data.motion import Motion
+from lipcore.data.motion import Array, Motion
 from lipcore.fitting.options import FitOptions
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
@@ -35,39 +34,38 @@ from tests.lipcore.oracles import random_problem
 from tests.service.data import QUICK, stream
 
 TYPES = ("revolute", "prismatic", "revolute")
-NOISE = torch.tensor([0.04, 0.01, 0.09], dtype=torch.float64)
+NOISE = np.array([0.04, 0.01, 0.09])
 
 
-def problem(seed: int, samples: int = 12) -> tuple[Basis, Motion, torch.Tensor]:
+def problem(seed: int, samples: int = 12) -> tuple[Basis, Motion, Array]:
     """A basis of fewer torques than there are samples, and samples that it does not cover entirely."""
     found = random_problem(TYPES, samples, seed, "chain")
     kernel = SumKernel(found.kernel, FrictionKernel(len(TYPES)))
-    basis = Basis.build(kernel, found.params, found.motion[:4], torch.tensor([0, 1, 3, 5, 8, 10]))
-    generator = torch.Generator().manual_seed(seed)
-    return basis, found.motion, torch.randn((samples, len(TYPES)), generator=generator, dtype=torch.float64)
+    basis = Basis.build(kernel, found.params, found.motion[:4], np.array([0, 1, 3, 5, 8, 10]))
+    return basis, found.motion, np.random.default_rng(seed).standard_normal((samples, len(TYPES)))
 
 
 def same(one: Statistics, other: Statistics, tolerance: float = 1e-8) -> bool:
-    scale = float(other.a.abs().max()) + 1e-30
+    scale = float(np.abs(other.a).max()) + 1e-30
     return (
-        torch.allclose(one.a, other.a, rtol=0, atol=tolerance * scale)
-        and torch.allclose(one.b, other.b, rtol=0, atol=tolerance * scale)
+        np.allclose(one.a, other.a, rtol=0, atol=tolerance * scale)
+        and np.allclose(one.b, other.b, rtol=0, atol=tolerance * scale)
         and abs(one.samples - other.samples) <= tolerance * max(1.0, other.samples)
     )
 
 
-def dense(basis: Basis, motion: Motion, residual: torch.Tensor) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def dense(basis: Basis, motion: Motion, residual: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Φᵀ (N n, M), noise variances and residuals as NumPy arrays, sample by sample, one query at a time."""
     rows, variances = [], []
     for k in range(len(motion)):
         one = motion[k : k + 1]
-        features = basis.features(one).numpy()
+        features = basis.features(one)
         rows.append(features.T)
         assert basis.term is not None
-        prior = basis.term.variance(basis.params, one)[0].diagonal().numpy()
+        prior = basis.term.variance(basis.params, one)[0].diagonal()
         open_ = prior - np.square(features[: len(basis.outputs)]).sum(0)
-        variances.append(NOISE.numpy() + np.maximum(open_, 0.0))
-    return np.concatenate(rows), np.concatenate(variances), residual.numpy().reshape(-1)
+        variances.append(NOISE + np.maximum(open_, 0.0))
+    return np.concatenate(rows), np.concatenate(variances), residual.reshape(-1)
 
 
 @given(st.integers(0, 10_000), st.permutations(range(12)), st.lists(st.integers(1, 11), unique=True, max_size=4))
@@ -79,7 +77,7 @@ def test_all_at_once_in_parts_in_any_order_and_one_by_one_are_the_same(
     parts, one_by_one = empty(len(basis)), empty(len(basis))
     edges = [0, *sorted(cuts), 12]
     for first, last in pairwise(edges):
-        rows = torch.tensor(order[first:last])
+        rows = np.array(order[first:last])
         parts = merge(collect(basis, NOISE, motion[rows], residual[rows]), parts)
     for k in order:
         one_by_one = update(one_by_one, basis, NOISE, motion[k : k + 1], residual[k : k + 1])
@@ -100,31 +98,30 @@ def test_what_is_added_can_be_taken_back_and_ages_factor(seed: int, first: float
 def test_sums_are_those_of_every_sample_by_itself_and_their_solution_that_of_linear_regression() -> None:
     basis, motion, residual = problem(5)
     rows, variances, values = dense(basis, motion, residual)
-    counts = torch.arange(1, 13, dtype=torch.float64) / 6
-    variances = variances / np.repeat(counts.numpy(), 3)
+    counts = np.arange(1, 13) / 6
+    variances = variances / np.repeat(counts, 3)
     found = collect(basis, NOISE, motion, residual, counts)
-    assert np.allclose(found.a.numpy(), rows.T @ (rows / variances[:, None]), rtol=1e-10, atol=1e-10)
-    assert np.allclose(found.b.numpy(), rows.T @ (values / variances), rtol=1e-10, atol=1e-10)
+    assert np.allclose(found.a, rows.T @ (rows / variances[:, None]), rtol=1e-10, atol=1e-10)
+    assert np.allclose(found.b, rows.T @ (values / variances), rtol=1e-10, atol=1e-10)
     assert found.samples == pytest.approx(13.0)
-    assert torch.equal(found.a, found.a.T)
-    centre = torch.randn(len(basis), generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    assert np.array_equal(found.a, found.a.T)
+    centre = np.random.default_rng(2).standard_normal(len(basis))
     solution = solve(found, centre)
     # the dual form: conditioning on the N n values themselves
     gain = rows.T @ np.linalg.inv(rows @ rows.T + np.diag(variances))
-    assert np.allclose(solution.mean.numpy(), centre.numpy() + gain @ (values - rows @ centre.numpy()), atol=1e-9)
-    assert np.allclose(np.eye(len(basis)) - solution.covariance.numpy(), gain @ rows, atol=1e-9)
+    assert np.allclose(solution.mean, centre + gain @ (values - rows @ centre), atol=1e-9)
+    assert np.allclose(np.eye(len(basis)) - solution.covariance, gain @ rows, atol=1e-9)
 
 
 def test_large_products_are_symmetric_and_those_of_small_ones() -> None:
     found = random_problem(TYPES, 100, 6, "chain")
-    basis = Basis.build(found.kernel, found.params, found.motion, torch.arange(300))  # more than one block
-    residual = torch.randn((100, 3), generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    basis = Basis.build(found.kernel, found.params, found.motion, np.arange(300))  # more than one block
+    residual = np.random.default_rng(1).standard_normal((100, 3))
     whole = collect(basis, NOISE, found.motion, residual)
-    features = basis.features(found.motion) * (
-        (NOISE + basis.uncovered(found.motion, basis.features(found.motion))).rsqrt().reshape(-1)
-    )
-    assert torch.allclose(whole.a, features @ features.T, rtol=1e-12, atol=1e-9)
-    assert torch.equal(whole.a, whole.a.T)
+    features = basis.features(found.motion)
+    features /= np.sqrt(NOISE + basis.uncovered(found.motion, features)).reshape(-1)
+    assert np.allclose(whole.a, features @ features.T, rtol=1e-12, atol=1e-9)
+    assert np.array_equal(whole.a, whole.a.T)
 
 
 @pytest.mark.parametrize(("count", "largest"), [(3, 1e2), (20, 1e2), (60, 1e2), (60, 1e5)])
@@ -134,35 +131,33 @@ def test_what_is_learnt_is_exact_and_triangular(first: int, count: int, largest:
     generator = np.random.default_rng(count)
     columns = generator.standard_normal((20, count)) * np.geomspace(1, largest, 20)[:, None]
     b, centre = generator.standard_normal(20), generator.standard_normal(20)
-    found = solve(
-        Statistics(torch.from_numpy(columns @ columns.T), torch.from_numpy(b), count), torch.from_numpy(centre), first
-    )
+    found = solve(Statistics(columns @ columns.T, b, count), centre, first)
     # from the columns and not from their products, whose condition number is the square
     vectors, values, _ = np.linalg.svd(columns)
     values = np.concatenate([values, np.zeros(20 - len(values))]) ** 2
     learnt = (vectors * (values / (1 + values))) @ vectors.T
     mean = (vectors / (1 + values)) @ vectors.T @ (centre + b)
-    assert np.allclose(np.eye(20) - found.covariance.numpy(), learnt, rtol=0, atol=1e-10)
-    assert np.allclose(found.mean.numpy(), mean, rtol=0, atol=1e-9)
-    assert torch.count_nonzero(found.root.triu(1)) == 0
+    assert np.allclose(np.eye(20) - found.covariance, learnt, rtol=0, atol=1e-10)
+    assert np.allclose(found.mean, mean, rtol=0, atol=1e-9)
+    assert np.count_nonzero(np.triu(found.root, 1)) == 0
     again = known(found.mean, found.covariance, first)
-    assert np.allclose(again.covariance.numpy(), found.covariance.numpy(), rtol=0, atol=1e-9)
+    assert np.allclose(again.covariance, found.covariance, rtol=0, atol=1e-9)
     whole = learnt_root(found.covariance)
-    assert np.allclose((whole.T @ whole).numpy(), learnt, rtol=0, atol=1e-10)
-    assert torch.count_nonzero(whole.triu(1)) == 0
+    assert np.allclose((whole.T @ whole), learnt, rtol=0, atol=1e-10)
+    assert np.count_nonzero(np.triu(whole, 1)) == 0
 
 
 @pytest.mark.parametrize("first", [0, 7, 20])
 def test_eigenvalues_say_the_same_where_rounding_has_gone_too_far(first: int, monkeypatch) -> None:
     columns = np.random.default_rng(0).standard_normal((20, 3)) * np.geomspace(1, 100, 20)[:, None]
-    sums = Statistics(torch.from_numpy(columns @ columns.T), torch.ones(20).double(), 3)
+    sums = Statistics(columns @ columns.T, np.ones(20), 3)
     expected = solve(sums, None, first)
     monkeypatch.setattr("lipcore.posterior.statistics._by_cholesky", lambda a: None)
     found = solve(sums, None, first)
-    assert np.allclose(found.covariance.numpy(), expected.covariance.numpy(), rtol=0, atol=1e-9)
-    assert np.allclose(found.mean.numpy(), expected.mean.numpy(), rtol=0, atol=1e-9)
-    assert not torch.equal(found.root, expected.root)
-    assert torch.count_nonzero(found.root.triu(1)) == 0
+    assert np.allclose(found.covariance, expected.covariance, rtol=0, atol=1e-9)
+    assert np.allclose(found.mean, expected.mean, rtol=0, atol=1e-9)
+    assert not np.array_equal(found.root, expected.root)
+    assert np.count_nonzero(np.triu(found.root, 1)) == 0
 
 
 @pytest.mark.parametrize("factor", [-0.1, 1.1, float("nan")])
@@ -175,7 +170,7 @@ def test_statistics_of_no_samples_are_refused() -> None:
     basis, motion, residual = problem(10)
     statistics = collect(basis, NOISE, motion, residual)
     with pytest.raises(NotPositiveDefiniteError, match="none below zero"):
-        solve(replace(statistics, a=statistics.a - torch.eye(len(basis), dtype=torch.float64)))
+        solve(replace(statistics, a=statistics.a - np.eye(len(basis))))
 
 
 TWO = ["revolute"] * 2
@@ -220,16 +215,16 @@ def test_the_fast_sum_is_that_of_the_statistics(estimator, samples):
     for part in (slice(0, 77), slice(77, 200)):
         summing.add(total, samples.rows(part), weights[part])
     motion, slow = samples.motion(), empty(len(posterior.basis))
-    residual = samples.torque() - posterior.kernel.mean(motion)
+    residual = samples.tau - posterior.kernel.mean(motion)
     for row in range(len(samples)):
-        one, weight = slice(row, row + 1), torch.tensor(weights[row : row + 1])
+        one, weight = slice(row, row + 1), np.array(weights[row : row + 1])
         slow = merge(
             slow, collect(posterior.basis, posterior.row_variance(motion[one]), motion[one], residual[one], weight)
         )
-    a = total.a + np.tril(total.a, -1).T
-    assert np.abs(a - slow.a.numpy()).max() <= 1e-8 * slow.a.abs().max()
-    assert np.abs(total.b - slow.b.numpy()).max() <= 1e-8 * slow.b.abs().max()
-    assert np.array_equal(total.packed(), total.a.T[np.triu_indices(len(a))])
+    a = total.a + np.triu(total.a, 1).T
+    assert np.abs(a - slow.a).max() <= 1e-8 * np.abs(slow.a).max()
+    assert np.abs(total.b - slow.b).max() <= 1e-8 * np.abs(slow.b).max()
+    assert np.array_equal(total.packed(), total.a[np.triu_indices(len(a))])
 
 
 def test_the_form_of_other_devices_sums_alike(few, samples):
@@ -238,7 +233,7 @@ def test_the_form_of_other_devices_sums_alike(few, samples):
     summing = Summing.of(few.posterior)
     summing.add(fast, samples)
     found = summing._elsewhere(slow, samples, np.ones(len(samples)))
-    np.testing.assert_allclose(np.tril(found.T @ found), fast.a, rtol=1e-8, atol=1e-8 * np.abs(fast.a).max())
+    np.testing.assert_allclose(np.triu(found.T @ found), fast.a, rtol=1e-8, atol=1e-8 * np.abs(fast.a).max())
     np.testing.assert_allclose(slow.b, fast.b, rtol=1e-8, atol=1e-8 * np.abs(fast.b).max())
 
 

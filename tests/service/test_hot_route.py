@@ -182,7 +182,6 @@ def test_the_echo(api, body, given, answered):
 
 COUNT_THREADS = """
 import asyncio, sys
-import torch
 from anyio import to_thread
 from threadpoolctl import threadpool_info
 from service.app import create_app
@@ -191,7 +190,6 @@ from service.foundation.settings import Settings
 async def main():
     app = create_app(Settings(home=sys.argv[1]))
     async with app.router.lifespan_context(app):
-        print(torch.get_num_threads(), await to_thread.run_sync(torch.get_num_threads))
         print(*(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
 
 asyncio.run(main())

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import torch
 from fastapi.testclient import TestClient
 from hypothesis import given
 from hypothesis import strategies as st
@@ -156,7 +155,7 @@ def test_json_of_any_kind_is_answered_or_refused(api, trained, data):
 
 
 def test_inertia_that_cannot_be_inverted_is_refused_naming_the_query(api, trained, monkeypatch):
-    singular = torch.eye(2, dtype=torch.float64).repeat(3, 1, 1)
+    singular = np.tile(np.eye(2), (3, 1, 1))
     singular[1, 1, 1] = -0.1
     monkeypatch.setattr(dynamics, "inertia_matrix", lambda *_: singular)
     batch = {name: np.tile(values, (3, 1)) for name, values in (MOTION | {"tau": [0.0, 0.0]}).items()}

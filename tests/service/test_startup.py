@@ -12,7 +12,7 @@ from service import __version__
 from service.foundation.settings import shipped_models
 from tests.packaging.test_pieces import BASE
 
-NUMERICS = ("numpy", "torch", "scipy", "numba")
+NUMERICS = ("numpy", "scipy", "numba")
 FITTING = ("scipy.optimize", "scipy.signal", "scipy.stats")
 CLIENTS = ("httpx", "lipserve.sending", "lipserve.stream", "service.cli.demo", "benchmarks", "matplotlib", "pandas")
 OF_EXTRAS = {module for each in EXTRAS.values() for module in each.modules if module not in BASE}
@@ -30,7 +30,7 @@ def imported(statement):
 @pytest.mark.slow
 def test_the_command_that_serves_imports_no_client_and_no_experiment():
     result = imported("import service.cli.serve")
-    assert {"service.app", "fastapi"} <= result
+    assert {"service.app", "numba", "fastapi"} <= result
     assert result.isdisjoint((*FITTING, *CLIENTS, *OF_EXTRAS))
 
 

@@ -7,13 +7,12 @@ from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from lipcore.data.motion import Motion
-from lipcore.kernels.base import Array, Cross, PairKernel, Params
+from lipcore.data.motion import Array, Motion
+from lipcore.kernels.base import Cross, PairKernel, Params
 from lipcore.kernels.compiled.joints import Flags, columns, read_rows
 from lipcore.kernels.compiled.lanes import LANES
+from lipcore.kernels.compiled.pairs import Hyper
 from lipcore.kernels.compiled.views import Memory
 from lipcore.vocabulary import JointType
 
@@ -28,52 +27,52 @@ class Driver(NamedTuple):
 
 
 class CompiledKernel(PairKernel):
-    """A pair kernel whose Gram matrices and gradients are compiled; on devices other than the CPU torch does it all."""
+    """A pair kernel whose Gram matrices and gradients are compiled. Of tensors, its formula makes them."""
 
     driver: ClassVar[Driver]
     joint_types: tuple[JointType, ...]
 
     @abstractmethod
-    def hyper(self, params: Params) -> tuple[Tensor, Tensor, Tensor]:
-        """`pairs.Hyper`: shares (E, n, 3), scales (n,) and weights (n, n), differentiable in params."""
+    def hyper(self, params: Params) -> Hyper:
+        """What compiled code takes of the hyperparameters: shares (E, n, 3), scales (n,) and weights (n, n)."""
 
-    def gram(self, params: Params, x: Motion, y: Motion) -> Tensor:
+    @abstractmethod
+    def hyper_adjoint(self, hyper: Hyper, slopes: Hyper) -> dict[str, Array]:
+        """Derivatives by each hyperparameter. hyper: what `hyper` has made of them; slopes: derivatives by that."""
+
+    def gram(self, params: Params, x: Motion, y: Motion) -> Array:
         """Covariance of all torques of x with all of y: (N n, M n)."""
-        return super().gram(params, x, y) if x.device.type != "cpu" else self._gram(params, x, y, symmetric=False)
+        return self._gram(params, x, y, symmetric=False) if isinstance(x.q, np.ndarray) else super().gram(params, x, y)
 
-    def symmetric_gram(self, params: Params, x: Motion) -> Tensor:
+    def symmetric_gram(self, params: Params, x: Motion) -> Array:
         """Covariance of all torques of x with each other, (N n, N n), exactly symmetric."""
-        if x.device.type != "cpu":
+        if not isinstance(x.q, np.ndarray):
             return super().symmetric_gram(params, x)
         return self._gram(params, x, x, symmetric=True)
 
-    def gradient(self, params: Params, x: Motion, weight: Tensor) -> dict[str, Tensor]:
-        """Derivative of Σ weight ∘ gram(x, x) by each hyperparameter: compiled by `hyper`, from there on autograd's."""
-        if x.device.type != "cpu":
-            return super().gradient(params, x, weight)
-        n, size = self.n_joints, len(x)
-        leaves = {name: params[name].detach().clone().requires_grad_(True) for name in self.names()}
-        hyper = self.hyper(leaves)
+    def gradient(self, params: Params, x: Motion, weight: Array) -> dict[str, Array]:
+        """Derivative of Σ weight ∘ gram(x, x) by each hyperparameter: compiled by `hyper`, the rest by its adjoint."""
+        n, size, hyper = self.n_joints, len(x), self.hyper(params)
         rows = read_rows(x.arrays(), self._prismatic())
         memory = _memory(rows, hyper, self.driver.size(n))
-        sums = np.zeros(LANES * sum(part.numel() for part in hyper))
-        by_sample = weight.contiguous().reshape(size, n, size, n).numpy()
-        self.driver.gradient(memory, len(hyper[0]), rows, by_sample, sums)
-        derivatives = torch.from_numpy(sums.reshape(-1, LANES).sum(1))
-        torch.dot(torch.cat([part.reshape(-1) for part in hyper]), derivatives).backward()  # type: ignore[no-untyped-call]
-        return {name: torch.zeros_like(leaf) if leaf.grad is None else leaf.grad for name, leaf in leaves.items()}
+        sums = np.zeros(LANES * sum(part.size for part in hyper))
+        by_sample = np.ascontiguousarray(weight).reshape(size, n, size, n)
+        self.driver.gradient(memory, len(hyper.shares), rows, by_sample, sums)
+        parts = np.split(sums.reshape(-1, LANES).sum(1), np.cumsum([part.size for part in hyper])[:-1])
+        slopes = Hyper(*(slope.reshape(part.shape) for slope, part in zip(parts, hyper, strict=True)))
+        return self.hyper_adjoint(hyper, slopes)
 
     def cross(self, params: Params, inducing: Motion) -> Cross:
         """Covariance of one query with the inducing samples and itself, for serving."""
         return CompiledCross(self.driver, self.hyper(params), self._prismatic(), inducing)
 
-    def _gram(self, params: Params, x: Motion, y: Motion, symmetric: bool) -> Tensor:
+    def _gram(self, params: Params, x: Motion, y: Motion, symmetric: bool) -> Array:
         n, hyper, prismatic = self.n_joints, self.hyper(params), self._prismatic()
         rows = read_rows(x.arrays(), prismatic)
         others = rows if symmetric else read_rows(y.arrays(), prismatic)
         out = np.empty((len(x), n, len(y), n))
-        self.driver.gram(_memory(others, hyper, self.driver.size(n)), len(hyper[0]), rows, symmetric, out)
-        return torch.from_numpy(out).reshape(len(x) * n, len(y) * n)
+        self.driver.gram(_memory(others, hyper, self.driver.size(n)), len(hyper.shares), rows, symmetric, out)
+        return out.reshape(len(x) * n, len(y) * n)
 
     def _prismatic(self) -> Flags:
         return np.array([kind == "prismatic" for kind in self.joint_types])
@@ -82,13 +81,11 @@ class CompiledKernel(PairKernel):
 class CompiledCross(Cross):
     """`Cross` of a kernel with a driver. hyper: of `CompiledKernel.hyper`; prismatic: (n,)."""
 
-    def __init__(
-        self, driver: Driver, hyper: tuple[Tensor, Tensor, Tensor], prismatic: Flags, inducing: Motion
-    ) -> None:
+    def __init__(self, driver: Driver, hyper: Hyper, prismatic: Flags, inducing: Motion) -> None:
         self.size, self.n_joints = len(inducing), inducing.n_joints
-        self._run, self._kernels, self._prismatic = driver.cross, len(hyper[0]), prismatic
+        self._run, self._kernels, self._prismatic = driver.cross, len(hyper.shares), prismatic
         work = 6 * self.n_joints + driver.size(self.n_joints)
-        self._memory = Memory([columns(read_rows(inducing.arrays(), prismatic), 1), *_arrays(hyper)], work)
+        self._memory = Memory([columns(read_rows(inducing.arrays(), prismatic), 1), *hyper], work)
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write the covariances of one query."""
@@ -99,9 +96,5 @@ class CompiledCross(Cross):
         self._run(self._memory.flat, self._kernels, self._prismatic, motions, out)
 
 
-def _memory(others: Array, hyper: tuple[Tensor, Tensor, Tensor], work: int) -> Array:
-    return Memory([columns(others, 0), *_arrays(hyper)], work).flat
-
-
-def _arrays(hyper: tuple[Tensor, Tensor, Tensor]) -> list[Array]:
-    return [part.detach().cpu().numpy() for part in hyper]
+def _memory(others: Array, hyper: Hyper, work: int) -> Array:
+    return Memory([columns(others, 0), *hyper], work).flat

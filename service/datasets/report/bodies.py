@@ -99,7 +99,7 @@ class Bodies:
         kernel = ArmKernel(replace(self._arm, geometry=replace(self._arm.geometry, gravity=np.array(down, np.float64))))
         weights = kernel.prior_weights()
         assert weights is not None
-        return kernel.torque(weights.numpy(), Motion.from_arrays(q, dq, ddq))
+        return kernel.torque(weights, Motion.from_arrays(q, dq, ddq))
 
     def parts(self, signals: Signals) -> tuple[Array, Array]:
         """Torques of gravity and of the rest, (R, n) each."""

@@ -302,7 +302,7 @@ def _regressors(kernel: ArmKernel, q: Array, dq: Array, ddq: Array) -> Iterator[
     rows = max(1, CHUNK // q.shape[1])
     for first in range(0, len(q), rows):
         part = slice(first, first + rows)
-        features = kernel.features(Motion.from_arrays(q[part], dq[part], ddq[part])).numpy()
+        features = kernel.features(Motion.from_arrays(q[part], dq[part], ddq[part]))
         masses = features[:, :, : PARAMETERS * q.shape[1]]
         yield first, masses.reshape(-1, masses.shape[2])
 

@@ -242,14 +242,14 @@ def predict(
     model = served.model if carrying is None else carrying
     codes, predicted = rows.code.copy(), rows.code == LEARNT
     asked = predicted | ((codes == STATIONARY) & np.isfinite(rows.ddq).all(axis=1))
-    good, floor = rows.take(asked), model.posterior.floor.numpy()
+    good, floor = rows.take(asked), model.posterior.floor
     if answered is None:
         mean, bare = _answers(good, model)
         std = np.sqrt(np.maximum(bare**2, floor))
     else:
         mean, std = (values[asked] for values in answered)
         bare = _answers(good, model)[1] if floor.any() else std
-    known = np.isfinite(mean).all(axis=1) & np.isfinite(std).all(axis=1)
+    known = np.asarray(np.isfinite(mean).all(axis=1) & np.isfinite(std).all(axis=1))
     score = scores(good.tau[known] - mean[known], std[known], model.noise_std)
     seen = Seen(good.time[known], score, None if factor is None else factor[asked][known])
     answerable = asked.copy()

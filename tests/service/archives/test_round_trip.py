@@ -83,7 +83,7 @@ def test_version_knows_its_software_hyperparameters_and_metrics(api, trained):
     version = api.get(f"/v1/models/{trained.name}/versions/1").json()
     params = trained.model.posterior.params
     assert version["hyperparameters"] == {name: value.tolist() for name, value in params.items()}
-    assert version["lineage"]["software"].keys() >= {"lipserve", "model_format", "python", "torch", "numpy"}
+    assert version["lineage"]["software"].keys() >= {"lipserve", "model_format", "python", "scipy", "numpy"}
     assert version["calibration"] == {"function_std_factor": trained.model.calibration.function_std_factor}
     metrics = version["lineage"]["training_metrics"]
     answer = trained.model.predict(trained.samples.q, trained.samples.dq, trained.samples.ddq)

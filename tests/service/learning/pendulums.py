@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 import lipcore
 from lipcore import FitOptions, Samples, TorqueModel
@@ -168,7 +167,7 @@ def at_once(numbers: Iterable[int] = (), parts: Iterable[Rows] = ()) -> tuple[np
     learnt = [*(rows(number) for number in numbers), *parts]
     if learnt:
         every = Rows.concatenate(learnt).learnt
-        residual = torch.from_numpy(every.tau) - posterior.kernel.mean(every.motion())
+        residual = every.tau - posterior.kernel.mean(every.motion())
         known = merge(known, collect(posterior.basis, posterior.row_variance(every.motion()), every.motion(), residual))
     noise, misfit = posterior.noise_variance, posterior.misfit
     built = CompactPosterior.build(posterior.kernel, posterior.basis, known, noise, posterior.std_factor, misfit)

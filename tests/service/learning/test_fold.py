@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from sqlalchemy import delete
+from threadpoolctl import threadpool_limits
 
 import lipcore
 from lipcore.online import transfer
@@ -165,7 +165,7 @@ def test_long_logs_too(pieces, page_rows, start):
 
 def make(home: Path, page_rows: int, connection) -> None:
     """Make the state of a log in a process, and send a digest of it and of the answers that are solved from it."""
-    torch.set_num_threads(1)
+    threadpool_limits(1)
     course.PAGE_ROWS = page_rows
     database, files = Database(home), Files(home)
     base = lipcore.load(files.version_folder(registry.find(database, ARM, 1).folder))
