@@ -73,8 +73,10 @@ def test_options_say_how_a_file_is_read(visitor: Visitor) -> None:
     page.get_by_role("button", name="Upload", exact=True).click()
     page.get_by_role("link", name="Read its report").click()
     expect(page.get_by_role("heading", level=1, name="current.npz")).to_be_visible()
+    page.get_by_role("tab", name="Preparation").click()
     expect(page.get_by_text("torque is current times 2, 4 N·m/A")).to_be_visible()
-    expect(page.get_by_text("shoulder, elbow").first).to_be_visible()
+    page.get_by_text("samples of 2 joints").click()
+    expect(page.get_by_text("Joints: shoulder, elbow")).to_be_visible()
 
 
 def test_lines_break_between_episodes(visitor: Visitor, dashboard: Dashboard) -> None:

@@ -5,6 +5,7 @@ import { h, replace } from "../dom.js";
 import { card, errorBox, field, heading, notice, select } from "../ui.js";
 import { robotSelect, robots } from "./data/robots.js";
 import { advancedOptions } from "./train/advanced.js";
+import { rowsOf } from "./data/stretch.js";
 import { datasetChoice } from "./train/choice.js";
 import { ESTIMATORS, estimatorChoice } from "./train/estimators.js";
 import { holdoutChoice } from "./train/holdout.js";
@@ -15,7 +16,7 @@ const PROMOTION = [
   ["always", "let it answer in any case"],
 ];
 
-/** The page `#/train`; `?datasets=ID,ID&model=NAME` chooses beforehand. */
+/** The page `#/train`; `?datasets=ID,ID&model=NAME` chooses beforehand, `&hold_out=300-450` rows of the one data set. */
 export async function render(view, { query }, { signal, title }) {
   title("Train a model");
   const [datasets, models] = await Promise.all([
@@ -42,7 +43,8 @@ export async function render(view, { query }, { signal, title }) {
     const said = new Set(picked.map((each) => each.report.robot));
     if (said.size === 1 && !robot.select.value) robot.choose([...said][0]);
   });
-  const holdout = holdoutChoice();
+  const rows = preselected.length === 1 ? rowsOf(query.get("hold_out")) : null;
+  const holdout = holdoutChoice(rows && { [preselected[0]]: [rows] });
   const promotion = select(PROMOTION, "");
   promotion.name = "promotion";
   const advanced = advancedOptions(signal);
