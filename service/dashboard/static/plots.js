@@ -67,7 +67,8 @@ export function colours(n) {
   return Array.from({ length: n }, (_, index) => jointColour(index));
 }
 
-const CONFIG = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+// without its bar of buttons: they cannot be reached by keys in what is a picture, and one would send the plot to another host
+const CONFIG = { responsive: true, displayModeBar: false };
 
 function painted(traces) {
   return traces.flat().map(({ colour, filled, ...trace }) => {
@@ -87,7 +88,6 @@ function themed({ title = "", x = "", y = "", height = 300, ...rest }) {
     margin: { l: 56, r: 16, t: title ? 40 : 16, b: 44 },
     legend: { orientation: "h", y: -0.22, yanchor: "top" },
     hovermode: "x unified",
-    modebar: { bgcolor: "rgba(0,0,0,0)", color: css("muted"), activecolor: css("accent") },
     ...rest,
     title: title ? { text: title, x: 0, xanchor: "left", font: { size: 15 } } : undefined,
     height,
