@@ -86,6 +86,7 @@ def ready(visitor: Visitor, name: str) -> None:
     if name == "live":
         expect(page.get_by_role("region", name="Innovation").locator(".linked")).to_be_attached()
         expect(page.get_by_role("region", name="External torque")).to_be_visible()
+        expect(page.get_by_role("img", name="over the last 10 seconds, large")).to_be_attached()
     if name == "data-set-signals":
         expect(page.locator(".strip .linked")).to_have_count(4)
 

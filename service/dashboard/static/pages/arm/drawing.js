@@ -21,11 +21,11 @@ export function drawable() {
 }
 
 /** Draw the arm of a version into an element; at(q) is where to begin. Returns {draw(q, joint)}, which moves it; joint: whose axis is thick. */
-export async function drawing(element, { joint_names: names, parameters, training_range: range }, q, { height = 460, signal }) {
+export async function drawing(element, { joint_names: names, parameters, training_range: range }, q, { height = 460, legend = true, signal }) {
   const arm = new Arm(names, parameters, range);
   const label = `The arm in 3-D, ${names.length} joints from base to tip: ${arm.names.join(", ")}. The tables hold the same numbers.`;
   let last = q;
-  const layout = (shown) => ({ ...arm.layout(shown), height });
+  const layout = (shown) => ({ ...arm.layout(shown), height, ...(legend ? {} : { showlegend: false }) });
   const first = arm.at(last);
   const made = await plot(element, arm.traces(first), layout(first), { label, signal });
   const draw = (positions, thick = arm.thick) => {

@@ -23,10 +23,10 @@ export function moving(place, name, pose, signal) {
     const found = await shown(name, number, signal);
     if (!found?.parameters?.geometry || !drawable()) return replace(place);
     const figure = h("div", { style: `height: ${HEIGHT}px` });
-    replace(place, card("The arm", figure, h("p", { class: "hint" }, `At the positions of the newest row. ${CANNOT}`)));
+    replace(place, card("The arm", figure, h("p", { class: "hint" }, `At the positions of the newest row; the joint that is shown large is thick. ${CANNOT}`)));
     watch.disconnect();
     watch.observe(figure);
-    made = await drawing(figure, found, q, { height: HEIGHT, signal: left.signal });
+    made = await drawing(figure, found, q, { height: HEIGHT, legend: false, signal: left.signal });
   };
   return {
     async draw(status, joint) {

@@ -20,10 +20,10 @@ export function lately(rows, joints) {
   return worst;
 }
 
-/** The joint with the largest of these numbers; the one before stays unless another is clearly larger. */
-export function largest(scores, before = 0) {
+/** The joint with the largest of these numbers; the one before, if not null, stays unless another is clearly larger. */
+export function largest(scores, before) {
   const top = scores.indexOf(Math.max(...scores));
-  return scores[top] > STAYS * (scores[before] ?? 0) ? top : before;
+  return before === null || scores[top] > STAYS * scores[before] ? top : before;
 }
 
 /**

@@ -42,7 +42,7 @@ export function torque(place, joints, types, view, linked, { pick, signal }) {
     ),
   );
 
-  let shown = 0, last = [];
+  let shown = null, chosen = false, last = [];
   const draw = async (each, joint, range, label) => {
     const rows = thin(last, each.size.most);
     const reach = reached(rows, joint);
@@ -73,7 +73,8 @@ export function torque(place, joints, types, view, linked, { pick, signal }) {
     async draw(rows) {
       last = rows;
       const scores = lately(rows, joints);
-      shown = view.joint ?? largest(scores, shown);
+      shown = view.joint ?? largest(scores, chosen ? null : shown);
+      chosen = view.joint !== null;
       large.title.textContent = short[shown];
       large.element.style.setProperty("--own", jointVar(shown));
       why.textContent = view.joint === null ? `largest innovation of the last seconds: ${number(scores[shown], 2)} σ` : "chosen by you";
