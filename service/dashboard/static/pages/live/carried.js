@@ -41,9 +41,9 @@ export function externalCard(rows, joints, types) {
   const far = found.flatMap((each, joint) => (each && Math.abs(each.mean) > FAR * each.std ? [short[joint]] : []));
   return card(
     "External torque",
-    h("p", {}, far.length ? badge(`something acts on ${far.join(", ")}`, "warn") : badge("nothing acts on it", "good")),
+    h("p", {}, far.length ? badge(`something acts on ${far.join(", ")}`, "warn") : badge("nothing beyond what the model is unsure of", "good")),
     h("ul", { class: "forces" }, found.map((each, joint) => h("li", { "data-key": joints[joint] }, h("span", { class: "joint", style: `--own: ${jointVar(joint)}` }, short[joint]), force(each, most, torqueUnit(types[joint]))))),
-    h("p", { class: "hint" }, "Measured − predicted, mean of the last half second. The grey range holds 95 % of single measurements where nothing acts. No safety function."),
+    h("p", { class: "hint" }, "Measured − predicted, mean of the last half second. The grey range holds 95 % of single measurements where nothing acts; it is wide where the model is unsure. No safety function."),
   );
 }
 
