@@ -21,11 +21,12 @@ const TABS = [
 export async function render(view, { id, query }, { signal, title }) {
   const dataset = await get(path`/v1/datasets/${id}`, {}, signal);
   title(dataset.name);
-  const state = { tab: TABS.some(([tab]) => tab === query.get("tab")) ? query.get("tab") : "signals", rows: rowsOf(query.get("hold_out")) };
+  const state = { tab: TABS.some(([tab]) => tab === query.get("tab")) ? query.get("tab") : TABS[0][0], rows: rowsOf(query.get("hold_out")) };
   const train = link("Train on it", "", "primary");
   const remember = () => {
     const held = state.rows ? { hold_out: state.rows.join("-") } : {};
-    history.replaceState(null, "", `#/data/${encodeURIComponent(id)}?${new URLSearchParams({ tab: state.tab, ...held })}`);
+    const seen = new URLSearchParams({ ...(state.tab === TABS[0][0] ? {} : { tab: state.tab }), ...held }).toString();
+    history.replaceState(null, "", `#/data/${encodeURIComponent(id)}${seen && `?${seen}`}`);
     train.setAttribute("href", `#/train?${new URLSearchParams({ datasets: id, ...held })}`);
   };
   const choose = (rows) => {
