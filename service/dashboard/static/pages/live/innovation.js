@@ -30,7 +30,7 @@ export function innovation(place, joints, view, linked, signal) {
       const thinned = thin(rows);
       const x = broken(thinned, (row) => row.x);
       const curves = joints.map((_name, joint) =>
-        line(x, broken(thinned, (row) => clip(score(row, joint))), short[joint], joint, { line: { width: joint === shown ? 2.2 : 0.8 } }),
+        line(x, broken(thinned, (row) => clip(score(row, joint))), short[joint], joint, { line: { width: joint === shown ? 2.2 : 0.8 }, showlegend: false }),
       );
       const traces = [...curves, ...marks(rows, worst, clip)];
       const range = [-span(rows, view.window), 0];
@@ -38,6 +38,7 @@ export function innovation(place, joints, view, linked, signal) {
         y: "σ", height: HEIGHT, margin: { l: 52, r: 8, t: 8, b: 40 }, hovermode: false, dragmode: false,
         xaxis: { range, zeroline: false, ticksuffix: " s", automargin: false },
         yaxis: { range: [-1.05 * top, 1.05 * top], automargin: false },
+        showlegend: true, // of marks: the joints' colours are named above
         legend: { orientation: "h", y: -0.16, yanchor: "top", itemclick: false, itemdoubleclick: false },
         shapes: limits(status.contact_threshold, top),
       };

@@ -115,7 +115,7 @@ export function closest(rows, x) {
 }
 
 function values({ tau, mean }, joint, unit) {
-  const [measured, predicted] = [tau[joint], mean[joint]].map((each) => (each === null ? "–" : each.toFixed(2)));
+  const [measured, predicted] = [tau[joint], mean[joint]].map((each) => (each === null ? "–" : unit ? each.toFixed(2) : number(each, 2)));
   return unit ? `measured ${measured}, predicted ${predicted} ${unit}` : `${measured} | ${predicted}`;
 }
 
