@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import posixpath
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -134,14 +134,14 @@ def _markdown() -> MarkdownIt:
     made.core.ruler.push("guide", _adapt)
     made.add_render_rule("table_open", lambda *_: _SCROLLED)
     made.add_render_rule("table_close", lambda *_: "</table></div>\n")
-    for kind in ("fence", "code_block"):
-        made.renderer.rules[kind] = partial(_reached, made.renderer.rules[kind])
+    made.add_render_rule("fence", lambda self, *arguments: _reached(self.fence(*arguments)))
+    made.add_render_rule("code_block", lambda self, *arguments: _reached(self.code_block(*arguments)))
     return made
 
 
-def _reached(render: Callable[..., str], *arguments: Any) -> str:
+def _reached(block: str) -> str:
     """A block of code that keys reach, as it may have to be scrolled."""
-    return render(*arguments).replace("<pre>", '<pre tabindex="0">', 1)
+    return block.replace("<pre>", '<pre tabindex="0">', 1)
 
 
 def _adapt(state: Any) -> None:
