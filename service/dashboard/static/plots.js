@@ -1,5 +1,6 @@
 // Plots by Plotly, whose JavaScript is loaded when the first one is drawn. Colours follow the page's theme.
 
+import { css, faint, jointColour } from "./colours.js";
 import { h } from "./dom.js";
 
 let loaded = null;
@@ -63,13 +64,7 @@ export function band(x, lower, upper, name, colour) {
 
 /** Colours of n joints, in the page's theme. */
 export function colours(n) {
-  return Array.from({ length: n }, (_, index) => css(`--joint-${(index % 8) + 1}`));
-}
-
-/** A colour of the theme by the name of its CSS variable, without --. */
-export function css(name) {
-  const full = name.startsWith("--") ? name : `--${name}`;
-  return getComputedStyle(document.documentElement).getPropertyValue(full).trim();
+  return Array.from({ length: n }, (_, index) => jointColour(index));
 }
 
 const CONFIG = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
@@ -77,17 +72,12 @@ const CONFIG = { responsive: true, displaylogo: false, modeBarButtonsToRemove: [
 function painted(traces) {
   return traces.flat().map(({ colour, filled, ...trace }) => {
     if (colour === undefined) return trace;
-    const found = typeof colour === "number" ? css(`joint-${(colour % 8) + 1}`) : css(colour) || colour;
+    const found = typeof colour === "number" ? jointColour(colour) : css(colour) || colour;
     const made = { ...trace, line: { color: found, ...trace.line } };
     if (trace.marker || trace.mode?.includes("markers")) made.marker = { color: found, ...trace.marker };
-    if (filled) made.fillcolor = translucent(found);
+    if (filled) made.fillcolor = faint(found, 0.22);
     return made;
   });
-}
-
-function translucent(colour) {
-  const [r, g, b] = [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
-  return `rgba(${r},${g},${b},0.22)`;
 }
 
 function themed({ title = "", x = "", y = "", height = 300, ...rest }) {

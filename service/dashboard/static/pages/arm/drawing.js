@@ -1,7 +1,8 @@
 // The arm that a version has learnt, drawn in 3-D at a posture: links, joint axes, masses, and how sure it is of them.
 
+import { css, faint, jointColour } from "../../colours.js";
 import { shortNames } from "../../format.js";
-import { css, plot } from "../../plots.js";
+import { plot } from "../../plots.js";
 import { add, centres, frames, scaled, times, upright } from "./kinematics.js";
 
 const AXIS = 0.12; // half an axis' length, of the arm's size
@@ -75,7 +76,7 @@ class Arm {
       path(links, { name: "links", line: { color: css("muted"), width: 7 }, hoverinfo: "skip" }),
       path(arms, { name: "to the masses", line: { color: css("line-strong"), width: 2 }, hoverinfo: "skip", connectgaps: false }),
       ...turned.map(({ origin, axis }, place) => path([add(origin, scaled(axis, -half)), add(origin, scaled(axis, half))], {
-        name: this.names[place], line: { color: css(`joint-${(place % 8) + 1}`), width: 9 }, hovertemplate: `${this.names[place]}, ${this.geometry.joints[place].type}<extra></extra>`,
+        name: this.names[place], line: { color: jointColour(place), width: 9 }, hovertemplate: `${this.names[place]}, ${this.geometry.joints[place].type}<extra></extra>`,
       })),
       {
         ...points(masses), type: "scatter3d", mode: "markers", name: "masses", showlegend: false,
@@ -153,9 +154,4 @@ function points(list) {
 
 function cross([a, b, c], [x, y, z]) {
   return [b * z - c * y, c * x - a * z, a * y - b * x];
-}
-
-function faint(colour, opacity) {
-  const [r, g, b] = [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
-  return `rgba(${r},${g},${b},${opacity})`;
 }

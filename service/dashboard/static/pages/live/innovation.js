@@ -1,8 +1,9 @@
 // How far every row was from its prediction, in standard deviations, with marks of what was kept out and what is novel.
 
+import { css } from "../../colours.js";
 import { h, replace } from "../../dom.js";
 import { shortNames } from "../../format.js";
-import { css, line, plot } from "../../plots.js";
+import { line, plot } from "../../plots.js";
 import { card } from "../../ui.js";
 import { CODES, NOVEL } from "./codes.js";
 import { WINDOW_S } from "./rows.js";
