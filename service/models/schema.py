@@ -62,6 +62,18 @@ class Promotion(BaseModel):
     reason: str
 
 
+class HeldOutQuality(BaseModel):
+    """How well a version predicts what its training held out, per joint; null where a joint's torque does not vary."""
+
+    samples: int = Field(description="Samples that the figures are of")
+    nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
+    coverage: list[float | None] = Field(description="Share of measurements inside the 95 % interval")
+    coverage_low: list[float] | None = Field(
+        None, description="Lower end of the coverage's confidence interval; null for versions of earlier releases"
+    )
+    coverage_high: list[float] | None = Field(None, description="Its upper end")
+
+
 class Version(BaseModel):
     """An immutable trained version."""
 
@@ -123,6 +135,12 @@ class VersionSummary(BaseModel):
     version: int
     created_at: str
     estimator: str
+    quality: HeldOutQuality | None = Field(
+        None, description="On what its training held out; null where that was nothing"
+    )
+    promotion: Promotion | None = Field(
+        None, description="Whether it answers by itself, and why; null for one that was refreshed, imported or shipped"
+    )
 
 
 class Model(BaseModel):

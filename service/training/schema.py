@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from lipserve.states import JobState, PromotionOption
-from service.models.schema import VERSION, Holdout, ModelName
+from service.models.schema import VERSION, HeldOutQuality, Holdout, ModelName
 
 _DEFAULTS = FitOptions()
 
@@ -171,6 +171,9 @@ class Job(BaseModel):
     progress: JobProgress
     attempts: int = Field(description="Times it was started; more than one after an interruption")
     version: int | None = Field(description="The version it made, once succeeded")
+    quality: HeldOutQuality | None = Field(
+        None, description="Of that version, on what the job held out; null where that is nothing"
+    )
     error: JobError | None
     created_at: str
     started_at: str | None

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from lipserve.call import KEY_HEADER, Answer, Call, Page, Route, given, new_key, nothing, page, record, route
 from lipserve.records.jobs import Job
 from lipserve.records.models import Alias, Model
+from lipserve.records.overview import ModelOverview
 from lipserve.results.arm import Version
 from lipserve.states import PromotionOption
 
@@ -90,6 +91,12 @@ C_FILES = ("lipserve_model.c", "lipserve_model.h")
 def models(at: Route) -> Call[Page[Model]]:
     """All models with their versions, newest first."""
     return at(page(Model), names={})
+
+
+@route("GET", "/v1/overview")
+def overview(at: Route) -> Call[Page[ModelOverview]]:
+    """All models at a glance, newest first: arm, quality, what came lately, what needs a decision."""
+    return at(page(ModelOverview), names={})
 
 
 @route("GET", "/v1/models/{model}")

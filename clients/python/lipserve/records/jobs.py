@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from lipserve.records import Record
+from lipserve.records.models import HeldOutQuality
 
 
 class Holdout(Record, frozen=True, kw_only=True):
@@ -90,6 +91,7 @@ class Job(Record, frozen=True, kw_only=True):
     refresh: What it refreshes; null for a job with data sets alone
     attempts: Times it was started; more than one after an interruption
     version: The version it made, once succeeded
+    quality: Of that version, on what the job held out; null where that is nothing
     heartbeat_at: When the training process last said that it lives
     history: What happened to it, oldest first
     retry_of: The job that it repeats
@@ -109,6 +111,7 @@ class Job(Record, frozen=True, kw_only=True):
     progress: JobProgress
     attempts: int
     version: int | None
+    quality: HeldOutQuality | None = None
     error: JobError | None
     created_at: str
     started_at: str | None
