@@ -140,7 +140,8 @@ def train(
         typer.Option(help="How to fit, as max_iterations=100: see `options` of POST /v1/jobs; repeat."),
     ] = None,
     hold_out: Annotated[
-        float | None, typer.Option(help="Share of the samples to hold out and evaluate the model on, such as 0.3.")
+        float | None,
+        typer.Option(help="Share of the samples to hold out and evaluate the model on; 0.3 by default, 0 for nothing."),
     ] = None,
     hold_out_by: Annotated[
         str | None,
@@ -181,7 +182,7 @@ def train(
             names(joint_types),
             options or None,
             robot=robot,
-            holdout=asked or None,
+            holdout=False if hold_out == 0 else asked or None,
             base=base,
             promotion=promotion,  # type: ignore[arg-type]  # the service checks it
             idempotency_key=new_key(),
@@ -215,7 +216,7 @@ def train(
     echo(f"{model} version {job.version} is trained and {'waits as candidate' if waits else 'answers'}")
     if made.selection is not None:
         print_selection(made.selection)
-    if asked:
+    if made.lineage.get("holdout") is not None:
         print_held_out(made)
     print_promotion(made)
     if waits:
