@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.records.datasets import AgainstRobot, DatasetReport, JointExcitation, JointNoise, Weight
-from lipserve.records.models import Selection
+from lipserve.records.models import HeldOutQuality, Selection
 from lipserve.results.arm import Arm
 from lipserve.results.evaluation import Comparison, Evaluation
 from lipserve.results.series import Prediction
@@ -44,6 +44,13 @@ def evaluation_table(result: Evaluation) -> Table:
     """Figures of an evaluation, joint by joint."""
     figures = {name: getattr(result, name).tolist() for name in FIGURES}
     return figures_table(result.title, result.joint_names, figures)
+
+
+def judged(quality: HeldOutQuality | None) -> tuple[str, str]:
+    """Mean nMSE and mean coverage of the joints on what was held out, as cells of a list."""
+    if quality is None:
+        return NOTHING, NOTHING
+    return _figure(_mean(quality.nmse), ".2e"), _figure(_mean(quality.coverage), ".0%")
 
 
 def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, Sequence[float | None]]) -> Table:
