@@ -19,7 +19,7 @@ export function scientific(x, digits = 1) {
 
 /** An nMSE: 0.071, and below a thousandth 3.1e-4. */
 export function nmse(x) {
-  return known(x) && x >= 1e-3 ? number(x, 2) : scientific(x);
+  return known(x) && (x === 0 || x >= 1e-3) ? number(x, 2) : scientific(x);
 }
 
 /** A whole number with thin spaces between thousands. */
