@@ -36,6 +36,15 @@ export function coverageBars(names, values, { marks = null, what = "Inside the 9
   return bars("coverage", columns, `${what} by joint: ${listed(names, values ?? marks, percent)}`, [[promised, "promised"]]);
 }
 
+/** Both of these charts, each below its name and the mean of the joints. shown, lately: {nmse, coverage}; lately may be null. */
+export function qualityCharts(names, shown, lately = null) {
+  const chart = (label, value, made) => h("div", {}, h("div", { class: "chart-label" }, h("span", {}, label), h("strong", {}, value)), made);
+  return [
+    chart("Error, nMSE", nmse(mean(shown.nmse)), errorBars(names, shown.nmse, { marks: lately?.nmse })),
+    chart("In the 95\u00a0% band", percent(mean(shown.coverage), 0), coverageBars(names, shown.coverage, { marks: lately?.coverage })),
+  ];
+}
+
 /**
  * How large innovations were along the last `seconds`, a line a joint; course: [{at, innovation}], oldest first; now: Unix s.
  * The dashed line is where errors are as large as the model says.

@@ -1,8 +1,8 @@
 // A card for each model: the arm that it has learnt, whether it is live, how well it predicts, and what needs somebody.
 
-import { coverageBars, errorBars, innovationCourse, mean } from "../../charts.js";
+import { innovationCourse, qualityCharts } from "../../charts.js";
 import { h, refresh } from "../../dom.js";
-import { ago, nmse, number, percent, seconds, shortNames } from "../../format.js";
+import { ago, number, seconds, shortNames } from "../../format.js";
 import { badge, link } from "../../ui.js";
 import { chain, sketch } from "../arm/sketch.js";
 
@@ -40,7 +40,7 @@ function isLive({ idle_s: idle }, live) {
 
 function robotCard(first) {
   const address = encodeURIComponent(first.name);
-  const state = h("span", {}), about = h("p", { class: "hint" }), charts = h("div", { class: "robot-charts" });
+  const state = h("span", {}), about = h("p", { class: "hint" }), charts = h("div", { class: "charts" });
   const lately = h("div", { class: "robot-course" }), news = h("div", { class: "robot-news" });
   const figure = h("a", { class: "robot-arm", href: `#/models/${address}?tab=arm`, "aria-label": `The arm of ${first.name}` });
   const element = h(
@@ -85,22 +85,15 @@ function standing(model, live) {
 function quality({ quality: judged, recent }, names) {
   const lately = recent?.rows ? recent : null;
   if (!judged && !lately) return h("p", { class: "hint" }, "Not judged yet: nothing was held out of its training, and no stream has come.");
-  const chart = (label, value, made) => h("div", {}, h("div", { class: "robot-label" }, h("span", {}, label), h("strong", {}, value)), made);
-  const shown = judged ?? lately;
   const note = judged && lately ? "Bars: held out. Lines: last hour." : judged ? "On what was held out." : "In the last hour.";
-  const marks = (name) => ({ marks: judged && lately ? lately[name] : null });
-  return [
-    chart("Error, nMSE", nmse(mean(shown.nmse)), errorBars(names, shown.nmse, marks("nmse"))),
-    chart("In the 95 % band", percent(mean(shown.coverage), 0), coverageBars(names, shown.coverage, marks("coverage"))),
-    h("p", { class: "hint" }, note),
-  ];
+  return [qualityCharts(names, judged ?? lately, judged ? lately : null), h("p", { class: "hint" }, note)];
 }
 
 function course({ recent }, names) {
   if (!recent?.course.length) return null;
   const now = Date.now() / 1000;
   return [
-    h("div", { class: "robot-label" }, h("span", {}, "Innovation, last hour"), h("span", { class: "hint" }, "dashed: 1 σ")),
+    h("div", { class: "chart-label" }, h("span", {}, "Innovation, last hour"), h("span", { class: "hint" }, "dashed: 1 σ")),
     innovationCourse(names, recent.course, recent.seconds, Math.max(now, recent.course.at(-1).at), Math.max(recent.seconds / BUCKETS, 1)),
   ];
 }
