@@ -11,7 +11,7 @@ from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATOR
 from lipserve.states import JobState, PromotionOption
 from service.models.schema import VERSION, HeldOutQuality, Holdout, ModelName
 
-_DEFAULTS = FitOptions()
+_DEFAULTS, _HOLDOUT = FitOptions(), Holdout()
 
 
 class Options(BaseModel):
@@ -95,8 +95,9 @@ class JobRequest(BaseModel):
     )
     options: Options = Field(default_factory=Options)
     holdout: Holdout | None = Field(
-        None,
-        description="What to hold out of the data sets, to evaluate the version on: its lineage keeps the figures",
+        default_factory=Holdout,
+        description="What to hold out of the data sets, to evaluate the version on: its lineage keeps the figures. By "
+        f"default {_HOLDOUT.share:.0%}, as `{_HOLDOUT.kind}` chooses; null: nothing",
     )
     promotion: PromotionOption | None = Field(
         None,

@@ -64,7 +64,11 @@ def test_a_model_is_made_without_a_mouse(visitor: Visitor) -> None:
 
     tab_to(page, "Name of the model")
     page.keyboard.type("keys")
-    tab_to(page, "auto")
+    tab_to(page, "More estimators")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("radio", name="lip-chain", exact=False).first).to_be_visible()
+    page.keyboard.press("Shift+Tab")
+    expect(page.get_by_role("radio", name="auto")).to_be_focused()
     page.keyboard.press("ArrowDown")
     page.keyboard.press("ArrowDown")
     expect(page.get_by_role("radio", name="lip-chain", exact=False).first).to_be_checked()

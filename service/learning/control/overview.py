@@ -30,6 +30,8 @@ from service.web.rows import Page, newest
 
 HOUR_S = 3600.0
 DECIMALS = 3
+AWAY = 0.3
+"""How far a posture lies within the training range, 0 to 1."""
 
 
 def page(learners: Learners, part: Page) -> OverviewPage:
@@ -123,12 +125,13 @@ def _watched(monitor: Monitor | None, served: Served | None, now: float) -> dict
 
 
 def _position(learners: Learners, model: str, manifest: dict[str, Any]) -> list[float]:
-    """Where the robot was when its last row came, the middle of the training range where that is not known."""
+    """Where the robot was when its last row came; where that is not known, a posture within the training range that is
+    not stretched out, so that its links can be told apart."""
     last = learners.live.positions.get(model)
     if last is not None and len(last) == len(manifest["joint_names"]):
         return last
     span = manifest["training_range"]["q"]
-    return [(low + high) / 2 for low, high in zip(span["min"], span["max"], strict=True)]
+    return [low + AWAY * (high - low) for low, high in zip(span["min"], span["max"], strict=True)]
 
 
 def _alarms(session: Session, models: Sequence[str]) -> dict[str, Alarm]:

@@ -68,7 +68,7 @@ class ModelOverview(BaseModel):
     candidate: int | None = Field(description="A version that waits under the alias `candidate`")
     arm: ArmSketch | None = Field(description="null: the estimator knows no arm")
     position: list[float] = Field(
-        description="Positions of the last row that this service took, rad (m); else the middle of the training range"
+        description="Where it was at the last row that this service took, rad (m); else a posture it was trained at"
     )
     idle_s: float | None = Field(description="Seconds since observations came last; null: never")
     recent: RecentQuality | None = Field(

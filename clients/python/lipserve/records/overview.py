@@ -75,7 +75,7 @@ class ModelOverview(Record, frozen=True, kw_only=True):
     quality: On what its training held out; null where that was nothing
     candidate: A version that waits under the alias `candidate`
     arm: null: the estimator knows no arm
-    position: Positions of the last row that this service took, rad (m); else the middle of the training range
+    position: Where it was at the last row that this service took, rad (m); else a posture it was trained at
     idle_s: Seconds since observations came last; null: never
     recent: Of the quality window nearest to an hour; null while nothing that this service knows has come
     payloads: What each stream's arm carries; null: no arm is known, or the model is not in memory

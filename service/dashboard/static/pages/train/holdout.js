@@ -4,19 +4,19 @@ import { h } from "../../dom.js";
 import { field } from "../../ui.js";
 
 const KINDS = [
-  ["auto", "the last part, or motion that the rest does not repeat"],
-  ["last", "the last part of each data set"],
+  ["auto", "the last part, or motion that nothing else repeats"],
+  ["last", "the last part of each recording"],
   ["episodes", "whole episodes"],
   ["blocks", "some of many equal blocks"],
   ["", "nothing: learn from all of it"],
 ];
 const SAID = {
-  auto: "The last part, unless it repeats motion that is learnt from and other motion does not: then some of that.",
-  last: "This does not test motion of another kind. For that, evaluate on another recording.",
-  episodes: "The seed chooses which. If each data set has 1 episode, whole data sets are held out.",
-  blocks: "The seed chooses which. Neighbouring blocks resemble each other, so figures look better than on a new recording.",
-  stretches: "The rows that you have chosen on the data set’s page. Other data sets are learnt from.",
-  "": "Nothing will show how well the model predicts. Choose this only after you have judged it on another recording.",
+  auto: "Usually the last part. If that only repeats earlier motion, a part that does not.",
+  last: "This does not test other kinds of motion: evaluate on another recording for that.",
+  episodes: "The seed chooses which. Of recordings with one episode each, whole recordings are held out.",
+  blocks: "The seed chooses which. Blocks resemble their neighbours, so figures look better than on a new recording.",
+  stretches: "The rows that you have chosen on the recording’s page. Other recordings are learnt from.",
+  "": "Then nothing shows how well the model predicts. Choose this only once you have judged it on another recording.",
 };
 
 /**
@@ -52,7 +52,7 @@ export function holdoutChoice(named = null) {
       "fieldset",
       {},
       h("legend", {}, "Hold out"),
-      h("p", { class: "hint" }, "The held-out part is not learnt from; the version is judged on it."),
+      h("p", { class: "hint" }, "The model does not learn from this part; it is judged on it."),
       h("div", { class: "grid" }, field("Which part", kind), fields.share, fields.blocks, fields.seed, fields.guard),
       about,
     ),
