@@ -87,7 +87,7 @@ def test_a_job_that_comes_takes_no_link_away(visitor: Visitor, dashboard: Dashbo
     known = place.locator(f'a[href="{some.get_attribute("href")}"]')
     links = [node(known), node(place.get_by_role("link", name="Train a model", exact=True).first)]
     if route == "#/":
-        cards = ("Follow pendulum live", "pendulum")
+        cards = ("Follow live: pendulum", "pendulum")
         links += [node(place.get_by_role("link", name=name, exact=True)) for name in ("All jobs", *cards)]
     links[0].focus()
 

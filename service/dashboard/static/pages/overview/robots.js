@@ -51,7 +51,7 @@ function robotCard(first) {
     h("div", { class: "robot-body" }, figure, charts),
     lately,
     news,
-    h("div", { class: "actions robot-foot" }, h("a", { href: `#/live/${address}`, "aria-label": `Follow ${first.name} live` }, "Follow live"), h("a", { href: `#/train?model=${address}`, "aria-label": `Train ${first.name} again` }, "Train again")),
+    h("div", { class: "actions robot-foot" }, h("a", { href: `#/live/${address}`, "aria-label": `Follow live: ${first.name}` }, "Follow live"), h("a", { href: `#/train?model=${address}`, "aria-label": `Train again: ${first.name}` }, "Train again")),
   );
   let drawn = null, arm = null, posture = null;
   const update = (model, live) => {
@@ -64,6 +64,8 @@ function robotCard(first) {
       arm = model.arm && sketch(model.arm, model.position, `The arm that ${model.name} has learnt, ${names.length} joints`);
       const unknown = [chain(names.length, `${names.length} joints`), h("span", { class: "hint" }, `${model.estimator} learns no arm`)];
       figure.replaceChildren(...(arm ? [arm.element] : unknown));
+      if (arm) figure.setAttribute("aria-label", `The arm of ${first.name}`);
+      else figure.removeAttribute("aria-label"); // its text names it
     } else if (posture !== JSON.stringify(model.position)) {
       posture = JSON.stringify(model.position);
       arm?.glide(model.position);
