@@ -114,17 +114,21 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     storage_errors.install(app)
     _add_middleware(app, settings, keyring, meters, hot)
     openapi.install(app, settings.keys_needed)
-    app.include_router(readiness.router)
-    app.include_router(metrics.router)
-    app.include_router(datasets.router)
-    app.include_router(robots.router)
-    app.include_router(training.router)
-    app.include_router(models.router)
-    app.include_router(inference.router)
-    app.include_router(control.router)
-    app.include_router(live.router)
-    app.include_router(oip.router)
-    app.include_router(stream.router())
+    for router in (
+        readiness.router,
+        metrics.router,
+        datasets.router,
+        robots.router,
+        training.router,
+        models.router,
+        inference.router,
+        control.router,
+        control.overview_router,
+        live.router,
+        oip.router,
+        stream.router(),
+    ):
+        app.include_router(router)
     dashboard.install(app)
     guide.install(app)
     return app

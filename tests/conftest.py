@@ -26,13 +26,14 @@ what takes long and begins late keeps the other processes waiting."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """What services that the tests start store things in."""
+    """What services that the tests start store things in, and where pictures go."""
     parser.addoption(
         "--backend",
         choices=("own", "shared"),
         default="own",
         help="own: SQLite and files of each service (the default); shared: PostgreSQL and S3, started by the tests",
     )
+    parser.addoption("--pictures", metavar="FOLDER", help="keep pictures of every page of the dashboard there")
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -6,6 +6,7 @@ while the files are not what this writes.
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -19,6 +20,7 @@ from pydantic.json_schema import models_json_schema
 
 from service.datasets import schema as datasets
 from service.learning import schema as observing
+from service.learning.control import overview_schema as overview
 from service.learning.control import payload_schema as payloads
 from service.learning.control import schema as learning
 from service.models import schema as models
@@ -50,6 +52,7 @@ ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
     ),
     "payloads": ("What arms carry.", (payloads.Payloads,)),
     "live": ("Events of a model followed live.", (learning.LiveStatus, learning.LiveLost)),
+    "overview": ("Models at a glance.", (overview.ModelOverview,)),
     "server": (
         "The service, and what the Open Inference Protocol tells of it.",
         (
@@ -81,7 +84,8 @@ def documents() -> dict[str, str]:
         own = [name for name in reached if name not in home]
         home |= dict.fromkeys(own, room)
         classes = "\n\n".join(_record(name, known[name]) for name in own)
-        made[f"{room}.py"] = _formatted(_head(text, classes, {n: home[n] for n in reached if n not in own}) + classes)
+        others = {n: home[n] for n in reached if n not in own and re.search(rf"\b{n}\b", classes)}
+        made[f"{room}.py"] = _formatted(_head(text, classes, others) + classes)
     return made
 
 

@@ -39,13 +39,16 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
     if not models:
         echo("no model yet: `lipserve train FILE --model NAME` makes one")
         return
-    table = Table("model", "serving", "versions", "estimator", "aliases", "made")
+    from service.cli.tables import judged  # noqa: PLC0415 - takes long to import; help needs none
+
+    table = Table("model", "serving", "nMSE held out", "in 95 %", "versions", "estimator", "aliases", "made")
     for model in models:
         serving = next((each for each in model.versions if each.version == model.serving_version), None)
         aliases = ", ".join(f"{name} → {at}" for name, at in model.aliases.items()) or "-"
         table.add_row(
             escape(model.name),
             str(model.serving_version),
+            *judged(None if serving is None else serving.quality),
             str(len(model.versions)),
             "-" if serving is None else serving.estimator,
             escape(aliases),
@@ -57,19 +60,33 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
 @app.command()
 def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """Print a model with its versions, and what one of them stands on: the one that serves, or one that is named."""
+    from lipserve import ApiError  # noqa: PLC0415 - takes long to import; help needs none
+    from service.cli.tables import judged  # noqa: PLC0415 - as above
+
     with connected(url) as client:
         record = client.model(model)
         detail = client.version(model, version or record.serving_version)
+        try:
+            learning = client.learning(model).status
+        except ApiError:  # the version that serves cannot be read: the others can be shown all the same
+            learning = None
     if as_json:
-        print_json({"model": record, "version": detail})
+        print_json({"model": record, "version": detail, "learning": learning})
         return
     echo(f"{record.name}: version {record.serving_version} serves, {record.latest_version} is the newest")
-    table = Table("version", "estimator", "made", "named")
+    if learning is not None:
+        held = ", held until you decide" if learning.held is not None else ""
+        echo(f"  revision {learning.published} of {learning.revision} answers, learnt since it was trained{held}")
+    table = Table("version", "nMSE held out", "in 95 %", "may answer", "estimator", "made", "named")
     for each in record.versions:
         named = [name for name, at in record.aliases.items() if at == each.version]
         named = [SERVING, *named] if each.version == record.serving_version else named
         at = each.created_at[:16].replace("T", " ")
-        table.add_row(str(each.version), each.estimator, at, escape(", ".join(named)) or "-")
+        passed = None if each.promotion is None else each.promotion.passed
+        may = {True: "yes", False: "no", None: "not judged"}[passed]
+        table.add_row(
+            str(each.version), *judged(each.quality), may, each.estimator, at, escape(", ".join(named)) or "-"
+        )
     out.print(table)
     _print_version(detail)
 

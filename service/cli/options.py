@@ -84,6 +84,16 @@ def pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
     return values
 
 
+def value(text: str) -> Any:
+    """A number, a truth value or None where it is one."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return {"true": True, "false": False, "null": None}.get(text.lower(), text)
+
+
 def confirm(question: str, yes: bool) -> None:
     """Ask whether something is meant, unless that is said; end the command where it is not."""
     if not yes:

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.records.datasets import AgainstRobot, DatasetReport, JointExcitation, JointNoise, Weight
-from lipserve.records.models import Selection
+from lipserve.records.models import HeldOutQuality, Selection
 from lipserve.results.arm import Arm
 from lipserve.results.evaluation import Comparison, Evaluation
 from lipserve.results.series import Prediction
@@ -46,9 +46,16 @@ def evaluation_table(result: Evaluation) -> Table:
     return figures_table(result.title, result.joint_names, figures)
 
 
+def judged(quality: HeldOutQuality | None) -> tuple[str, str]:
+    """Mean nMSE and mean coverage of the joints on what was held out, as cells of a list."""
+    if quality is None:
+        return NOTHING, NOTHING
+    return _figure(_mean(quality.nmse), ".2e"), _figure(_mean(quality.coverage), ".0%")
+
+
 def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, Sequence[float | None]]) -> Table:
     """Figures per joint, as an evaluation or a version's lineage tells them; older lineages have fewer."""
-    table = Table("joint", "nMSE", "RMSE N·m", "coverage of 95%", "known to be", "width N·m", "NLPD nats", title=title)
+    table = Table("joint", "nMSE", "RMSE N·m", "in 95 %", "known to be", "width N·m", "NLPD nats", title=title)
     columns = [figures.get(name) or [None] * len(joint_names) for name in FIGURES]
     for joint, nmse, rmse, coverage, low, high, count, width, nlpd in zip(joint_names, *columns, strict=True):
         known = "-" if count is None else f"{low:.0%} to {high:.0%}, by {count:.0f} errors"
@@ -63,7 +70,7 @@ def selection_table(selection: Selection) -> Table:
     title = "not judged"
     if held.blocks:
         title = f"judged on {held.blocks} stretches that the training did not see"
-    table = Table("estimator", "log density nats", "less than the best", "mean nMSE", "coverage of 95%", title=title)
+    table = Table("estimator", "log density nats", "less than the best", "mean nMSE", "in 95 %", title=title)
     for each in selection.table:
         name = f"{each.estimator} (chosen)" if each.estimator == selection.chosen else each.estimator
         if each.error is not None:
@@ -105,7 +112,7 @@ def comparison_table(comparison: Comparison) -> Table:
     """Figures of two versions, joint by joint."""
     title = f"{comparison.model} on {comparison.samples_used} samples of {comparison.dataset}"
     numbers = [f"version {each.version}" for each in comparison.versions]
-    heads = [f"{figure}, {number}" for figure in ("nMSE", "RMSE N·m", "coverage of 95%") for number in numbers]
+    heads = [f"{figure}, {number}" for figure in ("nMSE", "RMSE N·m", "in 95 %") for number in numbers]
     table = Table("joint", *heads, title=title)
     for at, joint in enumerate(comparison.joint_names):
         cells = [
@@ -135,8 +142,9 @@ def overview(report: DatasetReport) -> Iterator[str]:
     """What was read and what was done to it, a sentence each."""
     yield from report.reading
     yield from report.preparation
+    episodes = "1 episode" if report.episodes == 1 else f"{report.episodes} episodes"
     rate = NOTHING if report.rate_hz is None else f"{report.rate_hz:.4g} Hz"
-    yield f"{report.rows:,} of {report.rows_uploaded:,} rows are samples, in {report.episodes} episodes, at {rate}"
+    yield f"{report.rows:,} of {report.rows_uploaded:,} rows are samples, in {episodes}, at {rate}"
     if (timing := report.timing) is not None and timing.jitter_p99 is not None:
         yield f"jitter: 99 % of the steps within {timing.jitter_p99:.1%} of the usual one; {report.gaps} gaps"
 

@@ -134,7 +134,14 @@ def _markdown() -> MarkdownIt:
     made.core.ruler.push("guide", _adapt)
     made.add_render_rule("table_open", lambda *_: _SCROLLED)
     made.add_render_rule("table_close", lambda *_: "</table></div>\n")
+    made.add_render_rule("fence", lambda self, *arguments: _reached(self.fence(*arguments)))
+    made.add_render_rule("code_block", lambda self, *arguments: _reached(self.code_block(*arguments)))
     return made
+
+
+def _reached(block: str) -> str:
+    """A block of code that keys reach, as it may have to be scrolled."""
+    return block.replace("<pre>", '<pre tabindex="0">', 1)
 
 
 def _adapt(state: Any) -> None:

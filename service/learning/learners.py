@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends
+from sqlalchemy import select
 
 from lipserve.states import PartState
 from service.compute.process import Place
@@ -31,6 +32,7 @@ from service.learning.learner.publication import Contested, Failed, Message, Pub
 from service.learning.live.feed import Feed
 from service.learning.schema import ObservationRequest, ObservationResponse
 from service.models.loaded import LoadedModels, Served
+from service.storage.database import StreamRow
 from service.web.observability.readiness import Lasting
 
 logger = logging.getLogger(__name__)
@@ -166,8 +168,21 @@ class Learners:
         with self._lock:
             return dict(self._monitors)
 
+    def watched(self) -> dict[str, Monitor]:
+        """Monitors by model: those there are, and of models in memory that have got observations before the start. No
+        model is loaded for it, which would drop another one. Not for the event loop."""
+        with self.database.session() as session:
+            learning = list(session.scalars(select(StreamRow.model).distinct()))
+        fresh = {}
+        for model in learning:
+            if (served := self.loaded.peek(model)) is not None:
+                fresh[model] = self._monitor(served)
+                self._intake.follow(fresh[model], model)
+        return dict(sorted((self.monitors() | fresh).items()))
+
     def forget(self, model: str) -> None:
         """Keep nothing of a model that has been deleted."""
+        self.live.forget(model)
         with self._lock:
             self._monitors.pop(model, None)
             self._status = {key: status for key, status in self._status.items() if key[0] != model}

@@ -7,13 +7,11 @@ from collections.abc import Iterator
 
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
-from sqlalchemy import select
 
 from lipcore.vocabulary import CODES
 from service.learning.control import status
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
-from service.storage.database import StreamRow
 from service.web.observability.meters import MetricKind
 
 FIGURES = {
@@ -70,7 +68,7 @@ class Learning(Collector):
         gauges = {name: kind.family() for name, kind in QUALITY.items()}
         revision, novel, scale, lag, rows = (kind.family() for kind in (REVISION, NOVEL, SCALE, LAG, ROWS))
         payload, payload_std = PAYLOAD.family(), PAYLOAD_STD.family()
-        for model, monitor in self._monitors().items():
+        for model, monitor in self._learners.watched().items():
             _add_quality(gauges, model, monitor)
             for outcome in CODES:
                 rows.add_metric([model, outcome], monitor.counts[outcome])
@@ -89,15 +87,6 @@ class Learning(Collector):
                 novel.add_metric([model], share)
         yield from (*gauges.values(), revision, novel, scale, payload, payload_std, lag, rows)
         yield LOADED.of([((), len(self._learners.loaded.versions()))])
-
-    def _monitors(self) -> dict[str, Monitor]:
-        """Monitors by model: those there are, and of models in memory that have got observations before the start. No
-        model is loaded for it, which would drop another one."""
-        learners, loaded = self._learners, self._learners.loaded
-        with self._learners.database.session() as session:
-            learning = list(session.scalars(select(StreamRow.model).distinct()))
-        fresh = {model: learners.monitor(model) for model in learning if loaded.hot(model, None) is not None}
-        return dict(sorted((learners.monitors() | fresh).items()))
 
 
 def _add_quality(gauges: dict[str, GaugeMetricFamily], model: str, monitor: Monitor) -> None:

@@ -107,6 +107,12 @@ class LoadedModels:
             self._used[key] = next(self._clock)
         return served
 
+    def peek(self, model: str) -> Served | None:
+        """Return the version that serves if it is in memory; never waits. Asking does not count as using it."""
+        snapshot = self._snapshot
+        serving = snapshot.serving.get(model)
+        return None if serving is None else snapshot.served.get((model, serving.version))
+
     def newest(self, model: str, alias: str | None = None) -> int | None:
         """Return the version that answers where an alias is named, or none, in memory or dropped since; never waits."""
         return self._snapshot.pointed(model, alias)

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from sqlalchemy import bindparam, func, select, update
+from pydantic import ValidationError
+from sqlalchemy import bindparam, func, select, tuple_, update
 from sqlalchemy.orm import Session
 
 import lipcore
 from lipcore.files.persistence import checksums, read_manifest
 from service.foundation.errors import NotFoundError, not_found
 from service.foundation.settings import shipped_models
-from service.models.schema import Model, ModelPage, Promotion, Version, VersionSummary
+from service.models.schema import HeldOutQuality, Model, ModelPage, Promotion, Version, VersionSummary
 from service.storage.database import (
     AliasMoveRow,
     AliasRow,
@@ -304,10 +305,31 @@ def _show(session: Session, row: ModelRow) -> Model:
         serving_version=answering(session, row.name),
         aliases={each.alias: each.version for each in aliases},
         versions=[
-            VersionSummary(version=v.version, created_at=v.created_at, estimator=v.manifest["estimator"])
+            VersionSummary(
+                version=v.version,
+                created_at=v.created_at,
+                estimator=v.manifest["estimator"],
+                quality=quality(v.manifest),
+                promotion=v.manifest.get(PROMOTION),
+            )
             for v in versions
         ],
     )
+
+
+def quality(manifest: Mapping[str, Any]) -> HeldOutQuality | None:
+    """How well a version predicts what its training held out, as its manifest has it; None where that was nothing, or
+    is not as this release writes it: an import shows figures and does not read them."""
+    try:
+        return HeldOutQuality.model_validate(manifest["lineage"]["holdout"])
+    except (KeyError, TypeError, ValidationError):
+        return None
+
+
+def rows_of(session: Session, keys: Collection[tuple[str, int]]) -> dict[tuple[str, int], VersionRow]:
+    """Versions by model and number; those that are gone are left out."""
+    query = select(VersionRow).where(tuple_(VersionRow.model, VersionRow.version).in_(keys))
+    return {(row.model, row.version): row for row in session.scalars(query)}
 
 
 def lost(

@@ -62,6 +62,18 @@ class Promotion(BaseModel):
     reason: str
 
 
+class HeldOutQuality(BaseModel):
+    """How well a version predicts what its training held out, per joint; null where a joint's torque does not vary."""
+
+    samples: int = Field(description="Samples that the figures are of")
+    nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
+    coverage: list[float | None] = Field(description="Share of measurements inside the 95 % interval")
+    coverage_low: list[float] | None = Field(
+        None, description="Lower end of the coverage's confidence interval; null for versions of earlier releases"
+    )
+    coverage_high: list[float] | None = Field(None, description="Its upper end")
+
+
 class Version(BaseModel):
     """An immutable trained version."""
 
@@ -123,6 +135,12 @@ class VersionSummary(BaseModel):
     version: int
     created_at: str
     estimator: str
+    quality: HeldOutQuality | None = Field(
+        None, description="On what its training held out; null where that was nothing"
+    )
+    promotion: Promotion | None = Field(
+        None, description="Whether it answers by itself, and why; null for one that was refreshed, imported or shipped"
+    )
 
 
 class Model(BaseModel):
@@ -186,8 +204,11 @@ class AliasList(BaseModel):
 _DEFAULTS = Split()
 
 
-HoldoutKind = Literal["auto", Kind]
-"""How a part is chosen to be held out; `auto` looks at the motion."""
+HoldoutKind = Literal["auto", "stretches", Kind]
+"""How a part is chosen to be held out; `auto` looks at the motion, `stretches` are named."""
+Row = Annotated[int, Field(ge=0, lt=2**63)]
+Stretch = Annotated[list[Row], Field(min_length=2, max_length=2)]
+"""Rows of a data set in order of episode and time: the first, and the last, exclusive."""
 
 
 class Holdout(BaseModel):
@@ -200,7 +221,7 @@ class Holdout(BaseModel):
         description="Of each data set: whole `episodes`, chosen by the seed; its `last` part; some of many equal "
         "`blocks`, chosen by the seed; or `auto`, the last part, unless that repeats motion that is learnt from and "
         "there are periods, episodes or stretches of motion that do not: then some of these, chosen by the seed. Of "
-        "several data sets of one episode each, `episodes` holds out whole data sets",
+        "several data sets of one episode each, `episodes` holds out whole data sets. `stretches`: rows that are named",
     )
     share: float = Field(
         _DEFAULTS.share, gt=0, lt=1, description="Of the samples, as nearly as whole episodes or blocks allow"
@@ -214,6 +235,13 @@ class Holdout(BaseModel):
         "low-pass that the data set was prepared with. Of a data set without times 25 samples are",
     )
     seed: int = Field(_DEFAULTS.seed, ge=0, lt=2**31, description="Of the choice")
+    stretches: dict[str, Annotated[list[Stretch], Field(min_length=1, max_length=1000)]] | None = Field(
+        None,
+        max_length=10_000,
+        description="With `kind` `stretches`: by the ids of data sets, which rows to hold out, first and last "
+        "(exclusive) in order of episode and time. Data sets that are not named are learnt from",
+        exclude_if=lambda value: value is None,  # lineages written before there were any compare as equal
+    )
 
 
 class HeldOutSet(BaseModel):
@@ -228,9 +256,7 @@ class HeldOutSet(BaseModel):
     guard_unit: Literal["s", "rows"]
     rows: int = Field(ge=1, lt=2**63, description="Samples held out")
     guarded: int = Field(ge=0, lt=2**63, description="Samples left out of both sides")
-    stretches: (
-        list[Annotated[list[Annotated[int, Field(ge=0, lt=2**63)]], Field(min_length=2, max_length=2)]] | None
-    ) = Field(
+    stretches: list[Stretch] | None = Field(
         None,
         max_length=1000,
         description="Which rows these were before the guard, first and last exclusive, in order of episode and "

@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.data.splits import GUARD_S, Mask, Numbers, Parts, Split, SplitError, choose, split
+from lipcore.data.splits import GUARD_S, Kind, Mask, Numbers, Parts, Split, SplitError, choose, split
 from service.foundation.errors import invalid_request
 from service.models.schema import HeldOutSet, Holdout, HoldoutLineage
 from service.storage.database import DatasetRow
@@ -54,7 +54,11 @@ class SetSplit:
         if self.entire:
             parts = Parts(np.zeros(len(t), dtype=bool), np.ones(len(t), dtype=bool))
         else:
-            kind = "last" if self.asked.kind == "auto" else self.asked.kind
+            match self.asked.kind:
+                case "auto" | "stretches":
+                    kind: Kind = "last"  # unless rows are named
+                case kind:
+                    pass
             how = Split(kind, self.asked.share, self.asked.blocks, self.guard, self.asked.seed)
             clock = t if self.unit == "s" else np.arange(len(t), dtype=np.float64)
             try:
@@ -90,6 +94,7 @@ class Divided:
 
 def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
     """Raise InvalidRequestError where reports tell already that the data sets cannot be split as asked for."""
+    _check_stretches(rows, asked)
     for index, row in enumerate(rows):
         if row.sha256 in [each.sha256 for each in rows[:index]]:
             raise invalid_request(f"datasets[{index}]", row.id, "other samples than those of the data sets before it")
@@ -97,10 +102,30 @@ def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
             raise invalid_request("holdout.guard_s", asked.guard_s, f"none, as data set {row.id} has no times")
     if asked.kind == "episodes" and len(rows) == 1 and rows[0].report["episodes"] < 2:
         raise invalid_request("holdout.kind", asked.kind, "last or blocks, as the data set is one episode")
-    left = round((1 - asked.share) * sum(row.rows for row in rows))
+    total = sum(row.rows for row in rows)
+    if asked.stretches is None:
+        field, value, left = "holdout.share", asked.share, round((1 - asked.share) * total)
+    else:
+        named = sum(last - first for stretches in asked.stretches.values() for first, last in stretches)
+        field, value, left = "holdout.stretches", named, total - named
     if left < min_samples:
         expected = f"less: it leaves {left} samples to train on, at least {min_samples} are needed"
-        raise invalid_request("holdout.share", asked.share, expected)
+        raise invalid_request(field, value, expected)
+
+
+def _check_stretches(rows: Sequence[DatasetRow], asked: Holdout) -> None:
+    """Raise InvalidRequestError where stretches are not rows of the data sets, in order and apart."""
+    if (asked.stretches is None) != (asked.kind != "stretches"):
+        raise invalid_request("holdout.stretches", asked.stretches, "rows, where `kind` is stretches, and only there")
+    known = {row.id: row.rows for row in rows}
+    for name, stretches in (asked.stretches or {}).items():
+        field = f"holdout.stretches.{name}"
+        if name not in known:
+            raise invalid_request(field, name, f"one of the data sets to train on: {', '.join(known)}")
+        borders = [border for stretch in stretches for border in stretch]
+        if any(a >= b for a, b in stretches) or borders != sorted(borders) or borders[-1] > known[name]:
+            expected = f"stretches in order, each of a first and a larger last row, at most {known[name]}"
+            raise invalid_request(field, stretches, expected)
 
 
 def hold_out(
@@ -121,7 +146,10 @@ def hold_out(
     entire = _entire([row for row in rows if row.id in single], asked) if len(single) > 1 else set()
     splits = {}
     for place, row in enumerate(rows):
-        if row.id in entire or row.id not in single:  # else the one episode that it has is learnt from
+        if asked.stretches is not None:
+            if row.id in asked.stretches:
+                splits[row.id] = _first(row, asked, False, asked.stretches[row.id])
+        elif row.id in entire or row.id not in single:  # else the one episode that it has is learnt from
             splits[row.id] = _first(row, asked, row.id in entire, unrepeated(place) if asked.kind == "auto" else None)
     return _divide(rows, clocks, splits)
 

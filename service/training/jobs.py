@@ -4,6 +4,7 @@ sets and on what was observed since."""
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 from sqlalchemy import Select, func, select
@@ -136,7 +137,7 @@ def show(queue: JobQueue, loaded: LoadedModels, job: str) -> Job:
     row = find(queue.database, job)
     if row.version is not None:
         loaded.announce([row.model])
-    return represent(row)
+    return represented(queue.database, [row])[0]
 
 
 def page(queue: JobQueue, loaded: LoadedModels, part: Page) -> JobPage:
@@ -144,7 +145,7 @@ def page(queue: JobQueue, loaded: LoadedModels, part: Page) -> JobPage:
     with queue.database.session() as session:
         rows, following = newest(session, JobRow, part)
     loaded.announce({row.model for row in rows if row.version is not None})
-    return JobPage(items=[represent(row) for row in rows], next_cursor=following)
+    return JobPage(items=represented(queue.database, rows), next_cursor=following)
 
 
 def find(database: Database, job: str) -> JobRow:
@@ -239,6 +240,19 @@ def represent(row: JobRow) -> Job:
     return Job.model_validate(fields)
 
 
+def represented(database: Database, rows: Sequence[JobRow]) -> list[Job]:
+    """Jobs as the API shows them, each with the quality of the version that it made."""
+    made = {(row.model, row.version) for row in rows if row.version is not None}
+    with database.session() as session:
+        versions = registry.rows_of(session, made) if made else {}
+    shown = []
+    for row in rows:
+        version = None if row.version is None else versions.get((row.model, row.version))
+        quality = None if version is None else registry.quality(version.manifest)
+        shown.append(represent(row).model_copy(update={"quality": quality}))
+    return shown
+
+
 Trigger = Literal["novelty", "linearisation", "asked"]
 
 
@@ -328,7 +342,8 @@ def retry(queue: JobQueue, job: str, named: Identity | None = None) -> Job:
         if again is not None:
             return refresh(queue, row.model, again["trigger"], row.id, named)
         request = JobRequest.model_validate(
-            {name: row.request[name] for name in JobRequest.model_fields if name in row.request}  # older ones lack some
+            # older ones lack some; those that lack a hold-out held nothing out
+            {"holdout": None} | {name: row.request[name] for name in JobRequest.model_fields if name in row.request}
         )
         return create(queue, request, retry_of=row.id, named=named)
     except NotFoundError as error:

@@ -9,9 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from lipserve.states import JobState, PromotionOption
-from service.models.schema import VERSION, Holdout, ModelName
+from service.models.schema import VERSION, HeldOutQuality, Holdout, ModelName
 
-_DEFAULTS = FitOptions()
+_DEFAULTS, _HOLDOUT = FitOptions(), Holdout()
 
 
 class Options(BaseModel):
@@ -95,8 +95,9 @@ class JobRequest(BaseModel):
     )
     options: Options = Field(default_factory=Options)
     holdout: Holdout | None = Field(
-        None,
-        description="What to hold out of the data sets, to evaluate the version on: its lineage keeps the figures",
+        default_factory=Holdout,
+        description="What to hold out of the data sets, to evaluate the version on: its lineage keeps the figures. By "
+        f"default {_HOLDOUT.share:.0%}, as `{_HOLDOUT.kind}` chooses; null: nothing",
     )
     promotion: PromotionOption | None = Field(
         None,
@@ -171,6 +172,9 @@ class Job(BaseModel):
     progress: JobProgress
     attempts: int = Field(description="Times it was started; more than one after an interruption")
     version: int | None = Field(description="The version it made, once succeeded")
+    quality: HeldOutQuality | None = Field(
+        None, description="Of that version, on what the job held out; null where that is nothing"
+    )
     error: JobError | None
     created_at: str
     started_at: str | None

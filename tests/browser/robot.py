@@ -9,9 +9,12 @@ import numpy as np
 
 from lipserve import StreamClient
 
+Row = Sequence[np.ndarray]
+"""q, dq, ddq and tau, (n,) each."""
+
 
 @contextmanager
-def playing(url: str, model: str, rows: Iterable[Sequence[np.ndarray]], rate: float) -> Iterator[None]:
+def playing(url: str, model: str, rows: Iterable[Row], rate: float) -> Iterator[None]:
     """Stream rows of q, dq, ddq and tau from a thread, to be learnt from, until the block ends; nothing may fail."""
     stop, failures = threading.Event(), list[Exception]()
 

@@ -1,4 +1,4 @@
-"""On a phone, in both themes and with the keyboard alone: everything has a name, can be read, reached and seen."""
+"""The theme that was chosen, and a model made with the keyboard alone. What every page owes: test_pages.py."""
 
 from __future__ import annotations
 
@@ -6,32 +6,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.browser.accessibility import audit, expect, focused, tab_to
+from tests.browser.accessibility import expect, focused, tab_to
 from tests.browser.conftest import Dashboard, Visit
-from tests.browser.visitor import PHONE, Visitor
+from tests.browser.visitor import Visitor
 from tests.service.data import arrays, npz, stream
-
-TABS = ("accuracy", "parts", "versions", "lineage", "ask", "learning")
-
-
-@pytest.mark.slow
-def test_every_page_can_be_read_on_a_phone_in_both_themes(windows: Visit, dashboard: Dashboard) -> None:
-    visitor = windows(dashboard.server.url, size=PHONE, scheme="dark", touch=True)
-    model = f"#/models/{dashboard.model}"
-    routes = [
-        *("#/", "#/data", f"#/data/{dashboard.dataset['id']}", "#/jobs", f"#/jobs/{dashboard.job['id']}", "#/train"),
-        *("#/models", *(f"{model}?tab={tab}" for tab in TABS), "#/live", f"#/live/{dashboard.model}"),
-    ]
-    problems = []
-    for route in [*routes, "/guide", "/guide/first-model"]:
-        page = visitor.open(route)
-        if (wider := visitor.overflow()) > 0:
-            problems.append(f"{route}: {wider} px wider than the screen")
-        problems += [f"{route}, dark: {problem}" for problem in audit(page)]
-        page.emulate_media(color_scheme="light")
-        problems += [f"{route}, light: {problem}" for problem in audit(page)]
-        page.emulate_media(color_scheme="dark")
-    assert problems == []
 
 
 @pytest.mark.slow
@@ -86,7 +64,11 @@ def test_a_model_is_made_without_a_mouse(visitor: Visitor) -> None:
 
     tab_to(page, "Name of the model")
     page.keyboard.type("keys")
-    tab_to(page, "auto")
+    tab_to(page, "More estimators")
+    page.keyboard.press("Enter")
+    expect(page.get_by_role("radio", name="lip-chain", exact=False).first).to_be_visible()
+    page.keyboard.press("Shift+Tab")
+    expect(page.get_by_role("radio", name="auto")).to_be_focused()
     page.keyboard.press("ArrowDown")
     page.keyboard.press("ArrowDown")
     expect(page.get_by_role("radio", name="lip-chain", exact=False).first).to_be_checked()

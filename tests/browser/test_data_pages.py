@@ -14,7 +14,7 @@ from tests.service.data import ENDLESS, arrays, columns, csv, ended, job, npz, q
 
 pytestmark = pytest.mark.slow
 
-LONG = {**ENDLESS, "hyperparameter_samples": 120, "starts": 1}
+LONG = {**ENDLESS, "hyperparameter_samples": 250, "starts": 1}
 """Its first iteration comes soon, its last does not."""
 SET_DEGREES = "Set the unit of q to deg and try again"
 
@@ -73,8 +73,10 @@ def test_options_say_how_a_file_is_read(visitor: Visitor) -> None:
     page.get_by_role("button", name="Upload", exact=True).click()
     page.get_by_role("link", name="Read its report").click()
     expect(page.get_by_role("heading", level=1, name="current.npz")).to_be_visible()
+    page.get_by_role("tab", name="Preparation").click()
     expect(page.get_by_text("torque is current times 2, 4 N·m/A")).to_be_visible()
-    expect(page.get_by_text("shoulder, elbow").first).to_be_visible()
+    page.get_by_text("samples of 2 joints").click()
+    expect(page.get_by_text("Joints: shoulder, elbow")).to_be_visible()
 
 
 def test_lines_break_between_episodes(visitor: Visitor, dashboard: Dashboard) -> None:
@@ -97,6 +99,7 @@ def test_lines_break_between_episodes(visitor: Visitor, dashboard: Dashboard) ->
 
 def test_the_form_offers_the_estimators_there_are(visitor: Visitor) -> None:
     page = visitor.open("#/train")
+    page.get_by_text("More estimators").click()
     assert [each.get_attribute("value") for each in page.get_by_role("radio").all()] == list(
         dict.fromkeys(["auto", "rigid-body", "lip-chain", "rigid-body+lip-chain", *ESTIMATORS])
     )
@@ -108,14 +111,14 @@ def test_the_form_offers_the_estimators_there_are(visitor: Visitor) -> None:
     expect(page.get_by_label("Robot", exact=True)).to_be_visible()
     page.get_by_label("Name of the model").fill("refused")
     page.get_by_role("button", name="Start training").click()
-    expect(page.get_by_role("alert")).to_contain_text("Choose at least one data set")
+    expect(page.get_by_role("alert")).to_contain_text("Choose at least one recording")
 
 
 def test_a_job_is_followed_through_a_lost_connection_stopped_and_repeated(
     visitor: Visitor, dashboard: Dashboard
 ) -> None:
     client = dashboard.client
-    dataset = upload(client, stream("ur5", samples=200), name="ur5.npz")
+    dataset = upload(client, stream("ur5", samples=400), name="ur5.npz")
     first = queue(client, "stopped", dataset["id"], options=LONG)["id"]
     page = visitor.open("#/")
     row = page.get_by_role("listitem").filter(has_text="stopped")

@@ -85,6 +85,7 @@ def trained(visitor: Visitor) -> None:
     expect(page.get_by_label(f"Train on {NAME}")).to_be_checked()
     assert audit(page) == []
     visitor.shot("train", 1100)
+    page.get_by_text("More estimators").click()
     page.locator('input[type=radio][value="lip-chain"]').check()
     page.get_by_text("Advanced options").click()
     for label, value in OPTIONS.items():

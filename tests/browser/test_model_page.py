@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.browser.accessibility import audit, expect
-from tests.browser.conftest import Dashboard
-from tests.browser.visitor import Visitor
+from tests.browser.conftest import Dashboard, Visit
+from tests.browser.visitor import DESKTOP, PHONE, Visitor
 from tests.service.data import QUICK, stream, train, upload
 
 pytestmark = pytest.mark.slow
@@ -130,3 +130,45 @@ def test_how_auto_has_chosen_is_shown_with_the_job_and_with_the_version(visitor:
         expect(card.locator("strong").first).to_have_text(chosen)
         visitor.settled()
         assert audit(page) == []
+
+
+def test_the_page_opens_on_what_was_held_out(visitor: Visitor, dashboard: Dashboard, model: str, long: str) -> None:
+    assert dashboard.client.get("/v1/datasets").json()["items"][0]["id"] != dashboard.dataset["id"], (
+        "a newer one is there"
+    )
+    page = visitor.open(f"#/models/{model}")
+    expect(page.get_by_label("Recording", exact=True)).to_have_value(dashboard.dataset["id"])
+    expect(page.get_by_label("Part", exact=True)).to_have_value("held_out")
+    expect(page.get_by_text("These samples flatter")).to_have_count(0)
+
+
+def test_coverage_and_verdict_are_seen_on_a_phone(windows: Visit, dashboard: Dashboard, model: str) -> None:
+    visitor = windows(dashboard.server.url, size=PHONE, touch=True)
+    page = visitor.open(f"#/models/{model}")
+    joints = page.get_by_role("region", name="Joint by joint").get_by_role("listitem")
+    expect(joints).to_have_count(2)
+    for joint in joints.all():
+        for part in (joint.get_by_role("img", name="inside the 95 % band"), joint.locator(".badge")):
+            box = part.bounding_box()
+            assert box is not None
+            assert box["x"] >= 0
+            assert box["x"] + box["width"] <= PHONE[0]
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_a_click_that_has_begun_is_not_lost_while_the_header_changes(
+    windows: Visit, dashboard: Dashboard, size: tuple[int, int]
+) -> None:
+    name = f"changing-{size[0]}"
+    for _ in range(2):
+        train(dashboard.client, name, dashboard.dataset["id"])
+    visitor = windows(dashboard.server.url, size=size)
+    page = visitor.open(f"#/models/{name}?version=2&tab=lineage")
+    place = page.get_by_role("link", name="Follow live").bounding_box()
+    assert place is not None
+    page.mouse.move(place["x"] + place["width"] / 2, place["y"] + place["height"] / 2)
+    page.mouse.down()
+    page.get_by_label("Version", exact=True).select_option("1")
+    expect(page.get_by_role("button", name="Serve version 1")).to_be_visible()
+    page.mouse.up()
+    expect(page.get_by_role("heading", level=1, name=f"{name} live")).to_be_visible()

@@ -169,6 +169,9 @@ def test_a_data_set_without_times_has_a_guard_in_rows(api):
         ({"share": 0.9}, "holdout.share", "it leaves 12 samples to train on, at least 30"),
         ({"blocks": 1}, "holdout.blocks", "greater than or equal to 2"),
         ({"guard": 1}, "holdout.guard", ""),
+        ({"kind": "stretches"}, "holdout.stretches", "rows, where `kind` is stretches"),
+        ({"stretches": {"ds_1": [[0, 9]]}}, "holdout.stretches", "and only there"),
+        ({"kind": "stretches", "stretches": {"ds_1": [[0, 9]]}}, "holdout.stretches.ds_1", "one of the data sets"),
     ],
 )
 def test_holdouts_that_are_refused(api, dataset, holdout, field, message):
@@ -176,6 +179,36 @@ def test_holdouts_that_are_refused(api, dataset, holdout, field, message):
     reply = error(api.post("/v1/jobs", json=body), 422, "invalid_request")
     assert reply["detail"][0]["field"] == field
     assert message in reply["message"]
+
+
+@pytest.mark.parametrize(
+    ("stretches", "field", "message"),
+    [
+        ([[9, 9]], "holdout.stretches.{}", "a first and a larger last row, at most 120"),
+        ([[50, 60], [40, 45]], "holdout.stretches.{}", "in order"),
+        ([[50, 121]], "holdout.stretches.{}", "at most 120"),
+        ([[0, 100]], "holdout.stretches", "it leaves 20 samples"),
+    ],
+)
+def test_stretches_that_are_refused(api, dataset, stretches, field, message):
+    holdout = {"kind": "stretches", "stretches": {dataset: stretches}}
+    body = {"model": "m", "datasets": [dataset], "options": QUICK, "holdout": holdout}
+    reply = error(api.post("/v1/jobs", json=body), 422, "invalid_request")
+    assert reply["detail"][0]["field"] == field.format(dataset)
+    assert message in reply["message"]
+
+
+def test_rows_that_are_named_are_held_out_and_found_again(api, dataset):
+    other = upload(api, recording(seed=7))["id"]
+    holdout = {"kind": "stretches", "stretches": {dataset: [[30, 60], [100, 110]]}}
+    result = material(api, dataset, other, **holdout)
+    assert rows_of(recording(), result.held_out[0]) == [*range(32, 58), *range(102, 108)]
+    assert len(result.samples.t) == ROWS - 32 - 4 * 4 + ROWS
+    job = train(api, "named-rows", dataset, other, holdout=holdout)
+    assert job["holdout"]["stretches"] == holdout["stretches"]
+    answer = ask(api, "named-rows", dataset, part="held_out").json()
+    assert answer["samples"] == 32
+    assert answer["in_training"] is False
 
 
 def test_a_split_that_leaves_nothing_fails_the_job(api, dataset):

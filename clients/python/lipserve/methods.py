@@ -106,6 +106,7 @@ class Calls:
     retry = One(calls.models.retry)
 
     models = Listed(calls.models.models)
+    overview = Listed(calls.models.overview)
     model = One(calls.models.model)
     delete_model = One(calls.models.delete_model)
     version = One(calls.models.version)

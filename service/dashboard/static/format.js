@@ -17,6 +17,11 @@ export function scientific(x, digits = 1) {
   return known(x) ? x.toExponential(digits).replace("e+", "e") : NONE;
 }
 
+/** An nMSE: 0.071, and below a thousandth 3.1e-4. */
+export function nmse(x) {
+  return known(x) && (x === 0 || x >= 1e-3) ? number(x, 2) : scientific(x);
+}
+
 /** A whole number with thin spaces between thousands. */
 export function count(x) {
   return known(x) ? Math.round(x).toLocaleString("en").replaceAll(",", "\u202f") : NONE;

@@ -1,5 +1,6 @@
 // Plots by Plotly, whose JavaScript is loaded in two parts, each when it first has something to draw. Colours follow the page's theme.
 
+import { css, faint, jointColour } from "./colours.js";
 import { h } from "./dom.js";
 
 const SPATIAL = new Set(["scatter3d", "mesh3d"]);
@@ -68,31 +69,21 @@ export function band(x, lower, upper, name, colour) {
 
 /** Colours of n joints, in the page's theme. */
 export function colours(n) {
-  return Array.from({ length: n }, (_, index) => css(`--joint-${(index % 8) + 1}`));
+  return Array.from({ length: n }, (_, index) => jointColour(index));
 }
 
-/** A colour of the theme by the name of its CSS variable, without --. */
-export function css(name) {
-  const full = name.startsWith("--") ? name : `--${name}`;
-  return getComputedStyle(document.documentElement).getPropertyValue(full).trim();
-}
-
-const CONFIG = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"] };
+// without its bar of buttons: they cannot be reached by keys in what is a picture, and one would send the plot to another host
+const CONFIG = { responsive: true, displayModeBar: false };
 
 function painted(traces) {
   return traces.flat().map(({ colour, filled, ...trace }) => {
     if (colour === undefined) return trace;
-    const found = typeof colour === "number" ? css(`joint-${(colour % 8) + 1}`) : css(colour) || colour;
+    const found = typeof colour === "number" ? jointColour(colour) : css(colour) || colour;
     const made = { ...trace, line: { color: found, ...trace.line } };
     if (trace.marker || trace.mode?.includes("markers")) made.marker = { color: found, ...trace.marker };
-    if (filled) made.fillcolor = translucent(found);
+    if (filled) made.fillcolor = faint(found, 0.22);
     return made;
   });
-}
-
-function translucent(colour) {
-  const [r, g, b] = [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
-  return `rgba(${r},${g},${b},0.22)`;
 }
 
 function themed({ title = "", x = "", y = "", height = 300, ...rest }) {
@@ -102,7 +93,6 @@ function themed({ title = "", x = "", y = "", height = 300, ...rest }) {
     margin: { l: 56, r: 16, t: title ? 40 : 16, b: 44 },
     legend: { orientation: "h", y: -0.22, yanchor: "top" },
     hovermode: "x unified",
-    modebar: { bgcolor: "rgba(0,0,0,0)", color: css("muted"), activecolor: css("accent") },
     ...rest,
     title: title ? { text: title, x: 0, xanchor: "left", font: { size: 15 } } : undefined,
     height,

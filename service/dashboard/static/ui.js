@@ -169,9 +169,11 @@ export function tabs(options, show, chosen = options[0]?.[0]) {
   );
   const list = h("div", { class: "tabs", role: "tablist" }, made);
   list.addEventListener("keydown", (event) => {
-    const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-    if (!step) return;
-    const next = made[(made.indexOf(document.activeElement) + step + made.length) % made.length];
+    const at = made.indexOf(document.activeElement);
+    const to = { ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: -1 }[event.key];
+    if (to === undefined) return;
+    event.preventDefault();
+    const next = made[(to + made.length) % made.length];
     next.focus();
     next.click();
   });

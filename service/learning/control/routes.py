@@ -16,7 +16,8 @@ from service.foundation.errors import (
     UnreadableVersionError,
     responses,
 )
-from service.learning.control import decisions, payload, schema, status
+from service.learning.control import decisions, overview, payload, schema, status
+from service.learning.control.overview_schema import OverviewPage
 from service.learning.control.payload_schema import PAYLOAD_EXAMPLE, PayloadRequest, Payloads
 from service.learning.learners import LearnersDep
 from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
@@ -39,6 +40,18 @@ class RefreshRequest(BaseModel):
     """Nothing to choose: estimator, options and robot are those of the version that serves."""
 
     model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{}]})
+
+
+overview_router = APIRouter(
+    prefix="/v1/overview", tags=["learning"], responses=responses(InvalidRequestError), route_class=Route
+)
+
+
+@overview_router.get("", summary="Models at a glance, newest first")
+def show_overview(learners: LearnersDep, page: PageQuery) -> OverviewPage:
+    """One page of models, each with all that a card of it shows: the learnt arm and its posture, error and coverage on
+    what was held out and on what came in the last hour, what it carries, and its newest alarm. Loads no model."""
+    return overview.page(learners, page)
 
 
 @router.get("/{model}/quality", summary="How well a model predicts what it has not learnt yet")

@@ -66,6 +66,10 @@ class Window:
         records = (bucket[1] for bucket in self._buckets if self._holds(bucket[0], now))
         return reduce(add, records, Record.empty(self._n_joints))
 
+    def course(self, now: float) -> list[tuple[float, Record]]:
+        """The records of the window's buckets, oldest first, each with when it began: Unix times, s."""
+        return [(number * self._length, record) for number, record, *_ in self._buckets if self._holds(number, now)]
+
     def counts(self, now: float) -> Counter[str]:
         """Sum of the counts within the window before a Unix time, s."""
         counts = (bucket[2] for bucket in self._buckets if self._holds(bucket[0], now))

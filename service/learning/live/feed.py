@@ -165,7 +165,10 @@ class FeedEvent(NamedTuple):
 
 
 class Feed(Counted):
-    """Followers of models. It belongs to the event loop, but for `note`."""
+    """Followers of models. It belongs to the event loop, but for `note` and `forget`.
+
+    positions: of the last row of each model that was finite, rad (m).
+    """
 
     too_many = "models are followed {} times, the most there may be: close one, or try again later"
     headers: ClassVar = {"Retry-After": "5"}
@@ -174,12 +177,21 @@ class Feed(Counted):
         super().__init__()
         self._rows_per_s = settings.live_rows_per_s
         self._followed: dict[str, Followed] = {}
+        self.positions: dict[str, list[float]] = {}
 
     def note(self, batch: Judged) -> None:
-        """Take note of a batch that was logged, where somebody follows its model. From any thread."""
+        """Take note of a batch that was logged: where its robot is, and what it shows to those who follow the model.
+        From any thread."""
+        known = batch.rows.q[np.isfinite(batch.rows.q).all(axis=1)]
+        if len(known):
+            self.positions[batch.served.name] = np.round(known[-1], DECIMALS).tolist()
         followed = self._followed.get(batch.served.name)
         if followed is not None:
             followed.waiting.append(batch)
+
+    def forget(self, model: str) -> None:
+        """Keep nothing of a model that has been deleted. From any thread."""
+        self.positions.pop(model, None)
 
     async def follow(self, model: str, look: Look, closing: asyncio.Event) -> AsyncIterator[FeedEvent]:
         """Events of a model until the service closes or the model is deleted; a status comes first."""

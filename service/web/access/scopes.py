@@ -44,6 +44,7 @@ TABLE: dict[tuple[str, str], str] = {
     ("GET", "/v1/jobs/{job}/events"): READ,
     ("POST", "/v1/jobs/{job}/cancel"): TRAIN,
     ("POST", "/v1/jobs/{job}/retry"): TRAIN,
+    ("GET", "/v1/overview"): READ,
     ("GET", "/v1/models"): READ,
     ("POST", "/v1/models/import"): ADMIN,
     ("GET", "/v1/models/{model}"): READ,

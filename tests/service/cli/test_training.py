@@ -144,3 +144,16 @@ def test_a_job_is_queued_followed_and_listed(refused, asked, recording):
     assert job in [each["id"] for each in asked("jobs", "list", "--json")]
     assert "cli-queued" in asked("jobs", "list")
     assert "conflict" in refused("jobs", "retry", job)
+
+
+def test_without_options_the_service_holds_out_what_it_does_by_default_and_zero_is_nothing(asked, server, recording):
+    path = recording(12, samples=120, rate=10.0)
+    job = asked("train", path, "--model", "by-default", *QUICKLY, "--json")
+    body = {"model": "by-default", "datasets": job["datasets"], "estimator": "lip-chain"}
+    plain = server.client.post("/v1/jobs", json=body).json()
+    server.client.post(f"/v1/jobs/{plain['id']}/cancel")
+    assert job["holdout"] == plain["holdout"]
+    assert (job["holdout"]["kind"], job["holdout"]["share"]) == ("auto", 0.3)
+    assert job["quality"]["samples"] > 0
+    job = asked("train", path, "--model", "by-default", *QUICKLY, "--hold-out", 0, "--json")
+    assert (job["holdout"], job["quality"]) == (None, None)

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from lipserve.call import KEY_HEADER, Answer, Call, Page, Route, given, new_key, nothing, page, record, route
 from lipserve.records.jobs import Job
 from lipserve.records.models import Alias, Model
+from lipserve.records.overview import ModelOverview
 from lipserve.results.arm import Version
 from lipserve.states import PromotionOption
 
@@ -24,7 +25,7 @@ def train(
     joint_types: Sequence[str] | None = None,
     options: Mapping[str, Any] | None = None,
     robot: str | None = None,
-    holdout: Mapping[str, Any] | None = None,
+    holdout: Mapping[str, Any] | Literal[False] | None = None,
     promotion: PromotionOption | None = None,
     base: str | None = None,
     *,
@@ -33,9 +34,9 @@ def train(
     """Queue a training job.
 
     robot: for rigid bodies, a profile such as panda or the id of an uploaded URDF; holdout: what to hold out of the
-    data sets and evaluate the version on, such as {"share": 0.3}; promotion: `ask` (default) lets the version answer if
-    it does well there, `always` in any case; base: a version of another unit of the same robot to start from, as
-    `model:3` or `model@alias`; idempotency_key: the same request under the same key queues one job, also
+    data sets and evaluate the version on, {"share": 0.3} by default, False for nothing; promotion: `ask` (default) lets
+    the version answer if it does well there, `always` in any case; base: a version of another unit of the same robot to
+    start from, as `model:3` or `model@alias`; idempotency_key: the same request under the same key queues one job, also
     from another client.
     """
     body: dict[str, Any] = {"model": model, "datasets": list(datasets), "options": dict(options or {})}
@@ -43,10 +44,12 @@ def train(
         estimator=estimator,
         joint_types=None if joint_types is None else list(joint_types),
         robot=robot,
-        holdout=None if holdout is None else dict(holdout),
+        holdout=dict(holdout) if holdout else None,
         promotion=promotion,
         base=base,
     )
+    if holdout is False:
+        body["holdout"] = None  # said: left out it is the service's default
     return at(record(Job), names={}, json=body, headers={KEY_HEADER: idempotency_key or new_key()})
 
 
@@ -90,6 +93,12 @@ C_FILES = ("lipserve_model.c", "lipserve_model.h")
 def models(at: Route) -> Call[Page[Model]]:
     """All models with their versions, newest first."""
     return at(page(Model), names={})
+
+
+@route("GET", "/v1/overview")
+def overview(at: Route) -> Call[Page[ModelOverview]]:
+    """All models at a glance, newest first: arm, quality, what came lately, what needs a decision."""
+    return at(page(ModelOverview), names={})
 
 
 @route("GET", "/v1/models/{model}")

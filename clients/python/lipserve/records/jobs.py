@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from lipserve.records import Record
+from lipserve.records.models import HeldOutQuality
 
 
 class Holdout(Record, frozen=True, kw_only=True):
@@ -13,19 +14,22 @@ class Holdout(Record, frozen=True, kw_only=True):
     kind: Of each data set: whole `episodes`, chosen by the seed; its `last` part; some of many equal `blocks`, chosen
         by the seed; or `auto`, the last part, unless that repeats motion that is learnt from and there are periods,
         episodes or stretches of motion that do not: then some of these, chosen by the seed. Of several data sets of one
-        episode each, `episodes` holds out whole data sets
+        episode each, `episodes` holds out whole data sets. `stretches`: rows that are named
     share: Of the samples, as nearly as whole episodes or blocks allow
     blocks: Equal stretches that `blocks` chooses from
     guard_s: Samples as near as that to the other side are left out of both, s; by default one period of the low-pass
         that the data set was prepared with. Of a data set without times 25 samples are
     seed: Of the choice
+    stretches: With `kind` `stretches`: by the ids of data sets, which rows to hold out, first and last (exclusive) in
+        order of episode and time. Data sets that are not named are learnt from
     """
 
-    kind: Literal["auto", "episodes", "last", "blocks"] = "auto"
+    kind: Literal["auto", "stretches", "episodes", "last", "blocks"] = "auto"
     share: float = 0.3
     blocks: int = 10
     guard_s: float | None = None
     seed: int = 0
+    stretches: dict[str, list[list[int]]] | None = None
 
 
 class Refresh(Record, frozen=True, kw_only=True):
@@ -90,6 +94,7 @@ class Job(Record, frozen=True, kw_only=True):
     refresh: What it refreshes; null for a job with data sets alone
     attempts: Times it was started; more than one after an interruption
     version: The version it made, once succeeded
+    quality: Of that version, on what the job held out; null where that is nothing
     heartbeat_at: When the training process last said that it lives
     history: What happened to it, oldest first
     retry_of: The job that it repeats
@@ -109,6 +114,7 @@ class Job(Record, frozen=True, kw_only=True):
     progress: JobProgress
     attempts: int
     version: int | None
+    quality: HeldOutQuality | None = None
     error: JobError | None
     created_at: str
     started_at: str | None

@@ -9,12 +9,50 @@ from msgspec import field
 from lipserve.records import Record
 
 
+class HeldOutQuality(Record, frozen=True, kw_only=True):
+    """How well a version predicts what its training held out, per joint; null where a joint's torque does not vary.
+
+    samples: Samples that the figures are of
+    nmse: Mean squared error / variance of the measured torque
+    coverage: Share of measurements inside the 95 % interval
+    coverage_low: Lower end of the coverage's confidence interval; null for versions of earlier releases
+    coverage_high: Its upper end
+    """
+
+    samples: int
+    nmse: list[float | None]
+    coverage: list[float | None]
+    coverage_low: list[float] | None = None
+    coverage_high: list[float] | None = None
+
+
+class Promotion(Record, frozen=True, kw_only=True):
+    """Whether a version that was trained answers by itself, and why: judged by what its training held out.
+
+    answers: Whether it answered once it was trained; else it waits under alias `candidate`
+    passed: Whether its intervals hold 90 % on every joint, as far as can be told, and it is not worse than the version
+        that serves; null where it was not judged
+    serving: The version that answered until then; null where it is the first
+    """
+
+    answers: bool
+    passed: bool | None
+    serving: int | None
+    reason: str
+
+
 class VersionSummary(Record, frozen=True, kw_only=True):
-    """A version in the list of its model."""
+    """A version in the list of its model.
+
+    quality: On what its training held out; null where that was nothing
+    promotion: Whether it answers by itself, and why; null for one that was refreshed, imported or shipped
+    """
 
     version: int
     created_at: str
     estimator: str
+    quality: HeldOutQuality | None = None
+    promotion: Promotion | None = None
 
 
 class Model(Record, frozen=True, kw_only=True):
@@ -32,21 +70,6 @@ class Model(Record, frozen=True, kw_only=True):
     serving_version: int
     aliases: dict[str, int]
     versions: list[VersionSummary]
-
-
-class Promotion(Record, frozen=True, kw_only=True):
-    """Whether a version that was trained answers by itself, and why: judged by what its training held out.
-
-    answers: Whether it answered once it was trained; else it waits under alias `candidate`
-    passed: Whether its intervals hold 90 % on every joint, as far as can be told, and it is not worse than the version
-        that serves; null where it was not judged
-    serving: The version that answered until then; null where it is the first
-    """
-
-    answers: bool
-    passed: bool | None
-    serving: int | None
-    reason: str
 
 
 class SelectionHeldOut(Record, frozen=True, kw_only=True):

@@ -1,15 +1,60 @@
-// One data set: what its report says, what its signals look like.
+// One data set: what to do about it, and tabs of what its signals and its report show.
 
 import { del, get, path } from "../api.js";
 import { h, replace } from "../dom.js";
-import { button, card, confirm, heading, link, notice } from "../ui.js";
+import { button, confirm, errorBox, heading, link, notice, tabs } from "../ui.js";
+import { excitationTab, frictionTab, preparationTab, timingTab } from "./data/figures.js";
 import { motion } from "./data/motion.js";
-import { reportCards, summary } from "./data/report.js";
+import { about, toDo } from "./data/report.js";
+import { rowsOf } from "./data/stretch.js";
 
-/** The page `#/data/{id}`. */
-export async function render(view, { id }, { signal, title }) {
+/** Each tab: its name in the address, its label, and what it shows. */
+const TABS = [
+  ["signals", "Signals", () => null],
+  ["timing", "Timing", timingTab],
+  ["excitation", "Excitation", excitationTab],
+  ["friction", "Friction", frictionTab],
+  ["preparation", "Preparation", preparationTab],
+];
+
+/** The page `#/data/{id}`; `?tab=timing` chooses a tab, `?hold_out=300-450` rows to hold out. */
+export async function render(view, { id, query }, { signal, title }) {
   const dataset = await get(path`/v1/datasets/${id}`, {}, signal);
   title(dataset.name);
+  const state = { tab: TABS.some(([tab]) => tab === query.get("tab")) ? query.get("tab") : TABS[0][0], rows: rowsOf(query.get("hold_out")) };
+  const train = link("Train on it", "", "primary");
+  const remember = () => {
+    const held = state.rows ? { hold_out: state.rows.join("-") } : {};
+    const seen = new URLSearchParams({ ...(state.tab === TABS[0][0] ? {} : { tab: state.tab }), ...held }).toString();
+    history.replaceState(null, "", `#/data/${encodeURIComponent(id)}${seen && `?${seen}`}`);
+    train.setAttribute("href", `#/train?${new URLSearchParams({ datasets: id, ...held })}`);
+  };
+  const choose = (rows) => {
+    state.rows = rows;
+    remember();
+  };
+
+  const panel = h("div", { role: "tabpanel" });
+  let left = new AbortController();
+  signal.addEventListener("abort", () => left.abort());
+  const show = async (tab) => {
+    left.abort();
+    left = new AbortController();
+    const mine = left.signal;
+    state.tab = tab;
+    remember();
+    const [, label, figures] = TABS.find(([each]) => each === tab);
+    const plots = tab === "signals" ? h("section", { class: "card", "aria-label": "Signals" }) : null;
+    panel.setAttribute("aria-label", label);
+    replace(panel, h("div", { dataset: { tab } }, plots, figures(dataset)));
+    try {
+      if (plots) await motion(plots, dataset, { rows: state.rows, choose, signal: mine });
+    } catch (error) {
+      if (mine.aborted || error.name === "AbortError") return;
+      if (error.name !== "ApiError") console.error(error);
+      replace(plots, errorBox(error, () => show(tab)));
+    }
+  };
   const remove = button("Delete", async () => {
     const question = `Delete “${dataset.name}” (${dataset.id})? Its samples will be gone. Models trained on it stay, but can no longer be judged on it.`;
     if (!(await confirm(question, "Delete"))) return;
@@ -17,14 +62,9 @@ export async function render(view, { id }, { signal, title }) {
     notice(`${dataset.name} is deleted.`);
     location.hash = "#/data";
   }, { kind: "danger" });
-  const { report } = dataset;
-  const signals = h("div", {});
-  replace(
-    view,
-    heading(dataset.name, link("Train on it", `#/train?datasets=${dataset.id}`, "primary"), remove),
-    summary(dataset),
-    card("Signals", signals),
-    reportCards(report, dataset.joint_names),
-  );
-  await motion(signals, dataset, signal);
+  const list = h("div", {});
+  replace(view, heading(dataset.name, train, remove), about(dataset), toDo(dataset), list, panel);
+  const bar = tabs(TABS.map(([tab, label]) => [tab, label]), show, state.tab);
+  bar.setAttribute("aria-label", `What is known of ${dataset.name}`);
+  replace(list, bar);
 }

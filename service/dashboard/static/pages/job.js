@@ -102,12 +102,18 @@ function offered(job, cancel, retry) {
 
 function live(job, active) {
   const at = job.progress;
-  const pairs = [...(active ? [["Doing", stage(job)]] : []), ["Iteration", at.max_iterations ? `${count(at.iteration)} of at most ${count(at.max_iterations)}` : "–"]];
+  const pairs = [...(active ? [["Doing", stage(job)]] : []), ["Iteration", iterations(at)]];
   if (active) pairs.push(["Done", percent(at.fraction, 0)]);
   pairs.push([active ? "Time so far" : "Time taken", seconds(at.elapsed_s)]);
   if (active) pairs.push(["Time left", left(job) || "not known yet"]);
   pairs.push(["Objective", at.objective === null ? "–" : `${at.objective.toFixed(1)} nats`]);
   return pairs;
+}
+
+// where several fits follow one another, or geometry is searched first, there are more than one fit may have
+function iterations({ iteration, max_iterations: most }) {
+  if (!most) return "–";
+  return iteration > most ? count(iteration) : `${count(iteration)} of at most ${count(most)}`;
 }
 
 function said(job, id) {

@@ -3,13 +3,22 @@
 import { get } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
 import { ago, percent, seconds, when } from "../format.js";
-import { badge, button, card, empty, every, heading, link, progress, table } from "../ui.js";
+import { listing } from "../tables.js";
+import { badge, button, card, empty, every, heading, link, progress } from "../ui.js";
 import { ACTIVE, left, stage } from "./job/words.js";
+import { QUALITY_HINT, qualityColumns } from "./quality.js";
 
 /** The page `#/jobs`. */
 export async function render(view, params, { signal, title }) {
   title("Training");
   const list = h("div", {});
+  const table = listing(COLUMNS, {
+    caption: "Jobs",
+    what: ["job", "jobs"],
+    key: (job) => job.id,
+    words: (job) => [job.model, job.state, job.estimator, job.id].join(" "),
+  });
+  const hint = h("p", { class: "hint" }, QUALITY_HINT);
   const stale = h("p", { class: "banner", role: "status", hidden: true });
   let older = [];
   let cursor = null;
@@ -18,7 +27,8 @@ export async function render(view, params, { signal, title }) {
   const draw = (newest) => {
     const ids = new Set(newest.map((job) => job.id));
     const jobs = [...newest, ...older.filter((job) => !ids.has(job.id))];
-    refresh(list, jobs.length ? listed(jobs) : nothing(), cursor ? more : null);
+    if (jobs.length) table.show(jobs);
+    refresh(list, jobs.length ? [table.element, hint] : nothing(), cursor ? more : null);
   };
   let newest = [];
   const more = button("Show older ones", async () => {
@@ -56,21 +66,19 @@ export async function render(view, params, { signal, title }) {
   );
 }
 
-function listed(jobs) {
-  return table(
-    [
-      { label: "Model", cell: (job) => link(job.model, `#/jobs/${job.id}`) },
-      { label: "State", cell: (job) => badge(job.state) },
-      { label: "Progress", cell: far },
-      { label: "Estimator", cell: (job) => job.estimator },
-      { label: "Data sets", numeric: true, cell: (job) => job.datasets.length },
-      { label: "Queued", cell: (job) => h("time", { datetime: job.created_at, title: when(job.created_at) }, ago(job.created_at)) },
-      { label: "Result", cell: (job) => (job.version === null ? "–" : link(`version ${job.version}`, `#/models/${job.model}?version=${job.version}`)) },
-    ],
-    jobs,
-    { caption: "Newest first", key: (job) => job.id },
-  );
-}
+const COLUMNS = [
+  { label: "Model", value: (job) => job.model, cell: (job) => link(job.model, `#/jobs/${job.id}`) },
+  { label: "State", value: (job) => job.state, cell: (job) => badge(job.state) },
+  ...qualityColumns((job) => ({ quality: job.quality, joints: null })).map((column) => ({
+    ...column,
+    cell: (job) => (job.state === "succeeded" ? column.cell(job) : "–"),
+  })),
+  { label: "Result", value: (job) => job.version, cell: (job) => (job.version === null ? "–" : link(`version ${job.version}`, `#/models/${job.model}?version=${job.version}`)) },
+  { label: "Progress", cell: far },
+  { label: "Estimator", value: (job) => job.estimator, cell: (job) => job.estimator },
+  { label: "Recordings", numeric: true, value: (job) => job.datasets.length, cell: (job) => job.datasets.length },
+  { label: "Queued", value: (job) => job.created_at, first: "descending", cell: (job) => h("time", { datetime: job.created_at, title: when(job.created_at) }, ago(job.created_at)) },
+];
 
 function far(job) {
   if (job.state === "failed") return job.error?.message ?? "failed";

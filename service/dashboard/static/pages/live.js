@@ -1,17 +1,22 @@
-// The live page: what streams measure and what was predicted before it was learnt, as it comes.
+// The live page: which robots stream now, and of one model what streams measure and what was predicted, as it comes.
 
 import { pages } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
 import { count, counted } from "../format.js";
-import { empty, heading, link, offer, select } from "../ui.js";
-import { alarms } from "./live/alarms.js";
-import { carriedCard } from "./live/carried.js";
+import { Linked } from "../linked.js";
+import { plotly } from "../plots.js";
+import { card, heading, offer, select } from "../ui.js";
+import { alarmMarks, alarms } from "./live/alarms.js";
+import { carriedCard, externalCard } from "./live/carried.js";
 import { follow } from "./live/connection.js";
 import { innovation } from "./live/innovation.js";
 import { moving } from "./live/moving.js";
 import { quiet } from "./live/quiet.js";
-import { Rows, WINDOW_S } from "./live/rows.js";
-import { answersCard, learningCard, qualityCard } from "./live/standing.js";
+import { address, robots } from "./live/robots.js";
+import { Rows } from "./live/rows.js";
+import { answersCard, learningFacts, qualityCard } from "./live/standing.js";
+import { switches } from "./live/switches.js";
+import { toolbar } from "./live/toolbar.js";
 import { torque } from "./live/torque.js";
 
 const DRAW_MS = 300;
@@ -20,45 +25,50 @@ const STALE_S = 3;
 const BREATH = 3; // times as long as drawing takes, nothing is drawn
 const LONGEST_BREATH_MS = 1500;
 
-/** The page `#/live`, where a model is chosen, and `#/live/{name}`. */
-export async function render(view, { name }, { signal, title }) {
+/** The page `#/live`, where robots are listed, and `#/live/{name}`; `?window=120&joint=joint4` chooses what is seen. */
+export async function render(view, { name, query }, { signal, title }) {
   title(name ? `${name} live` : "Live");
+  if (!name) return robots(view, signal);
   const models = (await pages("/v1/models", MOST_MODELS, {}, signal)).map((model) => model.name);
-  if (!models.length) {
-    const said = "There is no model to follow yet. Upload a recording of your robot, then train a model on it.";
-    replace(view, heading("Live"), empty(said, link("Upload a recording", "#/data", "primary")));
-    return;
-  }
-  if (!name) {
-    replace(
-      view,
-      heading("Live"),
-      h("p", {}, "Follow a model while it answers and learns: measured and predicted torque, rows kept out of learning, and answer times."),
-      h("ul", {}, models.map((each) => h("li", {}, link(each, address(each))))),
-    );
-    return;
-  }
-  await followed(view, name, models, signal);
+  await followed(view, name, models, query, signal);
 }
 
 /** Follow one model until the page is left; throws what the service refuses for good. */
-async function followed(view, name, models, signal) {
-  const page = parts(name, models);
+async function followed(view, name, models, query, signal) {
+  const learning = switches(name, signal);
+  const page = parts(name, models, learning.element);
   const seen = { rows: null, status: null, connection: null, pausedAt: null, drawn: 0, drawAt: 0, lost: 0 };
+  const choice = { window: 30, joint: null, cursor: null };
   const stream = streamChoice(seen);
-  let plots = null;
-  let drawing = false;
+  let plots = null, drawing = false;
+  plotly(); // is needed as soon as rows come
+
+  const again = () => {
+    seen.drawn = -1;
+    seen.drawAt = 0;
+  };
+  const point = (x) => {
+    choice.cursor = x;
+    linked.point(x);
+    tools?.point(x);
+    plots?.torque.point();
+  };
+  const linked = new Linked({ moved: point, stays: false });
+  let tools = null;
 
   const begin = (status) => {
-    const joints = status.joint_names;
+    const { joint_names: joints, joint_types: types } = status;
     if (seen.rows?.joints.join() === joints.join()) return;
     seen.rows = new Rows(joints);
-    plots = [
-      torque(page.torque, joints, status.joint_types, signal),
-      moving(page.arm, name, () => seen.rows.pose(), signal),
-      innovation(page.innovation, joints, signal),
-    ];
-    seen.drawn = -1;
+    tools = toolbar(name, joints, choice, query, { changed: again, point });
+    replace(page.tools, tools.element);
+    const pick = (joint) => tools.pick(joint);
+    plots = {
+      torque: torque(page.torque, joints, types, choice, linked, { pick, signal }),
+      innovation: innovation(page.innovation, joints, choice, linked, signal),
+      arm: moving(page.arm, name, () => seen.rows.pose(), signal),
+    };
+    again();
   };
   const hear = (event, data) => {
     if (event === "lost") seen.lost += data.events;
@@ -67,13 +77,16 @@ async function followed(view, name, models, signal) {
     begin(data);
     seen.status = data;
     data.novel.forEach((said) => seen.rows.mark(said));
+    learning.look(data);
     tell();
   };
   const tell = () => {
     said(page, seen, name);
     if (!seen.status) return;
     refresh(page.carried, carriedCard(seen.status));
-    refresh(page.standing, learningCard(seen.status), qualityCard(seen.status), answersCard(seen.status));
+    refresh(page.learning, learningFacts(seen.status));
+    refresh(page.quality, qualityCard(seen.status));
+    refresh(page.answers, answersCard(seen.status));
     alarms(page, seen.status, name, signal);
     const names = seen.rows.streams();
     refresh(page.streams, names.length < 2 ? null : offer(stream, names, seen.rows.chosen));
@@ -85,12 +98,17 @@ async function followed(view, name, models, signal) {
     seen.drawn = seen.rows.version;
     const began = Date.now();
     try {
-      const shown = seen.rows.shown();
-      for (const each of plots) await each.draw(shown, seen.status);
+      page.plots.hidden = false; // a plot takes its width from a place that is seen
+      const shown = seen.rows.shown(choice.window);
+      const joint = await plots.torque.draw(shown);
+      linked.mark(alarmMarks(seen.status.alarms, seen.rows.newest()));
+      refresh(page.external, externalCard(shown, seen.rows.joints, seen.status.joint_types));
+      await plots.arm.draw(seen.status, joint);
+      await plots.innovation.draw(shown, seen.status, joint);
     } finally {
       drawing = false;
       // on a slow machine less often: the page stays usable
-      seen.drawAt = Date.now() + Math.min(BREATH * (Date.now() - began), LONGEST_BREATH_MS);
+      if (seen.drawn !== -1) seen.drawAt = Date.now() + Math.min(BREATH * (Date.now() - began), LONGEST_BREATH_MS);
     }
   };
   page.pause.addEventListener("click", () => {
@@ -102,7 +120,6 @@ async function followed(view, name, models, signal) {
   replace(view, page.all);
   tell();
   const timers = [setInterval(draw, DRAW_MS), setInterval(() => said(page, seen, name), 1000)];
-  const again = () => (seen.drawn = -1);
   document.addEventListener("themechange", again);
   signal.addEventListener("abort", () => {
     timers.forEach(clearInterval);
@@ -115,28 +132,20 @@ async function followed(view, name, models, signal) {
 }
 
 /** The places of the page. */
-function parts(name, models) {
-  const page = Object.fromEntries(["state", "about", "quiet", "held", "carried", "standing", "alarms", "torque", "arm", "innovation"].map((each) => [each, h("div")]));
+function parts(name, models, learning) {
+  const places = ["about", "quiet", "held", "carried", "external", "learning", "quality", "answers", "alarms", "tools", "torque", "arm", "innovation"];
+  const page = Object.fromEntries(places.map((each) => [each, h("div")]));
   page.state = h("p", { role: "status", class: "actions" });
   page.about.className = "hint";
-  page.standing.className = "grid";
   page.pause = h("button", { type: "button" }, "Pause plots");
   page.streams = h("span");
   const choice = select(models.includes(name) ? models : [name, ...models], name, (chosen) => (location.hash = address(chosen)));
   choice.setAttribute("aria-label", "Model to follow");
   choice.style.width = "auto";
-  page.plots = h("div", {}, page.torque, page.arm, page.innovation);
-  page.all = [
-    heading(`${name} live`, choice, page.streams, page.pause),
-    page.state,
-    page.about,
-    page.held,
-    page.quiet,
-    page.carried,
-    page.plots,
-    page.standing,
-    page.alarms,
-  ];
+  const stage = h("div", { class: "stage" }, h("div", {}, page.torque, page.innovation), h("div", { class: "aside" }, page.arm, page.external));
+  const standing = h("div", { class: "grid wide" }, card("Learning", learning, page.learning), page.quality);
+  page.plots = h("div", { hidden: true }, page.tools, stage);
+  page.all = [heading(`${name} live`, choice, page.streams, page.pause), page.state, page.about, page.held, page.quiet, page.plots, page.carried, standing, page.answers, page.alarms];
   return page;
 }
 
@@ -153,7 +162,7 @@ function said(page, seen, name) {
   else words.push(["good", "✓ live"]);
   if (seen.pausedAt !== null) words.push(["warn", "! plots paused, rows still come"]);
   refresh(page.state, ...words.map(([kind, text]) => h("span", { class: `badge ${kind}`, style: "white-space: normal" }, text)));
-  page.pause.hidden = page.plots.hidden = !rows?.came;
+  page.pause.hidden = !rows?.came;
   page.torque.style.opacity = page.innovation.style.opacity = lost || age > STALE_S ? "0.75" : "";
   refresh(page.quiet, rows?.came || lost ? null : quiet(name, status));
   refresh(page.about, rows?.came ? about(seen, age) : null);
@@ -162,7 +171,7 @@ function said(page, seen, name) {
 function about({ rows, lost, pausedAt }, age) {
   const rate = rows.rate();
   const texts = [
-    `Stream ${rows.chosen}, the last ${WINDOW_S} s. `,
+    `Stream ${rows.chosen}. `,
     age > STALE_S ? `The newest row came ${Math.round(age)} s ago. ` : null,
     rate ? `${counted(Math.round(rate.came), "row")} come in each second. This page shows ${count(Math.round(rate.shown))} of them, those kept out of learning first. ` : null,
     pausedAt === null ? null : `Plots are paused since ${new Date(pausedAt).toLocaleTimeString("en-GB")}. `,
@@ -180,8 +189,4 @@ function streamChoice(seen) {
   made.setAttribute("aria-label", "Stream to show");
   made.style.width = "auto";
   return made;
-}
-
-function address(name) {
-  return `#/live/${encodeURIComponent(name)}`;
 }

@@ -12,7 +12,7 @@ import { chooser, firstChoice } from "./model/choice.js";
 import { learning } from "./model/learning.js";
 import { lineage } from "./model/lineage.js";
 import { parts } from "./model/parts.js";
-import { promoted } from "./model/promotion.js";
+import { mayAnswer, promoted } from "./model/promotion.js";
 import { confirmServing } from "./model/serving.js";
 import { versions } from "./model/versions.js";
 
@@ -91,7 +91,7 @@ function header(state, reload) {
   const { name, where } = state;
   const promote = button("", async () => {
     const shown = state.version.version;
-    if (!(await confirmServing(name, shown, state.model.serving_version))) return;
+    if (!(await confirmServing(name, state.version, state.model.serving_version))) return;
     await put(`${where}/aliases/serving`, { version: shown });
     notice(`Version ${shown} of ${name} answers from now on.`);
     await reload();
@@ -104,12 +104,14 @@ function header(state, reload) {
     const shown = version.version;
     const names = Object.entries(aliases).map(([alias, number]) => `${alias} → ${number}`);
     promote.textContent = `Serve version ${shown}`;
-    refresh(actions, shown === serving ? badge("serving") : promote, follow, train);
+    const { word, kind, why } = mayAnswer(version);
+    promote.title = `${why}.`;
+    refresh(actions, shown === serving ? badge("serving") : [badge(word, kind), promote], follow, train);
     refresh(about, facts([
       ["Answers now", `version ${serving}`],
       ["Shown here", `version ${shown}, ${version.estimator}, made ${when(version.created_at)}`],
       ...(names.length ? [["Aliases", names.join(", ")]] : []),
-    ]), promoted(version), warned(version.warnings));
+    ]), shown === serving || promoted(version)?.matches(".banner") ? promoted(version) : h("p", { class: "hint" }, `${why}.`), warned(version.warnings));
   };
   return [h("div", {}, heading(name, actions), about), update];
 }

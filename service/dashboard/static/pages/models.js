@@ -1,9 +1,11 @@
-// All models: which version answers, what it is, where to look at it.
+// All models: which version answers, how good it is, where to look at it.
 
 import { pages } from "../api.js";
 import { h, replace } from "../dom.js";
-import { count, when } from "../format.js";
-import { empty, heading, link, table } from "../ui.js";
+import { ago, count, when } from "../format.js";
+import { listing } from "../tables.js";
+import { card, empty, heading, link } from "../ui.js";
+import { QUALITY_HINT, qualityColumns } from "./quality.js";
 
 const MOST = 500;
 
@@ -19,20 +21,31 @@ export async function render(view, _params, { signal, title }) {
   }
   const serving = (model) => model.versions.find((each) => each.version === model.serving_version);
   const columns = [
-    { label: "Model", cell: (model) => link(model.name, address(model.name)) },
-    { label: "Answers", cell: (model) => `version ${model.serving_version}` },
-    { label: "Estimator", cell: (model) => serving(model)?.estimator ?? "–" },
-    { label: "Version made", cell: (model) => (serving(model) ? when(serving(model).created_at) : "–") },
-    { label: "Versions", numeric: true, cell: (model) => count(model.versions.length) },
+    { label: "Model", value: (model) => model.name, cell: (model) => link(model.name, address(model.name)) },
+    ...qualityColumns((model) => ({ quality: serving(model)?.quality, joints: null })),
+    { label: "Answers", value: (model) => model.serving_version, cell: (model) => link(`version ${model.serving_version}`, `${address(model.name)}?tab=versions`) },
+    { label: "Estimator", value: (model) => serving(model)?.estimator, cell: (model) => serving(model)?.estimator ?? "–" },
+    { label: "Made", value: (model) => serving(model)?.created_at, first: "descending", cell: (model) => (serving(model) ? time(serving(model).created_at) : "–") },
+    { label: "Versions", numeric: true, value: (model) => model.versions.length, first: "descending", cell: (model) => count(model.versions.length) },
     { label: "Aliases", cell: (model) => aliases(model.aliases) },
     { label: "Live", cell: (model) => h("a", { href: `#/live/${encodeURIComponent(model.name)}`, "aria-label": `Follow ${model.name} live` }, "follow") },
   ];
+  const list = listing(columns, {
+    caption: "Models",
+    what: ["model", "models"],
+    key: (model) => model.name,
+    words: (model) => [model.name, serving(model)?.estimator, aliases(model.aliases)].join(" "),
+  });
+  list.show(models);
   replace(
     view,
     heading("Models", train),
-    table(columns, models, { caption: "Newest first" }),
-    models.length === MOST ? h("p", { class: "hint" }, `The newest ${MOST} are shown.`) : null,
+    card("All models", list.element, h("p", { class: "hint" }, QUALITY_HINT), models.length === MOST ? h("p", { class: "hint" }, `The newest ${MOST} are shown.`) : null),
   );
+}
+
+function time(at) {
+  return h("time", { datetime: at, title: when(at) }, ago(at));
 }
 
 function address(name) {

@@ -1,52 +1,49 @@
-// Overview: whether the service is well, what runs, what is there, and what to do next.
+// Overview: every robot at a glance, what trains now, whether the service is well, and what to do first.
 
 import { get } from "../api.js";
 import { h, replace } from "../dom.js";
 import { heading, link, loading } from "../ui.js";
-import { attention, warnings } from "./overview/attention.js";
 import { follow } from "./overview/follow.js";
 import { health } from "./overview/health.js";
-import { counts } from "./overview/counts.js";
 import { jobBoard } from "./overview/jobs.js";
-import { newestModels } from "./overview/models.js";
+import { robots } from "./overview/robots.js";
 import { steps } from "./overview/steps.js";
 
 const OFTEN_S = 2;
-const SELDOM_S = 10;
+const MODELS = 24;
 
+/** The page `#/`. */
 export async function render(view, _params, { signal, title }) {
   title("Overview");
-  const places = Object.fromEntries(["stale", "attention", "steps", "counts", "jobs", "models"].map((name) => [name, h("div", { class: "place" })]));
-  const well = h("div");
+  const places = Object.fromEntries(["stale", "steps", "robots", "jobs", "health"].map((name) => [name, h("div", { class: "place" })]));
   replace(
     view,
     heading("Overview", link("Upload a recording", "#/data", "button"), link("Train a model", "#/train", "primary")),
-    well,
+    places.health,
     places.stale,
-    places.attention,
     places.steps,
-    places.counts,
+    places.robots,
     places.jobs,
-    places.models,
   );
+  const waiting = loading();
+  places.robots.append(waiting);
+  const show = robots(places.robots);
   const seen = { data: null, models: null, jobs: null };
-  replace(places.counts, loading());
-
   const tell = () => {
-    if (!seen.data || !seen.models || !seen.jobs) return;
-    counts(places.counts, seen);
-    steps(places.steps, seen);
+    if (seen.data !== null && seen.models && seen.jobs) steps(places.steps, seen);
   };
-  health(well, OFTEN_S, signal);
+  health(places.health, OFTEN_S, signal);
   follow(OFTEN_S, places.stale, signal, async (until) => {
-    seen.jobs = await get("/v1/jobs", {}, until);
-    jobBoard(places.jobs, seen.jobs.items);
+    seen.jobs = (await get("/v1/jobs", {}, until)).items;
+    jobBoard(places.jobs, seen.jobs);
     tell();
   });
-  follow(SELDOM_S, places.stale, signal, async (until) => {
-    [seen.data, seen.models] = await Promise.all([get("/v1/datasets", {}, until), get("/v1/models", {}, until)]);
-    newestModels(places.models, seen.models.items);
+  follow(OFTEN_S, places.stale, signal, async (until) => {
+    const page = await get("/v1/overview", { limit: MODELS }, until);
+    seen.models = page.items;
+    if (!seen.data) seen.data = (await get("/v1/datasets", { limit: 1 }, until)).items.length > 0;
+    waiting.remove();
+    show(page);
     tell();
-    attention(places.attention, await warnings(seen.models.items, until));
   });
 }

@@ -5,17 +5,18 @@ import { h, replace } from "../dom.js";
 import { card, errorBox, field, heading, notice, select } from "../ui.js";
 import { robotSelect, robots } from "./data/robots.js";
 import { advancedOptions } from "./train/advanced.js";
+import { rowsOf } from "./data/stretch.js";
 import { datasetChoice } from "./train/choice.js";
 import { ESTIMATORS, estimatorChoice } from "./train/estimators.js";
 import { holdoutChoice } from "./train/holdout.js";
 
 const PROMOTION = [
   ["", "as the service is set"],
-  ["ask", "let it answer if it does well on what was held out"],
-  ["always", "let it answer in any case"],
+  ["ask", "only if it does well on what was held out"],
+  ["always", "in any case"],
 ];
 
-/** The page `#/train`; `?datasets=ID,ID&model=NAME` chooses beforehand. */
+/** The page `#/train`; `?datasets=ID,ID&model=NAME` chooses beforehand, `&hold_out=300-450` rows of the one data set. */
 export async function render(view, { query }, { signal, title }) {
   title("Train a model");
   const [datasets, models] = await Promise.all([
@@ -23,8 +24,8 @@ export async function render(view, { query }, { signal, title }) {
     pages("/v1/models", 200, {}, signal),
   ]);
   const known = new Map(models.map((each) => [each.name, each]));
-  const robot = robotSelect({ none: "none: learn where the axes lie from the torque", withUrdf: true });
-  const withRobot = h("div", {}, field("Robot", robot.select, "Optional. With a robot, learning begins at its URDF; joints are matched by name."), robot.note, robot.add);
+  const robot = robotSelect({ none: "none: learn the joint axes from the torque", withUrdf: true });
+  const withRobot = h("div", {}, field("Robot", robot.select, "Optional. Learning then begins at the robot’s URDF; joints are matched by name."), robot.note, robot.add);
   const offerRobot = (taken) => {
     withRobot.hidden = !taken;
     robot.select.disabled = !taken;
@@ -35,14 +36,18 @@ export async function render(view, { query }, { signal, title }) {
     offerRobot(taken);
   });
   offerRobot(ESTIMATORS[0][2]);
+  const tellRobot = () => estimators.robot(robot.select.value ? robot.select.selectedOptions[0].textContent : "");
+  robot.select.addEventListener("change", tellRobot);
 
   const { element: nameField, input: model } = modelName(known, query.get("model"));
   const preselected = (query.get("datasets") ?? "").split(",");
   const choice = datasetChoice(datasets, preselected, (picked) => {
     const said = new Set(picked.map((each) => each.report.robot));
     if (said.size === 1 && !robot.select.value) robot.choose([...said][0]);
+    tellRobot();
   });
-  const holdout = holdoutChoice();
+  const rows = preselected.length === 1 ? rowsOf(query.get("hold_out")) : null;
+  const holdout = holdoutChoice(rows && { [preselected[0]]: [rows] });
   const promotion = select(PROMOTION, "");
   promotion.name = "promotion";
   const advanced = advancedOptions(signal);
@@ -53,13 +58,13 @@ export async function render(view, { query }, { signal, title }) {
     event.preventDefault();
     const picked = choice.chosen();
     if (!picked.length) {
-      replace(problems, h("div", { class: "error", role: "alert" }, "Choose at least one data set to train on."));
+      replace(problems, h("div", { class: "error", role: "alert" }, "Choose at least one recording to train on."));
       form.querySelector("[name=datasets]:not(:disabled)")?.focus();
       return;
     }
     const request = { model: model.value.trim(), datasets: picked.map((each) => each.id), estimator, options: advanced.values() };
     if (promotion.value) request.promotion = promotion.value;
-    if (holdout.value()) request.holdout = holdout.value();
+    request.holdout = holdout.value();
     if (!robot.select.disabled && robot.select.value) request.robot = robot.select.value;
     if (advanced.jointTypes().length) request.joint_types = advanced.jointTypes();
     start.disabled = true;
@@ -80,10 +85,10 @@ export async function render(view, { query }, { signal, title }) {
   const form = h(
     "form",
     { onsubmit: submit },
-    card("Data sets", choice.element),
-    card("Model", nameField, estimators, withRobot),
-    card("Held-out part", holdout.element, field("When it is trained", promotion, "“Does well”: its 95 % bands hold 90 % on every joint, as far as can be told, and it is not worse than the version that answers.")),
-    card("Fit", h("p", { class: "hint" }, "The defaults suit most recordings."), advanced.element),
+    card("Recordings", choice.element),
+    card("Model", nameField, estimators.element, withRobot),
+    card("How it is judged", holdout.element, field("May the new version answer?", promotion, "It does well if its 95\u00a0% bands hold at least 90\u00a0% on every joint, and it is no worse than the version that answers now.")),
+    card("Options", h("p", { class: "hint" }, "The defaults suit most recordings."), advanced.element),
     problems,
     h("div", { class: "actions" }, start),
   );
@@ -93,6 +98,7 @@ export async function render(view, { query }, { signal, title }) {
     (found) => {
       robot.fill(found);
       choice.changed?.();
+      tellRobot();
     },
     (error) => error.name === "AbortError" || notice(`robots: ${error.message}`, "bad"),
   );
@@ -117,7 +123,7 @@ function modelName(known, given) {
     const model = known.get(input.value.trim());
     const has = model?.latest_version === 1 ? "version 1" : `versions up to ${model?.latest_version}`;
     about.textContent = model
-      ? `${model.name} has ${has}. The new version will answer if it does well on what is held out, else wait as candidate.`
+      ? `${model.name} has ${has}. The new version answers if it does well on what is held out; else it waits as candidate.`
       : "";
   };
   input.addEventListener("input", say);

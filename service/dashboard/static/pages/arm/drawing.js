@@ -1,12 +1,14 @@
 // The arm that a version has learnt, drawn in 3-D at a posture: links, joint axes, masses, and how sure it is of them.
 
+import { css, faint, jointColour } from "../../colours.js";
 import { shortNames } from "../../format.js";
-import { css, plot } from "../../plots.js";
+import { plot } from "../../plots.js";
 import { add, centres, frames, scaled, times, upright } from "./kinematics.js";
 
 const AXIS = 0.12; // half an axis' length, of the arm's size
 const ROUND = 24; // corners of a disc
 const MARGIN = 0.15;
+const THICK = 20; // px, of a joint that is pointed out
 const SMALLEST = 7, LARGEST = 24; // of a mass, px
 
 /** What both pages say beside the drawing. */
@@ -18,16 +20,17 @@ export function drawable() {
   return document.createElement("canvas").getContext("webgl") !== null;
 }
 
-/** Draw the arm of a version into an element; at(q) is where to begin. Returns {draw(q)}, which moves it. */
-export async function drawing(element, { joint_names: names, parameters, training_range: range }, q, { height = 460, signal }) {
+/** Draw the arm of a version into an element; at(q) is where to begin. Returns {draw(q, joint)}, which moves it; joint: whose axis is thick. */
+export async function drawing(element, { joint_names: names, parameters, training_range: range }, q, { height = 460, legend = true, signal }) {
   const arm = new Arm(names, parameters, range);
   const label = `The arm in 3-D, ${names.length} joints from base to tip: ${arm.names.join(", ")}. The tables hold the same numbers.`;
   let last = q;
-  const layout = (shown) => ({ ...arm.layout(shown), height });
+  const layout = (shown) => ({ ...arm.layout(shown), height, ...(legend ? {} : { showlegend: false }) });
   const first = arm.at(last);
   const made = await plot(element, arm.traces(first), layout(first), { label, signal });
-  const draw = (positions) => {
+  const draw = (positions, thick = arm.thick) => {
     last = positions;
+    arm.thick = thick;
     const shown = arm.at(last);
     return made.react(arm.traces(shown), layout(shown));
   };
@@ -47,6 +50,7 @@ class Arm {
     const steps = geometry.joints.map((joint, place) => Math.hypot(...joint.translation) + slide(joint, place));
     this.size = Math.max(steps.reduce((all, each) => all + each, 0), ...this.centres.map((each) => Math.hypot(...each)), 0.05);
     this.reach = [[0, 0, 0], [0, 0, 0]];
+    this.thick = null;
   }
 
   /** Points of all that is drawn, with gravity downwards. */
@@ -75,7 +79,7 @@ class Arm {
       path(links, { name: "links", line: { color: css("muted"), width: 7 }, hoverinfo: "skip" }),
       path(arms, { name: "to the masses", line: { color: css("line-strong"), width: 2 }, hoverinfo: "skip", connectgaps: false }),
       ...turned.map(({ origin, axis }, place) => path([add(origin, scaled(axis, -half)), add(origin, scaled(axis, half))], {
-        name: this.names[place], line: { color: css(`joint-${(place % 8) + 1}`), width: 9 }, hovertemplate: `${this.names[place]}, ${this.geometry.joints[place].type}<extra></extra>`,
+        name: this.names[place], line: { color: jointColour(place), width: order[place] === this.thick ? THICK : 9 }, hovertemplate: `${this.names[place]}, ${this.geometry.joints[place].type}<extra></extra>`,
       })),
       {
         ...points(masses), type: "scatter3d", mode: "markers", name: "masses", showlegend: false,
@@ -153,9 +157,4 @@ function points(list) {
 
 function cross([a, b, c], [x, y, z]) {
   return [b * z - c * y, c * x - a * z, a * y - b * x];
-}
-
-function faint(colour, opacity) {
-  const [r, g, b] = [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
-  return `rgba(${r},${g},${b},${opacity})`;
 }

@@ -1,26 +1,41 @@
-// Plots of a data set's signals: positions, velocities, accelerations and torques, with breaks between episodes.
+// A data set's signals, one plot a quantity over the same axis: one cursor, one zoom, and the part to hold out by dragging.
 
 import { get, path } from "../../api.js";
 import { h, replace } from "../../dom.js";
 import { count, shortNames } from "../../format.js";
-import { line, plot, plotly } from "../../plots.js";
+import { Linked } from "../../linked.js";
+import { line, plot } from "../../plots.js";
 import { field, loading, select } from "../../ui.js";
+import { reading } from "./reading.js";
+import { holdOut } from "./stretch.js";
 
 const POINTS = 1000;
 const ALL = "all joints";
 const SAID = { q: "Position", dq: "Velocity", ddq: "Acceleration", tau: "Torque" };
+const AXES = { t: "time", rows: "sample number" };
+const DRAGS = { zoom: "zooms into all plots", hold: "chooses what is held out" };
 
-/** Draw the signals of a data set into an element, with a choice of joint and axis. */
-export async function motion(element, dataset, signal) {
+/**
+ * Draw the signals of a data set into an element.
+ * rows: [first, last) that are to be held out, null for none; choose(rows): others were chosen.
+ */
+export async function motion(element, dataset, { rows, choose, signal }) {
   replace(element, loading("Drawing"));
   const preview = await get(path`/v1/datasets/${dataset.id}/preview`, { points: POINTS }, signal);
   const names = shortNames(dataset.joint_names);
-  const axes = { t: "time", rows: "sample number" };
   // episodes may have clocks of their own: against time they would lie on top of each other
   const orderly = preview.columns.every(({ t }) => t.every((value, index) => index === 0 || value >= t[index - 1]));
   const shown = { joint: ALL, axis: orderly ? "t" : "rows" };
-  const places = Object.fromEntries(Object.keys(SAID).map((name) => [name, h("div", {})]));
+  const places = Object.fromEntries(Object.keys(SAID).map((name) => [name, h("div", { class: "strip" })]));
   const plots = new Map();
+  const values = reading(preview, names, dataset.report.joint_types, (x) => linked.point(x));
+  const held = holdOut(preview, dataset, rows, () => shown.axis, {
+    chosen: (stretch, found) => {
+      linked.shade(stretch);
+      choose(found);
+    },
+  });
+  const linked = new Linked({ zooms: true, moved: values.show, chosen: held.take });
 
   const draw = async () => {
     for (const [quantity, place] of Object.entries(places)) {
@@ -28,38 +43,52 @@ export async function motion(element, dataset, signal) {
       const traces = dataset.joint_names.flatMap((joint, index) => {
         if (shown.joint !== ALL && shown.joint !== joint) return [];
         const column = columns.find((each) => each.joint === joint);
-        return column ? [line(...broken(column, shown.axis, preview.starts), names[index], index, { hovertemplate: "%{y:.4g}" })] : [];
+        return column ? [line(...broken(column, shown.axis, preview.starts), names[index], index)] : [];
       });
       const derived = dataset.report.derived.includes(quantity) ? ", derived" : "";
       const layout = {
         title: `${SAID[quantity]} ${quantity}${derived}`,
-        x: shown.axis === "t" ? "t, s" : "sample",
         y: unit(columns[0]?.unit ?? "", dataset.report.joint_types),
-        height: 310,
-        showlegend: true,
-        legend: { orientation: "h", y: -0.3, yanchor: "top" },
+        height: 200,
+        showlegend: false, // the table of values names the colours
+        hovermode: false,
+        dragmode: matchMedia("(pointer: coarse)").matches ? false : "zoom",
+        margin: { l: 62, r: 10, t: 30, b: 26 }, // the same in each, so that a moment stands at one place in all
+        xaxis: { automargin: false, ticksuffix: shown.axis === "t" ? " s" : "" },
+        yaxis: { automargin: false, fixedrange: true },
         uirevision: shown.axis, // another joint is seen through the same window
       };
-      const label = `${SAID[quantity]} ${quantity} of ${shown.joint} against ${axes[shown.axis]}`;
+      const label = `${SAID[quantity]} ${quantity} of ${shown.joint} against ${AXES[shown.axis]}`;
       place.setAttribute("aria-label", label);
       if (plots.has(quantity)) plots.get(quantity).react(traces, layout);
-      else plots.set(quantity, await plot(place, traces, layout, { label, signal }));
+      else {
+        plots.set(quantity, await plot(place, traces, layout, { label, signal }));
+        if (signal.aborted) return;
+        linked.add(place);
+      }
     }
+    values.against(shown.axis, orderly || shown.axis === "rows");
+    held.against(shown.axis, orderly || shown.axis === "rows");
   };
 
+  const drag = select(Object.entries(DRAGS), "zoom", (what) => linked.drag(what === "hold"));
   replace(
     element,
     h(
       "div",
-      { class: "grid" },
-      field("Joint", select([ALL, ...dataset.joint_names], ALL, (joint) => { shown.joint = joint; draw(); })),
-      field("Against", select(Object.entries(axes), shown.axis, (axis) => { shown.axis = axis; draw(); })),
+      { class: "grid thirds" },
+      field("Joint", select([ALL, ...dataset.joint_names], ALL, (joint) => { shown.joint = joint; values.only(joint === ALL ? null : dataset.joint_names.indexOf(joint)); draw(); })),
+      field("Against", select(Object.entries(AXES), shown.axis, (axis) => { shown.axis = axis; draw(); })),
+      field("Dragging over a plot", drag),
     ),
-    h("div", { class: "grid wide" }, Object.values(places)),
-    h("p", { class: "hint" }, thinned(preview), " Lines break between episodes. Zooming one plot zooms all."),
+    h(
+      "div",
+      { class: "signals" },
+      h("div", { class: "beside" }, values.element, held.element),
+      h("div", { class: "strips" }, Object.values(places), h("p", { class: "hint" }, h("button", { type: "button", onclick: () => linked.reset() }, "Show all of it"), " ", thinned(preview), " Lines break between episodes.")),
+    ),
   );
   await draw();
-  if (!signal.aborted) await link(Object.values(places));
 }
 
 /** Times (or rows) and values with an empty point before each row that begins an episode. */
@@ -90,23 +119,4 @@ function thinned(preview) {
   const drawn = Math.max(...preview.columns.map((column) => column.rows.length));
   if (drawn >= preview.samples) return `All ${count(preview.samples)} samples are drawn.`;
   return `Each line has ${count(drawn)} points for ${count(preview.samples)} samples: the smallest and the largest of each stretch.`;
-}
-
-/** What is zoomed in one plot is zoomed in all. */
-async function link(elements) {
-  const Plotly = await plotly();
-  for (const element of elements) {
-    element.on("plotly_relayout", (change) => {
-      const range = change["xaxis.autorange"] ? { "xaxis.autorange": true } : zoomed(change);
-      for (const other of range ? elements.filter((each) => each !== element) : []) {
-        const now = other.layout.xaxis;
-        const same = range["xaxis.autorange"] ? now.autorange : now.range[0] === change["xaxis.range[0]"] && now.range[1] === change["xaxis.range[1]"];
-        if (!same) Plotly.relayout(other, range);
-      }
-    });
-  }
-}
-
-function zoomed(change) {
-  return "xaxis.range[0]" in change ? { "xaxis.range[0]": change["xaxis.range[0]"], "xaxis.range[1]": change["xaxis.range[1]"] } : null;
 }

@@ -1,8 +1,9 @@
 // What came of a job: how good the version is, or why there is none.
 
 import { get, path } from "../../api.js";
+import { qualityCharts } from "../../charts.js";
 import { h, replace } from "../../dom.js";
-import { count, number, percent, scientific, shortNames } from "../../format.js";
+import { count, nmse, number, percent, shortNames } from "../../format.js";
 import { card, link, table } from "../../ui.js";
 import { warned } from "../data/prose.js";
 import { known, narrowJoints } from "../model/coverage.js";
@@ -59,7 +60,7 @@ function answers(job, { promotion }) {
 
 function figures(caption, found, version) {
   const names = shortNames(version.joint_names);
-  return [verdicts(found, names), shownFigures(caption, found, names, version.joint_types)];
+  return [verdicts(found, names), h("div", { class: "charts wide" }, qualityCharts(names, found)), shownFigures(caption, found, names, version.joint_types)];
 }
 
 /** What the figures say to be careful with. */
@@ -83,11 +84,11 @@ function shownFigures(caption, found, names, types) {
   return table(
     [
       { label: "Joint", cell: (row) => row.name },
-      { label: "nMSE", numeric: true, cell: (row) => scientific(row.nmse) },
+      { label: "nMSE", numeric: true, cell: (row) => nmse(row.nmse) },
+      { label: "in 95\u00a0%", numeric: true, cell: (row) => percent(row.coverage) },
+      { label: "known to be", numeric: true, cell: (row) => row.known },
       { label: `RMSE, ${unit}`, numeric: true, cell: (row) => number(row.rmse) },
-      { label: "Within the 95 % band", numeric: true, cell: (row) => percent(row.coverage) },
-      { label: "which is known to be", numeric: true, cell: (row) => row.known },
-      { label: `95 % width, ${unit}`, numeric: true, cell: (row) => (row.width === undefined ? "–" : number(row.width)) },
+      { label: `95\u00a0% width, ${unit}`, numeric: true, cell: (row) => (row.width === undefined ? "–" : number(row.width)) },
     ],
     names.map((name, index) => ({ name, nmse: found.nmse[index], rmse: found.rmse[index], coverage: found.coverage[index], known: known(found, index), width: found.interval_width?.[index] })),
     { caption },

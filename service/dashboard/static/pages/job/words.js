@@ -31,11 +31,11 @@ export function left({ progress: at }) {
 /** What was held out, in a sentence. */
 export function heldOut(holdout) {
   if (!holdout) return "nothing";
-  const share = `${Math.round(100 * holdout.share)} %`;
+  const share = `${Math.round(100 * holdout.share)}\u00a0%`;
   const guard = holdout.guard_s === null ? "" : `, with a guard of ${holdout.guard_s} s`;
   const what = {
     last: `the last ${share} of each data set`,
-    auto: `${share}: the last part, or motion that the rest does not repeat`,
+    auto: `${share}: the last part, or motion that nothing else repeats`,
     episodes: `${share}, in whole episodes chosen by seed ${holdout.seed}`,
     blocks: `${share}, in some of ${holdout.blocks} blocks chosen by seed ${holdout.seed}`,
   };

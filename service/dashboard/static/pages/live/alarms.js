@@ -20,6 +20,13 @@ export function alarms(page, status, name, signal) {
   refresh(page.alarms, status.alarms.length ? list(status.alarms) : null);
 }
 
+const MARKS = { promotion: "good", payload: "good", change: "bad" };
+
+/** Alarms as marks of the plots' time axis, whose zero is the newest row's time, Unix seconds. */
+export function alarmMarks(found, newest) {
+  return found.map(({ at, kind }) => ({ x: Date.parse(at) / 1000 - newest, word: kind, kind: MARKS[kind] ?? "warn" }));
+}
+
 function decision({ held, alarms }, name, signal) {
   const replay = h("input", { type: "checkbox" });
   const decide = (choice) => async () => {

@@ -1,26 +1,28 @@
 // How far every row was from its prediction, in standard deviations, with marks of what was kept out and what is novel.
 
+import { css } from "../../colours.js";
 import { h, replace } from "../../dom.js";
 import { shortNames } from "../../format.js";
-import { css, line, plot } from "../../plots.js";
+import { line, plot } from "../../plots.js";
 import { card } from "../../ui.js";
 import { CODES, NOVEL } from "./codes.js";
-import { WINDOW_S } from "./rows.js";
-import { broken, HALF_WIDTH, thin } from "./torque.js";
+import { score } from "./scores.js";
+import { broken, HALF_WIDTH, span, thin } from "./torque.js";
 
+const HEIGHT = 300;
 const LEAST = 4;
 const MOST = 12;
 const MOST_MARKS = 150; // of a kind
 
-/** The plot in a place; draw(rows, status). */
-export function innovation(place, joints, signal) {
+/** The plot in a place; draw(rows, status). view: {window, joint}: the joint whose line is thick, null: none. */
+export function innovation(place, joints, view, linked, signal) {
   const short = shortNames(joints);
-  const element = h("div", { style: "min-height: 340px" });
+  const element = h("div", { style: `height: ${HEIGHT}px` });
   const hint = `Measured minus predicted torque, in standard deviations of a measurement. 95 % of the rows should lie between the dotted lines at ± ${HALF_WIDTH}. Symbols mark rows kept out of learning, and motion beyond what this version was trained on. A symbol stands at the joint with the largest error. Values beyond ± ${MOST} are drawn at ± ${MOST}.`;
-  replace(place, card("Innovation", element, h("p", { class: "hint" }, hint)));
+  replace(place, card("Innovation", element, h("details", { class: "hint" }, h("summary", {}, "How to read it"), h("p", {}, hint))));
   let made = null;
   return {
-    async draw(rows, status) {
+    async draw(rows, status, shown) {
       if (signal.aborted) return;
       const worst = rows.map(farthest);
       const top = Math.min(MOST, Math.max(LEAST, 1.1 * worst.reduce((most, z) => Math.max(most, Math.abs(z)), 0)));
@@ -28,25 +30,27 @@ export function innovation(place, joints, signal) {
       const thinned = thin(rows);
       const x = broken(thinned, (row) => row.x);
       const curves = joints.map((_name, joint) =>
-        line(x, broken(thinned, (row) => clip(score(row, joint))), short[joint], joint, { line: { width: 1 }, hovertemplate: "%{y:.2f} σ" }),
+        line(x, broken(thinned, (row) => clip(score(row, joint))), short[joint], joint, { line: { width: joint === shown ? 2.2 : 0.8 }, showlegend: false }),
       );
       const traces = [...curves, ...marks(rows, worst, clip)];
+      const range = [-span(rows, view.window), 0];
       const layout = {
-        y: "σ", height: 340, margin: { l: 48, r: 8, t: 10, b: 40 }, hovermode: "closest", uirevision: "live",
-        xaxis: { range: [-WINDOW_S, 0], ticksuffix: " s" },
-        yaxis: { range: [-1.05 * top, 1.05 * top] },
+        y: "σ", height: HEIGHT, margin: { l: 52, r: 8, t: 8, b: 40 }, hovermode: false, dragmode: false,
+        xaxis: { range, zeroline: false, ticksuffix: " s", automargin: false },
+        yaxis: { range: [-1.05 * top, 1.05 * top], automargin: false },
+        showlegend: true, // of marks: the joints' colours are named above
+        legend: { orientation: "h", y: -0.16, yanchor: "top", itemclick: false, itemdoubleclick: false },
         shapes: limits(status.contact_threshold, top),
       };
-      const label = `Innovation of all joints over the last ${WINDOW_S} seconds, with marks of rows that were kept out of learning`;
+      const label = `Innovation of all joints over the last ${-range[0]} seconds, with marks of rows that were kept out of learning`;
+      element.setAttribute("aria-label", label);
       if (made) await made.react(traces, layout);
-      else made = await plot(element, traces, layout, { label, signal });
+      else {
+        made = await plot(element, traces, layout, { label, signal });
+        if (!signal.aborted) linked.add(element);
+      }
     },
   };
-}
-
-function score(row, joint) {
-  const { tau, mean, std } = row;
-  return tau[joint] === null || mean[joint] === null ? null : (tau[joint] - mean[joint]) / std[joint];
 }
 
 /** The innovation of the joint that was farthest off; 0 where nothing was predicted. */
@@ -60,11 +64,10 @@ function farthest(row) {
 function marks(rows, worst, clip) {
   const kinds = new Map();
   const add = (kind, row, z) => {
-    if (!kinds.has(kind)) kinds.set(kind, { x: [], y: [], text: [] });
+    if (!kinds.has(kind)) kinds.set(kind, { x: [], y: [] });
     const found = kinds.get(kind);
     found.x.push(row.x);
     found.y.push(clip(z));
-    found.text.push(`${kind.words}${kind.why ? `: ${kind.why}` : ""}, ${z.toFixed(1)} σ`);
   };
   rows.forEach((row, index) => {
     if (row.code !== "learnt") add(CODES[row.code] ?? { words: row.code, symbol: "cross", colour: "contact" }, row, worst[index]);
@@ -72,7 +75,7 @@ function marks(rows, worst, clip) {
   });
   return [...kinds].map(([kind, data]) => ({
     ...few(data), mode: "markers", type: "scatter", name: kind.words, colour: kind.colour,
-    marker: { symbol: kind.symbol, size: 8 }, hoverinfo: "text",
+    marker: kind.lasting ? { symbol: kind.symbol, size: 4, opacity: 0.6 } : { symbol: kind.symbol, size: 8 },
   }));
 }
 

@@ -5,11 +5,11 @@ import { h, replace } from "../../dom.js";
 import { card } from "../../ui.js";
 import { CANNOT, drawable, drawing } from "../arm/drawing.js";
 
-const HEIGHT = 380;
+const HEIGHT = 340;
 
-/** The arm in a place; draw(rows, status) moves it to pose(), the newest positions, where it can be seen. */
+/** The arm in a place; draw(status, joint) moves it to pose(), the newest positions, where it can be seen; joint: thick. */
 export function moving(place, name, pose, signal) {
-  let made = null, version = null, seen = false, at = null, left = null;
+  let made = null, version = null, seen = false, at = null, thick = null, left = null;
   const watch = new IntersectionObserver((entries) => (seen = entries.at(-1).isIntersecting), { rootMargin: "200px 0px" });
   signal.addEventListener("abort", () => {
     watch.disconnect();
@@ -22,19 +22,19 @@ export function moving(place, name, pose, signal) {
     made = null;
     const found = await shown(name, number, signal);
     if (!found?.parameters?.geometry || !drawable()) return replace(place);
-    const figure = h("div", { style: `min-height: ${HEIGHT}px` });
-    replace(place, card("The arm", figure, h("p", { class: "hint" }, `At the positions of the newest row. ${CANNOT}`)));
+    const figure = h("div", { style: `height: ${HEIGHT}px` });
+    replace(place, card("The arm", figure, h("p", { class: "hint" }, `At the positions of the newest row; the joint that is shown large is thick. ${CANNOT}`)));
     watch.disconnect();
     watch.observe(figure);
-    made = await drawing(figure, found, q, { height: HEIGHT, signal: left.signal });
+    made = await drawing(figure, found, q, { height: HEIGHT, legend: false, signal: left.signal });
   };
   return {
-    async draw(_rows, status) {
+    async draw(status, joint) {
       const q = pose();
       if (q === null || signal.aborted) return;
       if (status.version !== version) await begin(status.version, q);
-      else if (made && seen && q !== at) await made.draw(q);
-      at = q;
+      else if (made && seen && (q !== at || joint !== thick)) await made.draw(q, joint);
+      [at, thick] = [q, joint];
     },
   };
 }

@@ -1,6 +1,7 @@
-// The rows of the last half minute, stream by stream.
+// The rows of the last minutes, stream by stream.
 
-export const WINDOW_S = 30;
+export const WINDOWS_S = [10, 30, 120];
+const KEPT_S = Math.max(...WINDOWS_S);
 const GAP_S = 1; // lines do not cross it
 const RATE_S = 5;
 const SILENT_S = 3;
@@ -27,7 +28,7 @@ export class Rows {
     });
     stream.rows.sort((one, other) => one.time - other.time);
     const newest = stream.rows.at(-1)?.time ?? 0;
-    stream.rows = stream.rows.filter((row) => row.time >= newest - WINDOW_S);
+    stream.rows = stream.rows.filter((row) => row.time >= newest - KEPT_S);
     stream.rate.push({ time: newest, rows: part.rows, shown: part.time.length });
     stream.rate = stream.rate.filter((each) => each.time > newest - RATE_S);
     stream.heard = at;
@@ -64,6 +65,11 @@ export class Rows {
     return this.#streams.get(this.chosen)?.q ?? null;
   }
 
+  /** Event time of the chosen stream's newest row, Unix seconds; null: there is none. */
+  newest() {
+    return this.#streams.get(this.chosen)?.rows.at(-1)?.time ?? null;
+  }
+
   /** Rows a second of the robot's own time that came and that were shown lately; null: not known yet. */
   rate() {
     const parts = this.#streams.get(this.chosen)?.rate ?? [];
@@ -73,10 +79,11 @@ export class Rows {
     return { came: sum("rows"), shown: sum("shown") };
   }
 
-  /** Rows to draw, `x` seconds after the newest one (so never positive), `cut` where the line does not go on. */
-  shown() {
-    const rows = this.#streams.get(this.chosen)?.rows ?? [];
-    const newest = rows.at(-1)?.time ?? 0;
+  /** Rows of the last so many seconds, `x` seconds after the newest one (so never positive), `cut` where the line does not go on. */
+  shown(seconds) {
+    const all = this.#streams.get(this.chosen)?.rows ?? [];
+    const newest = all.at(-1)?.time ?? 0;
+    const rows = all.filter((row) => row.time >= newest - seconds);
     return rows.map((row, index) => ({
       ...row,
       x: row.time - newest,

@@ -6,13 +6,12 @@ import { badge, facts, table } from "../../ui.js";
 import { words } from "./codes.js";
 
 /** Version, how far answers lag behind, and what became of rows. */
-export function learningCard(status) {
+export function learningFacts(status) {
   const [latest] = status.windows;
   const lately = { learnt: latest.accepted, ...latest.rejected };
   const codes = Object.keys(status.counts).filter((code) => !["batches", "duplicates"].includes(code) && (status.counts[code] || lately[code]));
   const state = status.held ? badge("held", "warn") : status.learns ? badge("learns", "good") : badge("does not learn", "plain");
-  return panel(
-    "Learning",
+  return [
     facts([
       ["Answers contain", `version ${status.version}, revision ${count(status.revision)}`],
       ["Not learnt yet", status.lag_events ? counted(status.lag_events, "batch", "batches") : "nothing"],
@@ -31,7 +30,7 @@ export function learningCard(status) {
           { caption: "What became of rows" },
         )
       : h("p", { class: "muted" }, "No row has come since the service started."),
-  );
+  ];
 }
 
 /** How well rows of the last minute were predicted before they were learnt. */

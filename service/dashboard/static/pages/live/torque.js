@@ -1,58 +1,127 @@
-// Measured and predicted torque of every joint over the last half minute, with the 95 % interval of a measurement.
+// Measured and predicted torque: one joint large, all of them small beside each other, with the 95 % interval of a measurement.
 
+import { jointVar } from "../../colours.js";
 import { h, replace } from "../../dom.js";
-import { shortNames, torqueUnit } from "../../format.js";
+import { number, shortNames, torqueUnit } from "../../format.js";
 import { line, plot } from "../../plots.js";
 import { card } from "../../ui.js";
-import { WINDOW_S } from "./rows.js";
+import { lately, largest } from "./scores.js";
 
 export const HALF_WIDTH = 1.96;
 const MOST_DRAWN = 300;
+const SMALL = { height: 110, margin: { l: 34, r: 4, t: 4, b: 16 }, most: 120 };
+const LARGE = { height: 320, margin: { l: 52, r: 8, t: 8, b: 28 }, most: MOST_DRAWN };
+const FULL = 8; // standard deviations that fill a joint's bar
 
-/** Plots of all joints in a place; draw(rows) draws those that can be seen. */
-export function torque(place, joints, types, signal) {
+/**
+ * Plots in a place. view: what the page shows, {window, joint, cursor}: joint null is the one with the largest innovation
+ * of late; pick(joint): a joint was chosen. Returns {draw(rows), point(): show values at the cursor}.
+ */
+export function torque(place, joints, types, view, linked, { pick, signal }) {
   const short = shortNames(joints);
-  const plots = joints.map((name, joint) => ({ name, joint, title: short[joint], unit: torqueUnit(types[joint]), element: h("div", { style: "min-height: 190px" }), seen: false, made: null }));
+  const large = figure(h("h3", { class: "joint" }), LARGE, "large");
+  const made = joints.map((name, joint) => {
+    const button = h("button", { type: "button", class: "joint", style: `--own: ${jointVar(joint)}`, onclick: () => pick(view.joint === joint ? null : joint) }, short[joint]);
+    button.setAttribute("aria-label", `Show ${name} large`);
+    return { ...figure(button, SMALL, "small"), name, joint, button };
+  });
   const watch = new IntersectionObserver((entries) => {
-    for (const entry of entries) plots.find((each) => each.element === entry.target).seen = entry.isIntersecting;
-  }, { rootMargin: "400px 0px" });
-  plots.forEach((each) => watch.observe(each.element));
+    for (const entry of entries) [large, ...made].find((each) => each.element === entry.target).seen = entry.isIntersecting;
+  }, { rootMargin: "300px 0px" });
+  [large, ...made].forEach((each) => watch.observe(each.element));
   signal.addEventListener("abort", () => watch.disconnect());
+  const why = h("span", { class: "muted" });
+  large.head.append(why);
   replace(
     place,
     card(
       "Torque",
+      large.element,
       h("p", { class: "hint" }, swatch("border-top: 3px solid var(--measured)"), "measured  ", swatch("border-top: 3px solid var(--predicted)"), "predicted before it was learnt  ", swatch("height: 0.8em; background: var(--predicted); opacity: 0.3"), "95 % of measurements are expected here: ± 1.96 √(std² + noise²)  ", h("b", { "aria-hidden": "true", style: "color: var(--contact)" }, "× "), "kept out of learning (at the edge: far off)"),
-      h("div", { class: "grid", style: "margin: 0; gap: 0.4rem" }, plots.map((each) => each.element)),
+      h("div", { class: "multiples" }, made.map((each) => each.element)),
     ),
   );
-  const draw = async (each, rows) => {
-    const range = reach(rows, each.joint);
-    const traces = [...curves(thin(rows), each.joint, each.unit), keptOut(rows, each.joint, range)];
+
+  let shown = null, chosen = false, last = [];
+  const draw = async (each, joint, range, label) => {
+    const rows = thin(last, each.size.most);
+    const reach = reached(rows, joint);
+    const traces = [...curves(rows, joint), keptOut(last, joint, reach)];
+    const small = each.size === SMALL;
     const layout = {
-      title: each.title,
-      y: each.unit,
-      height: 190,
+      y: small ? "" : torqueUnit(types[joint]),
+      height: each.size.height,
       showlegend: false,
-      margin: { l: 48, r: 8, t: 30, b: 28 },
-      xaxis: { range: [-WINDOW_S, 0], ticksuffix: " s" },
-      yaxis: { range },
-      uirevision: "live",
+      hovermode: false,
+      dragmode: false,
+      margin: each.size.margin,
+      xaxis: { range, zeroline: false, ticksuffix: " s", nticks: small ? 4 : 8, automargin: false, tickfont: small ? { size: 10 } : {} },
+      yaxis: { range: reach, nticks: small ? 4 : 8, automargin: false, tickfont: small ? { size: 10 } : {} },
     };
-    const label = `${each.name}: torque measured and predicted over the last ${WINDOW_S} seconds`;
-    if (each.made) await each.made.react(traces, layout);
-    else each.made = await plot(each.element, traces, layout, { label, signal });
+    each.plot.setAttribute("aria-label", label);
+    if (each.made) return each.made.react(traces, layout);
+    each.made = await plot(each.plot, traces, layout, { label, signal });
+    if (!signal.aborted) linked.add(each.plot);
+  };
+  const point = () => {
+    const at = view.cursor === null ? null : closest(last, view.cursor);
+    large.value.textContent = at ? values(at, shown, torqueUnit(types[shown])) : "";
+    for (const each of made) each.value.textContent = at ? values(at, each.joint, "") : `${number(each.score ?? 0, 2)} σ`;
   };
   return {
+    point,
     async draw(rows) {
-      for (const each of plots) if (each.seen && !signal.aborted) await draw(each, rows);
+      last = rows;
+      const scores = lately(rows, joints);
+      shown = view.joint ?? largest(scores, chosen ? null : shown);
+      chosen = view.joint !== null;
+      large.title.textContent = short[shown];
+      large.element.style.setProperty("--own", jointVar(shown));
+      why.textContent = view.joint === null ? `largest innovation of the last seconds: ${number(scores[shown], 2)} σ` : "chosen by you";
+      for (const each of made) {
+        each.score = scores[each.joint];
+        each.element.classList.toggle("largest", each.joint === shown);
+        each.button.setAttribute("aria-pressed", String(view.joint === each.joint));
+        each.element.style.setProperty("--of", String(Math.min(scores[each.joint] / FULL, 1)));
+        each.element.classList.toggle("far", scores[each.joint] > FULL);
+      }
+      point();
+      const range = [-span(rows, view.window), 0];
+      const text = (name) => `${name}: torque measured and predicted over the last ${-range[0]} seconds`;
+      if (large.seen || !large.made) await draw(large, shown, range, `${text(joints[shown])}, large`);
+      for (const each of made) if ((each.seen || !each.made) && !signal.aborted) await draw(each, each.joint, range, text(each.name));
+      return shown;
     },
   };
 }
 
+/** What a joint's plot stands in: a head with its name and its value, and a place that has its size before it is drawn. */
+function figure(title, size, kind) {
+  const value = h("span", { class: "value" });
+  const head = h("div", { class: "head" }, title, value);
+  const place = h("div", { style: `height: ${size.height}px` });
+  return { title, value, head, size, plot: place, seen: false, made: null, element: h("div", { class: `trace ${kind}` }, head, place) };
+}
+
+/** Seconds of a window that the x axis shows: while there are only a few, they are not squeezed into its end. */
+export function span(rows, window) {
+  const there = rows.length ? -rows[0].x : 0;
+  return [2, 5, 10, 30, 60, window].find((each) => each >= there && each <= window) ?? window;
+}
+
+/** The row nearest to a place of the x axis; null: there is none. */
+export function closest(rows, x) {
+  return rows.reduce((best, row) => (best === null || Math.abs(row.x - x) < Math.abs(best.x - x) ? row : best), null);
+}
+
+function values({ tau, mean }, joint, unit) {
+  const [measured, predicted] = [tau[joint], mean[joint]].map((each) => (each === null ? "–" : unit ? each.toFixed(2) : number(each, 2)));
+  return unit ? `measured ${measured}, predicted ${predicted} ${unit}` : `${measured} | ${predicted}`;
+}
+
 /** Few enough rows for a line; the first after a gap stays, and those that were kept out. */
-export function thin(rows) {
-  const step = Math.ceil(rows.length / MOST_DRAWN);
+export function thin(rows, most = MOST_DRAWN) {
+  const step = Math.ceil(rows.length / most);
   return step < 2 ? rows : rows.filter((row, index) => row.cut || index % step === 0 || odd(row));
 }
 
@@ -61,14 +130,14 @@ export function broken(rows, value) {
   return rows.flatMap((row) => (row.cut ? [null, value(row)] : [value(row)]));
 }
 
-function curves(rows, joint, unit) {
+function curves(rows, joint) {
   const x = broken(rows, (row) => row.x);
   // a torque beyond all limits would leave nothing to see of the others
   const measured = broken(rows, (row) => (row.code === "limit" ? null : row.tau[joint]));
   return [
     ribbon(rows.filter((row) => row.mean[joint] !== null), joint),
-    line(x, broken(rows, (row) => row.mean[joint]), "predicted", "predicted", { hovertemplate: `%{y:.4g} ${unit}` }),
-    line(x, measured, "measured", "measured", { hovertemplate: `%{y:.4g} ${unit}`, line: { width: 1.2 } }),
+    line(x, broken(rows, (row) => row.mean[joint]), "predicted", "predicted"),
+    line(x, measured, "measured", "measured", { line: { width: 1.2 } }),
   ];
 }
 
@@ -102,7 +171,7 @@ function odd(row) {
 }
 
 /** What the axis shows: all usual rows and their interval, and of those that were kept out as much again on either side. */
-function reach(rows, joint) {
+function reached(rows, joint) {
   const all = [Infinity, -Infinity];
   const usual = [Infinity, -Infinity];
   const widen = (range, y) => y !== null && ([range[0], range[1]] = [Math.min(range[0], y), Math.max(range[1], y)]);

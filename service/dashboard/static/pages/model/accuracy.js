@@ -5,6 +5,7 @@ import { h, replace } from "../../dom.js";
 import { card, loading } from "../../ui.js";
 import { boxes, figures, reliability } from "./figures.js";
 import { noData } from "./choice.js";
+import { verdicts } from "./coverage.js";
 import { around, broken, column, measurementStd } from "./curves.js";
 import { flattery } from "./flattery.js";
 import { joints } from "./joints.js";
@@ -56,7 +57,7 @@ export async function accuracy(view, state, { signal }) {
   });
   const evaluation = await evaluated;
   if (signal.aborted) return;
-  replace(table, figures(evaluation));
+  replace(table, verdicts(evaluation), figures(evaluation));
   await boxes(spread, evaluation, signal);
   await reliability(reliable, evaluation, signal);
 }

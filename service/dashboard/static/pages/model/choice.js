@@ -24,12 +24,12 @@ export function relation(version, dataset) {
   return version.lineage.datasets?.some(same) ? "trained on" : "";
 }
 
-/** The data set and part to begin with: what was asked for, else what the version has not seen, the newest first. */
+/** The data set and part to begin with: what was asked for, else what was held out, else what it has not seen, the newest first. */
 export function firstChoice(version, datasets, query) {
   const offered = fitting(version, datasets);
   const asked = offered.find((each) => each.id === query.get("dataset"));
   const by = (...kinds) => offered.find((each) => kinds.includes(relation(version, each)));
-  const dataset = asked ?? by("") ?? by("held out", "partly held out") ?? offered[0] ?? null;
+  const dataset = asked ?? by("held out", "partly held out") ?? by("") ?? offered[0] ?? null;
   if (dataset === null) return { dataset: null, part: "all" };
   const has = relation(version, dataset).endsWith("held out");
   const part = has && query.get("part") !== "all" ? "held_out" : "all";

@@ -3,10 +3,9 @@
 import { h, replace } from "../../dom.js";
 import { count, counted, number, percent, scientific, shortNames } from "../../format.js";
 import { line, plot } from "../../plots.js";
-import { badge, card, table } from "../../ui.js";
-import { coverageVerdict, known } from "./coverage.js";
+import { card, table } from "../../ui.js";
 
-/** Figures of each joint, with what to make of its coverage. */
+/** Figures of each joint. */
 export function figures(evaluation) {
   const { joint_names: joints, coverages, stretches } = evaluation;
   const short = shortNames(joints);
@@ -19,14 +18,12 @@ export function figures(evaluation) {
     ...coverages.map((each, level) => numeric(`in ${percent(each.level, 0)}`, (joint) => percent(coverages[level].coverage[joint]))),
     numeric("95 % width, N·m", (joint) => number(evaluation.interval_width[joint])),
     numeric("NLPD, nats", (joint) => number(evaluation.nlpd[joint])),
-    { label: "95 % band", cell: (joint) => badge(...coverageVerdict(evaluation, joint)) },
-    numeric("“In 95 %” is known to be", (joint) => known(evaluation, joint)),
   ];
   return card(
-    "Accuracy on this recording",
+    "All figures",
     evaluation.warnings.map((text) => h("div", { class: "banner", role: "note" }, `${text[0].toUpperCase()}${text.slice(1)}.`)),
     table(columns, joints.map((_name, joint) => joint), { caption: `On ${used} samples${stretches.kind === "episodes" ? `, ${counted(stretches.samples.length, "episode")}` : ""}` }),
-    h("p", { class: "hint" }, "nMSE is the mean squared error / variance of the measured torque. 1 is no better than always answering the mean; a joint whose torque is mostly noise cannot come near 0. “In 95 %” is the share of measurements inside the 95 % band, and should be near 95 %. Neighbouring errors are alike: the last column says how far so many independent ones tell that share (95 % confidence)."),
+    h("p", { class: "hint" }, "nMSE is the mean squared error / variance of the measured torque. 1 is no better than always answering the mean; a joint whose torque is mostly noise cannot come near 0. “In 95 %” is the share of measurements inside the 95 % band, and should be near 95 %."),
   );
 }
 

@@ -1,5 +1,6 @@
 // Small plots, one a joint, that zoom together; where not every row is shown, zooming fetches the rows between.
 
+import { jointVar } from "../../colours.js";
 import { h, replace } from "../../dom.js";
 import { count, shortNames, torqueUnit } from "../../format.js";
 import { plot, plotly } from "../../plots.js";
@@ -119,7 +120,7 @@ export async function joints(element, { first, fetch, views, about, signal }) {
 function legend(traces) {
   const named = traces.filter((trace) => trace.showlegend !== false);
   return named.map(({ name, colour, filled, opacity = 1 }) => {
-    const paint = `var(--${typeof colour === "number" ? `joint-${(colour % 8) + 1}` : colour})`;
+    const paint = typeof colour === "number" ? jointVar(colour) : `var(--${colour})`;
     const form = filled ? `height: 0.8rem; opacity: 0.3; background: ${paint}` : `border-top: 3px solid ${paint}; opacity: ${opacity}`;
     return h("span", {}, h("span", { "aria-hidden": "true", style: `display: inline-block; width: 1.6rem; vertical-align: middle; margin-right: 0.4rem; ${form}` }), name);
   });

@@ -1,12 +1,14 @@
 // Moving what answers: always asked first, as robots may be listening.
 
 import { confirm } from "../../ui.js";
+import { mayAnswer } from "./promotion.js";
 
-/** Ask whether a version shall answer; true where it shall. */
+/** Ask whether a version, as the API shows it, shall answer; true where it shall. */
 export function confirmServing(name, version, serving) {
+  const { word, why } = mayAnswer(version);
   return confirm(
-    `Serve version ${version} of ${name} instead of version ${serving}? It will answer every query and stream that names no version, from the next one on. You can undo this under “Versions”.`,
-    `Serve version ${version}`,
+    `Serve version ${version.version} of ${name} instead of version ${serving}? From the next query on it answers all that name no version. You can undo this under “Versions”. Judged: ${word}. ${why}.`,
+    `Serve version ${version.version}`,
     "primary",
   );
 }

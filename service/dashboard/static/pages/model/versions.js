@@ -2,10 +2,13 @@
 
 import { del, get, path, post, put } from "../../api.js";
 import { h, replace } from "../../dom.js";
-import { when } from "../../format.js";
+import { ago, when } from "../../format.js";
+import { listing } from "../../tables.js";
 import { badge, button, card, confirm, field, loading, notice, select, table } from "../../ui.js";
+import { QUALITY_HINT, qualityColumns } from "../quality.js";
 import { compareForm } from "./compare.js";
 import { exportVersion } from "./export.js";
+import { mayAnswer } from "./promotion.js";
 import { confirmServing } from "./serving.js";
 
 /** The tab of versions. */
@@ -16,17 +19,18 @@ export async function versions(view, state, { signal, reload, select: look }) {
     view,
     card("Versions", versionTable(state, aliases, reload, look)),
     card("Aliases", aliasTable(state, aliases, reload), aliasForm(state, reload)),
-    state.model.versions.length > 1 ? card("Compare two versions", compareForm(state, signal)) : null,
+    state.model.versions.length > 1 ? card("Compare versions", compareForm(state, signal)) : null,
   );
 }
 
 function versionTable({ name, where, model, version }, aliases, reload, look) {
   const serving = model.serving_version;
   const named = (number) => aliases.filter((each) => each.version === number && each.alias !== "serving").map((each) => each.alias);
-  const actions = ({ version: number }) => {
+  const actions = (each) => {
+    const number = each.version;
     const made = [button("Show", () => look(number, "accuracy"))];
     if (number !== serving) made.push(button("Serve", async () => {
-      if (!(await confirmServing(name, number, serving))) return;
+      if (!(await confirmServing(name, each, serving))) return;
       await put(`${where}/aliases/serving`, { version: number });
       await done(reload, `Version ${number} of ${name} answers from now on.`);
     }, { kind: "primary" }));
@@ -36,12 +40,14 @@ function versionTable({ name, where, model, version }, aliases, reload, look) {
       await del(`${where}/versions/${number}`);
       await done(reload, `Version ${number} is deleted.`);
     }, { kind: "danger" }));
-    for (const each of made) each.setAttribute("aria-label", `${each.textContent}: version ${number}`);
+    for (const press of made) press.setAttribute("aria-label", `${press.textContent}: version ${number}`);
     return h("div", { class: "actions" }, made);
   };
   const columns = [
     {
       label: "Version",
+      value: (each) => each.version,
+      first: "descending",
       cell: (each) => [
         `${each.version} `,
         each.version === serving ? badge("serving") : null,
@@ -50,11 +56,26 @@ function versionTable({ name, where, model, version }, aliases, reload, look) {
         each.version === version.version ? h("span", { class: "muted" }, "shown here") : null,
       ],
     },
+    ...qualityColumns((each) => ({ quality: each.quality, joints: version.joint_names })),
+    { label: "May it answer?", value: (each) => mayAnswer(each).word, cell: judged },
+    { label: "Estimator", value: (each) => each.estimator, cell: (each) => each.estimator },
+    { label: "Made", value: (each) => each.created_at, first: "descending", cell: (each) => h("time", { datetime: each.created_at, title: when(each.created_at) }, ago(each.created_at)) },
     { label: "Actions", cell: actions },
-    { label: "Estimator", cell: (each) => each.estimator },
-    { label: "Made", cell: (each) => when(each.created_at) },
   ];
-  return table(columns, [...model.versions].reverse(), { caption: "Newest first" });
+  const list = listing(columns, {
+    caption: "Versions, newest first",
+    what: ["version", "versions"],
+    key: (each) => each.version,
+    words: (each) => [`version ${each.version}`, each.estimator, mayAnswer(each).word, ...named(each.version)].join(" "),
+    fewest: 4,
+  });
+  list.show([...model.versions].reverse());
+  return [list.element, h("p", { class: "hint" }, QUALITY_HINT)];
+}
+
+function judged(version) {
+  const { word, kind, why } = mayAnswer(version);
+  return h("details", { class: "why" }, h("summary", {}, badge(word, kind)), h("p", { class: "hint" }, `${why}.`));
 }
 
 function aliasTable({ name, where }, aliases, reload) {
@@ -91,7 +112,7 @@ function aliasForm({ where, model, name }, reload) {
   const set = button("Set alias", async () => {
     if (!alias.reportValidity()) return;
     const chosen = alias.value.trim(), number = Number(version.value);
-    if (chosen === "serving" && !(await confirmServing(name, number, model.serving_version))) return;
+    if (chosen === "serving" && !(await confirmServing(name, model.versions.find((each) => each.version === number), model.serving_version))) return;
     await put(`${where}/aliases/${encodeURIComponent(chosen)}`, { version: number });
     await done(reload, `${chosen} is version ${number} now.`);
   });

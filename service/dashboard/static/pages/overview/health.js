@@ -1,4 +1,4 @@
-// Live health: what /health/ready says of each part, without a key.
+// Health: one line while all is well; what is not well is listed. /health/ready tells it without a key.
 
 import { get } from "../../api.js";
 import { h, refresh, replace } from "../../dom.js";
@@ -6,26 +6,28 @@ import { when } from "../../format.js";
 import { badge, every } from "../../ui.js";
 import { changed } from "./follow.js";
 
-/** Keep the card up to date until the signal aborts. */
+/** Keep the line up to date until the signal aborts. */
 export function health(place, seconds, signal) {
   const state = h("span", { role: "status" }, badge("asking", "plain"));
   const since = h("span", { class: "hint" });
-  const parts = h("ul", { class: "parts" });
+  const wrong = h("ul", { class: "parts" }), all = h("ul", { class: "parts" });
   const version = h("span", { class: "muted" });
   replace(
     place,
     h(
       "section",
-      { class: "card", "aria-labelledby": "health" },
-      h("div", { class: "heading" }, h("div", { class: "row" }, h("h2", { id: "health" }, "Health"), state, version), since),
-      parts,
+      { class: "health", "aria-labelledby": "health" },
+      h("div", { class: "row" }, h("h2", { id: "health" }, "Health"), state, version, since),
+      wrong,
+      h("details", {}, h("summary", {}, "All parts"), all),
     ),
   );
   let answered = null;
   const show = (word, kind, checks) => {
-    if (!changed(parts, [word, checks])) return;
+    if (!changed(all, [word, checks])) return;
     refresh(state, badge(word, kind));
-    refresh(parts, checks.map(part));
+    refresh(wrong, checks.filter((check) => check.state !== "ok").map(part));
+    refresh(all, checks.map(part));
   };
   return every(
     seconds,
@@ -36,17 +38,17 @@ export function health(place, seconds, signal) {
         const warned = ready.checks.some((check) => check.state !== "ok");
         show(warned ? "ready, with warnings" : "ready", warned ? "warn" : "good", ready.checks);
         answered = new Date();
-        since.textContent = "checked every 2 s";
+        since.textContent = "";
       } catch (error) {
         if (signal.aborted || error.name === "AbortError") return;
         if (error.status === 503 && error.detail?.length) {
           const failed = error.detail.map((item) => ({ name: item.field, state: "failed", message: item.value }));
           show("not ready", "bad", failed);
           answered = new Date();
-          since.textContent = "checked every 2 s";
+          since.textContent = "";
         } else {
           show("no answer", "bad", [{ name: "service", state: "failed", message: error.message }]);
-          since.textContent = answered ? `last answer ${when(answered.toISOString())}; checked every 2 s` : "checked every 2 s";
+          since.textContent = answered ? `last answer ${when(answered.toISOString())}` : "";
         }
       }
     },

@@ -1,7 +1,8 @@
 // Jobs that run or wait, with their progress; the last ones that ended where none does.
 
+import { mean } from "../../charts.js";
 import { h, refresh } from "../../dom.js";
-import { ago, seconds } from "../../format.js";
+import { ago, nmse, percent, seconds } from "../../format.js";
 import { badge, card, link, progress } from "../../ui.js";
 
 const ENDED = 3;
@@ -27,6 +28,10 @@ function said(job) {
   const { stage, remaining_s: left } = job.progress;
   if (job.state === "queued") return `waiting, queued ${ago(job.created_at)}`;
   if (job.state === "running") return left ? `${stage}, at most about ${seconds(left)} left` : stage;
-  if (job.state === "succeeded") return `made version ${job.version}, ${ago(job.finished_at)}`;
+  if (job.state === "succeeded") return `made version ${job.version}${judged(job)}, ${ago(job.finished_at)}`;
   return `${job.error?.message ?? ""} ${ago(job.finished_at)}`.trim();
+}
+
+function judged({ quality }) {
+  return quality ? `: nMSE ${nmse(mean(quality.nmse))}, ${percent(mean(quality.coverage), 0)} in the 95\u00a0% band` : "";
 }

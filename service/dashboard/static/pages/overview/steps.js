@@ -4,13 +4,14 @@ import { h, refresh } from "../../dom.js";
 import { badge, card, link } from "../../ui.js";
 import { changed } from "./follow.js";
 
+const SHIPPED = "panda-sim";
+
 /** Show the way from nothing to a model, and how far one has come. */
 export function steps(place, { data, models, jobs }) {
-  const trained = jobs.items.find((job) => job.state === "succeeded");
-  const done = { data: data.items.length > 0, trained: trained !== undefined };
-  if (!changed(place, [done, trained?.model, models.items[0]?.name])) return;
+  const done = { data, trained: jobs.some((job) => job.state === "succeeded") || models.some((model) => model.name !== SHIPPED) };
+  if (!changed(place, [done, models[0]?.name])) return;
   if (done.data && done.trained) return void place.replaceChildren();
-  const shipped = models.items.find((model) => model.name === "panda-sim");
+  const shipped = models.find((model) => model.name === SHIPPED);
   refresh(
     place,
     card(

@@ -1,8 +1,9 @@
-// Choosing the data sets to train on: those that fit together.
+// Choosing the recordings to train on: those that fit together.
 
 import { h } from "../../dom.js";
 import { ago, count, counted, seconds, when } from "../../format.js";
-import { empty, link, table } from "../../ui.js";
+import { listing } from "../../tables.js";
+import { empty, link } from "../../ui.js";
 
 /** Checkboxes of data sets. Returns {element, chosen()}; onchange(chosen data sets) after every change. */
 export function datasetChoice(datasets, preselected, onchange) {
@@ -28,29 +29,31 @@ export function datasetChoice(datasets, preselected, onchange) {
       apart += fits ? 0 : 1;
     }
     const rows = picked.reduce((sum, each) => sum + each.report.rows, 0);
-    const others = apart ? ` ${counted(apart, "data set")} cannot be added: other joints, or another torque convention.` : "";
+    const others = apart ? ` ${counted(apart, "recording")} cannot be added: other joints, or another torque convention.` : "";
     note.textContent = picked.length ? `${picked.length} chosen, ${counted(rows, "sample")}.${others}` : "None chosen yet.";
     onchange(picked);
   };
-  const element = h(
-    "div",
-    {},
-    table(
-      [
-        { label: "Use", cell: (row) => boxes.get(row) },
-        { label: "Data set", cell: (row) => link(row.name, `#/data/${row.id}`) },
-        { label: "Samples", numeric: true, cell: (row) => count(row.report.rows) },
-        { label: "Length", numeric: true, cell: (row) => seconds(row.report.timing?.duration_s) },
-        { label: "Episodes", numeric: true, cell: (row) => count(row.report.episodes) },
-        { label: "Joints", numeric: true, cell: (row) => row.joint_names.length },
-        { label: "Robot", cell: (row) => row.report.robot ?? "–" },
-        { label: "Uploaded", cell: (row) => h("time", { datetime: row.created_at, title: when(row.created_at), style: "white-space: nowrap" }, ago(row.created_at)) },
-      ],
-      datasets,
-      { caption: "Data sets, newest first" },
-    ),
-    note,
+  const list = listing(
+    [
+      { label: "Use", cell: (row) => boxes.get(row) },
+      { label: "Recording", value: (row) => row.name, cell: (row) => link(row.name, `#/data/${row.id}`) },
+      { label: "Robot", value: (row) => row.report.robot, cell: (row) => row.report.robot ?? "–" },
+      { label: "Samples", numeric: true, value: (row) => row.report.rows, first: "descending", cell: (row) => count(row.report.rows) },
+      { label: "Length", numeric: true, value: (row) => row.report.timing?.duration_s, first: "descending", cell: (row) => seconds(row.report.timing?.duration_s) },
+      { label: "Episodes", numeric: true, value: (row) => row.report.episodes, cell: (row) => count(row.report.episodes) },
+      { label: "Joints", numeric: true, value: (row) => row.joint_names.length, cell: (row) => row.joint_names.length },
+      { label: "Uploaded", value: (row) => row.created_at, first: "descending", cell: (row) => h("time", { datetime: row.created_at, title: when(row.created_at) }, ago(row.created_at)) },
+    ],
+    {
+      caption: "Recordings, newest first",
+      what: ["recording", "recordings"],
+      key: (row) => row.id,
+      words: (row) => [row.name, row.report.robot, row.id, ...row.joint_names].join(" "),
+      fewest: 4,
+    },
   );
+  list.show(datasets);
+  const element = h("div", { class: "recordings" }, list.element, note);
   return { element, chosen, changed };
 }
 

@@ -4,23 +4,28 @@ import { h } from "../../dom.js";
 import { field } from "../../ui.js";
 
 const KINDS = [
-  ["auto", "the last part, or motion that the rest does not repeat"],
-  ["last", "the last part of each data set"],
+  ["auto", "the last part, or motion that nothing else repeats"],
+  ["last", "the last part of each recording"],
   ["episodes", "whole episodes"],
   ["blocks", "some of many equal blocks"],
   ["", "nothing: learn from all of it"],
 ];
 const SAID = {
-  auto: "The last part, unless it repeats motion that is learnt from and other motion does not: then some of that.",
-  last: "This does not test motion of another kind. For that, evaluate on another recording.",
-  episodes: "The seed chooses which. If each data set has 1 episode, whole data sets are held out.",
-  blocks: "The seed chooses which. Neighbouring blocks resemble each other, so figures look better than on a new recording.",
-  "": "Nothing will show how well the model predicts. Choose this only after you have judged it on another recording.",
+  auto: "Usually the last part. If that only repeats earlier motion, a part that does not.",
+  last: "This does not test other kinds of motion: evaluate on another recording for that.",
+  episodes: "The seed chooses which. Of recordings with one episode each, whole recordings are held out.",
+  blocks: "The seed chooses which. Blocks resemble their neighbours, so figures look better than on a new recording.",
+  stretches: "The rows that you have chosen on the recording’s page. Other recordings are learnt from.",
+  "": "Then nothing shows how well the model predicts. Choose this only once you have judged it on another recording.",
 };
 
-/** The part of the form. Returns {element, value()}: the holdout of a job request, null for nothing. */
-export function holdoutChoice() {
-  const kind = h("select", { name: "holdout.kind" }, KINDS.map(([value, label]) => h("option", { value }, label)));
+/**
+ * The part of the form. named: rows that a data set's page was asked to hold out, {data set: [[first, last]]}, or null.
+ * Returns {element, value()}: the holdout of a job request, null for nothing.
+ */
+export function holdoutChoice(named = null) {
+  const kinds = named ? [["stretches", "what was chosen in the plots"], ...KINDS] : KINDS;
+  const kind = h("select", { name: "holdout.kind" }, kinds.map(([value, label]) => h("option", { value }, label)));
   const share = number("holdout.share", 30, { min: 1, max: 90, step: "any", required: true });
   const blocks = number("holdout.blocks", 10, { min: 2, max: 1000, step: 1 });
   const seed = number("holdout.seed", 0, { min: 0, max: 2147483647, step: 1 });
@@ -34,7 +39,8 @@ export function holdoutChoice() {
   };
   const show = () => {
     about.textContent = SAID[kind.value];
-    fields.share.hidden = fields.guard.hidden = kind.value === "";
+    fields.guard.hidden = kind.value === "";
+    fields.share.hidden = kind.value === "" || kind.value === "stretches";
     fields.blocks.hidden = kind.value !== "blocks";
     fields.seed.hidden = kind.value !== "blocks" && kind.value !== "episodes";
     share.disabled = kind.value === ""; // a hidden value must not keep the form from being sent
@@ -46,15 +52,15 @@ export function holdoutChoice() {
       "fieldset",
       {},
       h("legend", {}, "Hold out"),
-      h("p", { class: "hint" }, "The held-out part is not learnt from; the version is judged on it."),
+      h("p", { class: "hint" }, "The model does not learn from this part; it is judged on it."),
       h("div", { class: "grid" }, field("Which part", kind), fields.share, fields.blocks, fields.seed, fields.guard),
       about,
     ),
     value: () => {
       if (!kind.value) return null;
-      const chosen = { kind: kind.value, share: share.valueAsNumber / 100 };
+      const chosen = { kind: kind.value, ...(kind.value === "stretches" ? { stretches: named } : { share: share.valueAsNumber / 100 }) };
       if (kind.value === "blocks") chosen.blocks = blocks.valueAsNumber;
-      if (kind.value !== "last") chosen.seed = seed.valueAsNumber;
+      if (kind.value !== "last" && kind.value !== "stretches") chosen.seed = seed.valueAsNumber;
       return guard.value ? { ...chosen, guard_s: guard.valueAsNumber } : chosen;
     },
   };

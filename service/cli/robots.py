@@ -1,0 +1,78 @@
+"""`lipserve robots`: robots that are known by name, and URDFs that were uploaded."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from lipserve.address import DEFAULT_URL
+from service.cli.connecting import connected
+from service.cli.consoles import CommandError, echo, out, print_json, print_result
+from service.cli.options import Json, Limit, Url, Yes, confirm, group
+
+app = group("Robots: list those that are known, show one, add and delete URDFs.")
+Robot = Annotated[str, typer.Argument(help="A profile such as panda, or the id of an uploaded URDF.")]
+RobotId = Annotated[str, typer.Argument(help="Id of an uploaded URDF.")]
+
+
+@app.command("list")
+def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """List robots: uploaded URDFs, newest first, then those that are known by name."""
+    with connected(url) as client:
+        uploaded, profiles = list(islice(client.robots(), limit)), client.profiles()
+    if as_json:
+        print_json({"uploaded": uploaded, "profiles": profiles})
+        return
+    table = Table("robot", "name", "joints")
+    for each in uploaded:
+        table.add_row(each.id, escape(each.name), str(len(each.joints)))
+    for known in profiles:
+        table.add_row(known.name, escape(known.title), str(len(known.joints)))
+    out.print(table)
+
+
+@app.command()
+def show(robot: Robot, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """Print the joints of a robot with their limits; of a URDF also when it was uploaded, and its hash."""
+    with connected(url) as client:
+        known = client.profile(robot)
+        uploaded = client.robot(robot) if robot.startswith("urdf_") else None
+    if as_json:
+        print_json({"profile": known, "uploaded": uploaded})
+        return
+    echo(f"{known.name}: {known.title}, {len(known.joints)} joints")
+    if uploaded is not None:
+        echo(f"  uploaded {uploaded.created_at[:19].replace('T', ' ')}, sha256 {uploaded.sha256}")
+    table = Table("joint", "type", "lower", "upper", "speed", "torque")
+    for each in known.joints:
+        limits = (each.lower, each.upper, each.max_speed, each.max_torque)
+        table.add_row(escape(each.name), each.type, *("-" if limit is None else f"{limit:.3g}" for limit in limits))
+    out.print(table)
+
+
+@app.command()
+def add(
+    path: Annotated[Path, typer.Argument(help="A .urdf file.", exists=True, dir_okay=False)],
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """Upload a URDF, so that recordings and trainings can name it."""
+    if path.suffix != ".urdf":
+        raise CommandError(f"path is {str(path)!r}, expected a .urdf file")
+    with connected(url) as client:
+        robot = client.upload_robot(path)
+    print_result(robot, as_json, f"{path.name} is uploaded as {robot.id}: `lipserve train … --robot {robot.id}`")
+
+
+@app.command()
+def delete(robot: RobotId, yes: Yes = False, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """Delete an uploaded URDF. Models that were trained with it keep their copy."""
+    confirm(f"delete {robot} for good?", yes)
+    with connected(url) as client:
+        client.delete_robot(robot)
+    print_result({"deleted": robot}, as_json, f"{robot} is deleted")

@@ -1,0 +1,115 @@
+// A card for each model: the arm that it has learnt, whether it is live, how well it predicts, and what needs somebody.
+
+import { innovationCourse, qualityCharts } from "../../charts.js";
+import { h, refresh } from "../../dom.js";
+import { ago, number, seconds, shortNames } from "../../format.js";
+import { badge, link } from "../../ui.js";
+import { chain, sketch } from "../arm/sketch.js";
+
+const NEW_MS = 86_400_000;
+const BUCKETS = 60; // of the course of the last hour
+const NEWS = { promotion: "promotion", payload: "payload" };
+
+/** Cards that are brought up to date: returns show(page of the overview of models). */
+export function robots(place) {
+  const cards = new Map();
+  const list = h("ul", { class: "robots" });
+  const more = h("p", {});
+  return ({ items, next_cursor: cursor, live_after_s: live }) => {
+    if (!list.isConnected) place.append(h("section", { "aria-label": "Models" }, list, more));
+    for (const name of cards.keys()) if (!items.some((each) => each.name === name)) cards.delete(name);
+    const shown = [...items].sort((a, b) => rank(a, live) - rank(b, live));
+    refresh(list, shown.map((model) => {
+      const made = cards.get(model.name) ?? robotCard(model);
+      cards.set(model.name, made);
+      made.update(model, live);
+      return made.element;
+    }));
+    refresh(more, cursor ? link("All models", "#/models") : null);
+  };
+}
+
+function rank(model, live) {
+  if (model.held || model.failure) return 0;
+  return isLive(model, live) ? 1 : 2;
+}
+
+function isLive({ idle_s: idle }, live) {
+  return idle !== null && idle < live;
+}
+
+function robotCard(first) {
+  const address = encodeURIComponent(first.name);
+  const state = h("span", {}), about = h("p", { class: "hint" }), charts = h("div", { class: "charts" });
+  const lately = h("div", { class: "robot-course" }), news = h("div", { class: "robot-news" });
+  const figure = h("a", { class: "robot-arm", href: `#/models/${address}?tab=arm`, "aria-label": `The arm of ${first.name}` });
+  const element = h(
+    "li",
+    { class: "card robot", "data-key": first.name },
+    h("div", { class: "robot-head" }, h("h2", {}, link(first.name, `#/models/${address}`)), state),
+    about,
+    h("div", { class: "robot-body" }, figure, charts),
+    lately,
+    news,
+    h("div", { class: "actions robot-foot" }, h("a", { href: `#/live/${address}`, "aria-label": `Follow live: ${first.name}` }, "Follow live"), h("a", { href: `#/train?model=${address}`, "aria-label": `Train again: ${first.name}` }, "Train again")),
+  );
+  let drawn = null, arm = null, posture = null;
+  const update = (model, live) => {
+    const names = shortNames(model.joint_names);
+    refresh(state, standing(model, live));
+    refresh(about, `Version ${model.serving_version}, ${model.estimator}, made ${ago(model.created_at)}.`, model.candidate ? ` Version ${model.candidate} waits.` : "");
+    if (drawn !== model.serving_version) {
+      drawn = model.serving_version;
+      posture = JSON.stringify(model.position);
+      arm = model.arm && sketch(model.arm, model.position, `The arm that ${model.name} has learnt, ${names.length} joints`);
+      const unknown = [chain(names.length, `${names.length} joints`), h("span", { class: "hint" }, `${model.estimator} learns no arm`)];
+      figure.replaceChildren(...(arm ? [arm.element] : unknown));
+      if (arm) figure.setAttribute("aria-label", `The arm of ${first.name}`);
+      else figure.removeAttribute("aria-label"); // its text names it
+    } else if (posture !== JSON.stringify(model.position)) {
+      posture = JSON.stringify(model.position);
+      arm?.glide(model.position);
+    }
+    refresh(charts, quality(model, names));
+    refresh(lately, course(model, names));
+    refresh(news, items(model, address));
+  };
+  return { element, update };
+}
+
+function standing(model, live) {
+  if (model.held) return badge("held");
+  if (model.failure) return badge("does not learn", "bad");
+  if (isLive(model, live)) return h("span", { class: "badge good live" }, "live");
+  return h("span", { class: "hint" }, model.idle_s === null ? "no stream yet" : `quiet for ${seconds(Math.round(model.idle_s))}`);
+}
+
+function quality({ quality: judged, recent }, names) {
+  const lately = recent?.rows ? recent : null;
+  if (!judged && !lately) return h("p", { class: "hint" }, "Not judged yet: nothing was held out of its training, and no stream has come.");
+  const note = judged && lately ? "Bars: held out. Lines: last hour." : judged ? "On what was held out." : "In the last hour.";
+  return [qualityCharts(names, judged ?? lately, judged ? lately : null), h("p", { class: "hint" }, note)];
+}
+
+function course({ recent }, names) {
+  if (!recent?.course.length) return null;
+  const now = Date.now() / 1000;
+  return [
+    h("div", { class: "chart-label" }, h("span", {}, "Innovation, last hour"), h("span", { class: "hint" }, "dashed: 1 σ")),
+    innovationCourse(names, recent.course, recent.seconds, Math.max(now, recent.course.at(-1).at), Math.max(recent.seconds / BUCKETS, 1)),
+  ];
+}
+
+function items(model, address) {
+  const found = [];
+  if (model.held) found.push([badge("held"), " The robot seems to have changed, and learning waits. ", link("Decide", `#/live/${address}`)]);
+  if (model.failure) found.push([badge("error"), ` It does not learn: ${model.failure}`]);
+  for (const { stream_id: stream, mass } of model.payloads ?? []) {
+    if (mass) found.push([badge("payload", "plain"), ` ${stream} carries ${number(mass.mean)} ± ${number(mass.std, 2)}\u00a0kg.`]);
+  }
+  const { alarm } = model;
+  if (alarm && !model.held && Date.now() - new Date(alarm.at).getTime() < NEW_MS) {
+    found.push([badge(NEWS[alarm.kind] ?? "warning", NEWS[alarm.kind] ? "plain" : "warn"), ` ${alarm.message} `, h("span", { class: "muted" }, ago(alarm.at))]);
+  }
+  return found.map((each) => h("p", {}, each));
+}

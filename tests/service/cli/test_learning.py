@@ -1,0 +1,149 @@
+"""`lipserve learning`, `alarms` and `robots`; and that every route has a command or a reason not to have one."""
+
+import ast
+import inspect
+from pathlib import Path
+
+import pytest
+
+from lipserve import Client
+from lipserve.call import ROUTES
+from service import cli
+from tests.service.cli.conftest import QUICKLY
+from tests.service.data import eventually
+from tests.service.learning.lessons import lesson
+
+REASONS = {
+    ("GET", "/metrics"): "for Prometheus, in its own format",
+    (
+        "GET",
+        "/v1/overview",
+    ): "the dashboard's first page; `models list`, `learning show`, `payload` print it",
+    ("GET", "/v1/datasets/{dataset}/preview"): "rows for the plots of the data set's page",
+    ("POST", "/v1/models/{model}/trace"): "rows for the plots of the model's page; `evaluate` prints the figures",
+    ("GET", "/v1/models/{model}/live"): "does not end, for pages: `lipserve open MODEL --live` tells their address",
+    ("POST", "/v1/models/{model}/observations"): "batches of programs; `lipserve stream` teaches from the shell",
+    ("POST", "/v1/echo"): "measures what transport costs, for clients and benchmarks",
+    ("GET", "/v1/jobs/{job}/events"): "for pages; `jobs follow` asks for the job again and again",
+    ("GET", "/health/live"): "for what watches over the service",
+    **dict.fromkeys(
+        (
+            ("GET", "/v2"),
+            ("GET", "/v2/health/live"),
+            ("GET", "/v2/health/ready"),
+            ("GET", "/v2/models/{model}"),
+            ("GET", "/v2/models/{model}/ready"),
+            ("GET", "/v2/models/{model}/versions/{version}"),
+            ("GET", "/v2/models/{model}/versions/{version}/ready"),
+            ("POST", "/v2/models/{model}/infer"),
+            ("POST", "/v2/models/{model}/versions/{version}/infer"),
+        ),
+        "of the Open Inference Protocol, which has clients of its own",
+    ),
+}
+"""Routes without a command, and why."""
+
+
+def methods(source, owner):
+    """Methods that a source calls of what it names `owner`."""
+    nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Attribute)]
+    return {node.attr for node in nodes if isinstance(node.value, ast.Name) and node.value.id == owner}
+
+
+def used_by_commands():
+    """Calls of the client that commands make, also by methods which make others."""
+    sources = [path.read_text() for path in Path(cli.__file__).parent.glob("*.py")]
+    used = set().union(*(methods(source, "client") for source in sources))
+    for node in ast.walk(ast.parse(inspect.getsource(Client))):
+        if isinstance(node, ast.FunctionDef) and node.name in used:
+            used |= methods(ast.unparse(node), "self")
+    return used
+
+
+def test_every_route_has_its_command_or_a_reason(api):
+    used, kinds = used_by_commands(), ("get", "post", "put", "patch", "delete")
+    paths = api.get("/openapi.json").json()["paths"]
+    routes = {(method.upper(), path) for path, found in paths.items() for method in found if method in kinds}
+    assert set(REASONS) <= routes, "a reason for a route that there is not"
+    for route in sorted(routes):
+        assert (ROUTES[route] in used) != (route in REASONS), (route, "a command, or else a reason")
+        assert len(REASONS.get(route, "has a command")) > 10
+
+
+@pytest.fixture
+def pupil(server, arm):
+    """A model of its own that has been taught two batches."""
+    name, _ = arm
+    archive = server.client.get(f"/v1/models/{name}/export").content
+    headers = {"content-type": "application/x-tar"}
+    made = server.client.post("/v1/models/import", content=archive, headers=headers, params={"name": "cli-pupil"})
+    assert made.status_code == 201, made.text
+    for number in range(2):
+        answer = server.client.post("/v1/models/cli-pupil/observations", json=lesson(number))
+        assert answer.status_code == 200, answer.text
+    eventually(lambda: server.client.get("/v1/models/cli-pupil/learning").json()["status"]["published"] == 2)
+    yield "cli-pupil"
+    assert server.client.delete("/v1/models/cli-pupil").status_code == 204
+
+
+def test_learning_is_shown_set_and_taken_back(asked, refused, server, pupil):
+    quality = server.client.get(f"/v1/models/{pupil}/quality").json()
+    text = asked("learning", "show", pupil)
+    assert "revision 2 of 2: learning goes on" in text
+    rows = quality["windows"][-1]["rows"]
+    assert f"{rows} rows of the last 3600 s, each predicted before it was learnt" in text
+    assert asked("learning", "show", pupil, "--json")["quality"]["revision"] == 2
+    assert "revision 2 of 2 answers" in asked("models", "show", pupil)
+
+    text = asked("learning", "set", pupil, "contact_threshold=100", "on_change=learn", "auto_refresh=false")
+    assert "on_change = learn" in text
+    options = server.client.get(f"/v1/models/{pupil}/learning").json()["options"]
+    assert (options["contact_threshold"], options["auto_refresh"], options["payloads"]) == (100.0, False, True)
+    assert "forgetting_s" in refused("learning", "set", pupil, "forgetting_s=0.1")
+
+    found = asked("learning", "batches", pupil, "--json")
+    assert [each["sequence"] for each in found] == [1, 0]
+    assert "learnt" in asked("learning", "batches", pupil, "--stream", "arm")
+    assert f"no batch of {pupil}" in asked("learning", "batches", pupil, "--stream", "nobody")
+    seen = asked("learning", "batch", pupil, "arm", 1)
+    assert f"{found[0]['accepted']} of {found[0]['rows']} rows teach" in seen
+    assert len(asked("learning", "batch", pupil, "arm", 1, "--rows", "--json")["observed"]["q"]) == found[0]["rows"]
+    assert "is unlearnt" in asked("learning", "unlearn", pupil, "arm", 1, "--yes")
+    assert "unlearnt" in asked("learning", "batch", pupil, "arm", 1)
+    assert "has been unlearnt" in refused("learning", "replay", pupil, "arm", 1)
+
+
+def test_alarms_are_listed(asked, pupil):
+    assert f"no alarm of {pupil}" in asked("alarms", pupil)
+    assert asked("alarms", pupil, "--json") == []
+
+
+def test_quality_stands_in_every_list(asked, server, recording):
+    path = recording(21, samples=120, rate=10.0)
+    asked("train", path, "--model", "cli-listed", *QUICKLY)
+    quality = server.client.get("/v1/models/cli-listed").json()["versions"][0]["quality"]
+    error = f"{sum(quality['nmse']) / 2:.2e}"
+    inside = f"{sum(quality['coverage']) / 2:.0%}"
+    for command in (("models", "list"), ("models", "show", "cli-listed"), ("jobs", "list")):
+        row = next(line for line in asked(*command).splitlines() if error in line)
+        assert inside in row
+
+
+def test_robots_are_added_listed_shown_and_deleted(asked, refused, tmp_path):
+    urdf = tmp_path / "one.urdf"
+    urdf.write_text(
+        '<robot name="one"><link name="a"/><link name="b"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" '
+        'ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="j" type="revolute"><parent link="a"/>'
+        '<child link="b"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="5" velocity="2"/></joint></robot>'
+    )
+    robot = asked("robots", "add", urdf, "--json")["id"]
+    text = asked("robots", "list")
+    assert robot in text
+    assert "panda" in text
+    shown = asked("robots", "show", robot)
+    assert "sha256" in shown
+    assert "-1" in next(line for line in shown.splitlines() if " j " in line)
+    assert "7 joints" in asked("robots", "show", "panda")
+    assert "is deleted" in asked("robots", "delete", robot, "--yes")
+    assert "no robot" in refused("robots", "show", robot)
+    assert "expected a .urdf file" in refused("robots", "add", Path(__file__))
