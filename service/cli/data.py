@@ -12,9 +12,10 @@ from rich.markup import escape
 from lipserve.address import DEFAULT_URL
 from lipserve.asking import SUFFIXES, Reading
 from service.cli import connecting
-from service.cli.connecting import connected
+from service.cli.connecting import connected, upload
 from service.cli.consoles import echo, out, print_json, print_result
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, group, names, pairs
+from service.cli.wording import in_shell
 
 if TYPE_CHECKING:
     from lipserve.records.datasets import Dataset
@@ -81,7 +82,7 @@ def add(
     }
     reading: Reading = {key: value for key, value in given.items() if value is not None}  # type: ignore[assignment]
     with connected(url) as client:
-        made = [client.upload(path, name, progress=True, **reading) for path in files]
+        made = [upload(client, [path], name, **reading) for path in files]
     if as_json:
         print_json(made if len(made) > 1 else made[0])
         return
@@ -137,15 +138,15 @@ def _print(dataset: Dataset) -> None:
     report = dataset.report
     out.print(f"[bold]{dataset.id}[/bold]  {escape(dataset.name)}  torque: {dataset.torque_convention}")
     for line in tables.overview(report):
-        echo(f"  {line}")
+        echo(f"  {in_shell(line)}")
     for table in tables.report_tables(report, dataset.joint_names):
         out.print(table)
     if report.excitation is not None:
         echo(f"  {report.excitation.text}")
     for line in report.warnings:
-        out.print(f"[yellow]warning:[/yellow] {escape(line)}", highlight=False)
+        out.print(f"[yellow]warning:[/yellow] {escape(in_shell(line))}", highlight=False)
     for line in report.advice:
-        out.print(f"[cyan]next:[/cyan] {escape(line)}", highlight=False)
+        out.print(f"[cyan]next:[/cyan] {escape(in_shell(line))}", highlight=False)
 
 
 def _one_or_more(text: str) -> str | list[str]:

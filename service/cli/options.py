@@ -29,11 +29,13 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text."
 Limit = Annotated[int, typer.Option(min=1, help="Most that are listed.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask whether that is meant.")]
 Model = Annotated[str, typer.Argument(help="Name of the model.", autocompletion=connecting.models)]
-DatasetId = Annotated[str, typer.Argument(help="Id of a data set.", autocompletion=connecting.datasets)]
+DatasetId = Annotated[str, typer.Argument(help="Id or name of a data set.", autocompletion=connecting.datasets)]
 JobId = Annotated[str, typer.Argument(help="Id of a job.", autocompletion=connecting.jobs)]
 Data = Annotated[
     str,
-    typer.Argument(help="A recording, which is uploaded, or the id of a data set.", autocompletion=connecting.datasets),
+    typer.Argument(
+        help="A recording, which is uploaded, or the id or name of a data set.", autocompletion=connecting.datasets
+    ),
 ]
 Version = Annotated[
     int | None, typer.Option(help="A version; the one that serves by default.", autocompletion=connecting.versions)

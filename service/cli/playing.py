@@ -24,6 +24,7 @@ from lipcore.vocabulary import TorqueConvention
 from lipserve import StreamClient, StreamError
 from lipserve.exchange import StreamAnswer, StreamLearnt
 from service.cli.consoles import CommandError
+from service.cli.wording import in_shell
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
@@ -184,7 +185,7 @@ def recorded(path: Path, seconds: float | None = None) -> Motion:
         try:
             staged, convention = _staged(path, Path(folder))
         except ServiceError as error:
-            raise CommandError(f"{path.name}: {error}") from error
+            raise CommandError(f"{path.name}: {in_shell(str(error))}") from error
         t = staged.read("t")
         rows = slice(None) if seconds is None else t - t[0] <= seconds
         parts = {name: staged.table(name, rows) for name in ("q", "dq", "ddq", "tau")}

@@ -15,18 +15,22 @@ from lipcore.robots.simulation import FAST, Payload, Stream, simulate
 from service.cli.consoles import print_result
 from service.cli.options import Json, alone
 
+COLUMNS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque"}
+"""What stands behind a joint's name in the columns of a CSV."""
+
 
 def write_recording(path: Path, samples: Samples) -> None:
-    """Write samples as CSV or NPZ by the path's ending; raise ValueError for another ending."""
+    """Write samples as CSV or NPZ by the path's ending, with the names of the joints, so that an upload has them.
+
+    Raise ValueError for another ending.
+    """
     if path.suffix == ".npz":
         names = ("t", "episode", "q", "dq", "ddq", "tau")
         arrays = {name: getattr(samples, name) for name in names}
         np.savez(path, joint_names=np.array(samples.joint_names), **arrays)
     elif path.suffix == ".csv":
-        joints = range(1, samples.n_joints + 1)
-        quantities = ("q", "dq", "ddq", "tau")
-        header = ["t", "episode", *(f"{name}{joint}" for name in quantities for joint in joints)]
-        table = np.column_stack([samples.t, samples.episode, *(getattr(samples, name) for name in quantities)])
+        header = ["t", "episode", *(f"{joint}/{word}" for word in COLUMNS.values() for joint in samples.joint_names)]
+        table = np.column_stack([samples.t, samples.episode, *(getattr(samples, name) for name in COLUMNS)])
         formats = ["%.17g", "%d", *["%.17g"] * (4 * samples.n_joints)]
         np.savetxt(path, table, fmt=formats, delimiter=",", header=",".join(header), comments="")
     else:
