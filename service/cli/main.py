@@ -105,6 +105,8 @@ class Commands(LazyGroup):
             "service.cli.answers", "Compare a model with a recording, joint by joint.", ANSWERS, "evaluate_app"
         ),
         "stream": Entry("service.cli.stream", "Play a motion to a model in real time, and teach it.", ANSWERS),
+        "learning": Entry("service.cli.learning", "Whether a model learns; decide about what it waits for.", ROBOT),
+        "alarms": Entry("service.cli.learning", "What the owner of a model should know.", ROBOT, "alarms_app"),
         "payload": Entry("service.cli.payload", "Show what the arm carries, declare it, or that it is gone.", ROBOT),
         "simulate": Entry("service.cli.simulate", "Simulate a robot's stream and write it as a recording.", ROBOT),
         "excite": Entry("service.cli.excite", "Plan the motion that tells most of what is not known.", ROBOT),

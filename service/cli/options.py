@@ -43,6 +43,27 @@ Version = Annotated[
 Alias = Annotated[str | None, typer.Option(help="A version by its alias.", autocompletion=connecting.aliases)]
 
 
+def simulation(help_: str, *names: str, **limits: Any) -> Any:
+    """An option that describes a simulated stream."""
+    return typer.Option(*names, help=help_, rich_help_panel="Simulation", **limits)
+
+
+Seed = Annotated[int, simulation("Equal seeds give equal streams.", min=0)]
+Sinusoids = Annotated[int, simulation("50 for training, 100 for testing in the paper.", min=1)]
+Range = Annotated[str, simulation("middle (±0.5 rad) or full.")]
+Along = Annotated[str, simulation("sinusoids, periodic, or rests: from point to point.")]
+Fast = Annotated[bool, simulation("The faster-moving variant.", "--fast")]
+Noise = Annotated[float, simulation("Std of the torque noise, N·m.")]
+Viscous = Annotated[float, simulation("Viscous friction, N·m·s/rad.")]
+Coulomb = Annotated[float, simulation("Coulomb friction, N·m.")]
+Mass = Annotated[float, simulation("Payload, kg.")]
+MassAt = Annotated[float, simulation("When the payload is attached, s.")]
+DirtShare = Annotated[
+    float,
+    simulation("Friction with memory, ripple, coloured noise, encoders: 1 is an industrial arm's.", min=0.0),
+]
+
+
 def group(help_: str) -> typer.Typer:
     """An application of several commands."""
     return typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=help_)

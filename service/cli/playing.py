@@ -19,7 +19,7 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.robots.library import SimulationUnavailableError, load_robot
-from lipcore.robots.simulation import FAST, Payload, Stream, simulate
+from lipcore.robots.simulation import Stream, simulate
 from lipcore.vocabulary import TorqueConvention
 from lipserve import StreamClient, StreamError
 from lipserve.exchange import StreamAnswer, StreamLearnt
@@ -31,10 +31,8 @@ from service.datasets.options import UploadOptions
 from service.datasets.staging import Staged, prepare
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
+from service.learning.ingest.opening import BAND, LENGTH, Opening
 from service.storage.storage import Disk
-
-BAND = 1.959963984540054
-"""Standard deviations on both sides that hold 95 %."""
 
 
 class Tally:
@@ -45,7 +43,8 @@ class Tally:
         self.rows, self.late, self.behind_s = 0, 0, 0.0
         self.refused = Counter[str]()
         self._trips = array("d")
-        self._sums = np.zeros((4, len(noise_std)))  # answers inside the band, squared errors, torques, squared torques
+        # answers inside the band, squared errors, torques, squared torques, inside the band as the model itself has it
+        self._sums = np.zeros((5, len(noise_std)))
 
     def add(self, answer: StreamAnswer, tau: Array, seconds: float, behind_s: float) -> None:
         """Count an answer with its std.
@@ -57,11 +56,11 @@ class Tally:
         self.late += answer.late
         self.behind_s = max(self.behind_s, behind_s)
         self._trips.append(seconds)
-        inside = np.zeros(tau.shape, np.bool_)
+        inside = own = np.zeros(tau.shape, np.bool_)
         if answer.tau_std is not None:
-            scale = 1.0 if answer.scale is None else answer.scale
-            inside = np.abs(error) <= BAND * scale * np.hypot(answer.tau_std, self._noise)
-        self._sums += np.array((inside, error**2, tau, tau**2))
+            scale, half = 1.0 if answer.scale is None else answer.scale, BAND * np.hypot(answer.tau_std, self._noise)
+            inside, own = np.abs(error) <= scale * half, np.abs(error) <= half
+        self._sums += np.array((inside, error**2, tau, tau**2, own))
 
     def merge(self, other: Tally) -> None:
         """Add the figures of another stretch of the same stream."""
@@ -88,11 +87,16 @@ class Tally:
             "coverage": float(self._sums[0].mean() / self.rows) if self.rows else None,
         }
 
+    def opening(self, seconds: float) -> Opening:
+        """What the model's own band, which no stream has widened, held of the first seconds of a stream."""
+        rows = min(LENGTH * seconds, float(self.rows))
+        return Opening(rows, rows * self._sums[4] / max(self.rows, 1))
+
     def joints(self, joint_names: Sequence[str]) -> list[dict[str, Any]]:
         """Figures of each joint: rmse N·m, nmse (None where the torque does not vary), coverage of the 95 % band."""
         if not self.rows:
             return []
-        coverage, squared, mean, mean_square = self._sums / self.rows
+        coverage, squared, mean, mean_square = self._sums[:4] / self.rows
         variance = mean_square - mean**2
         return [
             {
@@ -156,19 +160,11 @@ class Motion:
         return replace(self, **columns, joint_names=tuple(joint_names)), True
 
 
-def simulated(
-    robot: str, seconds: float, rate: float, seed: int = 0, fast: bool = False, payload: float = 0.0, at: float = 0.0
-) -> Motion:
-    """A robot along random sinusoids, with a payload (kg) from a time (s) on where that is not 0.
+def simulated(robot: str, stream: Stream, seed: int = 0) -> Motion:
+    """A simulated robot's stream.
 
     Raise CommandError where what simulates is not installed, ValueError for other robots.
     """
-    stream = Stream(
-        n_samples=max(2, round(seconds * rate)),
-        rate=rate,
-        speed=FAST if fast else 1.0,
-        payload=Payload(payload, at) if payload else None,
-    )
     try:
         made = simulate(load_robot(robot), stream, seed)
     except SimulationUnavailableError as error:
