@@ -40,20 +40,22 @@ class Tally:
 
     def __init__(self, noise_std: Array) -> None:
         self._noise = noise_std
-        self.rows, self.late, self.behind_s = 0, 0, 0.0
+        self.rows, self.late, self.received_late, self.behind_s = 0, 0, 0, 0.0
         self.refused = Counter[str]()
         self._trips = array("d")
         # answers inside the band, squared errors, torques, squared torques, inside the band as the model itself has it
         self._sums = np.zeros((5, len(noise_std)))
 
-    def add(self, answer: StreamAnswer, tau: Array, seconds: float, behind_s: float) -> None:
+    def add(self, answer: StreamAnswer, tau: Array, seconds: float, behind_s: float, deadline: float = np.inf) -> None:
         """Count an answer with its std.
 
-        tau: (n) measured there; seconds: of the round trip; behind_s: how long after it was due the row was sent.
+        tau: (n) measured there; seconds: of the round trip; behind_s: how long after it was due the row was sent;
+        deadline: s, after which the answer is late, by the service's clock or by this one.
         """
         error = tau - answer.tau
         self.rows += 1
         self.late += answer.late
+        self.received_late += seconds > deadline
         self.behind_s = max(self.behind_s, behind_s)
         self._trips.append(seconds)
         inside = own = np.zeros(tau.shape, np.bool_)
@@ -66,13 +68,15 @@ class Tally:
         """Add the figures of another stretch of the same stream."""
         self.rows += other.rows
         self.late += other.late
+        self.received_late += other.received_late
         self.behind_s = max(self.behind_s, other.behind_s)
         self.refused.update(other.refused)
         self._trips.extend(other._trips)
         self._sums += other._sums
 
     def figures(self) -> dict[str, Any]:
-        """The figures for JSON: rmse in N·m over all joints, coverage of the 95 % band; None without answers.
+        """The figures for JSON: rmse in N·m over all joints, coverage of the 95 % band; None without answers; late by
+        the service's clock, and received late by this one, which has the network in it.
 
         All compare answers with torque that the model had not learnt yet when it answered.
         """
@@ -82,6 +86,7 @@ class Tally:
             "refused": dict(self.refused),
             "round_trip_ms": {"p50": p50, "p99": p99},
             "late": self.late,
+            "received_late": self.received_late,
             "behind_s": self.behind_s,
             "rmse": float(np.sqrt(self._sums[1].mean() / self.rows)) if self.rows else None,
             "coverage": float(self._sums[0].mean() / self.rows) if self.rows else None,
@@ -264,7 +269,7 @@ def play(
                 raise
             part.refused[error.code] += 1
             continue
-        part.add(answer, motion.tau[row], time.perf_counter() - sent, max(0.0, -wait))
+        part.add(answer, motion.tau[row], time.perf_counter() - sent, max(0.0, -wait), deadline)
     if part.rows or part.refused:
         each_second(second, part)
         total.merge(part)

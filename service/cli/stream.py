@@ -65,7 +65,12 @@ def stream(
         float | None, typer.Option(min=0.1, help="How long: all of a recording, 60 of a simulation by default.")
     ] = None,
     deadline: Annotated[
-        float | None, typer.Option(min=0, help="ms after which an answer is late; one step of the motion by default.")
+        float | None,
+        typer.Option(
+            min=0,
+            help="ms after which an answer is late by the service's clock, and received late by this one; one step of "
+            "the motion by default.",
+        ),
     ] = None,
     stream_id: Annotated[
         str | None, typer.Option(help="Name of the source of the torques; a new one by default.")
@@ -252,7 +257,7 @@ def _line(figures: dict[str, Any]) -> str:
         trip = figures["round_trip_ms"]
         parts += [
             f"round trip p50 {trip['p50']:.2f} ms, p99 {trip['p99']:.2f} ms",
-            f"{figures['late']} late",
+            f"{figures['late']} late, {figures['received_late']} received late",
             f"error {figures['rmse']:.4f} N·m, {figures['coverage']:.1%} in the 95 % band",
         ]
     if figures["behind_s"] > 0.1:

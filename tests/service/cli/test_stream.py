@@ -112,6 +112,7 @@ def test_a_recording_is_played(asked, refused, arm, recording):
     path = recording(85, "motion.csv", samples=20, rate=40.0)
     text = asked("stream", arm[0], path)
     assert "in all  20 rows; round trip p50 " in text
+    assert " late, " in text
     assert "in the 95 % band" in text
     mismatch = "the motion has 2 joints (joint1, joint2), expected the model's 7"
     assert mismatch in refused("stream", "panda-sim", path)
@@ -155,11 +156,12 @@ def test_figures_are_those_of_all_rows():
         part = Tally(noise)
         for row in range(first, 25 if first == 0 else 40):
             answer = StreamAnswer(row, mean[row], std[row], 1, 0, row % 10 == 0, 0, 0.0)
-            part.add(answer, tau[row], seconds=row / 1e3, behind_s=row / 1e2)
+            part.add(answer, tau[row], seconds=row / 1e3, behind_s=row / 1e2, deadline=0.0295)
         tally.merge(part)
     figures, error = tally.figures(), tau - mean
     inside = np.abs(error) <= 1.959963984540054 * np.hypot(std, noise)
     assert (figures["rows"], figures["late"], figures["behind_s"]) == (40, 4, 0.39)
+    assert figures["received_late"] == 10
     assert figures["rmse"] == pytest.approx(np.sqrt((error**2).mean()))
     assert figures["coverage"] == pytest.approx(inside.mean())
     assert figures["round_trip_ms"]["p50"] == pytest.approx(19.5)
