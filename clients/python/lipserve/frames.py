@@ -20,7 +20,7 @@ Answer, 32 + 8 n bytes, 8 n more with tau_std, 8 n with scale, 24 n + 16 with ex
 
     offset  type     field
     0       u32      sequence of the request
-    4       u16      flags: 1 = tau_std follows tau; 2 = late, see below;      4 = error; 8 = no sequence;
+    4       u16      flags: 1 = tau_std follows tau; 2 = late; 4 = error; 8 = no sequence;
                      16 = scale follows; 32 = external torque follows; 64 = payload follows, last
     6       u16      n; 0 in an error
     8       u32      version that answers

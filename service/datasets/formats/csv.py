@@ -79,6 +79,10 @@ def read_header(path: Path, delimiter: str | None) -> Header:
     names = tuple(name.strip() for name in cells(header, chosen))
     if len(names) < 2:
         raise invalid_data("header", _cut(header), EXPECTED)
+    widths = {len(cells(row, chosen)) for row in rows}
+    if len(rows) > 1 and len(widths) == 1 and widths != {len(names)}:  # else it is a row that is wrong
+        expected = f"{widths.pop()}, as each of the first {len(rows)} rows has so many values"
+        raise invalid_data("header", f"{len(names)} names", expected)
     return Header(names, chosen, index + 1)
 
 
@@ -130,7 +134,8 @@ def _choose(header: str, rows: list[str]) -> str:
         width = len(cells(header, candidate))
         fitting = sum(len(cells(row, candidate)) == width for row in rows)
         # blanks may stand beside any delimiter: they are the last resort
-        scores[candidate] = (width > 1 and (fitting > 0 or not rows), candidate != BLANK, fitting, width)
+        some = width > 1
+        scores[candidate] = (some and (fitting > 0 or not rows), some, candidate != BLANK, fitting, width)
     return max(scores, key=scores.__getitem__)
 
 

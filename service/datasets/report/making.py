@@ -14,6 +14,7 @@ from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
 from service.datasets import schema
+from service.datasets.mapping.choice import WARNING
 from service.datasets.report.advice import advice, in_words, warnings
 from service.datasets.report.bodies import Against, Bodies, Signals, compare
 from service.datasets.report.causes import Work, causes
@@ -43,8 +44,6 @@ from service.foundation.settings import Settings
 
 UNSEEN = 1e-3
 """Share of a torque's spread below which a factor of it would be one of rounding."""
-WARNING = "warning: "
-"""What a sentence of the reading begins with that belongs to the warnings."""
 
 
 def make_report(
