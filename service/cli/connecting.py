@@ -8,8 +8,11 @@ import hashlib
 import http.client
 import json
 import shlex
+import shutil
 import socket
+import tempfile
 import time
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http.client import HTTPException
@@ -139,18 +142,25 @@ def dataset_of(client: Client, data: str, **reading: Any) -> str:
     path = recording_of(data)
     if path is None:
         return data
+    hint = f"`lipserve data add {shlex.quote(data)}` takes options that say how to read it; then give its id here"
+    with advised(hint):
+        dataset = upload(client, [path], **reading)
+    note(f"{path.name} is data set {dataset.id}")
+    return dataset.id
+
+
+@contextmanager
+def advised(hint: str | None) -> Iterator[None]:
+    """Say what to do about a recording that the service cannot read; raise CommandError."""
     from lipserve import ApiError  # noqa: PLC0415 - as above
 
     try:
-        dataset = upload(client, [path], **reading)
+        yield
     except ApiError as error:
-        if error.code != "invalid_data":
+        if error.code != "invalid_data" or hint is None:
             raise
         refusal = explain(error, (ApiError,)) or Explained(str(error))
-        hint = f"`lipserve data add {shlex.quote(data)}` takes options that say how to read it; then give its id here"
         raise CommandError(in_shell(refusal.message), hint) from error
-    note(f"{path.name} is data set {dataset.id}")
-    return dataset.id
 
 
 def recording_of(data: str) -> Path | None:
@@ -167,14 +177,28 @@ def recording_of(data: str) -> Path | None:
 
 
 def upload(client: Client, paths: Sequence[Path], name: str | None = None, **reading: Any) -> Dataset:
-    """Upload the files of a recording; the same content, called and read alike, is the same data set each time."""
+    """Upload a recording; the same content, called and read alike, is the same data set each time.
+
+    paths: its file, or tables of text that are to be joined.
+    """
     content = hashlib.sha256(json.dumps([name or paths[0].name, reading], sort_keys=True).encode())
     for path in paths:
-        content.update(path.suffix.lower().encode())
+        content.update((path.suffix.lower() if len(paths) == 1 else path.name).encode())
         with path.open("rb") as file:
             content.update(hashlib.file_digest(file, "sha256").digest())
     key = f"content-{content.hexdigest()}"
-    return client.upload(paths[0], name, progress=True, idempotency_key=key, **reading)
+    if len(paths) == 1:
+        return client.upload(paths[0], name, progress=True, idempotency_key=key, **reading)
+    with tempfile.TemporaryDirectory() as folder:
+        joined = Path(folder) / "joined.zip"
+        with zipfile.ZipFile(joined, "w") as archive:
+            for path in paths:
+                entry = zipfile.ZipInfo(path.name)  # of no date: equal files make equal archives
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                with path.open("rb") as file, archive.open(entry, "w", force_zip64=True) as member:
+                    shutil.copyfileobj(file, member)
+        called = name or "+".join(path.stem for path in paths)
+        return client.upload(joined, called, progress=True, idempotency_key=key, **reading)
 
 
 def _existing(url: str, message: str) -> str | None:

@@ -14,6 +14,7 @@ FLAGS = {
     **{name: f"--{name}" for name in ("robot", "effort", "topic", "delimiter", "cutoff", "filtering", "rate", "gap")},
     **{name: f"--{name}" for name in ("trim", "joints", "form", "model", "estimator", "base", "promotion")},
     **{"drop_joints": "--drop", "columns": "--column", "units": "--unit", "options": "--option"},
+    **{"column_names": "--columns", "dt": "--dt"},
     **{"holdout.share": "--hold-out", "holdout.kind": "--hold-out-by"},
 }
 """Options of the command line by the fields of the API."""

@@ -106,6 +106,41 @@ def test_refusals_of_an_upload_speak_as_the_shell_does(refused, recording, tmp_p
     assert "leave out locked joints, --drop joint2 (invalid_data" in refused("data", "add", path)
 
 
+@pytest.fixture
+def flat(tmp_path):
+    """Files of a recording without column names: positions.txt, velocities.txt, torques.txt; and its samples."""
+    samples = stream(seed=78, samples=60, rate=50.0)
+    for name, quantity in (("positions", "q"), ("velocities", "dq"), ("torques", "tau")):
+        np.savetxt(tmp_path / f"{name}.txt", getattr(samples, quantity))
+    return [tmp_path / f"{name}.txt" for name in ("positions", "velocities", "torques")], samples
+
+
+def test_files_that_belong_together_are_joined(asked, refused, flat):
+    files, samples = flat
+    made = asked("data", "add", *files, "--join", "--dt", 0.02, "--filtering", "never", "--json")
+    assert (made["name"], made["report"]["rows_uploaded"]) == ("positions+velocities+torques", 60)
+    assert made["report"]["derived"] == ["ddq"]
+    assert made["report"]["ranges"]["tau"]["max"] == pytest.approx(samples.tau.max(0), rel=0.05)
+    options = ("--join", "--dt", 0.02, "--filtering", "never", "--json")
+    assert asked("data", "add", *files, *options)["id"] == made["id"]
+    message, hint = refused("data", "add", *files, "--dt", 0.02).splitlines()
+    assert "or --columns t,q1..q7,tau1..tau7 names them" in message
+    assert hint == "hint: --join takes files for one recording"
+    files[2].write_text("\n".join(files[2].read_text().splitlines()[:50]))
+    assert "torques.txt is 50 rows, expected 60, as positions.txt has" in refused("data", "add", *files, "--join")
+
+
+def test_tables_without_names_are_named_from_the_shell(asked, refused, tmp_path):
+    samples = stream(seed=79, samples=60, rate=50.0)
+    path, table = tmp_path / "bare.csv", np.column_stack([samples.t, samples.q, samples.dq, samples.ddq, samples.tau])
+    np.savetxt(path, table, delimiter=",")
+    made = asked("data", "add", path, "--columns", "t,q1..q2,dq1..dq2,ddq1..2,tau1,tau2", "--json")
+    assert made["report"]["rows"] == 60
+    assert made["report"]["ranges"]["q"]["max"] == pytest.approx(samples.q.max(0))
+    assert "--columns is 3 names, expected 9" in refused("data", "add", path, "--columns", "t,q1..q2")
+    assert "--columns is q5..q1, expected a range" in refused("data", "add", path, "--columns", "q5..q1")
+
+
 def test_an_upload_prints_its_report(asked, recording):
     path = recording(72, "two-joints.csv", samples=600, rate=100.0)
     options = ("--joint-names", "shoulder,elbow", "--filtering", "always", "--rate", 50)
