@@ -11,6 +11,7 @@ from rich.markup import escape
 
 from lipserve.address import DEFAULT_URL
 from lipserve.asking import SUFFIXES, Reading
+from lipserve.wording import counted
 from service.cli import connecting
 from service.cli.connecting import advised, connected, upload
 from service.cli.consoles import echo, out, print_json, print_result
@@ -117,8 +118,8 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
         echo("no data set yet: `lipserve data add FILE` uploads a recording")
     for each in datasets:
         rate = "" if each.report.rate_hz is None else f" at {each.report.rate_hz:.4g} Hz"
-        joints = f"{len(each.joint_names)} joints"
-        echo(f"{each.id}  {each.created_at[:19]}  {each.name}: {each.report.rows:,} samples{rate}, {joints}")
+        joints = counted(len(each.joint_names), "joint")
+        echo(f"{each.id}  {each.created_at[:19]}  {each.name}: {counted(each.report.rows, 'sample')}{rate}, {joints}")
 
 
 @app.command()

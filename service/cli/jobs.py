@@ -13,6 +13,7 @@ from rich.table import Column, Table
 
 from lipcore.vocabulary import CHOICES, DEFAULT_ESTIMATOR
 from lipserve.address import DEFAULT_URL
+from lipserve.wording import percent
 from service.cli import connecting
 from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
@@ -45,7 +46,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
     for job in jobs:
         version = "-" if job.version is None else str(job.version)
         at = job.created_at[:16].replace("T", " ")
-        table.add_row(job.id, escape(job.model), job.estimator, job.state, f"{job.progress.fraction:.0%}", version, at)
+        table.add_row(job.id, escape(job.model), job.estimator, job.state, percent(job.progress.fraction), version, at)
     out.print(table)
 
 
@@ -92,7 +93,7 @@ def _print(job: Job, as_json: bool) -> None:
     echo(f"{job.id}  {job.model} ({job.estimator}): {job.state}{made}")
     at = job.progress
     left = "" if not at.remaining_s else f", at most about {at.remaining_s:.0f} s left"
-    echo(f"  {at.stage}, {at.fraction:.0%} after {at.elapsed_s:.0f} s{left}; data sets {', '.join(job.datasets)}")
+    echo(f"  {at.stage}, {percent(at.fraction)} after {at.elapsed_s:.0f} s{left}; data sets {', '.join(job.datasets)}")
     for change in job.history:
         echo(f"  {change.at[:19].replace('T', ' ')}  {change.state}: {change.message}")
     if job.error is not None:

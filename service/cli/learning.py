@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
+from lipserve.wording import counted
 from service.cli.connecting import connected
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result
 from service.cli.options import Json, Limit, Model, Url, alone, group
@@ -62,7 +63,7 @@ def decide(
         raise CommandError(f"decision is {decision!r}, expected {' or '.join(DECISIONS)}")
     with connected(url) as client:
         decided = client.decide(model, cast(Literal["adapt", "ignore"], decision), replay)
-    print_result(decided, as_json, f"{model} learns again; {decided.rows} rows that were kept out are learnt")
+    print_result(decided, as_json, f"{model} learns again; {counted(decided.rows, 'row')} of those kept out learnt")
 
 
 @alarms_app.command()

@@ -12,6 +12,7 @@ from lipcore.data.samples import Samples
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import ROBOTS, SimulationUnavailableError, load_robot
 from lipcore.robots.simulation import FAST, Payload, Stream, simulate
+from lipserve.wording import counted
 from service.cli.consoles import print_result
 from service.cli.options import (
     Along,
@@ -112,4 +113,4 @@ def simulate_(
     data = simulate(load_robot(robot), stream, seed)
     write_recording(output, data)
     document = {"file": output, "samples": len(data), "rate_hz": rate, "joint_names": data.joint_names}
-    print_result(document, as_json, f"{output}: {len(data)} samples of {', '.join(data.joint_names)}")
+    print_result(document, as_json, f"{output}: {counted(len(data), 'sample')} of {', '.join(data.joint_names)}")

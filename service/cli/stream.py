@@ -10,6 +10,7 @@ import typer
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
+from lipserve.wording import counted, percent
 from service.cli.connecting import connected
 from service.cli.consoles import INTERRUPTED, CommandError, Explained, echo, note, out, print_error, print_json
 from service.cli.options import (
@@ -156,7 +157,7 @@ class Doubt:
         if self._source is not None:
             self.decide(stream)
         elif second == 1 and part.opening(1.0).misfit:
-            share = f"{part.opening(1.0).coverage.mean():.0%}".replace("%", " %")
+            share = percent(part.opening(1.0).coverage.mean())
             print_error(Explained(f"only {share} of the first second lies within the 95 % band of the model", CHECK))
 
     def decide(self, stream: StreamClient) -> None:
@@ -173,11 +174,14 @@ class Doubt:
             hint = f"`lipserve alarms {self._model}` tells why; `lipserve learning decide {self._model} …` ends it"
             print_error(Explained(f"learning of {self._model} is held: rows are kept, and not learnt", hint))
             return
-        share = f"{evidence['coverage']:.0%}".replace("%", " %")
+        share = percent(evidence["coverage"])
         text = f"only {share} of the stream's first second lies within the 95 % band of {self._model}"
         if self._confirmed:
             decided = self._client.decide(self._model, "ignore", replay=True)
-            note(f"careful: {text}; it is learnt all the same, as --yes-learn says: {decided.rows} rows that waited")
+            note(
+                f"careful: {text}; it is learnt all the same, as --yes-learn says: "
+                f"{counted(decided.rows, 'row')} that waited"
+            )
             return
         self.held = True
         hint = (
@@ -240,10 +244,10 @@ def _print_all(total: Tally, stream: StreamClient, learn: bool, as_json: bool) -
         return
     if figures["joints"]:
         title = "answers against measured torque" + (", each given before its row was learnt" if learn else "")
-        table = Table("joint", "nMSE", "RMSE N·m", "coverage of 95%", title=title)
+        table = Table("joint", "nMSE", "RMSE N·m", "coverage of 95 %", title=title)
         for each in figures["joints"]:
             nmse = "-" if each["nmse"] is None else f"{each['nmse']:.2e}"
-            table.add_row(each["joint"], nmse, f"{each['rmse']:.4f}", f"{each['coverage']:.1%}")
+            table.add_row(each["joint"], nmse, f"{each['rmse']:.4f}", percent(each["coverage"], 1))
         out.print(table)
     echo(f"in all  {_line(figures)}")
     for each in figures.get("not_logged", ()):
@@ -252,13 +256,13 @@ def _print_all(total: Tally, stream: StreamClient, learn: bool, as_json: bool) -
 
 def _line(figures: dict[str, Any]) -> str:
     """Figures of a second, or of all, on one line."""
-    parts = [f"{figures['rows']} rows"]
+    parts = [counted(figures["rows"], "row")]
     if figures["rows"]:
         trip = figures["round_trip_ms"]
         parts += [
             f"round trip p50 {trip['p50']:.2f} ms, p99 {trip['p99']:.2f} ms",
             f"{figures['late']} late, {figures['received_late']} received late",
-            f"error {figures['rmse']:.4f} N·m, {figures['coverage']:.1%} in the 95 % band",
+            f"error {figures['rmse']:.4f} N·m, {percent(figures['coverage'], 1)} in the 95 % band",
         ]
     if figures["behind_s"] > 0.1:
         parts.append(f"{figures['behind_s']:.1f} s behind")

@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
 from lipcore.online.holding import Watch
+from lipserve.wording import percent
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
 from service.journal.log import NewBatch
@@ -267,7 +268,7 @@ def _alarm(session: Session, served: Served, options: LearningOptions, verdict: 
         found = f"has left what version {verdict.departed.version} was trained on, step by step ({evidence['cause']}):"
     message = f"the torque of {joints} {found} {CONSEQUENCES[options.on_change]}"
     if verdict.opened is not None:
-        share = f"{verdict.opened.coverage.mean():.0%}".replace("%", " %")
+        share = percent(verdict.opened.coverage.mean())
         message = (
             f"stream {event.stream_id} does not fit the model: {share} of its first second lies within the 95 % band; "
             f"is it this robot, with the friction and the payload that were learnt? {CONSEQUENCES[options.on_change]}"
