@@ -231,7 +231,7 @@ def train(
         print_held_out(made)
     print_promotion(made)
     if waits:
-        note(f"`lipserve models promote {model} {job.version}` lets it answer all the same")
+        note(f"`lipserve models promote {model} {job.version}` makes it answer all the same")
 
 
 def _value(text: str) -> Any:
