@@ -172,8 +172,8 @@ class ObservationResponse(BaseModel):
     state: State = Field(description="What has become of the batch since")
     rejected: dict[str, int] = Field(
         description="Rows that are kept but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`, "
-        "`stationary`, `contact`, `change` (a changed robot, or a stream that did not fit, and its owner has not decided), `payload` (the arm "
-        "carries something, of which the row teaches instead), `edge` (acceleration not "
+        "`stationary`, `contact`, `change` (a changed robot, or a stream that did not fit, and its owner has not "
+        "decided), `payload` (the arm carries something, of which the row teaches instead), `edge` (acceleration not "
         "derivable; where the stream goes on, these are learnt with the next batch)"
     )
     gaps: list[list[int]] = Field(
