@@ -24,7 +24,7 @@ QUANTITIES_BY_NAME = ("columns", "units", "options")
 _GIVEN = re.compile(rf"\b({'|'.join(QUANTITIES_BY_NAME)})=(?=\{{)")
 _VALUE = re.compile(rf"(?<![\w.-])({'|'.join(map(re.escape, FLAGS))})=([^\s{{}}`]*[^\s{{}}`.,;:?!])")
 _MARKED = re.compile(rf"`({'|'.join(map(re.escape, FLAGS))})`")
-_BARE = re.compile(rf"(?<![\w.`-])({'|'.join(re.escape(name) for name in FLAGS if '_' in name)})(?![\w\[=])")
+_BARE = re.compile(rf"\b(say|with) ({'|'.join(re.escape(name) for name in FLAGS if '_' in name)})(?![\w\[=])")
 _FIELD = re.compile(rf"^({'|'.join(map(re.escape, FLAGS))})(?:\.(\w+))? is ")
 
 
@@ -33,7 +33,7 @@ def in_shell(text: str) -> str:
     text = _FIELD.sub(_field, text)
     text = _VALUE.sub(lambda match: _option(match[1], match[2]), _objects(text))
     text = _MARKED.sub(lambda match: f"`{FLAGS[match[1]]}`", text)
-    return _BARE.sub(lambda match: FLAGS[match[1]], text)
+    return _BARE.sub(lambda match: f"{match[1]} {FLAGS[match[2]]}", text)
 
 
 def _field(match: re.Match[str]) -> str:

@@ -39,6 +39,7 @@ def test_options_of_the_api_become_options_of_the_command_line(said):
         "the joints of the model, joint1: the rate is 3 Hz",
         'columns={"broken": is no JSON',
         "no model 'effort'",
+        "expected a version with the joints of the data; that has other joint_names than the data",
     ],
 )
 def test_other_sentences_stay_as_they_are(said):
