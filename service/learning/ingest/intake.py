@@ -174,6 +174,7 @@ class Intake:
                 "departure": None if verdict.watch.departure is None else verdict.watch.departure.to_json(),
                 "opening": None if verdict.watch.opening is None else verdict.watch.opening.to_json(),
                 "waited": held,
+                "doubted": verdict.held and (verdict.opened is not None or monitor.doubts(batch.stream_id)),
                 "until": screened.until,
                 **adaptive,
                 **({} if watch is None else {"payload": watch.to_json()}),

@@ -153,6 +153,11 @@ class Monitor:
         known = self._scales.get(stream_id)
         return Adaptive.start(own) if known is None or known.version != version else known.state
 
+    def doubts(self, stream_id: str) -> bool:
+        """Whether a stream did not fit from its first second on, and its owner had not decided at its last batch."""
+        known = self._scales.get(stream_id)
+        return known is not None and known.doubted
+
     def factors(self, version: int) -> dict[str, Factor]:
         """What the intervals of a version are wide by now, stream by stream."""
         return intervals.factors(self._scales, version)

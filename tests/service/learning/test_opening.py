@@ -87,6 +87,17 @@ def test_the_owner_is_told_how_it_began(strange):
     assert pupil.get("learning")["status"]["held"]["evidence"] == evidence
 
 
+def test_its_errors_widen_no_other_answers(strange, school):
+    """The answers to its own questions are wide; those of others are not about this robot."""
+    pupil, _, before = strange
+    assert pupil.predict()["scale"] == before["scale"]
+    scales = school.service.loaded.get(pupil.model, None).scales
+    assert (scales.of("arm") > 2 * scales.of(None)).all()
+    pupil.post("learning/change", {"decision": "ignore"})
+    drive(pupil, range(4, 5), push=OFF)
+    assert (np.array(pupil.predict()["scale"]) > 2 * np.array(before["scale"])).all()
+
+
 def test_once_confirmed_it_is_learnt(school):
     pupil = school.enrol("confirmed", **WATCHFUL, on_change="hold")
     drive(pupil, range(3), push=OFF)
