@@ -25,7 +25,7 @@ import typer
 from lipserve.address import UNIX, headers_of, url_of
 from lipserve.asking import SUFFIXES
 from service.cli.consoles import START, CommandError, Explained, err, explain, note
-from service.cli.wording import in_shell
+from service.cli.wording import FLAGS, in_shell
 
 if TYPE_CHECKING:
     from lipserve import Client
@@ -140,6 +140,9 @@ def connected(url: str) -> Iterator[Client]:
 def dataset_of(client: Client, data: str, **reading: Any) -> str:
     """Return the id or name of a data set: one that is given, or the id of that of a recording, which is uploaded."""
     path = recording_of(data)
+    if path is None and reading:
+        expected = "expected a recording: a data set was read when it was uploaded"
+        raise CommandError(f"data is {data!r} beside {', '.join(FLAGS[name] for name in reading)}, {expected}")
     if path is None:
         return data
     hint = f"`lipserve data add {shlex.quote(data)}` takes options that say how to read it; then give its id here"

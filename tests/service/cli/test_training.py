@@ -138,6 +138,9 @@ def test_other_names_of_joints_come_with_the_remedy(asked, refused, tmp_path):
     assert "if they are the same joints, upload the recording with --robot panda (invalid_request" in message
     answer = asked("evaluate", "panda-sim", path, "--robot", "panda", "--json")
     assert answer["joint_names"] == list(samples.joint_names)
+    assert "beside --robot, expected a recording" in refused(
+        "evaluate", "panda-sim", answer["dataset"], "--robot", "panda"
+    )
     two = tmp_path / "two.csv"
     two.write_bytes(csv(columns(stream(seed=16))))
     assert "same joints" not in refused("evaluate", "panda-sim", two)
