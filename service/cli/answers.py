@@ -11,6 +11,7 @@ from rich.table import Table
 
 from lipcore.vocabulary import COMPONENTS
 from lipserve.address import DEFAULT_URL
+from lipserve.call import given
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, out, print_json, print_warnings
 from service.cli.options import Alias, Data, Json, Model, Url, Version, alone, group, names, numbers
@@ -114,6 +115,9 @@ def evaluate(
     url: Url = DEFAULT_URL,
     version: Version = None,
     alias: Alias = None,
+    robot: Annotated[
+        str | None, typer.Option(help="Of a recording: a profile such as panda, or the id of an uploaded URDF.")
+    ] = None,
     held_out: Annotated[
         bool, typer.Option("--held-out", help="Only on what the training of the version held out of it.")
     ] = False,
@@ -121,7 +125,7 @@ def evaluate(
 ) -> None:
     """Compare a model with a recording, joint by joint. On what it was trained on, the figures flatter."""
     with connected(url) as client:
-        dataset = dataset_of(client, data)
+        dataset = dataset_of(client, data, **given(robot=robot))
         answer = client.evaluate(model, dataset, version, alias, "held_out" if held_out else "all")
     if as_json:
         print_json(answer)

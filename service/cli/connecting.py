@@ -4,11 +4,16 @@ they are asked for with the least of a client, as nothing may be imported that t
 
 from __future__ import annotations
 
+import hashlib
 import http.client
 import json
-import re
+import shlex
+import shutil
 import socket
-from collections.abc import Callable, Iterator
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http.client import HTTPException
 from pathlib import Path
@@ -18,10 +23,13 @@ from urllib.parse import quote, urlsplit
 import typer
 
 from lipserve.address import UNIX, headers_of, url_of
+from lipserve.asking import SUFFIXES
 from service.cli.consoles import START, CommandError, Explained, err, explain, note
+from service.cli.wording import FLAGS, in_shell
 
 if TYPE_CHECKING:
     from lipserve import Client
+    from lipserve.records.datasets import Dataset
     from lipserve.records.jobs import Job
 
 
@@ -108,7 +116,6 @@ def _asked(context: typer.Context, path: str) -> Any:
         return None
 
 
-DATASET = re.compile(r"ds_\w+")
 MOST_NAMES = 20
 """Models that a hint lists, at most."""
 
@@ -125,24 +132,76 @@ def connected(url: str) -> Iterator[Client]:
             yield client
     except (ApiError, StreamError) as error:
         refusal = explain(error, (ApiError, StreamError)) or Explained(str(error))
-        raise CommandError(refusal.message, refusal.hint or _existing(url, str(error))) from error
+        raise CommandError(in_shell(refusal.message), refusal.hint or _existing(url, str(error))) from error
     except ServiceUnreachableError as error:
         raise CommandError(str(error), None if "lipserve serve" in str(error) else START) from error
 
 
 def dataset_of(client: Client, data: str, **reading: Any) -> str:
-    """Return the id of a data set: one that is given, or that of a recording, which is uploaded."""
-    path = Path(data)
-    if DATASET.fullmatch(data) and not path.exists():
+    """Return the id or name of a data set: one that is given, or the id of that of a recording, which is uploaded."""
+    path = recording_of(data)
+    if path is None and reading:
+        expected = "expected a recording: a data set was read when it was uploaded"
+        raise CommandError(f"data is {data!r} beside {', '.join(FLAGS[name] for name in reading)}, {expected}")
+    if path is None:
         return data
-    if not path.is_file():
+    hint = f"`lipserve data add {shlex.quote(data)}` takes options that say how to read it; then give its id here"
+    with advised(hint):
+        dataset = upload(client, [path], **reading)
+    note(f"{path.name} is data set {dataset.id}")
+    return dataset.id
+
+
+@contextmanager
+def advised(hint: str | None) -> Iterator[None]:
+    """Say what to do about a recording that the service cannot read; raise CommandError."""
+    from lipserve import ApiError  # noqa: PLC0415 - as above
+
+    try:
+        yield
+    except ApiError as error:
+        if error.code != "invalid_data" or hint is None:
+            raise
+        refusal = explain(error, (ApiError,)) or Explained(str(error))
+        raise CommandError(in_shell(refusal.message), hint) from error
+
+
+def recording_of(data: str) -> Path | None:
+    """The file that an argument names; None where it names a data set. Raise CommandError for a file that is none."""
+    path = Path(data)
+    if path.is_file():
+        return path
+    if path.is_dir() or (path.suffix.lower() in SUFFIXES and path.name != data):
         raise CommandError(
-            f"data is {data!r}, expected a recording or the id of a data set",
+            f"data is {data!r}, expected a recording, or the id or name of a data set",
             "`lipserve data list` shows the data sets that exist",
         )
-    dataset = client.upload(path, progress=True, **reading)
-    note(f"{path.name} is uploaded as {dataset.id}")
-    return dataset.id
+    return None
+
+
+def upload(client: Client, paths: Sequence[Path], name: str | None = None, **reading: Any) -> Dataset:
+    """Upload a recording; the same content, called and read alike, is the same data set each time.
+
+    paths: its file, or tables of text that are to be joined.
+    """
+    content = hashlib.sha256(json.dumps([name or paths[0].name, reading], sort_keys=True).encode())
+    for path in paths:
+        content.update((path.suffix.lower() if len(paths) == 1 else path.name).encode())
+        with path.open("rb") as file:
+            content.update(hashlib.file_digest(file, "sha256").digest())
+    key = f"content-{content.hexdigest()}"
+    if len(paths) == 1:
+        return client.upload(paths[0], name, progress=True, idempotency_key=key, **reading)
+    with tempfile.TemporaryDirectory() as folder:
+        joined = Path(folder) / "joined.zip"
+        with zipfile.ZipFile(joined, "w") as archive:
+            for path in paths:
+                entry = zipfile.ZipInfo(path.name)  # of no date: equal files make equal archives
+                entry.compress_type = zipfile.ZIP_DEFLATED
+                with path.open("rb") as file, archive.open(entry, "w", force_zip64=True) as member:
+                    shutil.copyfileobj(file, member)
+        called = name or "+".join(path.stem for path in paths)
+        return client.upload(joined, called, progress=True, idempotency_key=key, **reading)
 
 
 def _existing(url: str, message: str) -> str | None:
@@ -159,26 +218,62 @@ def _existing(url: str, message: str) -> str | None:
 
 
 _LISTS = {
-    "no dataset": "`lipserve data list` shows the data sets that exist",
+    "no dataset": "`lipserve data list` shows the data sets that exist; a recording is given by its path",
     "no job": "`lipserve jobs list` shows the jobs that exist",
     "no version": "`lipserve models show MODEL` shows the versions that exist",
     "no alias": "`lipserve models show MODEL` shows the aliases that exist",
 }
 
 
-def watch(client: Client, job: Job, cancels: bool) -> tuple[Job, bool]:
+PATIENCE, PAUSE = 300.0, 1.0
+"""Longest wait for a service that has gone away, and between two looks for it, s."""
+AWAY = (429, 502, 503, 504)
+"""What a service that starts or ends, or a proxy in its place, answers."""
+
+
+def watch(client: Client, job: Job, cancels: bool, patience: float = PATIENCE) -> tuple[Job, bool]:
     """Show a job's progress on standard error until it ends; return it, and whether Ctrl-C ended the watching.
 
-    cancels: Ctrl-C cancels the job and waits for its end, a second one does not wait; else the job goes on.
+    cancels: Ctrl-C cancels the job and waits for its end, a second one does not wait; else the job goes on. patience:
+    longest wait for a service that is away, s; raise CommandError beyond.
     """
     from lipserve.progress import job_bar  # noqa: PLC0415 - takes long to import; help needs none
 
     try:
         with job_bar(err) as show:
-            return client.wait(job.id, show), False
+            return _waited(client, job.id, show, patience), False
     except KeyboardInterrupt:
         if not cancels:
             return client.job(job.id), True
         note(f"cancelling {job.id} …")
         client.cancel(job.id)
         return client.wait(job.id), True
+
+
+def _waited(client: Client, job: str, show: Callable[[Job], None], patience: float) -> Job:
+    """The job as it ended; a service that restarts is waited for, as the job goes on with it."""
+    from lipserve import ApiError, ServiceUnreachableError  # noqa: PLC0415 - as above
+
+    gone: float | None = None
+
+    def look(seen: Job) -> None:
+        nonlocal gone
+        if gone is not None:
+            gone = None
+            note("the service is back")
+        show(seen)
+
+    while True:
+        try:
+            return client.wait(job, look)
+        except (ApiError, ServiceUnreachableError) as error:
+            if isinstance(error, ApiError) and error.status not in AWAY:
+                raise
+            now = time.monotonic()
+            if gone is None:
+                gone = now
+                note(f"{error}; {job} goes on when the service is back: waiting up to {patience:.0f} s")
+            if now - gone >= patience:
+                hint = f"the job may go on: `lipserve jobs follow {job}` once the service is back"
+                raise CommandError(f"the service has been away for {patience:.0f} s", hint) from error
+            time.sleep(min(PAUSE, patience))

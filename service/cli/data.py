@@ -11,10 +11,12 @@ from rich.markup import escape
 
 from lipserve.address import DEFAULT_URL
 from lipserve.asking import SUFFIXES, Reading
+from lipserve.wording import counted
 from service.cli import connecting
-from service.cli.connecting import connected
+from service.cli.connecting import advised, connected, upload
 from service.cli.consoles import echo, out, print_json, print_result
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, group, names, pairs
+from service.cli.wording import in_shell
 
 if TYPE_CHECKING:
     from lipserve.records.datasets import Dataset
@@ -49,6 +51,17 @@ def add(
     unit: Annotated[list[str] | None, typer.Option(help="Unit of a quantity: q=deg, t=ms; repeat.")] = None,
     topic: Annotated[str | None, typer.Option(help="Of a bag.")] = None,
     delimiter: Annotated[str | None, typer.Option(help="Of a CSV.")] = None,
+    column_names: Annotated[
+        str | None, typer.Option("--columns", help="Names of all columns, of text without any: t,q1..q7,tau1..tau7.")
+    ] = None,
+    dt: Annotated[float | None, typer.Option(help="s from row to row, of a file without times.")] = None,
+    join: Annotated[
+        bool,
+        typer.Option(
+            "--join",
+            help="The files are one recording: tables side by side, such as positions.txt torques.txt.",
+        ),
+    ] = False,
     cutoff: Annotated[float | None, _preparation("Of the low-pass, Hz; 4 by default.")] = None,
     filtering: Annotated[str | None, _preparation("derived (default), always or never.")] = None,
     form: Annotated[str | None, _preparation("acausal (default), or causal as on a live stream.")] = None,
@@ -58,7 +71,7 @@ def add(
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Upload recordings, one data set each, and print their reports."""
+    """Upload recordings, one data set each or, with --join, all as one, and print their reports."""
     given = {
         "robot": robot,
         "joint_names": names(joint_names),
@@ -72,6 +85,8 @@ def add(
         "units": pairs("--unit", unit) or None,
         "topic": topic,
         "delimiter": delimiter,
+        "column_names": names(column_names),
+        "dt": dt,
         "cutoff": cutoff,
         "filtering": filtering,
         "form": form,
@@ -80,8 +95,10 @@ def add(
         "trim": trim,
     }
     reading: Reading = {key: value for key, value in given.items() if value is not None}  # type: ignore[assignment]
-    with connected(url) as client:
-        made = [client.upload(path, name, progress=True, **reading) for path in files]
+    parts = [files] if join else [[each] for each in files]
+    hint = "--join takes files for one recording" if len(parts) > 1 else None
+    with connected(url) as client, advised(hint):
+        made = [upload(client, part, name, **reading) for part in parts]
     if as_json:
         print_json(made if len(made) > 1 else made[0])
         return
@@ -101,8 +118,8 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
         echo("no data set yet: `lipserve data add FILE` uploads a recording")
     for each in datasets:
         rate = "" if each.report.rate_hz is None else f" at {each.report.rate_hz:.4g} Hz"
-        joints = f"{len(each.joint_names)} joints"
-        echo(f"{each.id}  {each.created_at[:19]}  {each.name}: {each.report.rows:,} samples{rate}, {joints}")
+        joints = counted(len(each.joint_names), "joint")
+        echo(f"{each.id}  {each.created_at[:19]}  {each.name}: {counted(each.report.rows, 'sample')}{rate}, {joints}")
 
 
 @app.command()
@@ -137,15 +154,15 @@ def _print(dataset: Dataset) -> None:
     report = dataset.report
     out.print(f"[bold]{dataset.id}[/bold]  {escape(dataset.name)}  torque: {dataset.torque_convention}")
     for line in tables.overview(report):
-        echo(f"  {line}")
+        echo(f"  {in_shell(line)}")
     for table in tables.report_tables(report, dataset.joint_names):
         out.print(table)
     if report.excitation is not None:
         echo(f"  {report.excitation.text}")
     for line in report.warnings:
-        out.print(f"[yellow]warning:[/yellow] {escape(line)}", highlight=False)
+        out.print(f"[yellow]warning:[/yellow] {escape(in_shell(line))}", highlight=False)
     for line in report.advice:
-        out.print(f"[cyan]next:[/cyan] {escape(line)}", highlight=False)
+        out.print(f"[cyan]next:[/cyan] {escape(in_shell(line))}", highlight=False)
 
 
 def _one_or_more(text: str) -> str | list[str]:

@@ -23,6 +23,7 @@ from lipserve import ApiError, Client, Evaluation, Prediction
 from lipserve.asking import Reading
 from lipserve.progress import follow
 from lipserve.states import SUCCEEDED
+from lipserve.wording import percent
 from service.cli.consoles import out
 from service.cli.options import alone
 from service.cli.plotting import draw_torque
@@ -140,7 +141,7 @@ def _upload(client: Client, robot: Robot, stream: Stream, seed: int, path: Path)
 def _table(name: str, result: Evaluation, samples: Samples) -> Table:
     table = Table(title=f"{name} trajectory, {result.samples_used} unseen samples, model version {result.version}")
     table.add_column("joint")
-    for heading in ("torque std N·m", "nMSE", "RMSE N·m", f"coverage of {result.level:.0%}", "interval N·m"):
+    for heading in ("torque std N·m", "nMSE", "RMSE N·m", f"coverage of {percent(result.level)}", "interval N·m"):
         table.add_column(heading, justify="right")
     spread = samples.tau.std(axis=0)
     for j, joint in enumerate(result.joint_names):
@@ -150,7 +151,7 @@ def _table(name: str, result: Evaluation, samples: Samples) -> Table:
             f"{spread[j]:.3f}",
             "-" if np.isnan(nmse) else f"{nmse:.1e}",
             f"{result.rmse[j]:.4f}",
-            f"{result.coverage[j]:.1%}",
+            percent(result.coverage[j], 1),
             f"{result.interval_width[j]:.3f}",
         )
     return table

@@ -31,6 +31,7 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 from lipserve import ApiError, Client
 from lipserve.address import DEFAULT_URL, URL_VARIABLE
+from lipserve.wording import percent
 from service.cli import plotting
 from service.cli.consoles import err, print_json
 from service.cli.options import Json, alone
@@ -231,7 +232,9 @@ def excite(
             limits,
             options,
             arm.robot,
-            lambda step, left: status.update(f"planning, step {step}: {left:.2%} of the variance would be left"),
+            lambda step, left: status.update(
+                f"planning, step {step}: {percent(left, 2)} of the variance would be left"
+            ),
         )
     write(out, made)
     if plot is not None:
@@ -301,8 +304,8 @@ def table(made: Plan, random: Random) -> Table:
         grid.add_column(heading, justify="right")
     rows = zip(made.limits.joint_names, made.left, random.slow, random.fast, made.used.T, strict=True)
     for joint, *left, used in rows:
-        grid.add_row(joint, *(f"{share:.2%}" for share in left), *("-" if np.isnan(u) else f"{u:.0%}" for u in used))
-    means = [f"{np.exp(np.log(each).mean()):.2%}" for each in (made.left, random.slow, random.fast)]
+        grid.add_row(joint, *(percent(share, 2) for share in left), *("-" if np.isnan(u) else percent(u) for u in used))
+    means = [percent(np.exp(np.log(each).mean()), 2) for each in (made.left, random.slow, random.fast)]
     grid.add_section()
     grid.add_row("geometric mean", *means, "", "", "", "")
     return grid

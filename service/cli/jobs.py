@@ -13,8 +13,9 @@ from rich.table import Column, Table
 
 from lipcore.vocabulary import CHOICES, DEFAULT_ESTIMATOR
 from lipserve.address import DEFAULT_URL
+from lipserve.wording import percent
 from service.cli import connecting
-from service.cli.connecting import connected, dataset_of, watch
+from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
 from service.cli.models import print_held_out, print_promotion, print_selection
 from service.cli.options import HELD_OUT_BY, PROMOTION, JobId, Json, Limit, Url, alone, group, names, pairs, value
@@ -22,6 +23,10 @@ from service.cli.options import HELD_OUT_BY, PROMOTION, JobId, Json, Limit, Url,
 if TYPE_CHECKING:
     from lipserve.records.jobs import Job
 
+
+Patience = Annotated[
+    float, typer.Option(min=0, help="Longest wait for a service that is away, s: the job goes on when it is back.")
+]
 
 app = group("Training jobs: list, show, follow, cancel and retry them.")
 
@@ -44,7 +49,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
     for job in jobs:
         version = "-" if job.version is None else str(job.version)
         at = job.created_at[:16].replace("T", " ")
-        cells = (job.estimator, job.state, f"{job.progress.fraction:.0%}", version, *judged(job.quality), at)
+        cells = (job.estimator, job.state, percent(job.progress.fraction), version, *judged(job.quality), at)
         table.add_row(job.id, escape(job.model), *cells)
     out.print(table)
 
@@ -71,10 +76,11 @@ def retry(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
 
 
 @app.command()
-def follow(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
-    """Show a job's progress until it ends; Ctrl-C stops watching, and the job goes on."""
+def follow(job: JobId, patience: Patience = PATIENCE, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """Show a job's progress until it ends, also over a restart of the service; Ctrl-C stops watching, and the job goes
+    on."""
     with connected(url) as client:
-        ended, interrupted = watch(client, client.job(job), cancels=False)
+        ended, interrupted = watch(client, client.job(job), cancels=False, patience=patience)
     _print(ended, as_json)
     if interrupted:
         note(f"{ended.id} goes on: `lipserve jobs cancel {ended.id}` ends it")
@@ -91,7 +97,7 @@ def _print(job: Job, as_json: bool) -> None:
     echo(f"{job.id}  {job.model} ({job.estimator}): {job.state}{made}")
     at = job.progress
     left = "" if not at.remaining_s else f", at most about {at.remaining_s:.0f} s left"
-    echo(f"  {at.stage}, {at.fraction:.0%} after {at.elapsed_s:.0f} s{left}; data sets {', '.join(job.datasets)}")
+    echo(f"  {at.stage}, {percent(at.fraction)} after {at.elapsed_s:.0f} s{left}; data sets {', '.join(job.datasets)}")
     for change in job.history:
         echo(f"  {change.at[:19].replace('T', ' ')}  {change.state}: {change.message}")
     if job.error is not None:
@@ -106,7 +112,7 @@ def train(
     data: Annotated[
         list[str],
         typer.Argument(
-            help="Recordings, which are uploaded, and ids of data sets.", autocompletion=connecting.datasets
+            help="Recordings, which are uploaded, and ids or names of data sets.", autocompletion=connecting.datasets
         ),
     ],
     model: Annotated[
@@ -163,6 +169,7 @@ def train(
             autocompletion=lambda: PROMOTION,
         ),
     ] = None,
+    patience: Patience = PATIENCE,
     wait: Annotated[bool, typer.Option(help="Wait for the job's end; --no-wait leaves it to `lipserve jobs`.")] = True,
     as_json: Json = False,
 ) -> None:
@@ -174,23 +181,27 @@ def train(
     if prior is not None:
         options["prior"] = prior
     asked = {name: value for name, value in (("share", hold_out), ("kind", hold_out_by)) if value is not None}
+    urdf = None if robot is None or not robot.endswith(".urdf") else Path(robot)
+    if urdf is not None and not urdf.is_file():
+        raise CommandError(f"--robot is {robot!r}, expected a profile such as panda, the id of a URDF, or a .urdf file")
+    request = {
+        "estimator": estimator,
+        "joint_types": names(joint_types),
+        "options": options or None,
+        "robot": robot if urdf is None else None,
+        "holdout": False if hold_out == 0 else asked or None,
+        "base": base,
+        "promotion": promotion,
+    }
     with connected(url) as client:
+        there = [each for each in data if recording_of(each) is None]
+        client.check_training(model, there if len(there) == len(data) else (), **request)  # type: ignore[arg-type]
+        for each in there:
+            client.dataset(each)
         datasets = [dataset_of(client, each) for each in data]
-        if robot is not None and robot.endswith(".urdf"):
-            robot = client.upload_robot(Path(robot)).id
-        queue = partial(
-            client.train,
-            model,
-            datasets,
-            estimator,
-            names(joint_types),
-            options or None,
-            robot=robot,
-            holdout=False if hold_out == 0 else asked or None,
-            base=base,
-            promotion=promotion,  # type: ignore[arg-type]  # the service checks it
-            idempotency_key=new_key(),
-        )
+        if urdf is not None:
+            request["robot"] = client.upload_robot(urdf).id
+        queue = partial(client.train, model, datasets, **request, idempotency_key=new_key())  # type: ignore[arg-type]
         try:
             job = queue()
         except KeyboardInterrupt:
@@ -198,7 +209,8 @@ def train(
             raise
         interrupted = False
         if wait:
-            job, interrupted = watch(client, job, cancels=True)
+            note(f"{job.id} is queued: `lipserve jobs follow {job.id}` follows it, too")
+            job, interrupted = watch(client, job, cancels=True, patience=patience)
         made = None if job.version is None else client.version(model, job.version)
     if as_json:
         print_json(job)

@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
+from lipserve.wording import counted
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result, print_warnings
@@ -118,7 +119,9 @@ def rollback(
             _moved(model, client.rollback_alias(model, alias), as_json)
             return
         back = client.rollback(model, revision=revision)
-    print_result(back, as_json, f"{model} is back at revision {revision}: {back.undone} batches do not teach any more")
+    print_result(
+        back, as_json, f"{model} is back at revision {revision}: {counted(back.undone, 'batch', 'batches')} taken back"
+    )
 
 
 @app.command()
@@ -310,7 +313,7 @@ def _print_guarantee(conformal: dict[str, Any]) -> None:
 
 def _print_version(version: VersionRecord) -> None:
     names = version.joint_names
-    echo(f"version {version.version}: {version.estimator}, {len(names)} joints: {', '.join(names)}")
+    echo(f"version {version.version}: {version.estimator}, {counted(len(names), 'joint')}: {', '.join(names)}")
     noise = ", ".join(f"{value:.3g}" for value in version.noise_std)
     echo(f"  torque {version.torque_convention.replace('_', ' ')}, noise of a measurement {noise} N·m")
     if version.selection is not None:

@@ -29,16 +29,39 @@ Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text."
 Limit = Annotated[int, typer.Option(min=1, help="Most that are listed.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask whether that is meant.")]
 Model = Annotated[str, typer.Argument(help="Name of the model.", autocompletion=connecting.models)]
-DatasetId = Annotated[str, typer.Argument(help="Id of a data set.", autocompletion=connecting.datasets)]
+DatasetId = Annotated[str, typer.Argument(help="Id or name of a data set.", autocompletion=connecting.datasets)]
 JobId = Annotated[str, typer.Argument(help="Id of a job.", autocompletion=connecting.jobs)]
 Data = Annotated[
     str,
-    typer.Argument(help="A recording, which is uploaded, or the id of a data set.", autocompletion=connecting.datasets),
+    typer.Argument(
+        help="A recording, which is uploaded, or the id or name of a data set.", autocompletion=connecting.datasets
+    ),
 ]
 Version = Annotated[
     int | None, typer.Option(help="A version; the one that serves by default.", autocompletion=connecting.versions)
 ]
 Alias = Annotated[str | None, typer.Option(help="A version by its alias.", autocompletion=connecting.aliases)]
+
+
+def simulation(help_: str, *names: str, **limits: Any) -> Any:
+    """An option that describes a simulated stream."""
+    return typer.Option(*names, help=help_, rich_help_panel="Simulation", **limits)
+
+
+Seed = Annotated[int, simulation("Equal seeds give equal streams.", min=0)]
+Sinusoids = Annotated[int, simulation("50 for training, 100 for testing in the paper.", min=1)]
+Range = Annotated[str, simulation("middle (±0.5 rad) or full.")]
+Along = Annotated[str, simulation("sinusoids, periodic, or rests: from point to point.")]
+Fast = Annotated[bool, simulation("The faster-moving variant.", "--fast")]
+Noise = Annotated[float, simulation("Std of the torque noise, N·m.")]
+Viscous = Annotated[float, simulation("Viscous friction, N·m·s/rad.")]
+Coulomb = Annotated[float, simulation("Coulomb friction, N·m.")]
+Mass = Annotated[float, simulation("Payload, kg.")]
+MassAt = Annotated[float, simulation("When the payload is attached, s.")]
+DirtShare = Annotated[
+    float,
+    simulation("Friction with memory, ripple, coloured noise, encoders: 1 is an industrial arm's.", min=0.0),
+]
 
 
 def group(help_: str) -> typer.Typer:

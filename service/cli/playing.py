@@ -19,21 +19,20 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import FAST, Payload, Stream, simulate
+from lipcore.robots.simulation import Stream, simulate
 from lipcore.vocabulary import TorqueConvention
 from lipserve import StreamClient, StreamError
 from lipserve.exchange import StreamAnswer, StreamLearnt
 from service.cli.consoles import CommandError
+from service.cli.wording import in_shell
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
 from service.datasets.staging import Staged, prepare
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
+from service.learning.ingest.opening import BAND, LENGTH, Opening
 from service.storage.storage import Disk
-
-BAND = 1.959963984540054
-"""Standard deviations on both sides that hold 95 %."""
 
 
 class Tally:
@@ -41,38 +40,43 @@ class Tally:
 
     def __init__(self, noise_std: Array) -> None:
         self._noise = noise_std
-        self.rows, self.late, self.behind_s = 0, 0, 0.0
+        self.rows, self.late, self.received_late, self.behind_s = 0, 0, 0, 0.0
         self.refused = Counter[str]()
         self._trips = array("d")
-        self._sums = np.zeros((4, len(noise_std)))  # answers inside the band, squared errors, torques, squared torques
+        # answers inside the band, squared errors, torques, squared torques, inside the band as the model itself has it
+        self._sums = np.zeros((5, len(noise_std)))
 
-    def add(self, answer: StreamAnswer, tau: Array, seconds: float, behind_s: float) -> None:
+    def add(self, answer: StreamAnswer, tau: Array, seconds: float, behind_s: float, deadline: float = np.inf) -> None:
         """Count an answer with its std.
 
-        tau: (n) measured there; seconds: of the round trip; behind_s: how long after it was due the row was sent.
+        tau: (n) measured there; seconds: of the round trip; behind_s: how long after it was due the row was sent;
+        deadline: s, after which the answer is late, by the service's clock or by this one.
         """
         error = tau - answer.tau
         self.rows += 1
         self.late += answer.late
+        self.received_late += seconds > deadline
         self.behind_s = max(self.behind_s, behind_s)
         self._trips.append(seconds)
-        inside = np.zeros(tau.shape, np.bool_)
+        inside = own = np.zeros(tau.shape, np.bool_)
         if answer.tau_std is not None:
-            scale = 1.0 if answer.scale is None else answer.scale
-            inside = np.abs(error) <= BAND * scale * np.hypot(answer.tau_std, self._noise)
-        self._sums += np.array((inside, error**2, tau, tau**2))
+            scale, half = 1.0 if answer.scale is None else answer.scale, BAND * np.hypot(answer.tau_std, self._noise)
+            inside, own = np.abs(error) <= scale * half, np.abs(error) <= half
+        self._sums += np.array((inside, error**2, tau, tau**2, own))
 
     def merge(self, other: Tally) -> None:
         """Add the figures of another stretch of the same stream."""
         self.rows += other.rows
         self.late += other.late
+        self.received_late += other.received_late
         self.behind_s = max(self.behind_s, other.behind_s)
         self.refused.update(other.refused)
         self._trips.extend(other._trips)
         self._sums += other._sums
 
     def figures(self) -> dict[str, Any]:
-        """The figures for JSON: rmse in N·m over all joints, coverage of the 95 % band; None without answers.
+        """The figures for JSON: rmse in N·m over all joints, coverage of the 95 % band; None without answers; late by
+        the service's clock, and received late by this one, which has the network in it.
 
         All compare answers with torque that the model had not learnt yet when it answered.
         """
@@ -82,16 +86,22 @@ class Tally:
             "refused": dict(self.refused),
             "round_trip_ms": {"p50": p50, "p99": p99},
             "late": self.late,
+            "received_late": self.received_late,
             "behind_s": self.behind_s,
             "rmse": float(np.sqrt(self._sums[1].mean() / self.rows)) if self.rows else None,
             "coverage": float(self._sums[0].mean() / self.rows) if self.rows else None,
         }
 
+    def opening(self, seconds: float) -> Opening:
+        """What the model's own band, which no stream has widened, held of the first seconds of a stream."""
+        rows = min(LENGTH * seconds, float(self.rows))
+        return Opening(rows, rows * self._sums[4] / max(self.rows, 1))
+
     def joints(self, joint_names: Sequence[str]) -> list[dict[str, Any]]:
         """Figures of each joint: rmse N·m, nmse (None where the torque does not vary), coverage of the 95 % band."""
         if not self.rows:
             return []
-        coverage, squared, mean, mean_square = self._sums / self.rows
+        coverage, squared, mean, mean_square = self._sums[:4] / self.rows
         variance = mean_square - mean**2
         return [
             {
@@ -155,19 +165,11 @@ class Motion:
         return replace(self, **columns, joint_names=tuple(joint_names)), True
 
 
-def simulated(
-    robot: str, seconds: float, rate: float, seed: int = 0, fast: bool = False, payload: float = 0.0, at: float = 0.0
-) -> Motion:
-    """A robot along random sinusoids, with a payload (kg) from a time (s) on where that is not 0.
+def simulated(robot: str, stream: Stream, seed: int = 0) -> Motion:
+    """A simulated robot's stream.
 
     Raise MissingExtraError where what simulates is not installed, ValueError for other robots.
     """
-    stream = Stream(
-        n_samples=max(2, round(seconds * rate)),
-        rate=rate,
-        speed=FAST if fast else 1.0,
-        payload=Payload(payload, at) if payload else None,
-    )
     made = simulate(load_robot(robot), stream, seed)
     return Motion(made.t, made.q, made.dq, made.ddq, made.tau, tuple(made.joint_names), "gravity_included")
 
@@ -181,7 +183,7 @@ def recorded(path: Path, seconds: float | None = None) -> Motion:
         try:
             staged, convention = _staged(path, Path(folder))
         except ServiceError as error:
-            raise CommandError(f"{path.name}: {error}") from error
+            raise CommandError(f"{path.name}: {in_shell(str(error))}") from error
         t = staged.read("t")
         rows = slice(None) if seconds is None else t - t[0] <= seconds
         parts = {name: staged.table(name, rows) for name in ("q", "dq", "ddq", "tau")}
@@ -264,7 +266,7 @@ def play(
                 raise
             part.refused[error.code] += 1
             continue
-        part.add(answer, motion.tau[row], time.perf_counter() - sent, max(0.0, -wait))
+        part.add(answer, motion.tau[row], time.perf_counter() - sent, max(0.0, -wait), deadline)
     if part.rows or part.refused:
         each_second(second, part)
         total.merge(part)

@@ -11,6 +11,7 @@ from lipcore.data.samples import Samples
 from lipcore.excitation import Plan
 from lipcore.extras import need
 from lipserve import Prediction
+from lipserve.wording import percent
 
 HEADINGS = ("position, rad (m)", "speed, per s", "acceleration, per s²")
 
@@ -35,13 +36,13 @@ def draw_motion(path: Path, made: Plan) -> None:
             for bound in (low[j], high[j]):
                 axis.axhline(bound, color="tab:red", lw=0.7, ls="--")
             axis.tick_params(labelsize=7)
-        row[0].set_ylabel(f"{limits.joint_names[j]}\n{made.left[j]:.1%} left", fontsize=7)
+        row[0].set_ylabel(f"{limits.joint_names[j]}\n{percent(made.left[j], 1)} left", fontsize=7)
     for axis, heading in zip(axes[0], HEADINGS, strict=True):
         axis.set_title(heading, fontsize=8)
     for axis in axes[-1]:
         axis.set_xlabel("s", fontsize=8)
     mean = float(np.exp(np.log(made.left).mean()))
-    figure.suptitle(f"planned motion: {mean:.2%} of the torque's variance expected to be left", fontsize=9)
+    figure.suptitle(f"planned motion: {percent(mean, 2)} of the torque's variance expected to be left", fontsize=9)
     figure.tight_layout()
     figure.savefig(path, dpi=100)
     plt.close(figure)
@@ -54,7 +55,7 @@ def draw_torque(path: Path, samples: Samples, answer: Prediction, level: float =
     figure, axes = plt.subplots(samples.n_joints, 1, sharex=True, figsize=(9, 1.5 * samples.n_joints))
     for j, axis in enumerate(np.atleast_1d(axes)):
         axis.fill_between(
-            samples.t, lower[:, j], upper[:, j], color="tab:blue", alpha=0.25, lw=0, label=f"{level:.0%} interval"
+            samples.t, lower[:, j], upper[:, j], color="tab:blue", alpha=0.25, lw=0, label=f"{percent(level)} interval"
         )
         axis.plot(samples.t, answer.tau[:, j], color="tab:blue", lw=1, label="predicted")
         axis.plot(samples.t, samples.tau[:, j], ".", color="black", ms=1.5, label="measured")

@@ -1,4 +1,4 @@
-"""Writing samples as the files that the service reads."""
+"""`lipserve simulate`: streams as files that the service reads, and the options that describe a simulation."""
 
 from __future__ import annotations
 
@@ -12,54 +12,63 @@ from lipcore.data.samples import Samples
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import ROBOTS, load_robot
 from lipcore.robots.simulation import FAST, Payload, Stream, simulate
+from lipserve.wording import counted
 from service.cli.consoles import print_result
-from service.cli.options import Json, alone
+from service.cli.options import (
+    Along,
+    Coulomb,
+    DirtShare,
+    Fast,
+    Json,
+    Mass,
+    MassAt,
+    Noise,
+    Range,
+    Seed,
+    Sinusoids,
+    Viscous,
+    alone,
+    simulation,
+)
+
+COLUMNS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque"}
+"""What stands behind a joint's name in the columns of a CSV."""
 
 
 def write_recording(path: Path, samples: Samples) -> None:
-    """Write samples as CSV or NPZ by the path's ending; raise ValueError for another ending."""
+    """Write samples as CSV or NPZ by the path's ending, with the names of the joints, so that an upload has them.
+
+    Raise ValueError for another ending.
+    """
     if path.suffix == ".npz":
         names = ("t", "episode", "q", "dq", "ddq", "tau")
         arrays = {name: getattr(samples, name) for name in names}
         np.savez(path, joint_names=np.array(samples.joint_names), **arrays)
     elif path.suffix == ".csv":
-        joints = range(1, samples.n_joints + 1)
-        quantities = ("q", "dq", "ddq", "tau")
-        header = ["t", "episode", *(f"{name}{joint}" for name in quantities for joint in joints)]
-        table = np.column_stack([samples.t, samples.episode, *(getattr(samples, name) for name in quantities)])
+        header = ["t", "episode", *(f"{joint}/{word}" for word in COLUMNS.values() for joint in samples.joint_names)]
+        table = np.column_stack([samples.t, samples.episode, *(getattr(samples, name) for name in COLUMNS)])
         formats = ["%.17g", "%d", *["%.17g"] * (4 * samples.n_joints)]
         np.savetxt(path, table, fmt=formats, delimiter=",", header=",".join(header), comments="")
     else:
         raise ValueError(f"file is {path.name!r}, expected the ending .csv or .npz")
 
 
-app = alone()
-
-
-@app.command("simulate")
-def simulate_(
-    robot: Annotated[str, typer.Argument(help=f"One of {', '.join(ROBOTS)}.", autocompletion=lambda: list(ROBOTS))],
-    output: Annotated[Path, typer.Argument(help="File to write, .csv or .npz.", dir_okay=False)],
-    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal streams.")] = 0,
-    samples: Annotated[int, typer.Option(min=2, help="How many.")] = 500,
-    rate: Annotated[float, typer.Option(help="Hz.")] = 10.0,
-    sinusoids: Annotated[int, typer.Option(min=1, help="50 for training, 100 for testing in the paper.")] = 50,
-    motion: Annotated[str, typer.Option(help="middle (±0.5 rad) or full.")] = "middle",
-    course: Annotated[str, typer.Option(help="sinusoids, periodic, or rests: from point to point.")] = "sinusoids",
-    fast: Annotated[bool, typer.Option("--fast", help="The faster-moving variant.")] = False,
-    noise: Annotated[float, typer.Option(help="Std of the torque noise, N·m.")] = 0.01,
-    viscous: Annotated[float, typer.Option(help="Viscous friction, N·m·s/rad.")] = 0.0,
-    coulomb: Annotated[float, typer.Option(help="Coulomb friction, N·m.")] = 0.0,
-    payload: Annotated[float, typer.Option(help="Payload, kg.")] = 0.0,
-    payload_at: Annotated[float, typer.Option(help="When the payload is attached, s.")] = 0.0,
-    dirt: Annotated[
-        float,
-        typer.Option(min=0.0, help="Friction with memory, ripple, coloured noise, encoders: 1 is an industrial arm's."),
-    ] = 0.0,
-    as_json: Json = False,
-) -> None:
-    """Simulate a robot's stream with Pinocchio and write it as a recording."""
-    stream = Stream(
+def described(
+    samples: int,
+    rate: float,
+    sinusoids: int,
+    motion: str,
+    course: str,
+    fast: bool,
+    noise: float,
+    viscous: float,
+    coulomb: float,
+    payload: float,
+    payload_at: float,
+    dirt: float,
+) -> Stream:
+    """What the options of a simulation ask for; `simulate` checks it."""
+    return Stream(
         n_samples=samples,
         rate=rate,
         n_sinusoids=sinusoids,
@@ -72,7 +81,35 @@ def simulate_(
         course=course,  # type: ignore[arg-type]  # as above
         dirt=Dirt().times(dirt) if dirt else None,
     )
+
+
+app = alone()
+
+
+@app.command("simulate")
+def simulate_(
+    robot: Annotated[str, typer.Argument(help=f"One of {', '.join(ROBOTS)}.", autocompletion=lambda: list(ROBOTS))],
+    output: Annotated[Path, typer.Argument(help="File to write, .csv or .npz.", dir_okay=False)],
+    samples: Annotated[int, typer.Option(min=2, help="How many.")] = 500,
+    rate: Annotated[float, simulation("Hz.")] = 10.0,
+    seed: Seed = 0,
+    sinusoids: Sinusoids = 50,
+    motion: Range = "middle",
+    course: Along = "sinusoids",
+    fast: Fast = False,
+    noise: Noise = 0.01,
+    viscous: Viscous = 0.0,
+    coulomb: Coulomb = 0.0,
+    payload: Mass = 0.0,
+    payload_at: MassAt = 0.0,
+    dirt: DirtShare = 0.0,
+    as_json: Json = False,
+) -> None:
+    """Simulate a robot's stream with Pinocchio and write it as a recording."""
+    stream = described(
+        samples, rate, sinusoids, motion, course, fast, noise, viscous, coulomb, payload, payload_at, dirt
+    )
     data = simulate(load_robot(robot), stream, seed)
     write_recording(output, data)
     document = {"file": output, "samples": len(data), "rate_hz": rate, "joint_names": data.joint_names}
-    print_result(document, as_json, f"{output}: {len(data)} samples of {', '.join(data.joint_names)}")
+    print_result(document, as_json, f"{output}: {counted(len(data), 'sample')} of {', '.join(data.joint_names)}")

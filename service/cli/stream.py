@@ -1,4 +1,4 @@
-"""`lipserve stream`."""
+"""`lipserve stream`: a motion played to a model in real time."""
 
 from __future__ import annotations
 
@@ -10,20 +10,37 @@ import typer
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
+from lipserve.wording import counted, percent
 from service.cli.connecting import connected
-from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
-from service.cli.options import ROBOTS, Alias, Json, Model, Url, Version, alone
+from service.cli.consoles import INTERRUPTED, CommandError, Explained, echo, note, out, print_error, print_json
+from service.cli.options import (
+    ROBOTS,
+    Alias,
+    Along,
+    Coulomb,
+    DirtShare,
+    Fast,
+    Json,
+    Mass,
+    MassAt,
+    Model,
+    Noise,
+    Range,
+    Seed,
+    Sinusoids,
+    Url,
+    Version,
+    Viscous,
+    alone,
+    simulation,
+)
 
 if TYPE_CHECKING:
-    from lipserve import StreamClient
+    from lipserve import Client, StreamClient
     from service.cli.playing import Motion, Tally
 
 app = alone()
 SECONDS = 60.0
-
-
-def _simulation(help_: str, *names: str, **limits: Any) -> Any:
-    return typer.Option(*names, help=help_, rich_help_panel="Simulation", **limits)
 
 
 @app.command()
@@ -39,31 +56,51 @@ def stream(
         bool,
         typer.Option("--learn", help="Also send the measured torque, for the model to learn from after it answered."),
     ] = False,
+    yes_learn: Annotated[
+        bool,
+        typer.Option(
+            "--yes-learn", help="With --learn: learn from the stream even if its first second does not fit the model."
+        ),
+    ] = False,
     seconds: Annotated[
         float | None, typer.Option(min=0.1, help="How long: all of a recording, 60 of a simulation by default.")
     ] = None,
     deadline: Annotated[
-        float | None, typer.Option(min=0, help="ms after which an answer is late; one step of the motion by default.")
+        float | None,
+        typer.Option(
+            min=0,
+            help="ms after which an answer is late by the service's clock, and received late by this one; one step of "
+            "the motion by default.",
+        ),
     ] = None,
     stream_id: Annotated[
         str | None, typer.Option(help="Name of the source of the torques; a new one by default.")
     ] = None,
     version: Version = None,
     alias: Alias = None,
-    rate: Annotated[float, _simulation("Hz.", min=1, max=2000)] = 100.0,
-    seed: Annotated[int, _simulation("Equal seeds give equal motions.", min=0)] = 0,
-    fast: Annotated[bool, _simulation("The faster-moving variant.", "--fast")] = False,
-    payload: Annotated[float, _simulation("Payload that the robot takes up, kg.", min=0)] = 0.0,
-    payload_at: Annotated[float, _simulation("When it does, s.", min=0)] = 0.0,
+    rate: Annotated[float, simulation("Hz.", min=1, max=2000)] = 100.0,
+    seed: Seed = 0,
+    sinusoids: Sinusoids = 50,
+    motion: Range = "middle",
+    course: Along = "sinusoids",
+    fast: Fast = False,
+    noise: Noise = 0.01,
+    viscous: Viscous = 0.0,
+    coulomb: Coulomb = 0.0,
+    payload: Mass = 0.0,
+    payload_at: MassAt = 0.0,
+    dirt: DirtShare = 0.0,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
     """Play a motion to a model over its WebSocket in real time, and compare its answers with the measured torque.
 
-    One line a second, then figures of the whole. Each answer is given before its row is learnt. Ctrl-C ends it.
+    One line a second, then figures of the whole. Each answer is given before its row is learnt. A stream whose first
+    second lies outside the model's band is not learnt until that is confirmed. Ctrl-C ends it.
     """
     # takes long to import; help needs none of it
     from service.cli.playing import Stop, play, recorded, simulated  # noqa: PLC0415
+    from service.cli.simulate import described  # noqa: PLC0415
 
     if (file is None) == (simulate is None):
         raise CommandError(
@@ -72,26 +109,89 @@ def stream(
     if file is not None:
         if not file.is_file():
             raise CommandError(f"file is {str(file)!r}, expected a recording")
-        motion = recorded(file, seconds)
+        played = recorded(file, seconds)
     else:
-        motion = simulated(simulate or "", seconds or SECONDS, rate, seed, fast, payload, payload_at)
+        samples = max(2, round((seconds or SECONDS) * rate))
+        asked = described(
+            samples, rate, sinusoids, motion, course, fast, noise, viscous, coulomb, payload, payload_at, dirt
+        )
+        played = simulated(simulate or "", asked, seed)
     source = (stream_id or f"lipserve-{secrets.token_hex(4)}") if learn else None
     with (
         Stop().listening() as stop,
         connected(url) as client,
         client.stream(model, version=version, alias=alias, stream_id=source, scale=True) as opened,
     ):
-        motion = _fitting(motion, opened)
-        step = motion.step if deadline is None else deadline / 1e3
-        _announce(motion, opened, source)
-        total = play(
-            opened, motion, learn, step, stop, lambda second, part: _print_second(second, part, opened, learn, as_json)
-        )
+        played = _fitting(played, opened)
+        step = played.step if deadline is None else deadline / 1e3
+        _announce(played, opened, source)
+        doubt = Doubt(client, model, source, yes_learn)
+
+        def each_second(second: int, part: Tally) -> None:
+            _print_second(second, part, opened, learn, as_json)
+            doubt.look(second, part, opened)
+
+        total = play(opened, played, learn, step, stop, each_second)
         if learn:
             opened.flush()
+            doubt.decide(opened)
         _print_all(total, opened, learn, as_json)
     if stop.asked:
         raise typer.Exit(INTERRUPTED)
+    if doubt.held:
+        raise typer.Exit(1)
+
+
+class Doubt:
+    """Says loudly that a stream does not fit its model, once, and confirms that it is to be learnt where that is asked.
+
+    source: name of the stream that teaches, None where it does not; held: whether it is not learnt for that reason.
+    """
+
+    def __init__(self, client: Client, model: str, source: str | None, confirmed: bool) -> None:
+        self._client, self._model, self._source, self._confirmed = client, model, source, confirmed
+        self._told, self.held = False, False
+
+    def look(self, second: int, part: Tally, stream: StreamClient) -> None:
+        """Look at a second that has ended: at the answers of the first, and at what became of the torques."""
+        if self._source is not None:
+            self.decide(stream)
+        elif second == 1 and part.opening(1.0).misfit:
+            share = percent(part.opening(1.0).coverage.mean())
+            print_error(Explained(f"only {share} of the first second lies within the 95 % band of the model", CHECK))
+
+    def decide(self, stream: StreamClient) -> None:
+        """Say that learning is held for how the stream began; confirm that it is meant where that was asked for."""
+        if self._told or not stream.learnt.rejected.get("change"):
+            return
+        held = self._client.learning(self._model).status.held
+        if held is None:
+            return
+        self._told = True
+        evidence = held.evidence
+        if evidence.get("stream_id") != self._source or evidence.get("kind") != "opening":
+            self.held = True
+            hint = f"`lipserve alarms {self._model}` tells why; `lipserve learning decide {self._model} …` ends it"
+            print_error(Explained(f"learning of {self._model} is held: rows are kept, and not learnt", hint))
+            return
+        share = percent(evidence["coverage"])
+        text = f"only {share} of the stream's first second lies within the 95 % band of {self._model}"
+        if self._confirmed:
+            decided = self._client.decide(self._model, "ignore", replay=True)
+            note(
+                f"careful: {text}; it is learnt all the same, as --yes-learn says: "
+                f"{counted(decided.rows, 'row')} that waited"
+            )
+            return
+        self.held = True
+        hint = (
+            f"{CHECK}. If it is meant: `lipserve learning decide {self._model} ignore --replay`, or --yes-learn next "
+            f"time; `lipserve learning decide {self._model} adapt --replay` if the robot has changed"
+        )
+        print_error(Explained(f"{text}: nothing of it is learnt", hint))
+
+
+CHECK = "check that it is this robot, with the friction, the payload and the units that were learnt"
 
 
 def _fitting(motion: Motion, stream: StreamClient) -> Motion:
@@ -144,10 +244,10 @@ def _print_all(total: Tally, stream: StreamClient, learn: bool, as_json: bool) -
         return
     if figures["joints"]:
         title = "answers against measured torque" + (", each given before its row was learnt" if learn else "")
-        table = Table("joint", "nMSE", "RMSE N·m", "coverage of 95%", title=title)
+        table = Table("joint", "nMSE", "RMSE N·m", "coverage of 95 %", title=title)
         for each in figures["joints"]:
             nmse = "-" if each["nmse"] is None else f"{each['nmse']:.2e}"
-            table.add_row(each["joint"], nmse, f"{each['rmse']:.4f}", f"{each['coverage']:.1%}")
+            table.add_row(each["joint"], nmse, f"{each['rmse']:.4f}", percent(each["coverage"], 1))
         out.print(table)
     echo(f"in all  {_line(figures)}")
     for each in figures.get("not_logged", ()):
@@ -156,13 +256,13 @@ def _print_all(total: Tally, stream: StreamClient, learn: bool, as_json: bool) -
 
 def _line(figures: dict[str, Any]) -> str:
     """Figures of a second, or of all, on one line."""
-    parts = [f"{figures['rows']} rows"]
+    parts = [counted(figures["rows"], "row")]
     if figures["rows"]:
         trip = figures["round_trip_ms"]
         parts += [
             f"round trip p50 {trip['p50']:.2f} ms, p99 {trip['p99']:.2f} ms",
-            f"{figures['late']} late",
-            f"error {figures['rmse']:.4f} N·m, {figures['coverage']:.1%} in the 95 % band",
+            f"{figures['late']} late, {figures['received_late']} received late",
+            f"error {figures['rmse']:.4f} N·m, {percent(figures['coverage'], 1)} in the 95 % band",
         ]
     if figures["behind_s"] > 0.1:
         parts.append(f"{figures['behind_s']:.1f} s behind")

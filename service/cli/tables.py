@@ -14,6 +14,7 @@ from lipserve.records.models import HeldOutQuality, Selection
 from lipserve.results.arm import Arm
 from lipserve.results.evaluation import Comparison, Evaluation
 from lipserve.results.series import Prediction
+from lipserve.wording import counted, percent
 
 
 def prediction_tables(answer: Prediction) -> list[Table]:
@@ -58,7 +59,7 @@ def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, 
     table = Table("joint", "nMSE", "RMSE N·m", "in 95 %", "known to be", "width N·m", "NLPD nats", title=title)
     columns = [figures.get(name) or [None] * len(joint_names) for name in FIGURES]
     for joint, nmse, rmse, coverage, low, high, count, width, nlpd in zip(joint_names, *columns, strict=True):
-        known = "-" if count is None else f"{low:.0%} to {high:.0%}, by {count:.0f} errors"
+        known = "-" if count is None else f"{percent(low)} to {percent(high)}, by {counted(round(count), 'error')}"
         cells = [_figure(nmse, ".2e"), _figure(rmse, ".4f"), _figure(coverage, ".1%"), known]
         table.add_row(joint, *cells, _figure(width, ".3f"), _figure(nlpd, ".3f"))
     return table
@@ -69,7 +70,7 @@ def selection_table(selection: Selection) -> Table:
     held = selection.held_out
     title = "not judged"
     if held.blocks:
-        title = f"judged on {held.blocks} stretches that the training did not see"
+        title = f"judged on {counted(held.blocks, 'stretch', 'stretches')} that the training did not see"
     table = Table("estimator", "log density nats", "less than the best", "mean nMSE", "in 95 %", title=title)
     for each in selection.table:
         name = f"{each.estimator} (chosen)" if each.estimator == selection.chosen else each.estimator
@@ -91,7 +92,7 @@ def _mean(values: Sequence[float | None] | None) -> float | None:
 
 
 def _figure(value: float | None, form: str) -> str:
-    return "-" if value is None or np.isnan(value) else format(value, form)
+    return "-" if value is None or np.isnan(value) else format(value, form).replace("%", " %")
 
 
 def _by_joint(table: Table, joint_names: Sequence[str], rows: list[list[str]]) -> Table:
@@ -142,11 +143,11 @@ def overview(report: DatasetReport) -> Iterator[str]:
     """What was read and what was done to it, a sentence each."""
     yield from report.reading
     yield from report.preparation
-    episodes = "1 episode" if report.episodes == 1 else f"{report.episodes} episodes"
     rate = NOTHING if report.rate_hz is None else f"{report.rate_hz:.4g} Hz"
-    yield f"{report.rows:,} of {report.rows_uploaded:,} rows are samples, in {episodes}, at {rate}"
+    parts, gaps = counted(report.episodes, "episode"), counted(report.gaps, "gap")
+    yield f"{report.rows:,} of {report.rows_uploaded:,} rows are samples, in {parts}, at {rate}"
     if (timing := report.timing) is not None and timing.jitter_p99 is not None:
-        yield f"jitter: 99 % of the steps within {timing.jitter_p99:.1%} of the usual one; {report.gaps} gaps"
+        yield f"jitter: 99 % of the steps within {percent(timing.jitter_p99, 1)} of the usual one; {gaps}"
 
 
 def report_tables(report: DatasetReport, joint_names: Sequence[str]) -> Iterator[Table]:
@@ -175,7 +176,7 @@ def _joints(report: DatasetReport, joint_names: Sequence[str]) -> Table:
             f"{low['tau']:.3g} … {high['tau']:.3g}",
             _noise(report.torque_noise_estimate[index], known),
             NOTHING if late is None or late.seconds is None else f"{1e3 * late.seconds:.1f}",
-            NOTHING if used is None or used.range_used is None else f"{used.range_used:.0%}",
+            NOTHING if used is None or used.range_used is None else percent(used.range_used),
         )
     return table
 
@@ -191,7 +192,7 @@ def _against(found: AgainstRobot) -> Table:
     table = Table("joint", "gravity", "inertia", "explained", title=f"torque, times that of {found.robot}")
     for each in found.joints:
         times = [_times(each.gravity, each.gravity_std), _times(each.inertia, each.inertia_std)]
-        table.add_row(each.joint, *times, f"{each.explained:.0%}")
+        table.add_row(each.joint, *times, percent(each.explained))
     return table
 
 

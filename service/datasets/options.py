@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
@@ -32,7 +33,8 @@ class ReadOptions:
 
     columns: for t, episode, q, dq, ddq, tau what its columns are called: a pattern with `{joint}`, or a list; units: of
     these by name; topic: of a bag; delimiter: of a CSV; joint_names: of joints 1..n; effort: what tau is;
-    torque_constants: N·m/A a joint, of motor currents; torque_factors: by which each joint's torque is multiplied.
+    torque_constants: N·m/A a joint, of motor currents; torque_factors: by which each joint's torque is multiplied;
+    column_names: of text that has none; dt: s between rows that have no times.
     """
 
     columns: Mapping[str, str | tuple[str, ...]] = field(default_factory=dict)
@@ -43,6 +45,8 @@ class ReadOptions:
     effort: Effort | None = None
     torque_constants: tuple[float, ...] | None = None
     torque_factors: tuple[float, ...] | None = None
+    column_names: tuple[str, ...] | None = None
+    dt: float | None = None
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,8 @@ UPLOAD_BODY = upload_body(
     "`ddq1..`, `tau1..`, optional `episode`, in SI units; other names and units are recognised or declared by "
     "`columns` and `units`. `dq` and `ddq` may be absent and are then derived. NPZ holds `q`, `dq`, `ddq`, `tau` "
     "(N, n), `t` or `dt`, `episode`, `joint_names`; bags hold `sensor_msgs/JointState` or the states of a Franka; a "
-    "zip is the directory of a LeRobot data set or of a rosbag2.",
+    "zip is the directory of a LeRobot data set or of a rosbag2, or holds tables of text that are joined side by side: "
+    "positions.txt, velocities.txt, torques.txt may then lack column names.",
     {
         "text/csv": {"schema": {"type": "string"}, "example": "t,q1,dq1,ddq1,tau1\n0.0,0.1,0.0,0.2,1.5\n"},
         "application/x-ndjson": {
@@ -135,6 +140,13 @@ async def upload_options(
     delimiter: Annotated[
         str | None, Query(min_length=1, max_length=1, description="Of a CSV; found out where not given")
     ] = None,
+    column_names: Annotated[
+        Names,
+        Query(description="Names of the columns of text that has none, separated by commas; `q1..q7` stands for seven"),
+    ] = None,
+    dt: Annotated[
+        float | None, Query(gt=0, le=100, allow_inf_nan=False, description="s from row to row, of a file without times")
+    ] = None,
     cutoff: Annotated[float, Query(gt=0, le=1000, allow_inf_nan=False, description="Of the low-pass, Hz")] = CUTOFF,
     filtering: Annotated[
         Filtering,
@@ -168,6 +180,8 @@ async def upload_options(
         effort=effort,
         torque_constants=_numbers("torque_constants", torque_constants, "N·m/A"),
         torque_factors=_numbers("torque_factors", torque_factors, "no unit"),
+        column_names=_ranges("column_names", column_names),
+        dt=dt,
     )
     recipe = Recipe(cutoff_hz=cutoff, filtering=filtering, form=form, rate_hz=rate, trim_s=trim, gap_steps=gap)
     dropped = _names("drop_joints", drop_joints)
@@ -181,6 +195,24 @@ def _names(field: str, given: str | None) -> tuple[str, ...] | None:
     if len(names) > MOST_NAMES:
         raise invalid_request(field, f"{len(names)} names", f"at most {MOST_NAMES}")
     return names
+
+
+_RANGE = re.compile(r"(.*?)(\d{1,4})\.\.(.*?)(\d{1,4})")
+
+
+def _ranges(field: str, given: str | None) -> tuple[str, ...] | None:
+    """Names of columns, ranges of them written out: `q1..q3` stands for q1, q2, q3."""
+    names: list[str] = []
+    for name in _names(field, given) or ():
+        match = _RANGE.fullmatch(name)
+        if match is None:
+            names.append(name)
+            continue
+        first, last = int(match[2]), int(match[4])
+        if match[3] not in ("", match[1]) or not first <= last < first + MOST_NAMES:
+            raise invalid_request(field, name, "a range of names such as q1..q7")
+        names += [f"{match[1]}{number}" for number in range(first, last + 1)]
+    return tuple(names) if names else None
 
 
 def _numbers(field: str, given: str | None, unit: str) -> tuple[float, ...] | None:

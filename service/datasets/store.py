@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import Session
 
 from lipcore.data.samples import Array, Samples
 from lipcore.profiles import Profile
@@ -22,7 +23,7 @@ from service.datasets.options import UploadOptions
 from service.datasets.report.making import make_report
 from service.datasets.schema import MOST_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
 from service.datasets.staging import Staged, column, prepare, staging
-from service.foundation.errors import ConflictError, not_found
+from service.foundation.errors import ConflictError, invalid_request, not_found
 from service.robots.store import profile_of
 from service.storage import sample_file
 from service.storage.database import Database, DatasetRow, JobRow, now
@@ -31,6 +32,9 @@ from service.storage.sample_file import PartOf
 from service.storage.storage import Storage
 from service.web.rows import Identity, Page, done, mark, newest
 from service.web.storage_errors import undecided
+
+MOST_NAMED = 5
+"""Ids that are listed where several data sets have one name."""
 
 
 def add(
@@ -92,12 +96,25 @@ def show(database: Database, dataset: str) -> Dataset:
 
 
 def find(database: Database, dataset: str) -> DatasetRow:
-    """Return the row of a data set; raise NotFoundError."""
+    """Return the row of a data set by its id or its name; raise NotFoundError, or InvalidRequestError where several
+    have the name."""
     with database.session() as session:
-        row = session.scalar(select(DatasetRow).where(DatasetRow.id == dataset))
-    if row is None:
+        return existing(session, dataset)
+
+
+def existing(session: Session, dataset: str) -> DatasetRow:
+    """As `find`, in a session."""
+    row = session.scalar(select(DatasetRow).where(DatasetRow.id == dataset))
+    if row is not None:
+        return row
+    called = select(DatasetRow).where(DatasetRow.name == dataset).order_by(DatasetRow.seq.desc()).limit(MOST_NAMED + 1)
+    rows = list(session.scalars(called))
+    if not rows:
         raise not_found("dataset", dataset)
-    return row
+    if len(rows) > 1:
+        ids = ", ".join(each.id for each in rows[:MOST_NAMED]) + (" …" if len(rows) > MOST_NAMED else "")
+        raise invalid_request("dataset", dataset, f"the id of one of those that are called so: {ids}")
+    return rows[0]
 
 
 def samples(files: Files, row: DatasetRow, most: int | None = None, part: PartOf | None = None) -> Samples:
@@ -121,14 +138,12 @@ def page(database: Database, part: Page) -> DatasetPage:
 def delete(storage: Storage, dataset: str) -> None:
     """Delete a data set; raise ConflictError while a job waits for it or reads it."""
     with storage.database.transaction() as session:
-        row = session.scalar(select(DatasetRow).where(DatasetRow.id == dataset))
-        if row is None:
-            raise not_found("dataset", dataset)
+        row = existing(session, dataset)
         for job in session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE))):
-            if dataset in job.request["datasets"]:
+            if row.id in job.request["datasets"]:
                 raise ConflictError(f"data set {dataset!r} is in use by {job.id}: cancel it or wait for its end")
         session.delete(row)
-    storage.files.delete_samples(dataset)
+    storage.files.delete_samples(row.id)
 
 
 def _joint_types(profile: Profile, joint_names: Sequence[str]) -> list[JointType] | None:

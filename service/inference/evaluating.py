@@ -17,6 +17,7 @@ from lipcore.data.metrics import evaluate as compare
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
 from lipcore.model import dynamics
+from lipcore.profiles import profile, recognise
 from service.datasets import store
 from service.foundation.errors import DamagedDataError, invalid_request
 from service.foundation.fields import finite
@@ -112,12 +113,21 @@ def fitting(loaded: LoadedModels, dataset: str, *versions: Served) -> DatasetRow
     for served in versions:
         known = served.model
         if tuple(row.joint_names) != known.joint_names:
-            expected = f"the joints of the model, {list(known.joint_names)}"
-            raise invalid_request("dataset", f"a data set with the joints {row.joint_names}", expected)
+            expected = f"those of the model, {', '.join(known.joint_names)}{_how_to_upload(row, known.joint_names)}"
+            raise invalid_request("dataset", f"a data set with the joints {', '.join(row.joint_names)}", expected)
         if row.torque_convention != known.torque_convention:
             expected = f"that of the model, {known.torque_convention}"
             raise invalid_request("dataset", f"a data set whose torque is {row.torque_convention}", expected)
     return row
+
+
+def _how_to_upload(row: DatasetRow, joint_names: Sequence[str]) -> str:
+    """What makes a data set one of these joints, where it has as many."""
+    if len(row.joint_names) != len(joint_names):
+        return ""
+    named = next((name for name in recognise(joint_names) if profile(name).joint_names == tuple(joint_names)), None)
+    option = f"joint_names={','.join(joint_names)}" if named is None else f"robot={named}"
+    return f"; if they are the same joints, upload the recording with {option}"
 
 
 def evaluate(

@@ -19,7 +19,7 @@ from pydantic import (
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
 from lipserve.states import Outcome
 from service.foundation.errors import invalid_request
-from service.foundation.fields import each_once, rows_of_numbers
+from service.foundation.fields import LONGEST, each_once, rows_of_numbers
 from service.inference.payload import Payload
 from service.models.schema import AliasName, VersionNumber
 
@@ -159,7 +159,7 @@ class EvaluateRequest(VersionChoice):
         extra="forbid", strict=True, json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "version": 1}]}
     )
 
-    dataset: str = Field(max_length=40)
+    dataset: str = Field(max_length=LONGEST, description="Id or name of a data set")
     part: Part = Field(
         "all",
         description="`held_out`: only what the training of the version has held out of the data set, see `holdout` of "
@@ -312,7 +312,7 @@ class CompareRequest(BaseModel):
         json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "versions": ["production", 2]}]},
     )
 
-    dataset: str = Field(max_length=40)
+    dataset: str = Field(max_length=LONGEST, description="Id or name of a data set")
     versions: Annotated[list[VersionNumber | AliasName], Field(min_length=2, max_length=2)] = Field(
         description="Two versions of the model, by number or alias"
     )

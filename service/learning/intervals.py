@@ -23,11 +23,13 @@ MOST_EVENTS = 3000
 
 @dataclass(frozen=True)
 class Known:
-    """The scale of a stream after its last batch, which a version predicted and which came at `received`, Unix s."""
+    """The scale of a stream after its last batch, which a version predicted and which came at `received`, Unix s;
+    doubted: see `Factor`."""
 
     state: Adaptive
     version: int
     received: float
+    doubted: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,7 +77,8 @@ def known(event: EventRow) -> Known | None:
     values = (event.report or {}).get("scale")
     if values is None or event.version is None:
         return None
-    return Known(Adaptive.from_json(values), event.version, event.received)
+    doubted = bool((event.report or {}).get("doubted"))
+    return Known(Adaptive.from_json(values), event.version, event.received, doubted)
 
 
 def restored(session: Session, model: str) -> dict[str, Known]:
@@ -93,5 +96,7 @@ def restored(session: Session, model: str) -> dict[str, Known]:
 def factors(scales: Mapping[str, Known], version: int) -> dict[str, Factor]:
     """Those that a version answers with: of streams whose last batch it predicted."""
     return {
-        stream: Factor(each.state.factor, each.received) for stream, each in scales.items() if each.version == version
+        stream: Factor(each.state.factor, each.received, each.doubted)
+        for stream, each in scales.items()
+        if each.version == version
     }

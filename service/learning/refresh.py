@@ -17,6 +17,7 @@ from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
 from lipserve.states import ACTIVE
+from lipserve.wording import percent
 from service.foundation.errors import BusyError, ConflictError
 from service.foundation.settings import Settings
 from service.learning import owner
@@ -136,7 +137,7 @@ def _reasons(settings: Settings, published: Published) -> Iterator[Reason]:
     revision = {"version": published.version, "revision": published.revision}
     share = published.novel_share
     if share > settings.novelty_share:
-        text = f"{share:.0%} of the last {settings.novelty_rows} samples lie beyond what {named} can learn"
+        text = f"{percent(share)} of the last {settings.novelty_rows} samples lie beyond what {named} can learn"
         figures: dict[str, Any] = {
             "novel_share": share,
             "threshold": settings.novelty_share,
@@ -146,7 +147,9 @@ def _reasons(settings: Settings, published: Published) -> Iterator[Reason]:
         yield Reason("novelty", text, {**revision, **figures})
     errors = published.linearisation or (0.0,)
     if max(errors) > settings.linearisation_error:
-        text = f"the arm of {named} has moved from where its torque is linear: {max(errors):.0%} of the stated error"
+        text = (
+            f"the arm of {named} has moved from where its torque is linear: {percent(max(errors))} of the stated error"
+        )
         by_joint = {"linearisation_error": list(errors), "threshold": settings.linearisation_error}
         yield Reason("linearisation", text, {**revision, **by_joint})
 

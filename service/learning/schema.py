@@ -46,8 +46,9 @@ class LearningOptions(BaseModel):
     )
     on_change: Literal["hold", "adapt", "learn"] = Field(
         "hold",
-        description="What follows a detected change of the robot. `hold`: nothing is learnt until its owner decides; "
-        "`adapt`: a new regime begins; `learn`: learning goes on as before",
+        description="What follows a detected change of the robot, or a stream whose first second lies outside the 95 % "
+        "band. `hold`: nothing is learnt until its owner decides, nor of that second; `adapt`: a new regime begins; "
+        "`learn`: learning goes on as before",
     )
     torque_limits: list[TorqueLimit] | None = Field(
         None, description="Largest |tau| of each joint's actuator in N·m, to tell saturated samples; null: not known"
@@ -171,8 +172,8 @@ class ObservationResponse(BaseModel):
     state: State = Field(description="What has become of the batch since")
     rejected: dict[str, int] = Field(
         description="Rows that are kept but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`, "
-        "`stationary`, `contact`, `change` (a changed robot whose owner has not decided), `payload` (the arm "
-        "carries something, of which the row teaches instead), `edge` (acceleration not "
+        "`stationary`, `contact`, `change` (a changed robot, or a stream that did not fit, and its owner has not "
+        "decided), `payload` (the arm carries something, of which the row teaches instead), `edge` (acceleration not "
         "derivable; where the stream goes on, these are learnt with the next batch)"
     )
     gaps: list[list[int]] = Field(

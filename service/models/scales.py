@@ -14,10 +14,12 @@ RECENT_S = 60.0
 
 @dataclass(frozen=True)
 class Factor:
-    """Of a stream: values (n,), and when the batch came that made them, Unix time, s."""
+    """Of a stream: values (n,), and when the batch came that made them, Unix time, s. doubted: whether the stream did
+    not fit from its first second on, and nobody has confirmed it: its own answers have them, and no others."""
 
     values: Array
     received: float
+    doubted: bool = False
 
 
 class Scales:
@@ -45,8 +47,9 @@ class Scales:
 
     def take(self, streams: Mapping[str, Factor]) -> None:
         """Answer with these from now on."""
-        latest = max((each.received for each in streams.values()), default=0.0)
-        recent = [each.values for each in streams.values() if each.received >= latest - RECENT_S]
+        trusted = [each for each in streams.values() if not each.doubted]
+        latest = max((each.received for each in trusted), default=0.0)
+        recent = [each.values for each in trusted if each.received >= latest - RECENT_S]
         self._widest = widest(recent, self._own)
         self.asked = self._widest.tolist()
         self._streams = streams

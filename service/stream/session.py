@@ -204,7 +204,7 @@ class Session(Conversation):
         self._loaded, self._name = learners.loaded, served.name
         self._pin = served.version if pinned else None
         self._alias = None if alias == SERVING else alias
-        self._std, self._late, self._due = std, 0, inf
+        self._std, self._late = std, 0
         self._scale, self._payload, self._stream_id = scale, payload, stream_id
         self._meter, self._deadline = meter, learners.settings.stream_deadline_s
         self._learning = None if stream_id is None else Learning(learners, stream_id, self.send_text)
@@ -236,10 +236,6 @@ class Session(Conversation):
 
     async def reply(self, message: Message, arrived: float) -> bytes:
         """Return the answer frame; whatever is wrong becomes an error frame."""
-        if self.left > self._due:  # the last answer left in time, but its client did not read it
-            self._late += 1
-            self._meter.late += 1
-        self._due = inf
         sequence, flags = 0, frames.UNREAD
         try:
             data = message.get("bytes")
@@ -273,17 +269,12 @@ class Session(Conversation):
             unexpected = ServiceError("an unexpected error; the service's log says more")
             return self._refuse(sequence, flags, arrived, unexpected)
         served, (flags, numbers) = self._served, self._numbers(sequence, asked, arrived, data, tau, std, factor, more)
-        now = perf_counter()
-        seconds = now - arrived
+        seconds = perf_counter() - arrived
         self._meter.durations.add(seconds)
-        if budget:
-            self._due = arrived + budget
-            if now > self._due:
-                self._late, self._due = self._late + 1, inf
-                self._meter.late += 1
-                flags |= frames.LATE
-        elif seconds > self._deadline:
+        if seconds > (budget or self._deadline):
             self._meter.late += 1
+            if budget:
+                self._late, flags = self._late + 1, flags | frames.LATE
         return frames.ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, seconds) + numbers
 
     async def _admit(self, sequence: int, flags: int) -> None:

@@ -15,7 +15,7 @@ from lipcore.fitting.base import BaseMismatchError, Kind, check_base
 from lipcore.fitting.estimators import UnknownEstimatorError, check_estimator
 from lipcore.fitting.options import FitOptions
 from lipcore.robots.library import ROBOTS
-from lipcore.vocabulary import DIFFERENTIATED
+from lipcore.vocabulary import AUTO, CHOICES, DIFFERENTIATED, ROBOT_ESTIMATORS
 from lipserve.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
 from service.datasets import store
 from service.foundation.errors import (
@@ -36,7 +36,7 @@ from service.storage.database import Database, DatasetRow, JobRow, RobotRow, Ver
 from service.storage.files import new_id
 from service.training import holding_out, lifecycle, refresh_data
 from service.training.queue import JobQueue
-from service.training.schema import Job, JobPage, JobRequest, Options
+from service.training.schema import Job, JobDraft, JobPage, JobRequest, Options
 from service.web.observability.logs import request_id
 from service.web.rows import Identity, Page, done, mark, newest
 
@@ -49,33 +49,20 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
     request, which is not done again where it was before."""
     if (before := done_before(queue.database, named)) is not None:
         return before
-    _check_options(request.options, queue.settings)
-    if len(request.datasets) > queue.settings.max_job_datasets:
-        raise invalid_request("datasets", len(request.datasets), f"at most {queue.settings.max_job_datasets}")
-    rows = [store.find(queue.database, dataset) for dataset in request.datasets]
-    joint_types = _check_joints(request, rows)
-    if request.holdout is not None:
-        holding_out.check(rows, request.holdout, queue.settings.min_samples)
+    rows, joint_types, base = _checked(queue, request)
     queue.storage.disk.require()  # for the version that will be made
-    if queue.settings.cluster is None:  # else its workers have what it takes, or say so
-        _check_extra(request)
-    base = None
-    if request.base is None:
-        _check_estimator(queue.database, request, rows[0].joint_names, joint_types)
-    else:
-        base = registry.named(queue.database, request.base)
-        _check_base(base, request, rows[0], joint_types)
     with queue.database.transaction() as session:
         if (row := done(session, JobRow, named)) is not None:  # the same request was faster on another connection
             return represent(row)
-        content = {**request.model_dump(mode="json"), "joint_types": joint_types}
+        ids = [row.id for row in rows]
+        content = {**request.model_dump(mode="json"), "joint_types": joint_types, "datasets": ids}
         if base is not None:
             content["base"] = f"{base.model}:{base.version}"
             if not registry.exists(session, base.model, base.version):  # deleted since it was checked
                 raise not_found("version", base.version)
         job = add(session, queue.settings, request.model, content, retry_of, named)
-        present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(request.datasets))))
-        for dataset in request.datasets:
+        present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(ids))))
+        for dataset in ids:
             if dataset not in present:  # deleted since it was checked
                 raise not_found("dataset", dataset)
         uploaded = request.robot is not None and request.robot not in ROBOTS
@@ -83,6 +70,43 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
             raise not_found("robot", request.robot)
     queue.submit(job.id)
     return represent(job)
+
+
+def check(queue: JobQueue, draft: JobDraft) -> None:
+    """Check what a job would be queued with; raise what `create` would, as far as the data sets there allow."""
+    if draft.datasets:
+        _checked(queue, draft)
+        return
+    _check_options(draft.options, queue.settings)
+    if draft.base is not None:
+        registry.named(queue.database, draft.base)
+    if draft.estimator not in CHOICES:
+        raise invalid_request("estimator", draft.estimator, f"one of {', '.join(CHOICES)}")
+    if queue.settings.cluster is None:
+        _check_extra(draft)
+    if draft.robot is not None and draft.estimator not in (AUTO, *ROBOT_ESTIMATORS):
+        raise invalid_request("robot", draft.robot, f"none, as {draft.estimator} takes none")
+    if draft.robot is not None and draft.robot not in ROBOTS:
+        robots.profile_of(queue.database, draft.robot)
+
+
+def _checked(queue: JobQueue, request: JobRequest) -> tuple[list[DatasetRow], list[str], VersionRow | None]:
+    """The data sets of a request, the types of their joints, and the version to start from."""
+    _check_options(request.options, queue.settings)
+    if len(request.datasets) > queue.settings.max_job_datasets:
+        raise invalid_request("datasets", len(request.datasets), f"at most {queue.settings.max_job_datasets}")
+    rows = [store.find(queue.database, dataset) for dataset in request.datasets]
+    joint_types = _check_joints(request, rows)
+    if request.holdout is not None:
+        holding_out.check(rows, request.holdout, queue.settings.min_samples)
+    if queue.settings.cluster is None:  # else its workers have what it takes, or say so
+        _check_extra(request)
+    if request.base is None:
+        _check_estimator(queue.database, request, rows[0].joint_names, joint_types)
+        return rows, joint_types, None
+    base = registry.named(queue.database, request.base)
+    _check_base(base, request, rows[0], joint_types)
+    return rows, joint_types, base
 
 
 def done_before(database: Database, named: Identity | None) -> Job | None:
@@ -179,8 +203,8 @@ def cancel(queue: JobQueue, job: str) -> Job:
 def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
     first = rows[0]
     for index, row in enumerate(rows):
-        if row.id in request.datasets[:index]:
-            raise invalid_request(f"datasets[{index}]", row.id, "every data set once")
+        if row.id in [each.id for each in rows[:index]]:
+            raise invalid_request(f"datasets[{index}]", request.datasets[index], "every data set once")
         for what in ("joint_names", "torque_convention"):
             if getattr(row, what) != getattr(first, what):
                 expected = f"the {what} of datasets[0], {getattr(first, what)}"

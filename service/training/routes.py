@@ -24,7 +24,7 @@ from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.storage.database import JobRow
 from service.training import jobs
 from service.training.queue import JobQueue, JobQueueDep
-from service.training.schema import Job, JobPage, JobRequest
+from service.training.schema import Job, JobDraft, JobPage, JobRequest
 from service.web.observability.readiness import StoppingDep
 from service.web.route import Route
 from service.web.rows import KeyHeader, PageQuery, identity
@@ -86,6 +86,18 @@ def create(queue: JobQueueDep, request: JobRequest, response: Response, idempote
     job = jobs.create(queue, request, named=named)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
+
+
+@router.post(
+    "/check",
+    status_code=status.HTTP_204_NO_CONTENT,
+    summary="Check a job before its data are uploaded",
+    responses=responses(NotFoundError, ConflictError),
+)
+def check(queue: JobQueueDep, draft: JobDraft) -> None:
+    """Refuse what a request to train would be refused for, as far as the data sets that are there tell. Nothing is
+    queued."""
+    jobs.check(queue, draft)
 
 
 @router.get("", summary="List jobs, newest first")

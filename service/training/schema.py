@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from lipserve.states import JobState, PromotionOption
+from service.foundation.fields import LONGEST
 from service.models.schema import VERSION, HeldOutQuality, Holdout, ModelName
 
 _DEFAULTS, _HOLDOUT = FitOptions(), Holdout()
@@ -61,6 +62,9 @@ class Options(BaseModel):
     )
 
 
+DatasetName = Annotated[str, Field(max_length=LONGEST)]
+
+
 class JobRequest(BaseModel):
     """What to train on what."""
 
@@ -71,7 +75,7 @@ class JobRequest(BaseModel):
     )
 
     model: ModelName = Field(description="Name of the model; a new version of it is made")
-    datasets: list[Annotated[str, Field(max_length=40)]] = Field(min_length=1, description="Ids of data sets")
+    datasets: list[DatasetName] = Field(min_length=1, description="Ids or names of data sets")
     estimator: str = Field(
         DEFAULT_ESTIMATOR,
         max_length=40,
@@ -104,6 +108,14 @@ class JobRequest(BaseModel):
         description="Whether the version answers by itself: `ask`, if on what was held out its 95 % intervals hold "
         "90 % on every joint, as far as can be told, and it is not worse than the version that serves, else it waits "
         "under the alias `candidate`; `always`, in any case. The setting LIPSERVE_PROMOTION by default",
+    )
+
+
+class JobDraft(JobRequest):
+    """What somebody means to train on what, maybe on recordings that are not uploaded yet."""
+
+    datasets: list[DatasetName] = Field(
+        [], description="Those that are there already; without any, what depends on the data is not checked"
     )
 
 

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 DEADLINE = 600
-ROW = re.compile(r"(panda_joint[1-7]) +│ +([0-9.]+) │ ([0-9.e+-]+) │ +([0-9.]+) │ +([0-9.]+)%")
+ROW = re.compile(r"(panda_joint[1-7]) +│ +([0-9.]+) │ ([0-9.e+-]+) │ +([0-9.]+) │ +([0-9.]+) %")
 
 
 def demo(home, *options):

@@ -88,7 +88,7 @@ def test_a_joint_whose_torque_does_not_vary_has_no_nmse(api, trained):
 @pytest.mark.parametrize(
     ("robot", "convention", "words"),
     [
-        ("asr-twodof", "gravity_included", ("['joint1', 'joint2']", "['J1', 'J2']")),
+        ("asr-twodof", "gravity_included", ("joint1, joint2", "J1, J2")),
         ("double-pendulum", "gravity_compensated", ("gravity_compensated", "gravity_included")),
     ],
 )

@@ -232,7 +232,7 @@ def test_command_line_and_client(server, lipserve, tmp_path):  # noqa: F811 - th
     code, _, wrong = lipserve(*common, "--robot", tmp_path / "missing.urdf")
     assert (code, "missing.urdf" in wrong) == (1, True)
     code, _, wrong = lipserve(*common, "--base", "panda-sim")
-    assert (code, "base is panda-sim:1, expected a version with the joint_names of the data" in wrong) == (1, True), (
+    assert (code, "--base is panda-sim:1, expected a version with the joint_names of the data" in wrong) == (1, True), (
         wrong
     )
     with Client(server.url) as client:

@@ -17,7 +17,7 @@ MEDIA_TYPES = {
     "application/x-mcap": "mcap",
     "application/zip": "zip",
 }
-"""Kind of a file by its media type. A zip is a directory: of LeRobot, or of a rosbag2."""
+"""Kind of a file by its media type. A zip is a directory of LeRobot or of a rosbag2, or tables of text to be joined."""
 SUFFIXES = {
     ".csv": "csv",
     ".tsv": "csv",
@@ -43,7 +43,8 @@ class Reading(TypedDict, total=False):
     """What a client may say of an upload; what is left out is found out, or takes the route's default.
 
     joint_names, joints, drop_joints: names; torque_constants: N·m/A; torque_factors: of the torques; columns: for t,
-    episode, q, dq, ddq, tau a pattern with `{joint}` or a list of names; units: of these by name; cutoff, rate: Hz;
+    episode, q, dq, ddq, tau a pattern with `{joint}` or a list of names; units: of these by name; column_names:
+    of text that has none; dt: s from row to row, where there are no times; cutoff, rate: Hz;
     gap: usual steps of time; trim: s. The others are as in the route's documentation.
     """
 
@@ -59,6 +60,8 @@ class Reading(TypedDict, total=False):
     units: Mapping[str, str]
     topic: str
     delimiter: str
+    column_names: Sequence[str]
+    dt: float
     cutoff: float
     filtering: str
     form: str

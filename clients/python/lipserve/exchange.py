@@ -85,10 +85,11 @@ class StreamPayload(NamedTuple):
 class StreamAnswer:
     """Torque at one motion, N·m.
 
-    tau: (n,) mean; tau_std: (n,) standard deviation of the function, where asked for; late: whether the answer left
-    the service after its deadline; late_answers: how many of this connection have; seconds: from the arrival of the
-    frame in the service to the departure of the answer; scale: (n,) factor on the half width of intervals that hold
-    measurements, external: torque that is not explained, payload: what the arm carries, where asked for.
+    tau: (n,) mean; tau_std: (n,) standard deviation of the function, where asked for; late: whether `seconds` is
+    more than the deadline; late_answers: how many of this connection have been late, this one included; seconds: from
+    the arrival of the frame in the service to the departure of the answer; scale: (n,) factor on the half width of
+    intervals that hold measurements, external: torque that is not explained, payload: what the arm carries, where
+    asked for.
     """
 
     sequence: int

@@ -20,7 +20,7 @@ Answer, 32 + 8 n bytes, 8 n more with tau_std, 8 n with scale, 24 n + 16 with ex
 
     offset  type     field
     0       u32      sequence of the request
-    4       u16      flags: 1 = tau_std follows tau; 2 = late: left after its deadline; 4 = error; 8 = no sequence;
+    4       u16      flags: 1 = tau_std follows tau; 2 = late; 4 = error; 8 = no sequence;
                      16 = scale follows; 32 = external torque follows; 64 = payload follows, last
     6       u16      n; 0 in an error
     8       u32      version that answers
@@ -47,9 +47,11 @@ first answer of another version, the service sends one text message, a JSON obje
 
     {"layout": 1, "model", "version", "revision", "joint_names", "torque_convention", "noise_std", "max_position"}
 
-A frame arrives when the service has read its last byte, and an answer leaves when it is handed to the socket: what
-either waits in the network or in the sockets' buffers is not counted. An answer that had to wait for a client that
-does not read is counted as late in the header of the next.
+A frame arrives when the service has read its last byte, and an answer leaves when it is handed to the socket; seconds
+is the time between both. An answer is late where seconds is more than the deadline of its request: flag 2 says so, and
+late_answers counts the answers of the connection with flag 2. That is the service's clock. On the client's clock an
+answer is late where more than the deadline passes between sending the request and having the answer. The network and
+the sockets' buffers are in that, and what is late for the service is late for its client, too.
 
 External torque is no safety function. It is what the model does not explain: a touch, a payload, a fault of the sensor
 or of the model. tau must be finite then; nothing is learnt of it without flag 2.

@@ -99,6 +99,7 @@ class Calls:
     profile = One(calls.datasets.profile)
 
     train = One(calls.models.train)
+    check_training = One(calls.models.check_training)
     jobs = Listed(calls.models.jobs)
     job = One(calls.models.job)
     job_events = Followed(calls.models.job_events)

@@ -14,6 +14,7 @@ except ModuleNotFoundError as error:
 
 from lipserve.records.jobs import Job
 from lipserve.states import ACTIVE
+from lipserve.wording import percent
 
 if TYPE_CHECKING:  # which shows its progress with this
     from lipserve.sync import Client
@@ -50,7 +51,7 @@ def job_bar(console: Console | None = None) -> Iterator[Callable[[Job], None]]:
             bar.update(task, description=text, completed=at.fraction)
             if not console.is_terminal and (at.elapsed_s - printed >= PLAIN_EVERY or seen.state not in ACTIVE):
                 printed = at.elapsed_s
-                console.print(f"  {at.elapsed_s:5.1f} s  {at.fraction:4.0%}  {text}", highlight=False)
+                console.print(f"  {at.elapsed_s:5.1f} s  {percent(at.fraction):>5}  {text}", highlight=False)
 
         yield show
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,20 +29,27 @@ BLANK = " "
 """Stands for any run of blanks and tabs."""
 _NUMERIC = re.compile(rf"\s*(?:{NUMBER}|[+-]?(?:nan|inf(?:inity)?)|[+-]?\d+,\d+(?:[eE][+-]?\d+)?)\s*", re.IGNORECASE)
 _WORDS = {"tab": "\t", "\\t": "\t", "blank": BLANK, "space": BLANK, "comma": ",", "semicolon": ";"}
+HINT = "column_names=t,q1..q7,tau1..tau7"
 EXPECTED = "column names in the first line, separated by , ; | tabs or blanks"
 
 
 @dataclass(frozen=True)
 class Header:
-    """names: of the columns, as they stand there; delimiter: one character, BLANK for runs; lines: up to the rows."""
+    """names: of the columns, as they stand there; delimiter: one character, BLANK for runs; lines: up to the rows;
+    nameless: whether they do not stand there."""
 
     names: tuple[str, ...]
     delimiter: str
     lines: int
+    nameless: bool = False
 
 
-def read_header(path: Path, delimiter: str | None) -> Header:
-    """Find the header of a text file; raise InvalidDataError where there is none."""
+Naming = Callable[[int], tuple[str, ...]]
+"""Names of so many columns, of a file that has none; raises InvalidDataError where there are not as many."""
+
+
+def read_header(path: Path, delimiter: str | None, naming: Naming | None = None) -> Header:
+    """Find the header of a text file; raise InvalidDataError where there is none, and nobody names its columns."""
     lines = _first_lines(path)
     comment = None
     for index, line in enumerate(lines):
@@ -58,9 +65,11 @@ def read_header(path: Path, delimiter: str | None) -> Header:
     if (longest := max(map(len, lines[: index + 1]))) > MAX_HEADER:
         raise invalid_data("header", f"{longest} characters", f"at most {MAX_HEADER}")
     if index != comment and _all_numbers(lines[index], delimiter):
-        # as numpy.savetxt writes it: the names stand in the comment above the numbers
+        # as numpy.savetxt writes it: the names may stand in the comment above the numbers
+        if naming is not None and not _names_stand(lines[comment] if comment is not None else "", lines[index]):
+            return _nameless(lines, index, delimiter, naming)
         if comment is None:
-            raise invalid_data("header", _cut(lines[index]), f"{EXPECTED}, not numbers")
+            raise invalid_data("header", _cut(lines[index]), f"{EXPECTED}, not numbers; or {HINT} names them")
         index = comment
     header = lines[index].strip().lstrip("#%") if index == comment else lines[index].strip("\r\n")
     if "\0" in header:
@@ -70,7 +79,36 @@ def read_header(path: Path, delimiter: str | None) -> Header:
     names = tuple(name.strip() for name in cells(header, chosen))
     if len(names) < 2:
         raise invalid_data("header", _cut(header), EXPECTED)
+    widths = {len(cells(row, chosen)) for row in rows}
+    if len(rows) > 1 and len(widths) == 1 and widths != {len(names)}:  # else it is a row that is wrong
+        expected = f"{widths.pop()}, as each of the first {len(rows)} rows has so many values"
+        raise invalid_data("header", f"{len(names)} names", expected)
     return Header(names, chosen, index + 1)
+
+
+def _names_stand(comment: str, row: str) -> bool:
+    """Whether a comment holds as many names as the row below it has numbers."""
+    header = comment.strip().lstrip("#%")
+    return any(1 < len(cells(header, each)) == len(cells(row.strip(), each)) for each in (*DELIMITERS, BLANK))
+
+
+def _nameless(lines: list[str], index: int, delimiter: str | None, naming: Naming) -> Header:
+    """The header of a file without one, whose first row of numbers is that line."""
+    first = lines[index].strip("\r\n")
+    rows = [line for line in lines[index + 1 : index + 1 + SAMPLE_ROWS] if line.strip() and len(line) <= MAX_HEADER]
+    chosen = _delimiter(delimiter) if delimiter else _choose(first, rows)
+    return Header(naming(len(cells(first, chosen))), chosen, index, nameless=True)
+
+
+def _given(names: tuple[str, ...]) -> Naming:
+    """The names that a user gives."""
+
+    def naming(width: int) -> tuple[str, ...]:
+        if len(names) != width:
+            raise invalid_data("column_names", f"{len(names)} names", f"{width}, as the rows have so many values")
+        return names
+
+    return naming
 
 
 def cells(line: str, delimiter: str) -> list[str]:
@@ -121,7 +159,8 @@ def _choose(header: str, rows: list[str]) -> str:
         width = len(cells(header, candidate))
         fitting = sum(len(cells(row, candidate)) == width for row in rows)
         # blanks may stand beside any delimiter: they are the last resort
-        scores[candidate] = (width > 1 and (fitting > 0 or not rows), candidate != BLANK, fitting, width)
+        some = width > 1
+        scores[candidate] = (some and (fitting > 0 or not rows), some, candidate != BLANK, fitting, width)
     return max(scores, key=scores.__getitem__)
 
 
@@ -144,13 +183,21 @@ _NAMES = {";": "semicolons", "\t": "tabs", "|": "bars", BLANK: "blanks"}
 
 
 @contextmanager
-def open_csv(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
+def open_csv(path: Path, options: ReadOptions, settings: Settings, naming: Naming | None = None) -> Iterator[Table]:
     """Open a CSV file as a table; raise InvalidDataError naming row and column of what is wrong.
+
+    naming: names the columns of a file without names, by default `options.column_names`.
 
     Columns of text are left out, which is a fact of the table; an empty cell is a missing value; times as dates become
     seconds since the first.
     """
-    header = read_header(path, options.delimiter)
+    if naming is None and options.column_names is not None:
+        naming = _given(options.column_names)
+    header = read_header(path, options.delimiter, naming)
+    if options.column_names is not None and not header.nameless:
+        raise invalid_request(
+            "column_names", ", ".join(options.column_names), "none, as the first line of the file holds names"
+        )
     names = checked_names(header.names, settings)
     with path.open("rb") as file:
         for _ in range(header.lines):

@@ -17,9 +17,9 @@ from lipcore.data.samples import Array
 from service.datasets.formats.json import decode
 from service.datasets.formats.parquet import ParquetSource
 from service.datasets.formats.table import Table, checked_names, first_line
-from service.datasets.formats.zips import ERRORS, INFO, by_numbers, measure, open_zip, root_of
+from service.datasets.formats.zips import ERRORS, INFO, by_numbers, measure, open_zip, root_of, within
 from service.datasets.options import ReadOptions
-from service.foundation.errors import ServiceError, TooLargeError, invalid_data
+from service.foundation.errors import ServiceError, invalid_data
 from service.foundation.settings import Settings
 
 EXPECTED = "a zip of a LeRobot data set: meta/info.json and data/…parquet"
@@ -79,7 +79,7 @@ class _Files:
             try:
                 source = ParquetSource(file, self.settings, self._rename)
             except ServiceError as error:
-                raise _within(name, error) from None
+                raise within(name, error) from None
             yield source
 
     def blocks(self, columns: tuple[str, ...], clock: tuple[int, float] | None) -> Iterator[Array]:
@@ -92,7 +92,7 @@ class _Files:
                     for block in source.blocks():
                         yield block if clock is None else np.column_stack([block[:, clock[0]] * clock[1], block])
                 except ServiceError as error:
-                    raise _within(name, error) from None
+                    raise within(name, error) from None
 
     def _unpack(self, name: str, file: IO[bytes]) -> None:
         try:
@@ -149,10 +149,3 @@ def _clock(columns: tuple[str, ...], info: dict[str, Any], facts: list[str]) -> 
 def _text(info: dict[str, Any], key: str) -> str:
     value = info.get(key)
     return value[:50] if isinstance(value, str) and value.isprintable() else "unknown"
-
-
-def _within(name: str, error: ServiceError) -> ServiceError:
-    if isinstance(error, TooLargeError) or not error.detail:
-        return error
-    wrong = error.detail[0]
-    return invalid_data(f"{name}: {wrong.field}", wrong.value, wrong.expected)

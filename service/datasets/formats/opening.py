@@ -8,13 +8,18 @@ from importlib import import_module
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+
+from lipcore.data.samples import Array
 from lipcore.extras import need
+from service.datasets.formats.joined import tables_of
 from service.datasets.formats.json import decode, open_json, open_json_lines
 from service.datasets.formats.npz import open_npz
 from service.datasets.formats.table import Table
 from service.datasets.formats.zips import open_zip, root_of
+from service.datasets.mapping.recognition import clocks
 from service.datasets.options import ReadOptions
-from service.foundation.errors import ServiceError, invalid_data
+from service.foundation.errors import ServiceError, invalid_data, invalid_request
 from service.foundation.settings import Settings
 
 HEAD_BYTES = 64 * 1024
@@ -25,15 +30,18 @@ KINDS = {
     "json_lines": "JSON, one object a line",
     "json": "JSON",
     "lerobot": "a zip of a LeRobot data set",
+    "joined": "a zip of tables",
     "rosbag1": "a ROS 1 bag",
     "rosbag2": "a ROS 2 bag",
     "mcap": "MCAP",
 }
 """What is read here, in words."""
-ZIPPED = ("npz", "lerobot", "rosbag2")
+ZIPPED = ("npz", "lerobot", "joined", "rosbag2")
 ALIKE: tuple[set[str | None], ...] = ({"json", "json_lines"}, {"rosbag1", "rosbag2", "mcap"})
 """Kinds that are taken for one another so often that it is not worth telling."""
-_READABLE = "CSV, Parquet, NPZ, JSON, a bag of ROS 1 or 2, MCAP, or a zip of a LeRobot data set or a bag"
+_READABLE = (
+    "CSV, Parquet, NPZ, JSON, a bag of ROS 1 or 2, MCAP, or a zip of a LeRobot data set, a bag, or tables of text"
+)
 _MAGIC = (
     (b"PAR1", "parquet"),
     (b"SQLite format 3\0", "rosbag2"),
@@ -69,6 +77,7 @@ FURTHER = {
     "csv": ("service.datasets.formats.csv", "open_csv"),
     "parquet": ("service.datasets.formats.parquet", "open_parquet"),
     "lerobot": ("service.datasets.formats.lerobot", "open_lerobot"),
+    "joined": ("service.datasets.formats.joined", "open_joined"),
 }
 """Modules and names of openers that stand on Arrow; bags have one for all their kinds."""
 
@@ -109,6 +118,8 @@ def _zip(path: Path, settings: Settings) -> str | None:
         return "rosbag2"
     if any(name.endswith(".bag") for name in names):
         return "rosbag1"
+    if tables_of(names):
+        return "joined"
     return "npz" if names and all(name.endswith(".npy") for name in names) else None
 
 
@@ -151,9 +162,27 @@ def open_table(path: Path, kind: str | None, options: ReadOptions, settings: Set
         raise invalid_data("file", "empty", KINDS.get(kind or "", "a recording"))
     actual = _kind(path, kind, settings)
     with _open(path, actual, options, settings) as table:
+        if options.dt is not None:
+            _count_time(table, options.dt)
         if kind in KINDS and kind != actual and not any({kind, actual} <= family for family in ALIKE):
             table.facts.insert(0, f"sent as {KINDS[kind]}, but is {KINDS[actual]}: read as that")
         yield table
+
+
+def _count_time(table: Table, step: float) -> None:
+    """Give a table without times those of rows that are `step` s apart; raise InvalidRequestError where it has some."""
+    if times := clocks(table.names):
+        raise invalid_request("dt", f"{step:g}", f"none, as column {times[0].name} holds times")
+    blocks = table.blocks
+
+    def timed() -> Iterator[Array]:
+        row = 0
+        for block in blocks:
+            yield np.column_stack([step * np.arange(row, row + len(block)), block])
+            row += len(block)
+
+    table.names, table.blocks = ("t", *table.names), timed()
+    table.facts.append(f"times are counted in steps of {step:g} s, as the upload says")
 
 
 def _kind(path: Path, kind: str | None, settings: Settings) -> str:

@@ -15,7 +15,7 @@ from typing import IO, Any
 
 from lipcore.extras import need
 from service.datasets.formats.table import first_line
-from service.foundation.errors import TooLargeError, invalid_data
+from service.foundation.errors import ServiceError, TooLargeError, invalid_data
 from service.foundation.settings import Settings
 
 READ_BYTES = 16 * 1024 * 1024
@@ -72,6 +72,14 @@ def measure(members: list[zipfile.ZipInfo], settings: Settings) -> None:
     total = sum(member.file_size for member in members)
     if total > settings.max_unpacked_bytes:
         raise TooLargeError(f"the archive unpacks to {total} bytes, expected at most {settings.max_unpacked_bytes}")
+
+
+def within(member: str, error: ServiceError) -> ServiceError:
+    """An error of a member of an archive, which names it."""
+    if isinstance(error, TooLargeError) or not error.detail:
+        return error
+    wrong = error.detail[0]
+    return invalid_data(f"{member}: {wrong.field}", wrong.value, wrong.expected)
 
 
 def by_numbers(name: str) -> list[int]:

@@ -152,7 +152,7 @@ def epoch_unit(t: Array, rows: Rows, name: str) -> None:
 
 
 def _seconds(unit: str) -> str:
-    return f'seconds, or its unit: units={{"t": "{unit}"}} if it is {unit}, "s" if it is s'
+    return f'seconds, or its unit: units={{"t": "{unit}"}} if it is {unit}, units={{"t": "s"}} if it is s'
 
 
 def check_time_unit(t: Array, given: bool, name: str) -> None:

@@ -32,7 +32,9 @@ MEANINGS: dict[Effort, str] = {
     "current": "motor current, A",
 }
 
-BY_DEFAULT = "as nothing else is said"
+BY_DEFAULT, BY_NAME = "as nothing else is said", "as the columns are called"
+WARNING = "warning: "
+"""What a sentence begins with that belongs to the warnings of a report."""
 
 
 @dataclass(frozen=True)
@@ -74,13 +76,21 @@ def torque(
     options: UploadOptions,
     robot: Profile | None,
     constants: Sequence[float] | None,
+    commanded: str | None = None,
 ) -> Torque:
     """Say what the chosen columns are; raise InvalidDataError where that contradicts itself.
 
-    units: of the columns, as far as said; constants: of the robot's joints in the order of the columns.
+    units: of the columns, as far as said; constants: of the robot's joints in the order of the columns; commanded:
+    columns of commanded torque that could be read instead, where there are any.
     """
     effort, why = _effort(family, units, options, robot)
     notes = [f"{family.pattern} is taken as {MEANINGS[effort]}, {why}"]
+    if why == BY_NAME and effort == "commanded":
+        notes.append(
+            f"{WARNING}{family.pattern} is what was commanded, and no column was taken for measured torque, which is "
+            f"what a model should learn: name it with {columns_hint({'tau': '…{joint}…'})}, or say effort=commanded if "
+            "that is meant"
+        )
     if why == BY_DEFAULT and family.rank == CANONICAL:
         notes = []  # as documented
     wrong = next((unit for unit in units if unit is not None and is_current(unit) != (effort == "current")), None)
@@ -90,7 +100,7 @@ def torque(
         raise invalid_data(f"unit of {family.pattern}", wrong, "A or mA, as effort is current")
     given: tuple[float, ...] | None = None
     if effort == "current":
-        given = _constants(options, constants, len(units))
+        given = _constants(options, constants, len(units), commanded)
         notes.append(f"torque is current times {listed(given)} N·m/A of the joints")
     elif options.read.torque_constants is not None:
         raise invalid_request(
@@ -122,7 +132,7 @@ def _effort(
         return given, "as the upload says"
     by_name = named(family)
     if by_name != "measured":
-        return by_name, "as the columns are called"
+        return by_name, BY_NAME
     if any(is_current(unit) for unit in units):
         return "current", "by its unit"
     if robot is not None and robot.effort in EFFORT_CONVENTIONS:
@@ -138,7 +148,9 @@ def _effort(
     return "measured", BY_DEFAULT
 
 
-def _constants(options: UploadOptions, known: Sequence[float] | None, n: int) -> tuple[float, ...]:
+def _constants(
+    options: UploadOptions, known: Sequence[float] | None, n: int, commanded: str | None
+) -> tuple[float, ...]:
     given = options.read.torque_constants
     if given is not None:
         if len(given) != n:
@@ -147,10 +159,12 @@ def _constants(options: UploadOptions, known: Sequence[float] | None, n: int) ->
             raise invalid_request("torque_constants", list(given), "finite numbers of N·m/A, none of them 0")
         return given
     if known is None or not all(math.isfinite(value) for value in known):
+        instead = "" if commanded is None else f"; or {columns_hint({'tau': commanded})} to learn what was commanded"
         raise invalid_data(
             "torque_constants",
             "missing",
-            f"{n} numbers of N·m/A, one a joint, as effort is motor current; or effort=measured where it is torque",
+            f"{n} numbers of N·m/A, one a joint, as effort is motor current; or effort=measured where it is torque"
+            f"{instead}",
         )
     return tuple(float(value) for value in known)
 
@@ -196,6 +210,11 @@ class Families:
                     f"{columns_hint({quantity: others[0]})} reads that instead"
                 )
         return out
+
+    def commanded(self, joints: Sequence[Joint]) -> str | None:
+        """Columns of commanded torque, where there are any for these joints."""
+        rivals = (each for each in self.others if each.quantity == "tau" and named(each) == "commanded")
+        return next((each.pattern for each in rivals if covers(each, joints)), None)
 
     def _of(self, quantity: str, joints: Sequence[Joint]) -> Family | None:
         if (given := self.given.get(quantity)) is not None:

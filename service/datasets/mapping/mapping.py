@@ -69,7 +69,7 @@ def resolve(
     }
     tau = chosen["tau"]
     tau_units = [each.unit for each in quantities["tau"]]
-    meaning = torque(tau, tau_units, options, robot, order.constants)
+    meaning = torque(tau, tau_units, options, robot, order.constants, families.commanded(order.kept))
     for factors in (meaning.constants, meaning.factors):
         if factors is not None:
             quantities["tau"] = tuple(

@@ -68,7 +68,7 @@ QUANTITY_WORDS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(("ddq", "qdd", "qddot", "acc", "accel", "acceleration", "accelerations"), ("ddq", "acceleration")),
     **dict.fromkeys(("tau", "torque", "torques", "trq", "moment", "moments", "τ"), ("tau", "torque")),
     **dict.fromkeys(("effort", "efforts", "eff"), ("tau", "effort")),
-    **dict.fromkeys(("current", "currents", "cur", "iq"), ("tau", "current")),
+    **dict.fromkeys(("current", "currents", "cur", "iq", "i"), ("tau", "current")),
 }
 """Quantity by word, and what kind of word it is: an effort may be a torque or a current."""
 TWO_WORDS: dict[tuple[str, ...], tuple[str, str]] = {

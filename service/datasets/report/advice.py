@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from lipserve.wording import percent
 from service.datasets.report.excitation import SELDOM, SLOW
 from service.datasets.report.lag import SURE, clear
 from service.datasets.schema import Excitation, JointExcitation, JointLimits, JointNoise, JointSaturation, Lag, Timing
@@ -50,8 +51,8 @@ def warnings(
     out = []
     if timing.jitter_p99 is not None and timing.jitter_p99 > UNEVEN:
         out.append(
-            f"time stamps are uneven: 1 % of the steps are off by more than {timing.jitter_p99:.0%} of the usual one; "
-            "record the stamps of the robot's own clock, not those of receiving"
+            f"time stamps are uneven: 1 % of the steps are off by more than {percent(timing.jitter_p99)} of the usual "
+            "one; record the stamps of the robot's own clock, not those of receiving"
         )
     if timing.missing_rows > MISSING * rows:
         out.append(f"{timing.missing_rows} of {rows} rows lack a value and were left out")
@@ -60,8 +61,9 @@ def warnings(
         beyond = {joint: share for joint, share in shares.items() if share > BEYOND}
         if beyond:
             out.append(
-                f"{what} of {listed(beyond)} are beyond the robot's limits, in up to {max(beyond.values()):.1%} of the "
-                "samples: are the robot, the order of the joints and the units right?"
+                f"{what} of {listed(beyond)} are beyond the robot's limits, in up to "
+                f"{percent(max(beyond.values()), 1)} of the samples: are the robot, the order of the joints and the "
+                "units right?"
             )
     cut = [each.joint for each in saturation if each.flat > SATURATED]
     if cut:
@@ -87,7 +89,7 @@ def _late(lags: list[Lag]) -> list[str]:
             return [
                 f"torque and motion are not of the same time: torque comes {1e3 * abs(seconds):.1f} ms "
                 f"(± {1e3 * std:.1f}) {'after' if seconds > 0 else 'before'} motion, which turns up to "
-                f"{cost:.1%} of a joint's torque variance into error; use signals of one clock, filtered alike"
+                f"{percent(cost, 1)} of a joint's torque variance into error; use signals of one clock, filtered alike"
             ]
     odd = [each for each in others if each.improves]
     if ODD * len(odd) > known:
@@ -140,8 +142,8 @@ def advice(timing: Timing, excitation: Excitation, limits: list[JointLimits], no
         ),
         (
             [each.joint for each in moved if each.joint in slow],
-            f"slower than {LITTLE:.0%} of the limit of speed throughout; record faster motion, if that is what the "
-            "model is for",
+            f"slower than {percent(LITTLE)} of the limit of speed throughout; record faster motion, if that is what "
+            "the model is for",
         ),
         (
             [each.joint for each in moved if each.collinear > COLLINEAR],
@@ -159,8 +161,8 @@ def advice(timing: Timing, excitation: Excitation, limits: list[JointLimits], no
         )
     if loud := [each.joint for each in noise if (each.torque_share or 0.0) > LOUD]:
         out.append(
-            f"{listed(loud)}: noise is more than {LOUD:.0%} of the torque's spread; record larger or faster motion, "
-            "and longer"
+            f"{listed(loud)}: noise is more than {percent(LOUD)} of the torque's spread; record larger or faster "
+            "motion, and longer"
         )
     if smooth := [each.joint for each in noise if each.smoothed]:
         out.append(
@@ -169,8 +171,8 @@ def advice(timing: Timing, excitation: Excitation, limits: list[JointLimits], no
         )
     if (excitation.standstill or 0.0) > STANDING:
         out.append(
-            f"the robot stands still in {excitation.standstill:.0%} of the samples, which teach gravity and stiction "
-            "at few places only; record motion"
+            f"the robot stands still in {percent(excitation.standstill or 0.0)} of the samples, which teach gravity "
+            "and stiction at few places only; record motion"
         )
     dimensions = excitation.motion_dimensions
     if dimensions is not None and 0 < dimensions < TOGETHER * len(joints) and len(joints) - len(still) > 1:

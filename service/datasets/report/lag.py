@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from lipcore.data.samples import Array
+from lipserve.wording import percent
 from service.datasets.report.fit import EIGHTHS, Fit
 from service.datasets.report.signals import Rows
 from service.datasets.schema import Lag
@@ -96,7 +97,7 @@ class Lags:
     def _judge(self, name: str, curves: Array, cost: float, unexplained: float) -> Lag:
         """curves: squared residuals over the shifts, of all rows first, then without an eighth each, (9, S)."""
         if unexplained > UNEXPLAINED:
-            return _unknown(name, f"motion explains only {1 - unexplained:.0%} of the torque")
+            return _unknown(name, f"motion explains only {percent(1 - unexplained)} of the torque")
         if min(curves[0, 0], curves[0, -1]) < DISTINCT * curves[0].min():
             return _unknown(
                 name, "one shift of time explains the torque about as well as another: record faster motion"

@@ -14,6 +14,7 @@ from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
 from service.datasets import schema
+from service.datasets.mapping.choice import WARNING
 from service.datasets.report.advice import advice, in_words, warnings
 from service.datasets.report.bodies import Against, Bodies, Signals, compare
 from service.datasets.report.causes import Work, causes
@@ -43,8 +44,6 @@ from service.foundation.settings import Settings
 
 UNSEEN = 1e-3
 """Share of a torque's spread below which a factor of it would be one of rounding."""
-WARNING = "warning: "
-"""What a sentence of the reading begins with that belongs to the warnings."""
 
 
 def make_report(
@@ -68,7 +67,10 @@ def make_report(
     clock = look_at_clock(raw, recipe.gap_steps, prepared.repeated)
     recorded = _look_at_raw(raw, clock, limits)
     samples = _look_at_samples(prepared, limits, settings.max_report_rows)
-    rigid = _rigid_bodies(profile, limits, prepared, samples, gravity)
+    upload, signals = Upload(names, gravity, source), Signals(*samples.motion, samples.tau)
+    candidates, best = proposed(names, signals) if profile is None else ((), None)
+    known = profile if best is None else profiles.profile(best)
+    rigid = _rigid_bodies(known, limits_of(known, names), prepared, samples, gravity)
     excitation = _excitation(samples, rigid)
     constant = [
         f"tau{joint + 1} is constant: nothing can be learnt about this joint's torque"
@@ -81,9 +83,13 @@ def make_report(
         reading.append(f"the joints of robot {profile.name} are not those of the data: limits were not compared")
     if profile is not None and limits is not None and limits.by_order:
         reading.append(f"joints were taken for those of robot {profile.name} by their order")
-    if isinstance(rigid, str):
+    if isinstance(rigid, str) and profile is not None:
         reading.append(rigid)
-    against, remedies, candidates = _against_robot(profile, Upload(names, gravity, source), samples, excitation)
+    if isinstance(rigid, RigidExcitation) and profile is None:
+        reading.append(f"friction is judged beside the rigid bodies of {best}, as whose the joints are called")
+    against, remedies = _against_robot(known, upload, signals, samples, excitation)
+    proposal = suggestion(upload, candidates, best)
+    suggested = [] if proposal is None else [proposal]
     report = schema.DatasetReport(
         rows_uploaded=raw.rows,
         rows=prepared.staged.rows,
@@ -113,8 +119,8 @@ def make_report(
         noise=recorded.noise,
         excitation=excitation,
         against_robot=against,
-        remedies=remedies + candidates,
-        advice=[each.text for each in candidates] + advice(clock.timing, excitation, recorded.limits, recorded.noise),
+        remedies=remedies + suggested,
+        advice=[each.text for each in suggested] + advice(clock.timing, excitation, recorded.limits, recorded.noise),
     )
     return report.model_dump(mode="json")
 
@@ -255,19 +261,13 @@ def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> schem
 
 
 def _against_robot(
-    profile: Profile | None, upload: Upload, samples: _Samples, excitation: schema.Excitation
-) -> tuple[schema.AgainstRobot | None, list[schema.Remedy], list[schema.Remedy]]:
-    """Torque against the robot's, or that of the robot which the joints' names suggest; what is wrong; that robot."""
-    suggested, signals = [], Signals(*samples.motion, samples.tau)
-    if profile is None:
-        candidates, best = proposed(upload.names, signals)
-        if (proposal := suggestion(upload, candidates, best)) is not None:
-            suggested.append(proposal)
-        profile = None if best is None else profiles.profile(best)
-    bodies = None if profile is None else bodies_of(profile, upload.names)
+    robot: Profile | None, upload: Upload, signals: Signals, samples: _Samples, excitation: schema.Excitation
+) -> tuple[schema.AgainstRobot | None, list[schema.Remedy]]:
+    """Torque against that of the robot, given or suggested by the joints' names; and what is wrong."""
+    bodies = None if robot is None else bodies_of(robot, upload.names)
     against = None if bodies is None else compare(bodies, signals)
     wrong = causes(upload, bodies, against, signals, excitation.joints, samples.work)
-    return None if bodies is None or against is None else _figures(bodies, against), wrong, suggested
+    return None if bodies is None or against is None else _figures(bodies, against), wrong
 
 
 def _figures(bodies: Bodies, against: Against) -> schema.AgainstRobot:

@@ -193,7 +193,8 @@ class Stream(BaseModel):
 
 
 class Held(BaseModel):
-    """The robot seems to have changed: nothing is learnt until the owner has decided, or has chosen otherwise."""
+    """The robot seems to have changed, or a stream not to be of it (`evidence.kind` is `opening`): nothing is learnt
+    until the owner has decided, or has chosen otherwise."""
 
     at: float | None = Field(description="Event time of the change, Unix seconds")
     evidence: dict[str, Any]

@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
 from lipcore.online.holding import Watch
+from lipserve.wording import percent
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
 from service.journal.log import NewBatch
@@ -126,7 +127,9 @@ class Intake:
                 monitor.decided()
             usual = partial(monitor.usual, batch.received)
             since = None if watch is None or watch.held is None else watch.since
-            verdict = judging.judge(screened, monitor.watch(batch.stream_id), held, options, usual, since)
+            new = log.stream(session, model, batch.stream_id) is None
+            known = monitor.watch(batch.stream_id, new)
+            verdict = judging.judge(screened, known, held, options, usual, since, served.base.scale)
             if verdict.change is not None and options.on_change == "adapt":
                 log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
             adaptive = {}
@@ -144,6 +147,8 @@ class Intake:
             assert source is not None
             if source.offset == 0:
                 source.offset = batch.offset
+            if verdict.opened is not None and verdict.held:
+                _take_back(session, event)
             if verdict.change is not None:
                 _alarm(session, served, options, verdict, event)
             if watch is not None and handled and batch.received - monitor.told_payload >= PAYLOAD_ALARM_S:
@@ -167,7 +172,9 @@ class Intake:
                 "open": verdict.watch.gate.open,
                 "gate": verdict.watch.gate.to_json(),
                 "departure": None if verdict.watch.departure is None else verdict.watch.departure.to_json(),
+                "opening": None if verdict.watch.opening is None else verdict.watch.opening.to_json(),
                 "waited": held,
+                "doubted": verdict.held and (verdict.opened is not None or monitor.doubts(batch.stream_id)),
                 "until": screened.until,
                 **adaptive,
                 **({} if watch is None else {"payload": watch.to_json()}),
@@ -238,6 +245,19 @@ def _check_kept(session: Session, served: Served) -> None:
     raise ConflictError(f"version {served.version} of model {served.name!r} was deleted meanwhile: send it again")
 
 
+def _take_back(session: Session, event: EventRow) -> None:
+    """Unlearn what a stream has taught before the batch with which its opening was found not to fit."""
+    earlier = select(EventRow).where(
+        EventRow.model == event.model,
+        EventRow.stream_id == event.stream_id,
+        EventRow.kind == "batch",
+        EventRow.number < event.number,
+        EventRow.void.is_(False),
+    )
+    for each in session.scalars(earlier.order_by(EventRow.number)).all():
+        log.unlearn(session, event.model, each, event.received)
+
+
 def _alarm(session: Session, served: Served, options: LearningOptions, verdict: Verdict, event: EventRow) -> None:
     """Raise the alarm of a change, and hold learning where the owner is to decide about it."""
     change, names = verdict.change, served.model.joint_names
@@ -248,6 +268,12 @@ def _alarm(session: Session, served: Served, options: LearningOptions, verdict: 
     if verdict.departed is not None:
         found = f"has left what version {verdict.departed.version} was trained on, step by step ({evidence['cause']}):"
     message = f"the torque of {joints} {found} {CONSEQUENCES[options.on_change]}"
+    if verdict.opened is not None:
+        share = percent(verdict.opened.coverage.mean())
+        message = (
+            f"stream {event.stream_id} does not fit the model: {share} of its first second lies within the 95 % band; "
+            f"is it this robot, with the friction and the payload that were learnt? {CONSEQUENCES[options.on_change]}"
+        )
     owner.raise_alarm(session, served.name, "change", message, evidence)
     if options.on_change == "hold":
         owner.hold(session, served.name, {"at": change.at, "event": event.number, "evidence": evidence})

@@ -16,6 +16,7 @@ from lipcore.online.departure import Departure
 from lipcore.online.gates import Patience, is_contact
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
+from service.learning.ingest.opening import Opening
 from service.learning.ingest.screening import Screened, Trained
 from service.learning.schema import LearningOptions
 
@@ -106,12 +107,13 @@ class Innovations:
 @dataclass(frozen=True)
 class Watch:
     """State of judging after the rows before: the stream's gate, the model's detector, innovations and departure from
-    what it was trained on; immutable."""
+    what it was trained on, and the stream's opening, None where that has been judged; immutable."""
 
     gate: ContactGate
     detector: ChangeDetector
     innovations: Innovations
     departure: Departure | None = None
+    opening: Opening | None = None
 
 
 @dataclass(frozen=True)
@@ -121,8 +123,8 @@ class Verdict:
     surprise: mean of e²/s² of the same rows, (n,), with s less the floor of past errors, which would
     hide a change from the detector.
 
-    change: detected with these rows. held: whether these rows had to wait for a decision. departed: what shows the
-    change where that is the distance from the version as trained.
+    change: detected with these rows. held: whether these rows had to wait for a decision. departed, opened: what shows
+    the change where that is the distance from the version as trained, or how the stream began.
     """
 
     rows: Rows
@@ -132,12 +134,14 @@ class Verdict:
     change: Change | None
     held: bool
     departed: Departure | None = None
+    opened: Opening | None = None
 
     def evidence(self, joint_names: Sequence[str]) -> dict[str, Any]:
         """Evidence of the change, for JSON."""
         assert self.change is not None
         evidence = self.change.evidence(joint_names, self.watch.innovations.friction(self.change.at))
-        return evidence if self.departed is None else evidence | self.departed.evidence(joint_names)
+        shown = self.departed or self.opened
+        return evidence if shown is None else evidence | shown.evidence(joint_names)
 
 
 def judge(
@@ -147,10 +151,11 @@ def judge(
     options: LearningOptions,
     usual: Callable[[], Record],
     carried: float | None = None,
+    scale: Array | float = 1.0,
 ) -> Verdict:
     """Decide about the rows that were predicted. held: whether learning waits already; usual: the record of before;
     carried: event time, s, from which on the arm carries something, None where it does not: such rows teach what it
-    carries, and not the arm."""
+    carries, and not the arm; scale: of the version's intervals, (n,)."""
     rows = batch.rows.take(batch.predicted)
     if not len(rows):
         return Verdict(batch.rows, None, None, watch, None, held)
@@ -160,6 +165,10 @@ def judge(
     counted = np.ones(len(rows), np.bool_) if passing else ~contact
     detector, change, record, surprise = watch.detector, None, None, None
     departure, departed = watch.departure, None
+    opening, opened = watch.opening, None
+    if opening is not None and not held:
+        opening = _begun(opening, batch, rows, carried, scale)
+        opened, opening = (opening if opening.misfit else None), (None if opening.over else opening)
     if counted.any():
         error, bare = (rows.tau - batch.mean)[counted], batch.bare[counted]
         record = Record.of(rows.tau[counted], batch.mean[counted], batch.std[counted], batch.noise_std)
@@ -169,16 +178,19 @@ def judge(
             departure = _followed(departure, batch.trained, rows, counted, batch.noise_std)
     if held or watch.gate.open:
         change = None  # the consequence of a change that is known
+    elif opened is not None and opened.since is not None:
+        change = Change(opened.since, opened.joints, usual(), _everything(batch, rows), "sudden")
     elif change is None and gate.exhausted:
         change = _lasting(gate, _everything(batch, rows), usual(), rows)
     elif change is None and departure is not None and departure.joints:
         departed = departure
         change = Change(departure.began, departure.joints, usual(), _everything(batch, rows), "departure")
+    followed = change is not None and not (opened is not None and options.on_change == "learn")
     if change is not None and options.on_change == "hold":
         held = True
-    elif change is not None and departed is None:
+    elif followed and departed is None:
         gate = gate.stand_back()  # after a departure it does not, as what is learnt is followed too well
-    if departure is not None and change is not None and not held:
+    if departure is not None and followed and not held:
         departure = departure.decided()
     if not held and not gate.open:
         detector = detector.acknowledged()
@@ -188,8 +200,15 @@ def judge(
         learnt = np.where((learnt == LEARNT) & (rows.time >= carried), PAYLOAD, learnt)
     codes[batch.predicted] = CHANGE if held else learnt
     judged = replace(batch.rows, code=codes)
-    following = Watch(gate, detector, watch.innovations.then(rows, batch.mean), departure)
-    return Verdict(judged, record, surprise, following, change, held, departed)
+    following = Watch(gate, detector, watch.innovations.then(rows, batch.mean), departure, opening)
+    return Verdict(judged, record, surprise, following, change, held, departed, opened if change is not None else None)
+
+
+def _begun(opening: Opening, batch: Screened, rows: Rows, carried: float | None, scale: Array | float) -> Opening:
+    """A stream's opening after rows; those that carry what was noticed with them were predicted without it."""
+    own = np.full(len(rows), True) if carried is None or batch.trained is None else rows.time < carried
+    spread = scale * np.sqrt(batch.bare**2 + batch.noise_std**2)
+    return opening.step(rows.time[own], rows.weight[own], (rows.tau - batch.mean)[own], spread[own])
 
 
 def _everything(batch: Screened, rows: Rows) -> Record:

@@ -24,6 +24,7 @@ from service.foundation.settings import Settings
 from service.journal import log
 from service.learning import intervals
 from service.learning.ingest.judging import ContactGate, Innovations, Watch
+from service.learning.ingest.opening import Opening
 from service.learning.intervals import Held, Known
 from service.learning.payloads import Payloads
 from service.models.scales import Factor
@@ -109,6 +110,7 @@ class Monitor:
         self._patience, self._most_streams = settings.contact_patience_s, settings.max_observation_streams
         self._gates: OrderedDict[str, ContactGate] = OrderedDict()
         self._scales: dict[str, Known] = {}
+        self._openings: dict[str, Opening] = {}
         self._detector, self._innovations = ChangeDetector(), Innovations.empty(n)
         self._departure: Departure | None = None
         self.payloads = Payloads()
@@ -143,16 +145,22 @@ class Monitor:
             self.payloads.remember(event)
             self.number = event.number
 
-    def watch(self, stream_id: str) -> Watch:
-        """State of judging before the next rows of a stream."""
+    def watch(self, stream_id: str, new: bool = False) -> Watch:
+        """State of judging before the next rows of a stream. new: whether none of its rows is known."""
         gate = self._gates.get(stream_id) or ContactGate.start(self._patience)
-        return Watch(gate, self._detector, self._innovations, self._departure)
+        opening = Opening.start(len(self.joint_names)) if new else self._openings.get(stream_id)
+        return Watch(gate, self._detector, self._innovations, self._departure, opening)
 
     def scale(self, stream_id: str, version: int, own: Array) -> Adaptive:
         """The scale of a stream's intervals before its next rows, which a version predicts: another one begins anew,
         from its `own`, (n,)."""
         known = self._scales.get(stream_id)
         return Adaptive.start(own) if known is None or known.version != version else known.state
+
+    def doubts(self, stream_id: str) -> bool:
+        """Whether a stream did not fit from its first second on, and its owner had not decided at its last batch."""
+        known = self._scales.get(stream_id)
+        return known is not None and known.doubted
 
     def factors(self, version: int) -> dict[str, Factor]:
         """What the intervals of a version are wide by now, stream by stream."""
@@ -210,12 +218,16 @@ class Monitor:
                 gate = gate.stand_back() if waits else gate
             self._gates[event.stream_id] = gate
             self._gates.move_to_end(event.stream_id)
+            self._openings.pop(event.stream_id, None)
+            if (begun := report.get("opening")) is not None:
+                self._openings[event.stream_id] = Opening.from_json(begun)
             self._scales.pop(event.stream_id, None)
             if (scale := intervals.known(event)) is not None:
                 self._scales[event.stream_id] = scale
             if len(self._gates) > self._most_streams:
                 oldest = self._gates.popitem(last=False)[0]
                 self._scales.pop(oldest, None)
+                self._openings.pop(oldest, None)
                 self.payloads.forget(oldest)
         at = report.get("until", event.last)
         if at is None or not recent:

@@ -22,6 +22,7 @@ from lipcore.online.adaptive import scores
 from lipcore.online.batch import Rows
 from lipcore.online.gates import Limits, check_rows, time_span
 from lipcore.vocabulary import CODES, LEARNT
+from lipserve.wording import percent
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
 from service.journal import log
@@ -332,7 +333,9 @@ def _rate(t: Array) -> float:
     run = max(_runs(t, np.isfinite(t), step), key=len)
     if len(run) < 2 or 2 * np.count_nonzero(_even(steps, step)) < len(steps):
         spread = f"uneven, with steps from {steps.min():.3g} to {steps.max():.3g} s"
-        raise invalid_request("t", spread, f"steps that differ by at most {JITTER:.0%}, to derive ddq from dq with")
+        raise invalid_request(
+            "t", spread, f"steps that differ by at most {percent(JITTER)}, to derive ddq from dq with"
+        )
     rate = (len(run) - 1) / float(t[run[-1]] - t[run[0]])
     try:
         acceleration.window(rate * (1 - 1e-9))  # so that rounding leads to no other answer later

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from sqlalchemy import select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from lipcore.data.samples import Array
@@ -39,7 +39,8 @@ def floor(database: Database, model: str, version: int, through: int, n_joints: 
     """Function variance (N·m)², (n,), that a version's latest errors up to event `through` prove: its std is no lower.
 
     The batches are those of the last SECONDS before the newest one was received, and more until there are FEWEST_ROWS
-    rows. Like the learnt state, the floor is a function of the log up to that event, whatever was taken back since.
+    rows; a stream that did not fit from its first second on, and that nobody has confirmed, says nothing of this robot.
+    Like the learnt state, the floor is a function of the log up to that event, whatever was taken back since.
     """
     of_version = (EventRow.kind == "batch", EventRow.version == version)
     upto = (EventRow.model == model, EventRow.number <= through)
@@ -48,7 +49,9 @@ def floor(database: Database, model: str, version: int, through: int, n_joints: 
     newest: float | None = None
     with database.session() as session:
         counts = EventRow.void.is_(False) | EventRow.number.in_(_undone_later(session, model, through))
-        found = session.execute(query.where(counts).limit(MOST_EVENTS).execution_options(yield_per=READ_EVENTS))
+        fitting = func.coalesce(EventRow.report["doubted"].as_boolean(), False).is_(False)
+        latest = query.where(counts, fitting).limit(MOST_EVENTS)
+        found = session.execute(latest.execution_options(yield_per=READ_EVENTS))
         for received, record in found:
             if record is None:
                 continue

@@ -39,6 +39,7 @@ TABLE: dict[tuple[str, str], str] = {
     ("GET", "/v1/robots/{robot}"): READ,
     ("DELETE", "/v1/robots/{robot}"): TRAIN,
     ("POST", "/v1/jobs"): TRAIN,
+    ("POST", "/v1/jobs/check"): TRAIN,
     ("GET", "/v1/jobs"): READ,
     ("GET", "/v1/jobs/{job}"): READ,
     ("GET", "/v1/jobs/{job}/events"): READ,

@@ -109,7 +109,7 @@ PREDICTING = [
 TRAINING = [
     *wrong(JOBS, JOB, "model", "A", *ODD, None, 5),
     *wrong(JOBS, JOB, "datasets", [], "ds_0", [f"ds_{i}" for i in range(101)]),
-    *wrong(JOBS, JOB, "datasets", [5], ["d" * 41], [None], [HALF], named="datasets[0]"),
+    *wrong(JOBS, JOB, "datasets", [5], ["d" * 201], [None], [HALF], named="datasets[0]"),
     *missing(JOBS, JOB, "datasets", ["ds_0"], ["../x"], [""], named="dataset"),
     *wrong(JOBS, JOB, "estimator", None, "e" * 41),
     *wrong(JOBS, JOB, "joint_types", "revolute"),

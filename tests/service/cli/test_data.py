@@ -1,21 +1,31 @@
 """`lipserve data` and `simulate`: recordings made, brought in, reported on, and deleted."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from lipcore.data.samples import Samples
+from lipcore.profiles import profile
 from lipcore.robots.dirt import Dirt
+from lipcore.robots.library import ROBOTS
 from lipcore.robots.simulation import Payload
+from service.cli.simulate import write_recording
 from service.datasets.formats.opening import open_table
-from service.datasets.options import ReadOptions
+from service.datasets.mapping.mapping import resolve
+from service.datasets.options import ReadOptions, UploadOptions
 from service.foundation.settings import Settings
 from tests.service.data import arrays, stream
 
 
 def read(path):
-    """A written recording as it was uploaded: columns by canonical name."""
+    """A written recording as it was uploaded: columns by their names."""
     with open_table(path, None, ReadOptions(), Settings()) as table:
         rows = np.concatenate(list(table.blocks))
         return table, dict(zip(table.names, rows.T, strict=True))
+
+
+WORDS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque"}
 
 
 @pytest.mark.parametrize("ending", ["csv", "npz"])
@@ -26,7 +36,8 @@ def test_simulated_streams_are_read_back_equal(lipserve, tmp_path, ending):
     assert "50 samples of joint1, joint2" in out
     table, seen = read(path)
     for name, values in arrays(stream(samples=50, seed=3, rate=20.0, speed=1.0)).items():
-        columns = [seen[name]] if values.ndim == 1 else [seen[f"{name}{joint}"] for joint in (1, 2)]
+        pattern = f"joint{{}}/{WORDS.get(name)}" if ending == "csv" else f"{name}{{}}"
+        columns = [seen[name]] if values.ndim == 1 else [seen[pattern.format(joint)] for joint in (1, 2)]
         np.testing.assert_array_equal(np.squeeze(np.column_stack(columns)), values)
     assert table.joint_names == (None if ending == "csv" else ("joint1", "joint2"))
 
@@ -45,6 +56,91 @@ def test_options_of_the_simulator_matter(lipserve, tmp_path):
     np.testing.assert_array_equal(np.column_stack([columns["tau1"], columns["tau2"]]), expected.tau)
 
 
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_simulated_recordings_carry_the_names_of_the_robots_joints(tmp_path, robot):
+    names, moved = ROBOTS[robot].free, np.linspace(0.0, 1.0, 3 * len(ROBOTS[robot].free)).reshape(3, -1)
+    path, times = tmp_path / "named.csv", np.arange(3.0)
+    write_recording(path, Samples(names, times, np.zeros(3, np.int64), moved, moved, moved, moved))
+    table, _ = read(path)
+    for known in (None, profile(robot)):
+        columns = resolve(table.names, table.units, table.joint_names, UploadOptions(), known, len(names))
+        assert (columns.joints, columns.unused, columns.torque.effort) == (names, (), "measured")
+
+
+def test_the_same_recording_is_the_same_data_set(asked, recording, tmp_path):
+    path = recording(75, "twice.csv")
+    first = asked("data", "add", path, "--json")
+    again = tmp_path / "elsewhere" / "twice.csv"
+    again.parent.mkdir()
+    again.write_bytes(path.read_bytes())
+    assert asked("data", "add", again, "--json")["id"] == first["id"]
+    assert asked("data", "add", path, "--cutoff", 3, "--filtering", "always", "--json")["id"] != first["id"]
+    assert asked("data", "add", path, "--name", "another", "--json")["id"] != first["id"]
+    asked("data", "delete", first["id"], "--yes")
+    assert asked("data", "add", path, "--json")["id"] != first["id"]  # what was deleted is stored anew
+
+
+def test_data_sets_are_known_by_their_names(asked, refused, arm, recording):
+    path = recording(76, "by-name.csv")
+    made = asked("data", "add", path, "--name", "by name", "--json")
+    assert asked("data", "show", "by name", "--json") == made
+    assert asked("evaluate", arm[0], "by name", "--json")["dataset"] == made["id"]
+    other = asked("data", "add", path, "--name", "by name", "--cutoff", 3, "--filtering", "always", "--json")
+    message = refused("data", "delete", "by name", "--yes")
+    assert f"expected the id of one of those that are called so: {other['id']}, {made['id']}" in message
+    asked("data", "delete", made["id"], "--yes")
+    assert asked("data", "delete", "by name", "--yes", "--json") == {"deleted": ["by name"]}
+    assert "no dataset 'by name'" in refused("evaluate", arm[0], "by name")
+
+
+def test_refusals_of_an_upload_speak_as_the_shell_does(refused, recording, tmp_path):
+    path = recording(77, "in-degrees.csv", samples=60)
+    samples = stream(seed=77, samples=60)
+    turned = replace(samples, q=np.degrees(samples.q) * 50)
+    write_recording(path, turned)
+    message = refused("data", "add", path)
+    assert "are these degrees? Then say --unit q=deg (invalid_data" in message
+    hint = refused("train", path, "--model", "never").splitlines()[-1]
+    assert f"`lipserve data add {path}` takes options that say how to read it" in hint
+    write_recording(path, replace(samples, q=samples.q * [1.0, 0.0]))
+    assert "leave out locked joints, --drop joint2 (invalid_data" in refused("data", "add", path)
+
+
+@pytest.fixture
+def flat(tmp_path):
+    """Files of a recording without column names: positions.txt, velocities.txt, torques.txt; and its samples."""
+    samples = stream(seed=78, samples=60, rate=50.0)
+    for name, quantity in (("positions", "q"), ("velocities", "dq"), ("torques", "tau")):
+        np.savetxt(tmp_path / f"{name}.txt", getattr(samples, quantity))
+    return [tmp_path / f"{name}.txt" for name in ("positions", "velocities", "torques")], samples
+
+
+def test_files_that_belong_together_are_joined(asked, refused, flat):
+    files, samples = flat
+    made = asked("data", "add", *files, "--join", "--dt", 0.02, "--filtering", "never", "--json")
+    assert (made["name"], made["report"]["rows_uploaded"]) == ("positions+velocities+torques", 60)
+    assert made["report"]["derived"] == ["ddq"]
+    assert made["report"]["ranges"]["tau"]["max"] == pytest.approx(samples.tau.max(0), rel=0.05)
+    options = ("--join", "--dt", 0.02, "--filtering", "never", "--json")
+    assert asked("data", "add", *files, *options)["id"] == made["id"]
+    message, hint = refused("data", "add", *files, "--dt", 0.02).splitlines()
+    assert "or --columns t,q1..q7,tau1..tau7 names them" in message
+    assert hint == "hint: --join takes files for one recording"
+    files[2].write_text("\n".join(files[2].read_text().splitlines()[:50]))
+    assert "torques.txt is 50 rows, expected 60, as positions.txt has" in refused("data", "add", *files, "--join")
+
+
+def test_tables_without_names_are_named_from_the_shell(asked, refused, tmp_path):
+    samples = stream(seed=79, samples=60, rate=50.0)
+    path, table = tmp_path / "bare.csv", np.column_stack([samples.t, samples.q, samples.dq, samples.ddq, samples.tau])
+    np.savetxt(path, table, delimiter=",")
+    made = asked("data", "add", path, "--columns", "t,q1..q2,dq1..dq2,ddq1..2,tau1,tau2", "--json")
+    assert made["report"]["rows"] == 60
+    assert made["report"]["ranges"]["q"]["max"] == pytest.approx(samples.q.max(0))
+    assert "--columns is 3 names, expected 9" in refused("data", "add", path, "--columns", "t,q1..q2")
+    assert "--columns is q5..q1, expected a range" in refused("data", "add", path, "--columns", "q5..q1")
+
+
 def test_an_upload_prints_its_report(asked, recording):
     path = recording(72, "two-joints.csv", samples=600, rate=100.0)
     options = ("--joint-names", "shoulder,elbow", "--filtering", "always", "--rate", 50)
@@ -55,7 +151,7 @@ def test_an_upload_prints_its_report(asked, recording):
 
 def test_what_is_added_is_listed_shown_and_deleted(asked, refused, recording):
     paths = [recording(84, name) for name in ("a.csv", "b.csv")]
-    options = ("--name", "monday", "--column", "q=q{joint}", "--unit", "t=s")
+    options = ("--name", "monday", "--column", "q={joint}/position", "--unit", "t=s")
     added = asked("data", "add", paths[0], *options, "--json")
     assert added["name"] == "monday"
     assert next(line for line in asked("data", "list").splitlines() if added["id"] in line).count("monday") == 1

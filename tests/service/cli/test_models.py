@@ -112,7 +112,7 @@ def test_how_an_estimator_was_chosen_is_printed(capsys):
         "6 stretches",
         "rigid-body (chosen)",
         "2.00e-02",
-        "90.0%",
+        "90.0 %",
         "0.25 ± 0.10",
         "it errs least",
         "these figures flatter",

@@ -2,14 +2,18 @@
 
 import json
 import signal
+from itertools import count
 
 import numpy as np
 import pytest
+import typer
 
 from lipserve import StreamClient
 from lipserve.exchange import StreamAnswer
 from service.cli.playing import Tally, recorded
-from tests.service.data import stream, train, upload
+from service.cli.simulate import app as simulating
+from service.cli.stream import app as streaming_app
+from tests.service.data import eventually, stream, train, upload
 
 
 def lines(text):
@@ -35,10 +39,80 @@ def test_a_simulated_robot_is_played_and_taught(lipserve, server):
     assert sum(each["rows"] for each in observed) == 60
 
 
+def test_a_simulated_stream_takes_what_a_simulated_recording_does():
+    """But for how many samples there are and where they go."""
+    commands = [typer.main.get_command(each) for each in (simulating, streaming_app)]
+    simulate, stream_ = ({each.name: each for each in command.params} for command in commands)
+    for name in simulate.keys() - {"robot", "output", "samples", "as_json"}:
+        assert stream_[name].opts == simulate[name].opts
+        assert stream_[name].help == simulate[name].help
+        assert name == "rate" or stream_[name].default == simulate[name].default
+
+
+@pytest.fixture
+def steady(server, arm):
+    """A model that learns with the defaults, and takes contacts for such beyond eight standard deviations."""
+    name = f"cli-steady-{next(NUMBERS)}"
+    train(server.client, name, arm[1], estimator="rigid-body")
+    return name
+
+
+NUMBERS = count()
+PLAYED = ("--simulate", "double-pendulum", "--seconds", 1.5, "--rate", 100)
+
+
+def test_a_stream_that_does_not_fit_is_said_so_and_not_learnt(lipserve, server, steady):
+    before = server.client.post(f"/v1/models/{steady}/predict", json=QUERY).json()["tau"]
+    off = (*PLAYED, "--viscous", 1, "--coulomb", 1, "--url", server.url, "--json")
+    code, out, err = lipserve("stream", steady, *off, "--learn", "--stream-id", "other-arm")
+    assert code == 1
+    assert "of the stream's first second lies within the 95 % band of " + steady in err
+    assert "nothing of it is learnt" in err
+    assert f"`lipserve learning decide {steady} ignore --replay`" in err
+    assert lines(out)[-1]["summary"]["learnt"]["kept_out"]["change"] > 0
+    alarm = json.loads(lipserve("alarms", steady, "--url", server.url, "--json")[1])[0]
+    assert "stream other-arm does not fit the model: " in alarm["message"]
+    assert "learning is held" in lipserve("learning", "show", steady, "--url", server.url)[1]
+    seen = eventually(lambda: settled(server, steady))
+    assert seen == pytest.approx(before, abs=1e-9)
+    code, out, err = lipserve("stream", steady, *off)
+    assert (code, "of the first second lies within the 95 % band of the model" in err) == (0, True)
+    code, out, err = lipserve("learning", "decide", steady, "ignore", "--replay", "--url", server.url)
+    assert (code, "learns again" in out) == (0, True)
+    assert "learning goes on" in lipserve("learning", "show", steady, "--url", server.url)[1]
+    assert "expected adapt or ignore" in lipserve("learning", "decide", steady, "go", "--url", server.url)[2]
+
+
+def settled(server, model):
+    """What a model answers to QUERY once it contains its log."""
+    status = server.client.get(f"/v1/models/{model}/learning").json()["status"]
+    answer = server.client.post(f"/v1/models/{model}/predict", json=QUERY).json()
+    return answer["tau"] if answer["revision"] >= status["revision"] else None
+
+
+QUERY = {"q": [0.3, -0.4], "dq": [0.5, 0.2], "ddq": [0.1, -0.3]}
+
+
+def test_a_stream_that_does_not_fit_is_learnt_where_that_is_confirmed(lipserve, server, steady):
+    off = (*PLAYED, "--viscous", 1, "--coulomb", 1, "--url", server.url, "--json")
+    code, _, err = lipserve("stream", steady, *off, "--learn", "--yes-learn")
+    assert code == 0, err
+    assert "it is learnt all the same, as --yes-learn says" in err
+    assert json.loads(lipserve("learning", "show", steady, "--url", server.url, "--json")[1])["status"]["held"] is None
+
+
+def test_a_stream_that_fits_is_learnt_and_nothing_is_said(lipserve, server, steady):
+    code, out, err = lipserve("stream", steady, *PLAYED, "--url", server.url, "--json", "--learn")
+    assert (code, "band" in err) == (0, False)
+    assert lines(out)[-1]["summary"]["learnt"]["accepted"] > 0
+    assert lipserve("alarms", steady, "--url", server.url)[1] == f"no alarm of {steady}\n"
+
+
 def test_a_recording_is_played(asked, refused, arm, recording):
     path = recording(85, "motion.csv", samples=20, rate=40.0)
     text = asked("stream", arm[0], path)
     assert "in all  20 rows; round trip p50 " in text
+    assert " late, " in text
     assert "in the 95 % band" in text
     mismatch = "the motion has 2 joints (joint1, joint2), expected the model's 7"
     assert mismatch in refused("stream", "panda-sim", path)
@@ -82,17 +156,20 @@ def test_figures_are_those_of_all_rows():
         part = Tally(noise)
         for row in range(first, 25 if first == 0 else 40):
             answer = StreamAnswer(row, mean[row], std[row], 1, 0, row % 10 == 0, 0, 0.0)
-            part.add(answer, tau[row], seconds=row / 1e3, behind_s=row / 1e2)
+            part.add(answer, tau[row], seconds=row / 1e3, behind_s=row / 1e2, deadline=0.0295)
         tally.merge(part)
     figures, error = tally.figures(), tau - mean
     inside = np.abs(error) <= 1.959963984540054 * np.hypot(std, noise)
     assert (figures["rows"], figures["late"], figures["behind_s"]) == (40, 4, 0.39)
+    assert figures["received_late"] == 10
     assert figures["rmse"] == pytest.approx(np.sqrt((error**2).mean()))
     assert figures["coverage"] == pytest.approx(inside.mean())
     assert figures["round_trip_ms"]["p50"] == pytest.approx(19.5)
     for at, joint in enumerate(tally.joints(("a", "b"))):
         assert joint["nmse"] == pytest.approx((error[:, at] ** 2).mean() / tau[:, at].var())
         assert joint["coverage"] == pytest.approx(inside[:, at].mean())
+    own = tally.opening(1.0)
+    assert (own.rows, own.coverage) == (10.0, pytest.approx(inside.mean(axis=0)))
     assert Tally(noise).figures()["rmse"] is None
     assert Tally(noise).joints(("a", "b")) == []
 

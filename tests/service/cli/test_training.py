@@ -1,13 +1,16 @@
 """From a recording to a torque: `lipserve train`, `jobs`, `evaluate` and `predict`."""
 
 import json
+import threading
 from contextlib import contextmanager
 
 import pytest
 
-from lipserve import Client
+from lipserve import ApiError, Client, ServiceUnreachableError
+from service.cli import connecting
 from tests.service.cli.conftest import QUICKLY, options_of_train
-from tests.service.data import ENDLESS, ended, queue, stream, upload
+from tests.service.data import ENDLESS, columns, csv, ended, eventually, queue, stream, upload
+from tests.service.server import Server, free_port
 
 ENDLESSLY = options_of_train(ENDLESS)
 
@@ -22,8 +25,8 @@ def test_from_a_recording_to_figures_on_what_was_held_out_and_a_torque(asked, se
     assert f"on {held['samples']} samples held out" in text
     assert f"{held['nmse'][1]:.2e}" in text
     assert (
-        f"{held['coverage_low'][0]:.0%} to {held['coverage_high'][0]:.0%}, by {held['independent'][0]:.0f} errors"
-        in text
+        f"{100 * held['coverage_low'][0]:.0f} % to {100 * held['coverage_high'][0]:.0f} %, by "
+        f"{held['independent'][0]:.0f} errors" in text
     )
     assert "it answers by itself: its 95 % intervals hold 90 % of what was held out" in text
 
@@ -78,7 +81,69 @@ def test_refusals_of_the_service_are_passed_on(refused, recording, tmp_path):
     bad = tmp_path / "bad.csv"
     bad.write_text("t,q1,speed1\n0,0,0\n")
     assert "column tau1 is missing" in refused("train", bad, "--model", "m")
-    assert "holdout.kind" in refused("train", recording(12), "--model", "m", "--hold-out-by", "rows")
+    assert "--hold-out-by is rows" in refused("train", recording(12), "--model", "m", "--hold-out-by", "rows")
+
+
+WRONG = {
+    "--estimator is nope": ("--estimator", "nope"),
+    "--hold-out is 3.0": ("--hold-out", 3),
+    "--robot is pandda": ("--robot", "pandda"),
+    "--robot is 'no.urdf'": ("--robot", "no.urdf"),
+    "--robot is panda, expected none": ("--robot", "panda", "--estimator", "lip"),
+    "--option starts is 0": ("--option", "starts=0"),
+    "--promotion is never": ("--promotion", "never"),
+    "no model 'nobody'": ("--base", "nobody"),
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_nothing_is_uploaded_for_a_job_that_is_refused(refused, server, recording, message):
+    before = server.client.get("/v1/datasets", params={"limit": 1}).json()["items"]
+    assert message in refused("train", recording(13), "--model", "never", *WRONG[message])
+    assert server.client.get("/v1/datasets", params={"limit": 1}).json()["items"] == before
+
+
+def test_nothing_is_uploaded_where_another_argument_is_no_data_set(refused, server, recording):
+    before = server.client.get("/v1/datasets", params={"limit": 1}).json()["items"]
+    assert "no dataset 'gone.csv'" in refused("train", recording(13), "gone.csv", "--model", "never")
+    assert "--model is Never!" in refused("train", recording(13), "--model", "Never!")
+    assert server.client.get("/v1/datasets", params={"limit": 1}).json()["items"] == before
+
+
+def test_a_draft_of_a_job_is_checked_and_not_queued(server):
+    dataset = upload(server.client, stream())["id"]
+    before = server.client.get("/v1/jobs", params={"limit": 1}).json()["items"]
+    for datasets in ([], [dataset]):
+        answer = server.client.post("/v1/jobs/check", json={"model": "draft", "datasets": datasets})
+        assert (answer.status_code, answer.content) == (204, b"")
+    held = {"model": "draft", "datasets": [dataset], "joint_types": ["revolute"]}
+    answer = server.client.post("/v1/jobs/check", json=held).json()["error"]
+    assert answer["detail"][0]["field"] == "joint_types"
+    assert server.client.get("/v1/jobs", params={"limit": 1}).json()["items"] == before
+
+
+def test_a_job_of_data_sets_by_name_remembers_their_ids(server):
+    made = upload(server.client, stream(seed=14), name="named for a job")["id"]
+    job = queue(server.client, "cli-by-name", "named for a job", estimator="se")
+    assert job["datasets"] == [made]
+    assert ended(server.client, job["id"])["state"] == "succeeded"
+
+
+def test_other_names_of_joints_come_with_the_remedy(asked, refused, tmp_path):
+    path, samples = tmp_path / "numbered.csv", stream("panda", 40, seed=15)
+    path.write_bytes(csv(columns(samples)))
+    message = refused("evaluate", "panda-sim", path)
+    assert "data set with the joints joint1, joint2" in message
+    assert "expected those of the model, panda_joint1, panda_joint2" in message
+    assert "if they are the same joints, upload the recording with --robot panda (invalid_request" in message
+    answer = asked("evaluate", "panda-sim", path, "--robot", "panda", "--json")
+    assert answer["joint_names"] == list(samples.joint_names)
+    assert "beside --robot, expected a recording" in refused(
+        "evaluate", "panda-sim", answer["dataset"], "--robot", "panda"
+    )
+    two = tmp_path / "two.csv"
+    two.write_bytes(csv(columns(stream(seed=16))))
+    assert "same joints" not in refused("evaluate", "panda-sim", two)
 
 
 @pytest.fixture
@@ -157,3 +222,85 @@ def test_without_options_the_service_holds_out_what_it_does_by_default_and_zero_
     assert job["quality"]["samples"] > 0
     job = asked("train", path, "--model", "by-default", *QUICKLY, "--hold-out", 0, "--json")
     assert (job["holdout"], job["quality"]) == (None, None)
+
+
+def test_the_id_of_a_job_is_told_before_its_end(lipserve, server, recording):
+    code, out, err = lipserve("train", recording(17), "--model", "cli-told", *QUICKLY, "--url", server.url)
+    assert code == 0, err
+    assert "cli-told version 1 is trained" in out
+    (job,) = [job["id"] for job in server.client.get("/v1/jobs").json()["items"] if job["model"] == "cli-told"]
+    told = f"{job} is queued: `lipserve jobs follow {job}` follows it, too"
+    assert err.index(told) < err.index("100 %")
+
+
+def test_a_service_that_goes_away_is_waited_for(lipserve, server, recording, monkeypatch):
+    wait, lost = Client.wait, iter([ServiceUnreachableError("gone"), ApiError(503, "not_ready", "starting", [])])
+
+    def away(client, *arguments):
+        if (error := next(lost, None)) is not None:
+            raise error
+        return wait(client, *arguments)
+
+    monkeypatch.setattr(Client, "wait", away)
+    monkeypatch.setattr(connecting, "PAUSE", 0.0)
+    code, out, err = lipserve("train", recording(18), "--model", "cli-away", *QUICKLY, "--url", server.url)
+    assert code == 0, err
+    assert "cli-away version 1 is trained" in out
+    assert "goes on when the service is back: waiting up to 300 s" in err
+    assert "the service is back" in err
+
+
+def test_a_service_that_stays_away_is_not_waited_for_longer_than_asked(lipserve, server, arm, monkeypatch):
+    job = server.client.get("/v1/jobs").json()["items"][0]["id"]
+
+    def away(client, *arguments):
+        raise ServiceUnreachableError("gone")
+
+    monkeypatch.setattr(Client, "wait", away)
+    code, _, err = lipserve("jobs", "follow", job, "--patience", 0, "--url", server.url)
+    assert code == 1
+    assert "error: the service has been away for 0 s" in err
+    assert f"`lipserve jobs follow {job}` once the service is back" in err
+
+
+def test_refusals_while_a_job_is_followed_are_passed_on(lipserve, server, arm, monkeypatch):
+    job = server.client.get("/v1/jobs").json()["items"][0]["id"]
+
+    def forbidden(client, *arguments):
+        raise ApiError(403, "forbidden", "this key may not", [])
+
+    monkeypatch.setattr(Client, "wait", forbidden)
+    code, _, err = lipserve("jobs", "follow", job, "--url", server.url)
+    assert (code, "error: this key may not (forbidden, 403)" in err) == (1, True)
+
+
+def test_training_is_followed_over_a_restart_of_the_service(lipserve, tmp_path, recording):
+    """The service is killed once the job runs, and starts again at its address."""
+    port = free_port()
+    first = Server(tmp_path / "home", port=port)
+    started = []
+
+    def restart():
+        job = eventually(lambda: next(iter(running(first.client)), None))
+        first.kill()
+        started.extend([job, Server(tmp_path / "home", port=port)])
+
+    path = recording(19, robot="panda", samples=100)
+    options = options_of_train({**ENDLESS, "max_iterations": 60})
+    restarting = threading.Thread(target=restart)
+    restarting.start()
+    try:
+        code, out, err = lipserve("train", path, "--model", "cli-over", *options, "--url", first.url)
+    finally:
+        restarting.join()
+    job, second = started
+    with first, second:
+        assert code == 0, err
+        assert f"{job} is queued" in err
+        assert "cli-over version 1 is trained" in out
+        assert second.client.get(f"/v1/jobs/{job}").json()["attempts"] == 2
+
+
+def running(client):
+    """Ids of the jobs that run."""
+    return [job["id"] for job in client.get("/v1/jobs").json()["items"] if job["state"] == "running"]

@@ -40,7 +40,7 @@ def test_waiting_shows_how_far_a_job_is_also_where_there_is_no_terminal(local, p
     assert "100 %" in shown.getvalue()
     plain = console(False)
     assert follow(local, jobs[1], plain).state == "succeeded"
-    assert "100%" in plain.file.getvalue().splitlines()[-1]
+    assert "100 %" in plain.file.getvalue().splitlines()[-1]
 
 
 def test_ctrl_c_cancels(api, local, monkeypatch):

@@ -58,9 +58,9 @@ def test_an_evaluation_is_a_table():
     found = read_evaluation(answer(EVALUATION))
     assert str(found).splitlines() == [
         "m<b> version 2 on 50 samples of ds_1, which it was trained on: these figures flatter",
-        "joint      nMSE  RMSE N·m  coverage of 95%  at least  at most  independent errors  width N·m  NLPD nats",
-        "a      1.23e-02    0.5000            94.0%       60%     100%                  12      2.000     -1.500",
-        "b             -    0.2500           100.0%       63%     100%                   8      1.000      0.125",
+        "joint      nMSE  RMSE N·m  coverage of 95 %  at least  at most  independent errors  width N·m  NLPD nats",
+        "a      1.23e-02    0.5000            94.0 %      60 %    100 %                  12      2.000     -1.500",
+        "b             -    0.2500           100.0 %      63 %    100 %                   8      1.000      0.125",
         "careful: 97 % repeat: <flatters>",
     ]
     html = found._repr_html_()

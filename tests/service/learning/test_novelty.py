@@ -95,7 +95,7 @@ def test_novel_motion_is_told_and_a_candidate_trained_on_data_and_log(story):
     [alarm] = [each for each in story.alarms if each["kind"] == "novelty"]
     assert alarm["evidence"]["novel_share"] > alarm["evidence"]["threshold"] == 0.2
     assert alarm["evidence"]["version"] == 1
-    assert f"{alarm['evidence']['novel_share']:.0%} of the last 400 samples" in alarm["message"]
+    assert f"{100 * alarm['evidence']['novel_share']:.0f} % of the last 400 samples" in alarm["message"]
     refresh = story.job["refresh"]
     assert (story.job["state"], story.job["version"], refresh["version"]) == ("succeeded", 2, 1)
     assert refresh["trigger"] == "novelty"

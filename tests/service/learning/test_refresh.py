@@ -178,7 +178,7 @@ def test_much_novel_motion_leads_to_one_refresh_and_one_alarm(ready):
     assert job.refresh.model_dump() == {"version": 1, "through": log_end(*ready), "trigger": "novelty"}
     [(kind, message)] = alarms(ready[1])
     assert kind == "novelty"
-    assert "50% of the last 2000 samples" in message
+    assert "50 % of the last 2000 samples" in message
     assert consider(*ready) is None
     assert len(alarms(ready[1])) == 1
 
@@ -200,7 +200,7 @@ def test_an_arm_that_has_left_its_linearisation_is_refreshed(ready):
     assert job.refresh.trigger == "linearisation"
     [alarm] = ready[1].get("alarms")["items"]
     assert alarm["kind"] == "linearisation"
-    assert "80% of the stated error" in alarm["message"]
+    assert "80 % of the stated error" in alarm["message"]
     assert alarm["evidence"]["linearisation_error"] == [0.1, 0.8]
     assert alarm["evidence"]["job"] == job.id
 

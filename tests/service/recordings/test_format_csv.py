@@ -48,6 +48,21 @@ def test_one_table_in_many_dialects(tmp_path, body):
     np.testing.assert_array_equal(np.column_stack(list(result.columns.values())), ROWS)
 
 
+@pytest.mark.parametrize("sep", [",", ";", "\t"])
+def test_a_header_of_another_width_than_all_rows_is_what_is_wrong(tmp_path, sep):
+    names = ["t", *(f"{quantity}{joint}" for quantity in ("q", "dq", "ddq", "tau") for joint in range(1, 8)), "odd"]
+    rows = [[0.5 * column + row for column in range(29)] for row in range(60)]
+    said = refused(tmp_path, text(rows, names, sep).encode(), "csv", error=InvalidDataError)
+    assert said == ("header", "30 names", "29, as each of the first 50 rows has so many values")
+
+
+def test_a_row_of_another_width_than_the_others_is_what_is_wrong(tmp_path):
+    rows = [[*row] for row in ROWS * 4]
+    rows[5] = rows[5][:-1]
+    said = refused(tmp_path, text(rows).encode(), "csv", error=InvalidDataError)
+    assert said == ("row 6", "2 values", "3 values, as the header has columns")
+
+
 def test_dates_become_seconds_and_keep_nanoseconds(tmp_path):
     stamps = pd.to_datetime(1_700_000_000_000_000_000 + np.array([0, 1, 1_000_000_007]))
     frame = pd.DataFrame({"stamp": stamps, "q1": [1.0, 2.0, 3.0]})

@@ -50,6 +50,34 @@ def test_numbered_joints_are_found_in_order_whatever_their_base(patterns, of):
     assert all(each.factor == 1.0 for row in result.quantities.values() for each in row)
 
 
+def test_currents_beside_desired_torque_are_asked_about():
+    """Neither is a measured torque: nobody may take one for it without a word."""
+    names = numbered("q#", "i#", "tau_des#")
+    with pytest.raises(InvalidDataError) as asked:
+        mapped(names)
+    assert "torque_constants is missing, expected 3 numbers of N·m/A" in str(asked.value)
+    assert 'or columns={"tau": "tau_des{joint}"} to learn what was commanded' in str(asked.value)
+    result = mapped(names, options(torque_constants=(0.1, 0.2, 0.3)))
+    assert read_as(result)["tau"] == ["i1", "i2", "i3"]
+    chosen = mapped(names, options(columns={"tau": "tau_des{joint}"}))
+    assert read_as(chosen)["tau"] == ["tau_des1", "tau_des2", "tau_des3"]
+
+
+def test_desired_torque_alone_is_taken_with_a_warning():
+    result = mapped(numbered("q#", "tau_des#"))
+    (warned,) = [note for note in result.notes if note.startswith("warning: ")]
+    assert "tau_des{joint} is what was commanded, and no column was taken for measured torque" in warned
+    assert result.torque.effort == "commanded"
+    meant = mapped(numbered("q#", "tau_des#"), options(effort="commanded"))
+    assert not any(note.startswith("warning: ") for note in meant.notes)
+
+
+def test_measured_torque_is_preferred_to_desired_and_both_are_named():
+    result = mapped(numbered("q#", "tau_des#", "tau_meas#", "i#"))
+    assert read_as(result)["tau"] == ["tau_meas1", "tau_meas2", "tau_meas3"]
+    assert any("tau could also be tau_des{joint}, i{joint}" in note for note in result.notes)
+
+
 @pytest.mark.parametrize(
     "pattern",
     ["{}/position", "position_{}", "position[{}]", "observation.state.{}.pos"],

@@ -235,6 +235,26 @@ def test_names_and_torque_suggest_the_robot(
     assert report.warnings == []
 
 
+def test_friction_is_judged_beside_the_robot_that_names_suggest(tmp_path: Path) -> None:
+    """Without the robot's bodies, no such recording tells a constant torque from gravity."""
+    names, columns = tuple(f"fer_joint{joint}" for joint in range(1, 8)), recording("panda", *COURSES[0], False)
+    given, suggested, unknown = (tmp_path / name for name in ("given", "suggested", "unknown"))
+    for folder in (given, suggested, unknown):
+        folder.mkdir()
+    report = report_on(suggested, names, columns)
+    assert report.excitation.friction_beside == "rigid bodies"
+    with_robot = report_on(given, names, columns, profiles.profile("panda"))
+    for term in ("viscous", "coulomb", "offset"):
+        judged = [[getattr(each, term) for each in made.excitation.joints] for made in (report, with_robot)]
+        assert judged[0] == judged[1]
+    assert [each.coulomb.value for each in report.excitation.joints] == pytest.approx([0.3] * 7, abs=0.07)  # low-passed
+    assert "friction is judged beside the rigid bodies of panda, as whose the joints are called" in report.reading
+    assert not any("constant torque" in each for each in report.advice)
+    other = report_on(unknown, tuple(f"axis{joint}" for joint in range(1, 8)), columns)
+    assert other.excitation.friction_beside == "any motion"
+    assert any("constant torque" in each for each in other.advice)
+
+
 def test_the_robot_of_another_size_is_not_taken(tmp_path: Path) -> None:
     columns = recording("ur10", *COURSES[0], False, 30.0)
     report = report_on(tmp_path, tuple(f"{each}_joint" for each in UR), columns, profiles.profile("ur3"))

@@ -39,8 +39,44 @@ def train(
     start from, as `model:3` or `model@alias`; idempotency_key: the same request under the same key queues one job, also
     from another client.
     """
-    body: dict[str, Any] = {"model": model, "datasets": list(datasets), "options": dict(options or {})}
-    body |= given(
+    body = _asked(model, datasets, estimator, joint_types, options, robot, holdout, promotion, base)
+    return at(record(Job), names={}, json=body, headers={KEY_HEADER: idempotency_key or new_key()})
+
+
+@route("POST", "/v1/jobs/check")
+def check_training(
+    at: Route,
+    model: str,
+    datasets: Sequence[str] = (),
+    estimator: str | None = None,
+    joint_types: Sequence[str] | None = None,
+    options: Mapping[str, Any] | None = None,
+    robot: str | None = None,
+    holdout: Mapping[str, Any] | Literal[False] | None = None,
+    promotion: PromotionOption | None = None,
+    base: str | None = None,
+) -> Call[None]:
+    """Check what `train` would be asked, before its recordings are uploaded; raise ApiError where that is wrong.
+
+    datasets: those that are there already; without any, what depends on the data is not checked.
+    """
+    body = _asked(model, datasets, estimator, joint_types, options, robot, holdout, promotion, base)
+    return at(nothing, names={}, json=body)
+
+
+def _asked(
+    model: str,
+    datasets: Sequence[str],
+    estimator: str | None,
+    joint_types: Sequence[str] | None,
+    options: Mapping[str, Any] | None,
+    robot: str | None,
+    holdout: Mapping[str, Any] | Literal[False] | None,
+    promotion: PromotionOption | None,
+    base: str | None,
+) -> dict[str, Any]:
+    """The body of a request to train."""
+    body = {"model": model, "datasets": list(datasets), "options": dict(options or {})} | given(
         estimator=estimator,
         joint_types=None if joint_types is None else list(joint_types),
         robot=robot,
@@ -50,7 +86,7 @@ def train(
     )
     if holdout is False:
         body["holdout"] = None  # said: left out it is the service's default
-    return at(record(Job), names={}, json=body, headers={KEY_HEADER: idempotency_key or new_key()})
+    return body
 
 
 @route("GET", "/v1/jobs")

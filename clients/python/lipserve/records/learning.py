@@ -69,8 +69,9 @@ class LearningOptions(Record, frozen=True, kw_only=True):
     forgetting_s: Age in s at which a sample counts 1/e of a new one, in event time; null: nothing is forgotten
     friction_walk_s: Time in s over which friction may change by about 30 %, as that of an arm that warms up does: it is
         followed, and masses and geometry are not opened. 1800 suits most arms; null: friction stays as learnt
-    on_change: What follows a detected change of the robot. `hold`: nothing is learnt until its owner decides; `adapt`:
-        a new regime begins; `learn`: learning goes on as before
+    on_change: What follows a detected change of the robot, or a stream whose first second lies outside the 95 % band.
+        `hold`: nothing is learnt until its owner decides, nor of that second; `adapt`: a new regime begins; `learn`:
+        learning goes on as before
     torque_limits: Largest |tau| of each joint's actuator in N·m, to tell saturated samples; null: not known
     contact_threshold: Predictive standard deviations, noise included, beyond which a torque is taken for a contact
     adaptive_intervals: Widen and narrow intervals at once, so that 95 % of what streams measure lies inside: the
@@ -94,7 +95,8 @@ class LearningOptions(Record, frozen=True, kw_only=True):
 
 
 class Held(Record, frozen=True, kw_only=True):
-    """The robot seems to have changed: nothing is learnt until the owner has decided, or has chosen otherwise.
+    """The robot seems to have changed, or a stream not to be of it (`evidence.kind` is `opening`): nothing is learnt
+    until the owner has decided, or has chosen otherwise.
 
     at: Event time of the change, Unix seconds
     """

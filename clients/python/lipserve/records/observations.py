@@ -38,9 +38,9 @@ class ObservationResponse(Record, frozen=True, kw_only=True):
     duplicate: Whether the batch had come before: then this is what was said the first time
     state: What has become of the batch since
     rejected: Rows that are kept but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`,
-        `stationary`, `contact`, `change` (a changed robot whose owner has not decided), `payload` (the arm carries
-        something, of which the row teaches instead), `edge` (acceleration not derivable; where the stream goes on,
-        these are learnt with the next batch)
+        `stationary`, `contact`, `change` (a changed robot, or a stream that did not fit, and its owner has not
+        decided), `payload` (the arm carries something, of which the row teaches instead), `edge` (acceleration not
+        derivable; where the stream goes on, these are learnt with the next batch)
     gaps: Ranges [first, last] of sequences of the stream that have not come, the latest ones
     derived: What was derived because it was not sent
     held: Whether learning stands still until the model's owner has decided about a change

@@ -68,7 +68,7 @@ class Plain:
 
 def figure(value: float, form: str) -> str:
     """A number in a form, `-` where there is none."""
-    return "-" if np.isnan(value) else format(value, form)
+    return "-" if np.isnan(value) else format(value, form).replace("%", " %")
 
 
 def text_table(title: str, columns: Mapping[str, Sequence[str]]) -> str:

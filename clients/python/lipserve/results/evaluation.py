@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lipserve.results import Array, Plain, figure, html_table, reading, text_table
 from lipserve.states import Outcome
+from lipserve.wording import percent
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ class Evaluation(Plain):
         heads = {
             "nMSE": (self.nmse, ".2e"),
             "RMSE N·m": (self.rmse, ".4f"),
-            f"coverage of {self.level:.0%}": (self.coverage, ".1%"),
+            f"coverage of {percent(self.level)}": (self.coverage, ".1%"),
             "at least": (self.coverage_low, ".0%"),
             "at most": (self.coverage_high, ".0%"),
             "independent errors": (self.independent, ".0f"),
