@@ -43,6 +43,7 @@ from service.training import metrics as jobs_metrics
 from service.training import routes as training
 from service.training.queue import JobQueue, queue_of
 from service.web import openapi, storage_errors
+from service.web.access import audit, audit_routes
 from service.web.access.keys import Keyring
 from service.web.access.middleware import KeyAccess, LocalAccess
 from service.web.limits.requests import BodyLimit, Gate, RateLimit, Turns
@@ -83,6 +84,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             async with AsyncExitStack() as serving:
                 if keyring is not None:
                     await serving.enter_async_context(keyring.watching(storage.database))
+                await serving.enter_async_context(audit.cleaned(storage.database, settings))
                 if calls:
                     await serving.enter_async_context(_calls(app, settings, stopping))
                 yield
@@ -116,16 +118,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     storage_errors.install(app)
     _add_middleware(app, settings, keyring, meters, hot)
     openapi.install(app, settings.keys_needed)
-    app.include_router(readiness.router)
-    app.include_router(metrics.router)
-    app.include_router(datasets.router)
-    app.include_router(robots.router)
-    app.include_router(training.router)
-    app.include_router(models.router)
-    app.include_router(inference.router)
-    app.include_router(control.router)
-    app.include_router(live.router)
-    app.include_router(oip.router)
+    rooms = (readiness, metrics, audit_routes, datasets, robots, training, models, inference, control, live, oip)
+    for room in rooms:
+        app.include_router(room.router)
     app.include_router(stream.router())
     dashboard.install(app)
     guide.install(app)

@@ -94,6 +94,7 @@ class Commands(LazyGroup):
         "verify": Entry("service.cli.verify", "Read all that the home stores and report what is damaged.", RUN),
         "backup": Entry("service.cli.backup", "Copy the home into one file, also while it is used.", RUN, "backup_app"),
         "restore": Entry("service.cli.backup", "Make a home of a backup.", RUN, "restore_app"),
+        "audit": Entry("service.cli.audit", "List who changed what of which model.", RUN),
         "data": Entry("service.cli.data", "Recordings and their reports: add, list, show, delete.", DATA),
         "train": Entry("service.cli.jobs", "Train a model on recordings. Ctrl-C cancels the job.", MODELS, "train_app"),
         "jobs": Entry("service.cli.jobs", "Training jobs: list, show, follow, cancel, retry.", MODELS),

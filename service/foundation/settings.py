@@ -151,6 +151,10 @@ class Settings(BaseSettings):
     max_aliases: Count = Field(100, description="Most aliases of one model, `serving` aside.")
     max_alias_moves: Count = Field(20, description="Last moves of an alias that an answer lists.")
 
+    audit_retention_s: float = Field(
+        365 * 86400.0, gt=0, description="Age up to which the audit log of what changed models is kept, s."
+    )
+
     max_observation_rows: Count = Field(5000, description="Most samples of one observation batch.")
     max_observation_streams: Count = Field(1000, description="Most sources of observations of one model.")
     stream_flush_rows: Count = Field(100, description="Frames of a stream that are logged together, at most.")

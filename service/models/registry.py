@@ -29,6 +29,7 @@ from service.storage.database import (
     now,
 )
 from service.storage.files import Files, new_id
+from service.web.access import audit
 from service.web.rows import Page, newest
 
 logger = logging.getLogger(__name__)
@@ -78,6 +79,7 @@ def publish(
     if latest and session.get(ServingRow, model) is None:  # of a home from before there were candidates
         serve(session, model, latest)
     row.last_version = version = max(row.last_version, latest) + 1
+    audit.note(session, model, "version added", version, after={"estimator": manifest["estimator"], "job": job})
     session.add(
         VersionRow(
             model=model,
@@ -168,6 +170,7 @@ def note(
     session: Session, model: str, alias: str, before: int | None, version: int | None, takes_back: int | None = None
 ) -> None:
     """Write a move of an alias down. takes_back: number of the move that this one takes back."""
+    audit.note(session, model, "alias moved", version, alias, before, version)
     move = AliasMoveRow(model=model, alias=alias, before=before, version=version, takes_back=takes_back, at=now())
     session.add(move)
     session.flush()

@@ -30,6 +30,7 @@ from service.learning.control.payload_schema import (
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
 from service.models.served import Served
+from service.web.access import audit
 
 DRAWS = 500
 """Of a payload's parameters, for the spread of its inertia."""
@@ -101,6 +102,8 @@ def _say(learners: Learners, model: str, stream_id: str | None, known: dict[str,
     with learners.turn(model):
         with learners.database.transaction(model) as session:
             event = log.append(session, model, "payload", {"stream_id": stream_id, "body": known}, time.time())
+            declared = {"stream_id": stream_id, "body": known}
+            audit.note(session, model, "payload declared", served.version, after=declared)
         monitor.declared(event)
         served.loads.take(monitor.payloads.carried(served.carrier, served.version))
     learners.process.wake(model)
