@@ -70,7 +70,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     settings = settings or Settings()
     stopping, meters = Stopping(), Meters(settings.max_metric_models)
     calls = rpc.check_installed(settings)
-    keyring = Keyring(settings.keys_refresh_s) if settings.keys_needed else None
+    keyring = Keyring(settings.keys_refresh_s, settings.max_request_burst) if settings.keys_needed else None
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:

@@ -34,6 +34,13 @@ def create(
         list[str], typer.Option(help=f"What it may do: {', '.join(SCOPES)}; several separated by commas or repeated.")
     ],
     days: Annotated[float | None, typer.Option(help="Days after which it expires, never by default.")] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Most requests per s, in place of LIPSERVE_MAX_REQUESTS_PER_S; at once up to ten seconds' worth, and "
+            "LIPSERVE_MAX_REQUEST_BURST. A stream counts once."
+        ),
+    ] = None,
     file: Annotated[
         Path | None,
         typer.Option(help="File with a key to store, made elsewhere: lip_ and 43 or more letters. It is not printed."),
@@ -47,7 +54,7 @@ def create(
     with _database() as (database, settings):
         scopes = [part.strip() for given in scope for part in given.split(",")]
         given = None if file is None else file.read_text("utf-8").strip()
-        row, secret = keys.create(database, name, scopes, expires, given)
+        row, secret = keys.create(database, name, scopes, expires, given, rate)
     if as_json:
         print_json({**_document(row), **({"key": secret} if given is None else {})})
         return
@@ -67,11 +74,12 @@ def list_(as_json: Json = False) -> None:
     if as_json:
         print_json([_document(row) for row in rows])
         return
-    table = Table(Column("id", no_wrap=True), "name", "scopes", "state", "made", "expires", "last used")
+    table = Table(Column("id", no_wrap=True), "name", "scopes", "state", "per s", "made", "expires", "last used")
     for row in rows:
         document = _document(row)
         times = (_minute(document[field]) for field in ("created_at", "expires_at", "used_at"))
-        table.add_row(row.id, escape(row.name), ", ".join(row.scopes), document["state"], *times)
+        rate = "-" if row.max_requests_per_s is None else f"{row.max_requests_per_s:g}"
+        table.add_row(row.id, escape(row.name), ", ".join(row.scopes), document["state"], rate, *times)
     out.print(table)
 
 
@@ -97,7 +105,7 @@ def _database() -> Iterator[tuple[Database, Settings]]:
 
 
 def _document(row: ApiKeyRow) -> dict[str, Any]:
-    fields = ("id", "name", "scopes", "created_at", "expires_at", "revoked_at", "used_at")
+    fields = ("id", "name", "scopes", "created_at", "expires_at", "revoked_at", "used_at", "max_requests_per_s")
     return {**{field: getattr(row, field) for field in fields}, "state": keys.state_of(row, time.time())}
 
 

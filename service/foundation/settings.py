@@ -132,7 +132,10 @@ class Settings(BaseSettings):
     )
     max_requests: Count = Field(256, description="Most requests that are answered at a time; more are answered 429.")
     max_requests_per_s: float | None = Field(
-        None, gt=0, description="Most requests per s of one key, or address without keys; not limited by default."
+        None,
+        gt=0,
+        description="Most requests per s of one key that has no rate of its own, or address without keys; not "
+        "limited by default.",
     )
     max_request_burst: Count = Field(1000, description="Requests that a client may send at once where that is limited.")
     header_s: float = Field(10.0, gt=0, description="Longest time in s that a request's line and headers may take.")
