@@ -29,7 +29,7 @@ from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
 from service.learning.live import routes as live
 from service.learning.refresh import attach
-from service.models import registry
+from service.models import registry, signing
 from service.models import routes as models
 from service.models.loaded import LoadedModels
 from service.oip import routes as oip
@@ -70,6 +70,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     settings = settings or Settings()
     stopping, meters = Stopping(), Meters(settings.max_metric_models)
     calls = rpc.check_installed(settings)
+    signing.check_installed(settings)
     keyring = Keyring(settings.keys_refresh_s, settings.max_request_burst) if settings.keys_needed else None
 
     @asynccontextmanager

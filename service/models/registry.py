@@ -79,7 +79,7 @@ def publish(
     if latest and session.get(ServingRow, model) is None:  # of a home from before there were candidates
         serve(session, model, latest)
     row.last_version = version = max(row.last_version, latest) + 1
-    audit.note(session, model, "version added", version, after={"estimator": manifest["estimator"], "job": job})
+    audit.note(session, model, "version added", version, after=_origin(manifest, job))
     session.add(
         VersionRow(
             model=model,
@@ -97,6 +97,13 @@ def publish(
     if not candidate or not latest:
         serve(session, model, version)
     return version
+
+
+def _origin(manifest: dict[str, Any], job: str | None) -> dict[str, Any]:
+    """What the audit log says of a new version: of an imported one also where it comes from, and who has signed it."""
+    imported = manifest["lineage"].get("imported", []) if job is None else []
+    told = {name: imported[-1].get(name) for name in ("model", "version", "signed_by")} if imported else {}
+    return {"estimator": manifest["estimator"], "job": job, **({"imported": told} if told else {})}
 
 
 def _row(session: Session, model: str) -> ModelRow:
