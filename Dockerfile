@@ -10,7 +10,7 @@ COPY lipcore lipcore
 COPY service service
 COPY docs docs
 COPY models/panda-sim models/panda-sim
-RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check ./clients/python '.[cluster,grpc]' \
+RUN /opt/lipserve/bin/python -m pip install --no-cache-dir --disable-pip-version-check ./clients/python '.[cluster,grpc,signing]' \
     && /opt/lipserve/bin/python -m pip uninstall --yes --quiet setuptools pip \
     && site=$(echo /opt/lipserve/lib/python3*/site-packages) \
     && rm -rf "$site"/torch/include "$site"/torch/share "$site"/torch/test \
