@@ -29,13 +29,15 @@ def audit(
     model: Annotated[str | None, typer.Option(help="Only this model.", autocompletion=connecting.models)] = None,
     key: Annotated[str | None, typer.Option(help="Only changes by the API key of this id.")] = None,
     change: Annotated[str | None, typer.Option(help="Only one kind of change, as `alias moved`.")] = None,
+    since: Annotated[str | None, typer.Option(help="Only from this moment on, as 2026-11-24T08:00:00Z.")] = None,
+    until: Annotated[str | None, typer.Option(help="Only before this moment.")] = None,
     limit: Limit = 50,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
     """List who changed what of which model, newest first: versions, aliases, how it learns. Needs the scope admin."""
     with connected(url) as client:
-        entries = list(islice(client.audit(model, key, change), limit))
+        entries = list(islice(client.audit(model, key, change, since, until), limit))
     if as_json:
         print_json(entries)
         return

@@ -33,7 +33,9 @@ Change = Literal[
     "observations unlearnt",
     "observations replayed",
     "learning rolled back",
+    "learning held",
     "change decided",
+    "candidate dismissed",
     "payload declared",
 ]
 CHANGES: tuple[str, ...] = get_args(Change)
@@ -63,7 +65,8 @@ def note(
         what = f"job {job}"
         key, request = (None, None) if row is None else (row.key, row.request_id)
     elif scope is not None:
-        path = getattr(scope.get("route"), "path", scope["path"])
+        route = scope.get("route") or scope.get("endpoint")  # Starlette names no route of a WebSocket
+        path = getattr(route, "path", scope["path"])
         key, what = scope.get(KEY_ID), f"{scope.get('method', 'WEBSOCKET')} {path}"
     name = None if key is None else session.scalar(select(ApiKeyRow.name).where(ApiKeyRow.id == key))
     details = {"version": version, "alias": alias, "before": before, "after": after}
@@ -72,18 +75,35 @@ def note(
 
 
 def page(
-    database: Database, part: Page, model: str | None = None, key: str | None = None, change: str | None = None
+    database: Database,
+    part: Page,
+    model: str | None = None,
+    key: str | None = None,
+    change: str | None = None,
+    since: datetime | None = None,
+    until: datetime | None = None,
 ) -> tuple[list[AuditRow], str | None]:
-    """Lines of a page, newest first, and the cursor after it; of a model, a key or a kind of change where given."""
+    """Lines of a page, newest first, and the cursor after it; of a model, a key or a kind of change where given, from a
+    moment on and before another."""
     given = ((AuditRow.model, model), (AuditRow.key, key), (AuditRow.change, change))
+    conditions = [column == value for column, value in given if value is not None]
+    if since is not None:
+        conditions.append(AuditRow.at >= _text(since))
+    if until is not None:
+        conditions.append(AuditRow.at < _text(until))
     with database.session() as session:
-        return newest(session, AuditRow, part, *(column == value for column, value in given if value is not None))
+        return newest(session, AuditRow, part, *conditions)
+
+
+def _text(moment: datetime) -> str:
+    """A moment as lines have it: texts of one form are in the order of time."""
+    return moment.astimezone(UTC).isoformat(timespec="milliseconds")
 
 
 def clean(database: Database, settings: Settings) -> int:
     """Delete lines that are older than the setting says; return how many."""
     oldest = datetime.now(UTC) - timedelta(seconds=settings.audit_retention_s)
-    too_old = AuditRow.at < oldest.isoformat(timespec="milliseconds")
+    too_old = AuditRow.at < _text(oldest)
     with database.session() as session:
         if session.scalar(select(AuditRow.seq).where(too_old).limit(1)) is None:
             return 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
-from pydantic import BaseModel, Field
+from pydantic import AwareDatetime, BaseModel, Field
 
 from service.foundation.errors import InvalidRequestError, responses
 from service.storage.database import AuditRow
@@ -52,10 +52,12 @@ def list_audit(
     model: Annotated[str | None, Query(max_length=64, description="Only changes of this model")] = None,
     key: Annotated[str | None, Query(max_length=40, description="Only by the API key of this id")] = None,
     change: Annotated[Change | None, Query(description="Only changes of this kind")] = None,
+    since: Annotated[AwareDatetime | None, Query(description="Only from this moment on, ISO 8601 with a zone")] = None,
+    until: Annotated[AwareDatetime | None, Query(description="Only before this moment")] = None,
 ) -> AuditPage:
     """Who changed what of which model, when and by what. A line is written with the change and never altered; it is
     kept for `LIPSERVE_AUDIT_RETENTION_S`. What is learnt from observations is in their own log."""
-    rows, following = audit.page(storage.database, page, model, key, change)
+    rows, following = audit.page(storage.database, page, model, key, change, since, until)
     return AuditPage(items=[_show(row) for row in rows], next_cursor=following)
 
 

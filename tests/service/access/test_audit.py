@@ -1,7 +1,7 @@
 """Every route that changes a model leaves a line that says who, what, from and to; the lines stay as they were."""
 
 import json
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, timedelta, timezone
 
 import pytest
 from fastapi.testclient import TestClient
@@ -278,6 +278,14 @@ def test_lines_are_found_page_by_page_and_by_model_key_and_change(owned):
     assert {line["change"] for line in lines(owned, change="alias moved")} == {"alias moved"}
     assert {line["key"] for line in lines(owned, key=owned.key)} == {owned.key}
     assert lines(owned, model="nobody") == []
+    moment = every[3]["at"]
+    assert lines(owned, since=moment, until=moment) == []
+    later, earlier = lines(owned, since=moment), lines(owned, until=moment)
+    assert [line["id"] for line in later + earlier] == [line["id"] for line in every]
+    assert {line["at"] < moment for line in earlier} == {True}
+    elsewhere = datetime.fromisoformat(moment).astimezone(timezone(timedelta(hours=9))).isoformat()
+    assert lines(owned, since=elsewhere) == later
+    error(owned.get("/v1/audit?since=2026-11-24T08:00:00"), 422, "invalid_request")  # of which zone?
     error(owned.get("/v1/audit?change=nothing"), 422, "invalid_request")
 
 

@@ -154,7 +154,10 @@ def busy(tmp_path):
                 thread.join()
 
 
-@pytest.mark.parametrize("rounds", [20, 0], ids=["most files before", "all at the moment"])
+@pytest.mark.parametrize(
+    "rounds",
+    [pytest.param(20, id="most files before"), pytest.param(0, id="all at the moment", marks=pytest.mark.slow)],
+)
 def test_what_was_acknowledged_before_a_backup_under_load_is_restored(busy, tmp_path, monkeypatch, rounds):
     monkeypatch.setattr(backups, "MOST_ROUNDS", rounds)
     for number in range(ROUNDS):

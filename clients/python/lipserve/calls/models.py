@@ -198,7 +198,16 @@ def import_model(at: Route, path: Path | str, name: str | None = None) -> Call[V
 
 @route("GET", "/v1/audit")
 def audit(
-    at: Route, model: str | None = None, key: str | None = None, change: str | None = None
+    at: Route,
+    model: str | None = None,
+    key: str | None = None,
+    change: str | None = None,
+    since: str | None = None,
+    until: str | None = None,
 ) -> Call[Page[AuditEntry]]:
-    """Who changed what of which model, newest first; of a model, of the API key of an id, or of one kind of change."""
-    return at(page(AuditEntry), names={}, params={"model": model, "key": key, "change": change})
+    """Who changed what of which model, newest first; of a model, of the API key of an id, or of one kind of change.
+
+    since, until: from a moment on and before another, ISO 8601 with a zone, as 2026-11-24T08:00:00Z.
+    """
+    params = {"model": model, "key": key, "change": change, "since": since, "until": until}
+    return at(page(AuditEntry), names={}, params=params)

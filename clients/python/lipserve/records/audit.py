@@ -36,7 +36,9 @@ class AuditEntry(Record, frozen=True, kw_only=True):
         "observations unlearnt",
         "observations replayed",
         "learning rolled back",
+        "learning held",
         "change decided",
+        "candidate dismissed",
         "payload declared",
     ]
     version: int | None
