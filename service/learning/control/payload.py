@@ -79,8 +79,9 @@ def declare(learners: Learners, model: str, request: PayloadRequest) -> Payloads
     """Say what an arm carries from now on; raise NotFoundError, InvalidRequestError or ConflictError."""
     inertia = None if request.inertia is None else np.array(request.inertia)
     try:
-        Body(request.mass, np.array(request.com), inertia)
-    except ValueError as error:
+        with np.errstate(over="raise", invalid="raise"):  # numbers near the largest have no sums
+            Body(request.mass, np.array(request.com), inertia)
+    except (ValueError, FloatingPointError) as error:
         raise invalid_request("inertia", request.inertia, f"that of a body which can exist: {error}") from error
     known = {"mass": request.mass, "com": request.com, "inertia": request.inertia}
     return _say(learners, model, request.stream_id, known)
