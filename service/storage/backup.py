@@ -12,7 +12,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
 import sqlite3
 import tarfile
 from collections.abc import Iterable, Iterator
@@ -222,10 +221,8 @@ def _restored(home: Path, opened: IO[bytes]) -> Backup:
     except (tarfile.TarError, EOFError, json.JSONDecodeError, UnicodeDecodeError) as error:
         raise BackupError(f"the file is no backup, or is damaged: {error}") from error
     _check(about, sums)
-    for name in sums.keys() - about["files"].keys():  # deleted while the backup was made
-        (home / name).unlink()
-        if name.startswith("versions/"):
-            shutil.rmtree(home / _key(name))
+    for key in {_key(name) for name in sums.keys() - about["files"].keys()}:  # deleted while the backup was made
+        remove(home / key)
     with closing(sqlite3.connect(f"file:{quote(str(draft))}?mode=ro&immutable=1", uri=True)) as database:
         faults = [fault for (fault,) in database.execute("PRAGMA quick_check(1)")]
         counts = _counts(database)
@@ -259,8 +256,10 @@ def _check(about: Any, sums: dict[str, dict[str, Any]]) -> None:
     if about.get("format_version") != FORMAT_VERSION:
         message = f"the backup has format_version {about.get('format_version')!r}, expected {FORMAT_VERSION}"
         raise BackupError(f"{message}: a later release of LIPServe has made it")
-    files = {FILE: None, **about.get("files", {})}
-    for name, known in files.items():
+    files = about.get("files")
+    if not isinstance(files, dict):
+        raise BackupError(f"the backup is damaged: {MANIFEST} names no files")
+    for name, known in {FILE: None, **files}.items():
         if sums.get(name) != known or known is None:
             raise BackupError(f"the backup is damaged: {name} is not what {MANIFEST} says")
 

@@ -16,9 +16,10 @@ from sqlalchemy import delete
 
 from service.cli.verify import verify_home
 from service.foundation.settings import Settings
+from service.models import registry
 from service.storage import backup as backups
 from service.storage.backup import BackupError, backup, restore
-from service.storage.database import SnapshotRow
+from service.storage.database import LearnerRow, SnapshotRow, VersionRow
 from service.storage.storage import HomeError, hold_home
 from tests.service.archives.packing import TAR, exported, pack, unpack
 from tests.service.data import QUICK, arrays, eventually, npz, queue, stream
@@ -239,6 +240,28 @@ def test_what_is_deleted_after_the_moment_is_copied_and_nothing_is_committed_at_
     restore(tmp_path / "back", tmp_path / "b.tar")
     check_files(tmp_path / "back")
     assert verify_home(Settings(home=tmp_path / "back")).damages == []
+
+
+def test_what_is_deleted_after_it_was_copied_and_before_the_moment_is_left_out(arm, tmp_path, monkeypatch):
+    gone, home = arm.publish("gone"), arm.settings.home
+    folder = registry.find(arm.database, "gone", gone).folder
+    deleted, write = [], backups._add
+
+    def add(tar, files, sums, size=None):
+        write(tar, files, sums, size)
+        if f"versions/{folder}/manifest.json" in files:
+            with arm.database.transaction() as session:
+                session.execute(delete(LearnerRow).where(LearnerRow.model == "gone"))
+                session.execute(delete(VersionRow).where(VersionRow.model == "gone"))
+            shutil.rmtree(home / "versions" / folder)
+            deleted.append(folder)
+
+    monkeypatch.setattr(backups, "_add", add)
+    made = backup(home, tmp_path / "b.tar")
+    assert (deleted, made.versions) == ([folder], 1)
+    assert f"versions/{folder}/model.safetensors" in unpack((tmp_path / "b.tar").read_bytes())
+    assert restore(tmp_path / "back", tmp_path / "b.tar") == made
+    check_files(tmp_path / "back")
 
 
 def test_commands_copy_a_home_and_bring_it_back(lipserve, arm, tmp_path, monkeypatch):
