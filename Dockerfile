@@ -16,7 +16,7 @@ FROM sources AS build-serve
 RUN .ci/install-image ./clients/python '.'
 
 FROM sources AS build-full
-RUN .ci/install-image ./clients/python '.[train,robots,ingest,cluster,grpc]'
+RUN .ci/install-image ./clients/python '.[train,robots,ingest,cluster,grpc,signing]'
 
 # the system, without what installs packages of Python: a layer can only add, so it is copied as it is in the end
 FROM python:3.11-slim AS system

@@ -28,7 +28,7 @@ from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
 from service.learning.live import routes as live
 from service.learning.refresh import attach
-from service.models import registry
+from service.models import registry, signing
 from service.models import routes as models
 from service.models.loaded import LoadedModels
 from service.oip import routes as oip
@@ -42,6 +42,7 @@ from service.training import metrics as jobs_metrics
 from service.training import routes as training
 from service.training.queue import JobQueue, queue_of
 from service.web import openapi, storage_errors
+from service.web.access import audit, audit_routes
 from service.web.access.keys import Keyring
 from service.web.access.middleware import KeyAccess, LocalAccess
 from service.web.limits.requests import BodyLimit, Gate, RateLimit, Turns
@@ -68,7 +69,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     settings = settings or Settings()
     stopping, meters = Stopping(), Meters(settings.max_metric_models)
     calls = rpc.check_installed(settings)
-    keyring = Keyring(settings.keys_refresh_s) if settings.keys_needed else None
+    signing.check_installed(settings)
+    keyring = Keyring(settings.keys_refresh_s, settings.max_request_burst) if settings.keys_needed else None
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
@@ -81,6 +83,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             async with AsyncExitStack() as serving:
                 if keyring is not None:
                     await serving.enter_async_context(keyring.watching(storage.database))
+                await serving.enter_async_context(audit.cleaned(storage.database, settings))
                 if calls:
                     await serving.enter_async_context(_calls(app, settings, stopping))
                 yield
@@ -117,6 +120,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     for router in (
         readiness.router,
         metrics.router,
+        audit_routes.router,
         datasets.router,
         robots.router,
         training.router,

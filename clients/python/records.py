@@ -27,6 +27,7 @@ from service.models import schema as models
 from service.oip import schema as oip
 from service.robots import schema as robots
 from service.training import schema as training
+from service.web.access import audit_routes
 from service.web.observability import readiness
 
 TARGET = Path(__file__).parent / "lipserve/records"
@@ -53,6 +54,7 @@ ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
     "payloads": ("What arms carry.", (payloads.Payloads,)),
     "live": ("Events of a model followed live.", (learning.LiveStatus, learning.LiveLost)),
     "overview": ("Models at a glance.", (overview.ModelOverview,)),
+    "audit": ("What changed models.", (audit_routes.AuditEntry,)),
     "server": (
         "The service, and what the Open Inference Protocol tells of it.",
         (

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,10 +14,11 @@ import typer
 from rich.markup import escape
 from rich.table import Column, Table
 
-from service.cli.consoles import note, out, print_json
+from service.cli.consoles import CommandError, note, out, print_json, print_result
 from service.cli.options import Json, group
 from service.foundation.errors import InvalidRequestError
 from service.foundation.settings import Settings
+from service.models import signing
 from service.storage.database import ApiKeyRow, Database
 from service.storage.storage import HomeError, usable
 from service.web.access import keys
@@ -34,6 +36,13 @@ def create(
         list[str], typer.Option(help=f"What it may do: {', '.join(SCOPES)}; several separated by commas or repeated.")
     ],
     days: Annotated[float | None, typer.Option(help="Days after which it expires, never by default.")] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(
+            help="Most requests per s, in place of LIPSERVE_MAX_REQUESTS_PER_S; at once up to ten seconds' worth, and "
+            "LIPSERVE_MAX_REQUEST_BURST. A stream counts once."
+        ),
+    ] = None,
     file: Annotated[
         Path | None,
         typer.Option(help="File with a key to store, made elsewhere: lip_ and 43 or more letters. It is not printed."),
@@ -47,7 +56,7 @@ def create(
     with _database() as (database, settings):
         scopes = [part.strip() for given in scope for part in given.split(",")]
         given = None if file is None else file.read_text("utf-8").strip()
-        row, secret = keys.create(database, name, scopes, expires, given)
+        row, secret = keys.create(database, name, scopes, expires, given, rate)
     if as_json:
         print_json({**_document(row), **({"key": secret} if given is None else {})})
         return
@@ -67,11 +76,12 @@ def list_(as_json: Json = False) -> None:
     if as_json:
         print_json([_document(row) for row in rows])
         return
-    table = Table(Column("id", no_wrap=True), "name", "scopes", "state", "made", "expires", "last used")
+    table = Table(Column("id", no_wrap=True), "name", "scopes", "state", "per s", "made", "expires", "last used")
     for row in rows:
         document = _document(row)
         times = (_minute(document[field]) for field in ("created_at", "expires_at", "used_at"))
-        table.add_row(row.id, escape(row.name), ", ".join(row.scopes), document["state"], *times)
+        rate = "-" if row.max_requests_per_s is None else f"{row.max_requests_per_s:g}"
+        table.add_row(row.id, escape(row.name), ", ".join(row.scopes), document["state"], rate, *times)
     out.print(table)
 
 
@@ -89,6 +99,22 @@ def revoke(
     note(f"{row.id} is revoked; a running service refuses it after {settings.keys_refresh_s:g} s")
 
 
+@app.command("signing")
+def signing_(
+    file: Annotated[Path, typer.Argument(help="File of the private key, for LIPSERVE_SIGNING_KEY_FILE.")],
+    as_json: Json = False,
+) -> None:
+    """Make a key that exported archives are signed with, and print its public part, for LIPSERVE_TRUSTED_SIGNERS.
+
+    Of a file that is there only the public part is printed.
+    """
+    if find_spec("cryptography") is None:
+        raise CommandError(f"signing needs {signing.MISSING}")
+    made = not file.exists()
+    signer = signing.signer_of(signing.make_key(file) if made else signing.read_key(file))
+    print_result({"signer": signer, "made": made}, as_json, signer)
+
+
 @contextmanager
 def _database() -> Iterator[tuple[Database, Settings]]:
     settings = Settings()
@@ -97,7 +123,7 @@ def _database() -> Iterator[tuple[Database, Settings]]:
 
 
 def _document(row: ApiKeyRow) -> dict[str, Any]:
-    fields = ("id", "name", "scopes", "created_at", "expires_at", "revoked_at", "used_at")
+    fields = ("id", "name", "scopes", "created_at", "expires_at", "revoked_at", "used_at", "max_requests_per_s")
     return {**{field: getattr(row, field) for field in fields}, "state": keys.state_of(row, time.time())}
 
 

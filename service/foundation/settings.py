@@ -16,6 +16,8 @@ CONNECTIONS = 20
 
 MiB = 1024 * 1024
 Count = Annotated[int, Field(ge=1)]
+SIGNER = "^ed25519:[A-Za-z0-9+/]{43}=$"
+"""A public key that archives are signed with: base64 of its 32 bytes."""
 
 
 def _octal(mode: object) -> object:
@@ -132,7 +134,10 @@ class Settings(BaseSettings):
     )
     max_requests: Count = Field(256, description="Most requests that are answered at a time; more are answered 429.")
     max_requests_per_s: float | None = Field(
-        None, gt=0, description="Most requests per s of one key, or address without keys; not limited by default."
+        None,
+        gt=0,
+        description="Most requests per s of one key that has no rate of its own, or address without keys; not "
+        "limited by default.",
     )
     max_request_burst: Count = Field(1000, description="Requests that a client may send at once where that is limited.")
     header_s: float = Field(10.0, gt=0, description="Longest time in s that a request's line and headers may take.")
@@ -150,6 +155,10 @@ class Settings(BaseSettings):
 
     max_aliases: Count = Field(100, description="Most aliases of one model, `serving` aside.")
     max_alias_moves: Count = Field(20, description="Last moves of an alias that an answer lists.")
+
+    audit_retention_s: float = Field(
+        365 * 86400.0, gt=0, description="Age up to which the audit log of what changed models is kept, s."
+    )
 
     max_observation_rows: Count = Field(5000, description="Most samples of one observation batch.")
     max_observation_streams: Count = Field(1000, description="Most sources of observations of one model.")
@@ -298,6 +307,28 @@ class Settings(BaseSettings):
         description="Reverse proxies whose X-Forwarded-For names the client: addresses or networks, with commas.",
     )
 
+    signing_key_file: Path | None = Field(
+        None,
+        description="File with the private key that exported archives are signed with, as `lipserve keys signing` "
+        "makes one. Needs `lipserve[signing]`.",
+    )
+    trusted_signers: str = Field(
+        "",
+        pattern=f"^({SIGNER[1:-1]}( *, *{SIGNER[1:-1]})*)?$",
+        description="Public keys of those whose archives are taken where a signature is required, ed25519:…, with "
+        "commas.",
+    )
+    require_signed: bool = Field(
+        False,
+        description="Import only archives that a trusted signer has signed. A broken signature is always refused.",
+    )
+
+    @model_validator(mode="after")
+    def _signed_by_somebody(self) -> Self:
+        if self.require_signed and not self.trusted_signers:
+            raise ValueError("require_signed is true, expected trusted_signers too, whose archives are taken")
+        return self
+
     @model_validator(mode="after")
     def _shared_together(self) -> Self:
         if (self.database_url is None) != (self.files_url is None):
@@ -311,6 +342,11 @@ class Settings(BaseSettings):
         if self.grpc_port and self.grpc_port == self.port:
             raise ValueError(f"grpc_port is {self.grpc_port}, expected another port than that of HTTP")
         return self
+
+    @property
+    def signers(self) -> tuple[str, ...]:
+        """Those of `trusted_signers`."""
+        return tuple(each.strip() for each in self.trusted_signers.split(",") if each.strip())
 
     @property
     def keys_needed(self) -> bool:

@@ -43,6 +43,7 @@ ORDER = (
     "reference/cli.md",
     "reference/metrics.md",
     "reference/stream-protocol.md",
+    "reference/archives.md",
     "reproduction/results.md",
 )
 """Pages beside the index, as the guide lists them. What is not listed here is not a page."""

@@ -11,6 +11,7 @@ from service.foundation.errors import invalid_request, not_found
 from service.journal import log
 from service.learning.schema import CONTACT_THRESHOLD, FORGETTING_S, FRICTION_WALK_S, TORQUE_LIMIT, LearningOptions
 from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, fetch, now
+from service.web.access import audit
 from service.web.rows import Page, newest
 
 AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion"]
@@ -50,6 +51,7 @@ def set_options(database: Database, model: str, chosen: LearningOptions, n_joint
         )
     with database.turn(model), database.transaction(model) as session:
         row = _row(session, model)
+        audit.note(session, model, "learning set", before=row.options, after=chosen.model_dump())
         row.options = chosen.model_dump()
         memory = log.Memory(chosen.forgetting_s, chosen.friction_walk_s)
         if memory != log.memory(session, model, log.newest(session, model)):

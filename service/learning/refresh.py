@@ -31,6 +31,7 @@ from service.training import jobs
 from service.training import refresh_data as scope
 from service.training.queue import JobQueue
 from service.training.schema import Job
+from service.web.access import audit
 
 logger = logging.getLogger(__name__)
 
@@ -192,6 +193,8 @@ def _act(session: Session, contested: Contested, learner: LearnerRow) -> bool:
     else:
         registry.serve(session, model, new)
         message, promoted = f"version {new} predicts better than version {old} and answers from now on", True
+    if not promoted:
+        audit.note(session, model, "candidate dismissed", new, after={"verdict": contested.verdict, "serving": old})
     named = {"serving": old, "candidate": new, "verdict": contested.verdict, "promoted": promoted}
     owner.raise_alarm(session, model, "promotion", message, {**named, **contested.evidence})
     return promoted

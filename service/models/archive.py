@@ -22,13 +22,15 @@ from lipcore.files.c_writer import SUPPORTED, Origin, c_files
 from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, ModelFormatError
 from lipcore.files.urdf_writer import urdf_of_parameters
 from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, problem
-from service.models import registry
+from service.models import registry, signing
 from service.models.lineage import software
 from service.models.loaded import LoadedModels
+from service.models.signing import SIGNATURE
 from service.storage.database import VersionRow, now
 
 EXPORT, CHECKSUMS = "export.json", "checksums.json"
-MEMBERS = (EXPORT, CHECKSUMS, MANIFEST, TENSORS, ROBOT)
+MEMBERS = (EXPORT, CHECKSUMS, MANIFEST, TENSORS, ROBOT, SIGNATURE)
+OPTIONAL = frozenset({ROBOT, SIGNATURE})
 FORMAT, FORMAT_VERSION = "lipserve-archive", 1
 MEDIA_TYPE = "application/x-tar"
 BLOCK = 512
@@ -149,8 +151,10 @@ def export(
         "software": software(),
     }
     files = {EXPORT: _json(about), **files}
-    sums = {name: persistence.sha256(content) for name, content in files.items()}
-    file = _packed(loaded, {CHECKSUMS: _json(sums), **files})
+    sums = _json({name: persistence.sha256(content) for name, content in files.items()})
+    key = loaded.storage.settings.signing_key_file
+    signed = {} if key is None else {SIGNATURE: _json(signing.sign(signing.read_key(key), sums))}
+    file = _packed(loaded, {CHECKSUMS: sums, **signed, **files})
     return Exported(f"{row.model}-v{row.version}{suffix}.tar", file.tell(), _pieces(file))
 
 

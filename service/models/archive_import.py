@@ -17,11 +17,12 @@ from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings
 from service.foundation.errors import InvalidDataError, invalid_data, problem
 from service.foundation.settings import Settings
-from service.models import archive, registry
+from service.models import archive, registry, signing
 from service.models.archive import CHECKSUMS, EXPORT, ArchiveError
 from service.models.archive_fields import FIELDS
 from service.models.loaded import LoadedModels
 from service.models.schema import ModelName, Version
+from service.models.signing import SIGNATURE, Signature
 from service.storage.database import LearnerRow, ServingRow, now
 from service.storage.files import new_id
 from service.web.storage_errors import undecided
@@ -62,16 +63,17 @@ def add(loaded: LoadedModels, upload: Path, name: str | None) -> Version:
     other has to be chosen. Raise InvalidDataError naming the member that is wrong and what is wrong with it.
     """
     settings = loaded.storage.settings
-    files = _read(upload, settings)
+    files, signer = _read(upload, settings)
     try:
         about = About.model_validate(_json(EXPORT, files.pop(EXPORT)))
     except ValidationError as error:
         raise _invalid(EXPORT, error) from None
     manifest = _checked(files, settings)
     model = name or about.model
+    signed = {} if signer is None else {"signed_by": signer}
     manifest["lineage"] = {
         **manifest["lineage"],
-        "imported": [*manifest["lineage"].get("imported", []), {**about.model_dump(), "imported_at": now()}],
+        "imported": [*manifest["lineage"].get("imported", []), {**about.model_dump(), "imported_at": now(), **signed}],
     }
     files[MANIFEST] = persistence.manifest_bytes(manifest)
     loaded.storage.disk.require(sum(map(len, files.values())))
@@ -102,11 +104,12 @@ def _publish(loaded: LoadedModels, model: str, folder: str, manifest: dict[str, 
     return version, serves
 
 
-def _read(upload: Path, settings: Settings) -> dict[str, bytes]:
-    """The members of an archive, all but the checksums, which they have."""
+def _read(upload: Path, settings: Settings) -> tuple[dict[str, bytes], str | None]:
+    """The members of an archive, all but the checksums, which they have, and who has signed these, None: nobody."""
     limits = {
         EXPORT: SMALL,
         CHECKSUMS: SMALL,
+        SIGNATURE: SMALL,
         MANIFEST: MANIFEST_BYTES,
         TENSORS: settings.max_archive_bytes,
         ROBOT: settings.max_urdf_bytes,
@@ -116,16 +119,22 @@ def _read(upload: Path, settings: Settings) -> dict[str, bytes]:
     except ArchiveError as error:
         raise invalid_data(error.member, error.given, error.expected) from None
     for name in archive.MEMBERS:
-        if name not in files and name != ROBOT:
+        if name not in files and name not in archive.OPTIONAL:
             raise invalid_data(name, "missing", "a file of that name in the archive")
-    sums = _json(CHECKSUMS, files.pop(CHECKSUMS))
+    try:
+        signature = Signature.model_validate(_json(SIGNATURE, files.pop(SIGNATURE))) if SIGNATURE in files else None
+    except ValidationError as error:
+        raise _invalid(SIGNATURE, error) from None
+    checksums = files.pop(CHECKSUMS)
+    signer = signing.verify(settings, signature, checksums)
+    sums = _json(CHECKSUMS, checksums)
     if not isinstance(sums, dict) or sums.keys() != files.keys():
         given = f"of {', '.join(map(strict_json.quote, sums))}" if isinstance(sums, dict) else strict_json.quote(sums)
         raise invalid_data(CHECKSUMS, given, f"the sha256 of each of {', '.join(files)}")
     for name, content in files.items():
         if persistence.sha256(content) != sums[name]:
             raise invalid_data(name, "not what its sha256 in checksums.json says", "an undamaged file")
-    return files
+    return files, signer
 
 
 def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:

@@ -29,6 +29,7 @@ from service.storage.database import (
     now,
 )
 from service.storage.files import Files
+from service.web.access import audit
 
 logger = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
             session.execute(delete(SnapshotRow).where(*of_version))
             session.execute(delete(LearnerRow).where(LearnerRow.model == model, LearnerRow.version == version))
             session.delete(row)
+            audit.note(session, model, "version deleted", version, before=version)
         loaded.forget(model, [version])
     _remove_files(loaded.files, [row.folder], snapshots)
     loaded.wake(model)
@@ -78,6 +80,7 @@ def delete_model(loaded: LoadedModels, model: str) -> None:
             versions = list(session.scalars(select(VersionRow).where(VersionRow.model == model)))
             snapshots = list(session.scalars(select(SnapshotRow.id).where(SnapshotRow.model == model)))
             _note_deletion(session, row, [each.version for each in versions])
+            audit.note(session, model, "model deleted", before=[each.version for each in versions])
             for table in OF_MODEL:
                 session.execute(delete(table).where(table.model == model))
             session.execute(delete(VersionRow).where(VersionRow.model == model))

@@ -30,6 +30,7 @@ from service.storage.database import (
     now,
 )
 from service.storage.files import Files, new_id
+from service.web.access import audit
 from service.web.rows import Page, newest
 
 logger = logging.getLogger(__name__)
@@ -79,6 +80,7 @@ def publish(
     if latest and session.get(ServingRow, model) is None:  # of a home from before there were candidates
         serve(session, model, latest)
     row.last_version = version = max(row.last_version, latest) + 1
+    audit.note(session, model, "version added", version, after=_origin(manifest, job))
     session.add(
         VersionRow(
             model=model,
@@ -96,6 +98,13 @@ def publish(
     if not candidate or not latest:
         serve(session, model, version)
     return version
+
+
+def _origin(manifest: dict[str, Any], job: str | None) -> dict[str, Any]:
+    """What the audit log says of a new version: of an imported one also where it comes from, and who has signed it."""
+    imported = manifest["lineage"].get("imported", []) if job is None else []
+    told = {name: imported[-1].get(name) for name in ("model", "version", "signed_by")} if imported else {}
+    return {"estimator": manifest["estimator"], "job": job, **({"imported": told} if told else {})}
 
 
 def _row(session: Session, model: str) -> ModelRow:
@@ -169,6 +178,7 @@ def note(
     session: Session, model: str, alias: str, before: int | None, version: int | None, takes_back: int | None = None
 ) -> None:
     """Write a move of an alias down. takes_back: number of the move that this one takes back."""
+    audit.note(session, model, "alias moved", version, alias, before, version)
     move = AliasMoveRow(model=model, alias=alias, before=before, version=version, takes_back=takes_back, at=now())
     session.add(move)
     session.flush()

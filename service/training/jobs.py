@@ -37,7 +37,7 @@ from service.storage.files import new_id
 from service.training import holding_out, lifecycle, refresh_data
 from service.training.queue import JobQueue
 from service.training.schema import Job, JobDraft, JobPage, JobRequest, Options
-from service.web.observability.logs import request_id
+from service.web.observability.logs import KEY_ID, asked, request_id
 from service.web.rows import Identity, Page, done, mark, newest
 
 USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
@@ -142,6 +142,7 @@ def add(
         history=[],
         retry_of=retry_of,
         request_id=request_id.get(),
+        key=(asked.get() or {}).get(KEY_ID),
     )
     mark(job, named)
     lifecycle.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat {retry_of}")

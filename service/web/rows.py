@@ -18,10 +18,10 @@ from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, invalid_request, problem
-from service.storage.database import AlarmRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow
+from service.storage.database import AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow
 
 USUAL = 50
-Row = TypeVar("Row", AlarmRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow)
+Row = TypeVar("Row", AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow)
 
 
 class Page(BaseModel):

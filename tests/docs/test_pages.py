@@ -43,6 +43,11 @@ def test_the_api_reference_is_up_to_date():
     assert made["TARGET"].read_text("utf-8") == made["document"](), "run: python docs/api.py"
 
 
+def test_the_page_of_archives_is_up_to_date():
+    made = runpy.run_path(str(ROOT / "docs/archives.py"))
+    assert made["TARGET"].read_text("utf-8") == made["document"](), "run: python docs/archives.py"
+
+
 def test_the_page_of_the_stream_protocol_is_up_to_date():
     made = runpy.run_path(str(ROOT / "docs/stream.py"))
     assert made["TARGET"].read_text("utf-8") == made["document"](), "run: python docs/stream.py"

@@ -119,6 +119,7 @@ class Calls:
     export = One(calls.models.export)
     urdf = One(calls.models.urdf)
     import_model = One(calls.models.import_model)
+    audit = Listed(calls.models.audit)
 
     predict = One(calls.inference.predict)
     evaluate = One(calls.inference.evaluate)

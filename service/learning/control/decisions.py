@@ -24,6 +24,7 @@ from service.learning.learners import Learners
 from service.learning.schema import LearningOptions
 from service.models import registry
 from service.storage.database import Database, EventRow, LearnerRow
+from service.web.access import audit
 from service.web.rows import Page
 
 WORDS = {"unlearnt": "has been unlearnt", "rolled_back": "was undone by a rollback"}
@@ -60,6 +61,8 @@ def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> sc
         versions = list(session.scalars(trained.order_by(LearnerRow.version)))
         log.unlearn(session, model, batch, time.time())
         revised = revised_now(session, model, version)
+        taken = {"stream_id": stream_id, "sequence": sequence, "rows": rows}
+        audit.note(session, model, "observations unlearnt", version, before=taken)
     learners.process.wake(model)
     return schema.Unlearnt(**revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=rows, trained=versions)
 
@@ -96,6 +99,7 @@ def _to_revision(learners: Learners, model: str, revision: int) -> schema.Rolled
         count = session.scalar(undone) or 0
         log.rollback(session, model, to, time.time())
         revised = revised_now(session, model, version)
+        audit.note(session, model, "learning rolled back", version, before=newest, after=revision)
     learners.process.wake(model)
     return schema.RolledBack(**revised.model_dump(), undone=count, complete=True)
 
@@ -164,6 +168,8 @@ def decide(learners: Learners, model: str, request: schema.ChangeRequest) -> sch
             ended = len(pending) < CHUNK
             if ended:
                 owner.release(session, model)
+                decided = {"decision": request.decision, "rows": rows}
+                audit.note(session, model, "change decided", version, before=held, after=decided)
             else:
                 done = pending[-1].number
             revised = revised_now(session, model, version)
@@ -187,6 +193,8 @@ def replay(
         if not learnt:
             raise _refusal(session, batch, codes)
         revised = revised_now(session, model, version)
+        named = {"stream_id": stream_id, "sequence": sequence, "rows": learnt}
+        audit.note(session, model, "observations replayed", version, after=named)
     learners.process.wake(model)
     return schema.Replayed(
         **revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=sum(learnt.values()), codes=learnt

@@ -30,6 +30,7 @@ from service.learning.control.payload_schema import (
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
 from service.models.served import Served
+from service.web.access import audit
 
 DRAWS = 500
 """Of a payload's parameters, for the spread of its inertia."""
@@ -78,8 +79,9 @@ def declare(learners: Learners, model: str, request: PayloadRequest) -> Payloads
     """Say what an arm carries from now on; raise NotFoundError, InvalidRequestError or ConflictError."""
     inertia = None if request.inertia is None else np.array(request.inertia)
     try:
-        Body(request.mass, np.array(request.com), inertia)
-    except ValueError as error:
+        with np.errstate(over="raise", invalid="raise"):  # numbers near the largest have no sums
+            Body(request.mass, np.array(request.com), inertia)
+    except (ValueError, FloatingPointError) as error:
         raise invalid_request("inertia", request.inertia, f"that of a body which can exist: {error}") from error
     known = {"mass": request.mass, "com": request.com, "inertia": request.inertia}
     return _say(learners, model, request.stream_id, known)
@@ -101,6 +103,8 @@ def _say(learners: Learners, model: str, stream_id: str | None, known: dict[str,
     with learners.turn(model):
         with learners.database.transaction(model) as session:
             event = log.append(session, model, "payload", {"stream_id": stream_id, "body": known}, time.time())
+            declared = {"stream_id": stream_id, "body": known}
+            audit.note(session, model, "payload declared", served.version, after=declared)
         monitor.declared(event)
         served.loads.take(monitor.payloads.carried(served.carrier, served.version))
     learners.process.wake(model)

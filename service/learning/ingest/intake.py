@@ -30,6 +30,7 @@ from service.learning.schema import LearningDisabledError, LearningOptions
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
 from service.storage.database import EventRow, ModelRow
+from service.web.access import audit
 
 logger = logging.getLogger(__name__)
 
@@ -275,5 +276,9 @@ def _alarm(session: Session, served: Served, options: LearningOptions, verdict: 
             f"is it this robot, with the friction and the payload that were learnt? {CONSEQUENCES[options.on_change]}"
         )
     owner.raise_alarm(session, served.name, "change", message, evidence)
+    known = {"at": change.at, "event": event.number}
     if options.on_change == "hold":
-        owner.hold(session, served.name, {"at": change.at, "event": event.number, "evidence": evidence})
+        owner.hold(session, served.name, known | {"evidence": evidence})
+        audit.note(session, served.name, "learning held", served.version, after=known)
+    elif options.on_change == "adapt":
+        audit.note(session, served.name, "change decided", served.version, before=known, after={"decision": "adapt"})

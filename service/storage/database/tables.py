@@ -68,7 +68,7 @@ class JobRow(Base):
 
     history: what happened to it, oldest first, each {at, state, message}; retry_of: id of the job that it repeats;
     request_id: of the request that queued it; owner: id of the service that has it run, None where none does yet;
-    idempotency_key, request_digest: see `service.web.rows`.
+    idempotency_key, request_digest: see `service.web.rows`; key: id of the API key that queued it, None without keys.
     """
 
     __tablename__ = "jobs"
@@ -94,6 +94,7 @@ class JobRow(Base):
     owner: Mapped[str | None] = mapped_column(String(40))
     idempotency_key: Mapped[str | None] = mapped_column(String(100))
     request_digest: Mapped[str | None] = mapped_column(String(64))
+    key: Mapped[str | None] = mapped_column(String(40))
 
 
 class ReplicaRow(Base):
@@ -299,7 +300,8 @@ class ApiKeyRow(Base):
     """An API key: what it may do and until when. The key itself is not kept.
 
     id: shown in lists and logs; hash: sha256 of the key; scopes: see `web.access.scopes`; expires_at, revoked_at:
-    None where it never does, or has not been; used_at: when it was seen last, to about a minute.
+    None where it never does, or has not been; used_at: when it was seen last, to about a minute; max_requests_per_s:
+    None where the setting of this name holds.
     """
 
     __tablename__ = "api_keys"
@@ -313,3 +315,28 @@ class ApiKeyRow(Base):
     expires_at: Mapped[str | None]
     revoked_at: Mapped[str | None]
     used_at: Mapped[str | None]
+    max_requests_per_s: Mapped[float | None]
+
+
+class AuditRow(Base):
+    """One change of a model, see `service.web.access.audit`. No line refers to a model's row: it outlives that.
+
+    key, key_name: API key of who did it, None without keys; what: method and route, or `job` and its id, or `service`;
+    before, after: what was and what is, as JSON. The database refuses to change a line.
+    """
+
+    __tablename__ = "audit"
+    __table_args__ = (Index("audit_model", "model", "seq"),)
+
+    seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
+    at: Mapped[str]
+    key: Mapped[str | None] = mapped_column(String(40))
+    key_name: Mapped[str | None]
+    what: Mapped[str]
+    request_id: Mapped[str | None] = mapped_column(String(64))
+    model: Mapped[str] = mapped_column(String(64))
+    change: Mapped[str]
+    version: Mapped[int | None]
+    alias: Mapped[str | None] = mapped_column(String(64))
+    before: Mapped[Any | None] = mapped_column(JSON)
+    after: Mapped[Any | None] = mapped_column(JSON)

@@ -15,30 +15,53 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from hashlib import sha256
 from hmac import compare_digest
-from math import inf
-from time import time
+from math import ceil, inf
+from time import monotonic, time
 
 from anyio import CapacityLimiter, to_thread
 from sqlalchemy import select, update
 
-from service.foundation.errors import InvalidRequestError, UnauthorizedError
+from service.foundation.errors import InvalidRequestError, RateLimitedError, UnauthorizedError
 from service.foundation.fields import for_people
 from service.storage.database import ApiKeyRow, Database, now
 from service.storage.files import new_id
 from service.web.access.scopes import ADMIN, SCOPES
+from service.web.limits.requests import Rate
 
 PREFIX = "lip_"
 SECRET_BYTES = 32
+SLOWEST, FASTEST = 1e-3, 1e6
+"""Requests per s that a key may be limited to."""
 GIVEN = re.compile(rf"{PREFIX}[A-Za-z0-9_-]{{43,200}}")
 """A key that was made elsewhere: 43 letters of base64 are the 32 bytes of ours."""
+
+
+LONGEST_BURST_S = 10.0
+"""Seconds of its own rate that a key may ask for at once, at most."""
+
+
+class KeyRate:
+    """How often one key may ask, per s, as it was made; burst: most at once, of any client of the service."""
+
+    __slots__ = ("_rate", "per_s")
+
+    def __init__(self, per_s: float, burst: int) -> None:
+        self.per_s = per_s
+        self._rate = Rate(per_s, max(1, min(burst, ceil(LONGEST_BURST_S * per_s))))
+
+    def count(self, key: str) -> None:
+        """Count a request of the key; raise RateLimitedError where it comes too early."""
+        if wait := self._rate.wait(key, monotonic()):
+            message = f"the API key {key} asks more than {self.per_s:g} times per s, the most that it may"
+            raise RateLimitedError(message, headers={"Retry-After": str(ceil(wait))})
 
 
 @dataclass(slots=True, eq=False)
 class Key:
     """A stored key, as it is checked. Times are Unix times in s.
 
-    digest: sha256 of the key; expires: inf where it never does; seen: when it last let a request through, 0 where it
-    has not since the start.
+    digest: sha256 of the key; expires: inf where it never does; rate: of its own, None where it has none; seen: when it
+    last let a request through, 0 where it has not since the start.
     """
 
     id: str
@@ -46,6 +69,7 @@ class Key:
     scopes: frozenset[str]
     expires: float
     revoked: bool
+    rate: KeyRate | None = None
     seen: float = field(default=0.0)
 
     def allows(self, scope: str) -> bool:
@@ -63,11 +87,17 @@ def digest_of(secret: bytes) -> bytes:
 
 
 def create(
-    database: Database, name: str, scopes: Iterable[str], expires_at: datetime | None, given: str | None = None
+    database: Database,
+    name: str,
+    scopes: Iterable[str],
+    expires_at: datetime | None,
+    given: str | None = None,
+    max_requests_per_s: float | None = None,
 ) -> tuple[ApiKeyRow, str]:
     """Store a new key; return its row and the key, which nobody can tell again. Raise ValueError for wrong values.
 
     given: a key that was made elsewhere. One that is stored already, revoked or not, stays as it is.
+    max_requests_per_s: how often it may ask, instead of what the setting of this name says.
     """
     try:
         for_people("name", name)
@@ -81,6 +111,8 @@ def create(
             raise ValueError(f"scope is {scope!r}, expected one of {', '.join(SCOPES)}")
     if given is not None and not GIVEN.fullmatch(given):
         raise ValueError(f"the key is not one, expected {PREFIX} and 43 to 200 random letters, digits, - or _")
+    if max_requests_per_s is not None and not SLOWEST <= max_requests_per_s <= FASTEST:
+        raise ValueError(f"rate is {max_requests_per_s:g}, expected {SLOWEST:g} to {FASTEST:g} requests per s")
     secret = given or PREFIX + secrets.token_urlsafe(SECRET_BYTES)
     row = ApiKeyRow(
         id=new_id("key"),
@@ -90,6 +122,7 @@ def create(
         created_at=now(),
         expires_at=None if expires_at is None else expires_at.astimezone(UTC).isoformat(timespec="milliseconds"),
     )
+    row.max_requests_per_s = max_requests_per_s
     with database.transaction() as session:
         if given is not None:
             known = session.scalar(select(ApiKeyRow).where(ApiKeyRow.hash == row.hash))
@@ -148,11 +181,12 @@ CHALLENGE = 'Bearer realm="lipserve"'
 class Keyring:
     """The keys of one service, for its event loop. Empty until `watching`.
 
-    refresh_s: seconds after which a key that was made or revoked elsewhere is known here.
+    refresh_s: seconds after which a key that was made or revoked elsewhere is known here; burst: most requests at once
+    of a key that has a rate of its own.
     """
 
-    def __init__(self, refresh_s: float) -> None:
-        self._refresh_s = refresh_s
+    def __init__(self, refresh_s: float, burst: int) -> None:
+        self._refresh_s, self._burst = refresh_s, burst
         self._keys: dict[bytes, Key] = {}
         self._lasting: dict[Key, list[Callable[[], None]]] = {}
         self._noted: dict[str, float] = {}
@@ -234,6 +268,8 @@ class Keyring:
             read = key_of(row)
             key = known.pop(read.id, read)  # the same object: streams and counts hold on to it
             key.scopes, key.expires, key.revoked = read.scopes, read.expires, read.revoked
+            if row.max_requests_per_s is not None and key.rate is None:
+                key.rate = KeyRate(row.max_requests_per_s, self._burst)
             fresh[key.digest[:INDEXED]] = key
         for gone in known.values():
             gone.revoked = True

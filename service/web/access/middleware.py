@@ -16,6 +16,7 @@ from service.foundation.errors import ForbiddenError, NotFoundError, ServiceErro
 from service.foundation.settings import is_loopback
 from service.web.access.keys import CHALLENGE, Key, Keyring, refusal
 from service.web.access.scopes import ADMIN, WEBSOCKET, rule_of, scopes_of_stream
+from service.web.limits.requests import COUNTED
 from service.web.observability.logs import KEY_ID
 from service.web.server.connections import CONNECTION, StreamProtocol
 
@@ -136,7 +137,7 @@ class KeyAccess:
         self.app, self.keyring = app, keyring
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or answer it with 401, 403, or 404 where there is no such route."""
+        """Pass the request on, or answer it with 401, 403, 429, or 404 where there is no such route."""
         kind = scope["type"]
         if kind == "lifespan":
             await self.app(scope, receive, send)
@@ -149,6 +150,9 @@ class KeyAccess:
             key = self.keyring.find(secret_of(scope))
             scope[KEY_ID] = key.id  # also of what is refused: the log is to say whose it was
             self.keyring.use(key)
+            if key.rate is not None:
+                key.rate.count(key.id)
+                scope[COUNTED] = True
             if rule is None:
                 _check_unknown(key, scope)
             else:

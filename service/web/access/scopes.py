@@ -27,6 +27,7 @@ CALLS = "/inference.GRPCInferenceService/"
 
 TABLE: dict[tuple[str, str], str] = {
     ("GET", "/metrics"): READ,
+    ("GET", "/v1/audit"): ADMIN,
     ("POST", "/v1/datasets"): TRAIN,
     ("GET", "/v1/datasets"): READ,
     ("GET", "/v1/datasets/{dataset}"): READ,

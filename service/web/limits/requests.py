@@ -206,6 +206,8 @@ UploadsDep = Annotated[CapacityLimiter, Depends(_of("uploads"))]
 ArchivesDep = Annotated[CapacityLimiter, Depends(_of("archives"))]
 
 
+COUNTED = "lipserve.counted"
+"""In the ASGI scope of a request that was counted already: of a key with a rate of its own."""
 MAX_CLIENTS = 10_000
 """Clients that are told apart at a time; those beyond share one rate."""
 FORGET_S = 1.0
@@ -258,7 +260,7 @@ class RateLimit:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on, or answer it with 429."""
-        if scope["type"] != "lifespan" and not scope["path"].startswith(HEALTH):
+        if scope["type"] != "lifespan" and COUNTED not in scope and not scope["path"].startswith(HEALTH):
             client = client_of(scope)
             wait = self.rate.wait(client, monotonic())
             if wait:

@@ -15,6 +15,8 @@ from typing import Any, Literal, TextIO
 
 request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
 """Id of the request that is answered, None outside of one."""
+asked: ContextVar[MutableMapping[str, Any] | None] = ContextVar("asked", default=None)
+"""ASGI scope of the request that is answered, None outside of one."""
 job_id: ContextVar[str | None] = ContextVar("job_id", default=None)
 """Id of the job that is worked on, None outside of one."""
 

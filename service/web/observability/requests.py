@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from lipcore import extras
 from service.foundation.errors import ERROR_CODE
 from service.foundation.settings import Settings
-from service.web.observability.logs import KEY_ID, REQUEST_ID, given_request_id, new_request_id, request_id
+from service.web.observability.logs import KEY_ID, REQUEST_ID, asked, given_request_id, new_request_id, request_id
 from service.web.observability.meters import Kind, Meters
 
 _OF_CALLS = "/inference.GRPCInferenceService/"
@@ -140,6 +140,7 @@ class RequestContext:
             return
         name = given_request_id(scope["headers"]) or new_request_id()
         request_id.set(name)  # of this request's own task
+        asked.set(scope)
         if self.tracing:
             trace.get_current_span().set_attribute("lipserve.request_id", name)
         method: str = scope.get("method", WEBSOCKET)

@@ -67,13 +67,20 @@ def test_keys_are_listed_without_the_keys(lipserve, keys_database):
     keys.note_used(keys_database, {made[1][0].id: 1_800_000_000.0})
     with keys_database.transaction() as session:
         session.merge(made[2][0]).expires_at = "2026-01-01T00:00:00+00:00"
+    limited = json.loads(
+        lipserve("keys", "create", "--name", "loop", "--scope", "predict", "--rate", "250", "--json")[1]
+    )
+    assert limited["max_requests_per_s"] == 250.0
     text = lipserve("keys", "list", "--json")[1]
     listed = json.loads(text)
-    assert [item["state"] for item in listed] == ["revoked", "valid", "expired"]
+    assert [item["state"] for item in listed] == ["revoked", "valid", "expired", "valid"]
+    assert [item["max_requests_per_s"] for item in listed] == [None, None, None, 250.0]
     assert listed[1]["used_at"] == "2027-01-15T08:00:00.000+00:00"
     code, table, _ = lipserve("keys", "list")
     assert code == 0
     assert "two [bold]" in table
+    assert " 250 " in table
+    assert "2027-01-15 08:00" in table
     assert not any(secret in text + table or row.hash in text + table for row, secret in made)
 
 
@@ -85,6 +92,8 @@ def test_keys_are_listed_without_the_keys(lipserve, keys_database):
         ("", ("--scope", "read"), "name is"),
         ("x" * 201, ("--scope", "read"), "name is"),
         ("\x1b[31m\u202e", ("--scope", "read"), "expected 1 to 200 printable characters"),
+        ("x", ("--scope", "read", "--rate", "0"), "rate is 0, expected 0.001 to 1e+06 requests per s"),
+        ("x", ("--scope", "read", "--rate", "nan"), "rate is nan, expected"),
         ("x", ("--scope", "read", "--days", "0"), "days is 0, expected more than 0 and at"),
         ("x", ("--scope", "read", "--days", "nan"), "days is nan, expected more than 0"),
         ("x", ("--scope", "read", "--days", "1e300"), "days is 1e+300, expected"),

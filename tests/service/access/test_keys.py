@@ -5,10 +5,13 @@ import time
 from datetime import UTC, datetime, timedelta
 
 import pytest
+from fastapi.testclient import TestClient
 from sqlalchemy import delete, update
 
+from service.app import create_app
 from service.foundation.errors import UnauthorizedError
-from service.storage.database import ApiKeyRow
+from service.foundation.settings import Settings
+from service.storage.database import ApiKeyRow, Database
 from service.web.access import keys
 from service.web.access import keys as keyring_module
 from service.web.access.keys import Keyring
@@ -77,11 +80,83 @@ def test_when_a_key_was_used_is_stored(guarded):
     assert abs(time.time() - used) < 60
 
 
+def test_when_a_key_was_used_is_stored_at_most_once_a_minute(keys_database, monkeypatch):
+    made = [keys.create(keys_database, name, ["read"], None) for name in ("often", "never")]
+    stored, clock = [], [1e9]
+    write = keys.note_used
+
+    def note(database, seen):
+        stored.append(dict(seen))
+        write(database, seen)
+
+    monkeypatch.setattr(keyring_module, "note_used", note)
+    monkeypatch.setattr(keyring_module, "time", lambda: clock[0])
+
+    async def steps(keyring):
+        key, looked = keyring.find(made[0][1].encode()), keyring._refresh
+        turns = []
+
+        async def counted(database):
+            await looked(database)
+            turns.append(1)
+
+        monkeypatch.setattr(keyring, "_refresh", counted)
+        keyring.use(key)
+        await until(lambda: stored)
+        for _ in range(5):  # within the minute
+            clock[0] += 10.0
+            keyring.use(key)
+            before = len(turns)
+            await until(lambda at=before: len(turns) >= at + 2)
+        assert stored == [{key.id: 1e9}]
+        clock[0] += 20.0
+        keyring.use(key)
+        await until(lambda: len(stored) == 2)
+        clock[0] += 5.0
+        keyring.use(key)
+
+    watched(keys_database, steps)
+    often = made[0][0].id
+    assert stored == [{often: 1e9}, {often: 1e9 + 70}, {often: 1e9 + 75}]  # the last one at the end
+    used = {row.id: row.used_at for row in keys.stored(keys_database)}
+    assert used == {often: "2001-09-09T01:47:55.000+00:00", made[1][0].id: None}
+
+
+def test_a_key_with_a_rate_of_its_own_is_refused_beyond_it_and_no_other_key_is(tmp_path, monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(keyring_module, "monotonic", lambda: clock[0])
+    home = tmp_path / "home"
+    database = Database.of(Settings(home=home))
+    row, slow = keys.create(database, "slow", ["read"], None, max_requests_per_s=0.2)
+    _, free = keys.create(database, "free", ["read"], None)
+    _, fast = keys.create(database, "fast", ["read"], None, max_requests_per_s=1e3)
+    database.close()
+    settings = Settings(home=home, keys="on", max_requests_per_s=0.001, max_request_burst=3)
+    with TestClient(create_app(settings), "http://robot.example") as api:
+
+        def statuses(secret, count):
+            return [api.get("/v1/models", headers=bearer(secret)).status_code for _ in range(count)]
+
+        assert statuses(slow, 3) == [200, 200, 429]  # ten seconds' worth at once
+        refused = api.get("/v1/models", headers=bearer(slow))
+        said = error(refused, 429, "rate_limited")["message"]
+        assert said == f"the API key {row.id} asks more than 0.2 times per s, the most that it may"
+        assert refused.headers["retry-after"] == "5"
+        clock[0] += 5.0
+        assert statuses(slow, 2) == [200, 429]
+        assert statuses(fast, 3) == [200, 200, 200]  # the burst of the service, of which nothing is left
+        assert statuses(fast, 1) == [429]
+        clock[0] += 0.001
+        assert statuses(fast, 1) == [200]  # more often than keys without a rate
+        assert statuses(free, 4) == [200, 200, 200, 429]
+        assert api.get("/health/live", headers=bearer(slow)).status_code == 200
+
+
 def watched(database, steps):
     """Run `steps` with a keyring that watches a database."""
 
     async def run():
-        keyring = Keyring(REFRESH_S)
+        keyring = Keyring(REFRESH_S, 10)
         async with keyring.watching(database):
             return await steps(keyring)
 

@@ -116,7 +116,7 @@ def events(database, app, revoked=None):
         await asyncio.Event().wait()
 
     async def run():
-        keyring = Keyring(REFRESH_S)
+        keyring = Keyring(REFRESH_S, 10)
         async with keyring.watching(database), asyncio.timeout(30):
             if revoked == 0:
                 keys.revoke(database, row.id)

@@ -96,6 +96,9 @@ def test_the_owner_is_told_with_the_evidence(loaded):
     held = pupil.get("learning")["status"]["held"]
     assert held["evidence"] == evidence
     assert held["at"] == evidence["at"]
+    line = pupil.client.get("/v1/audit", params={"model": pupil.model}).json()["items"][0]
+    assert (line["change"], line["after"]["at"]) == ("learning held", held["at"])
+    assert line["what"] == "POST /v1/models/{model}/observations"
 
 
 @pytest.mark.slow
@@ -129,6 +132,12 @@ def test_adapting_begins_a_new_regime_before_the_batch_that_told(school):
         assert detail["t"] == pytest.approx(log.find_batch(session, pupil.model, "arm", 10).first, abs=0.02)
     alarm = pupil.get("alarms")["items"][0]
     assert "a new regime begins" in alarm["message"]
+    line = pupil.client.get("/v1/audit", params={"model": pupil.model}).json()["items"][0]
+    assert (line["change"], line["before"]["at"], line["after"]) == (
+        "change decided",
+        detail["t"],
+        {"decision": "adapt"},
+    )
     pupil.settled(said[-1]["revision"])
     rows = recording(samples=4000)
     query = part(rows, 900, 950)

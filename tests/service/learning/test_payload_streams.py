@@ -137,6 +137,7 @@ def test_what_is_switched_off_notices_nothing_and_says_why(panda, robot_stream):
         ({"mass": 2, "com": [0, 0]}, "com"),
         ({"mass": 2, "com": [0, 0, 11]}, "com[2]"),
         ({"mass": 2, "com": [0, 0, 0], "inertia": [[1, 0, 0], [0, 0, 0], [0, 0, 0]]}, "inertia"),
+        ({"mass": 2, "com": [0, 0, 0], "inertia": [[1.7e308, 0, 0], [0, 1.7e308, 0], [0, 0, 1.7e308]]}, "inertia"),
         ({"mass": 2, "com": [0, 0, 0], "stream_id": "../x"}, "stream_id"),
         ({"mass": 2, "com": [0, 0, 0], "tool": 1}, "tool"),
         ({"com": [0, 0, 0]}, "mass"),

@@ -156,6 +156,14 @@ def test_a_better_candidate_answers_and_learns_from_then_on(school, pupil):
     [alarm] = pupil.get("alarms")["items"]
     assert alarm["kind"] == "promotion"
     assert alarm["evidence"] == {"serving": 1, "candidate": 2, "verdict": "promote", "promoted": True, **EVIDENCE}
+    line = audited(pupil)
+    assert (line["change"], line["alias"], line["what"]) == ("alias moved", "serving", "service")
+    assert (line["before"], line["after"]) == (1, 2)
+
+
+def audited(pupil):
+    """The newest line of the audit log on a model."""
+    return answered(pupil.client.get("/v1/audit", params={"model": pupil.model}))["items"][0]
 
 
 def test_one_that_is_not_better_is_dismissed_for_good(school, pupil):
@@ -165,6 +173,9 @@ def test_one_that_is_not_better_is_dismissed_for_good(school, pupil):
     assert roles_of(school, pupil) == {1: "serving", 2: "dismissed"}
     [alarm] = pupil.get("alarms")["items"]
     assert (alarm["evidence"]["verdict"], alarm["evidence"]["promoted"]) == ("dismiss", False)
+    line = audited(pupil)
+    assert (line["change"], line["version"], line["what"]) == ("candidate dismissed", 2, "service")
+    assert line["after"] == {"verdict": "dismiss", "serving": 1}
     assert decide(school, pupil) == (False, [])
     assert answering(pupil) == (1, 1)
 

@@ -16,6 +16,7 @@ from service.models.loaded import LoadedModels
 from service.storage.database import (
     AlarmRow,
     AliasMoveRow,
+    AuditRow,
     Base,
     Database,
     DeletedModelRow,
@@ -135,7 +136,7 @@ def test_nothing_of_a_model_is_left_but_its_history(api, arm):
     assert delete(api, arm).status_code == 204
     with service.database.session() as session:
         left = {table for table in every if session.scalars(select(table).where(table.model == arm)).first()}
-        assert left == {JobRow}
+        assert left == {JobRow, AuditRow}
         assert session.scalar(select(ModelRow).where(ModelRow.name == arm)) is None
         assert session.get(DeletedModelRow, arm).last_version == 3
     assert not any(place.exists() for place in places)

@@ -1,4 +1,4 @@
-"""Calls about training jobs, and about models, their versions, aliases and archives."""
+"""Calls about training jobs, and about models, their versions, aliases and archives, and what changed them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lipserve.call import KEY_HEADER, Answer, Call, Page, Route, given, new_key, nothing, page, record, route
+from lipserve.records.audit import AuditEntry
 from lipserve.records.jobs import Job
 from lipserve.records.models import Alias, Model
 from lipserve.records.overview import ModelOverview
@@ -238,3 +239,20 @@ def import_model(at: Route, path: Path | str, name: str | None = None) -> Call[V
     return at(
         record(Version), names={}, params=given(name=name), headers=headers, file=Path(path), timeout=ARCHIVE_TIMEOUT
     )
+
+
+@route("GET", "/v1/audit")
+def audit(
+    at: Route,
+    model: str | None = None,
+    key: str | None = None,
+    change: str | None = None,
+    since: str | None = None,
+    until: str | None = None,
+) -> Call[Page[AuditEntry]]:
+    """Who changed what of which model, newest first; of a model, of the API key of an id, or of one kind of change.
+
+    since, until: from a moment on and before another, ISO 8601 with a zone, as 2026-11-24T08:00:00Z.
+    """
+    params = {"model": model, "key": key, "change": change, "since": since, "until": until}
+    return at(page(AuditEntry), names={}, params=params)

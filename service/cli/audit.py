@@ -1,0 +1,61 @@
+"""`lipserve audit`: who changed what of which model."""
+
+from __future__ import annotations
+
+import json
+from itertools import islice
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Column, Table
+
+from lipserve.address import DEFAULT_URL
+from service.cli import connecting
+from service.cli.connecting import connected
+from service.cli.consoles import out, print_json
+from service.cli.options import Json, Limit, Url, alone
+
+if TYPE_CHECKING:
+    from lipserve.records.audit import AuditEntry
+
+app = alone()
+WIDEST = 60
+"""Characters of a value that the table shows; JSON has all."""
+
+
+@app.command()
+def audit(
+    model: Annotated[str | None, typer.Option(help="Only this model.", autocompletion=connecting.models)] = None,
+    key: Annotated[str | None, typer.Option(help="Only changes by the API key of this id.")] = None,
+    change: Annotated[str | None, typer.Option(help="Only one kind of change, as `alias moved`.")] = None,
+    since: Annotated[str | None, typer.Option(help="Only from this moment on, as 2026-11-24T08:00:00Z.")] = None,
+    until: Annotated[str | None, typer.Option(help="Only before this moment.")] = None,
+    limit: Limit = 50,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
+) -> None:
+    """List who changed what of which model, newest first: versions, aliases, how it learns. Needs the scope admin."""
+    with connected(url) as client:
+        entries = list(islice(client.audit(model, key, change, since, until), limit))
+    if as_json:
+        print_json(entries)
+        return
+    table = Table(Column("at", no_wrap=True), "who", "by", "model", "change", "from", "to")
+    for each in entries:
+        at = each.at[:19].replace("T", " ")
+        who = each.key_name or each.key or "-"
+        values = (_value(each.before), _value(each.after))
+        table.add_row(at, *map(escape, (who, each.what, each.model, _what(each), *values)))
+    out.print(table)
+
+
+def _what(entry: AuditEntry) -> str:
+    if entry.alias is not None:
+        return f"{entry.change}: {entry.alias}"
+    return entry.change if entry.version is None else f"{entry.change}: {entry.version}"
+
+
+def _value(value: Any) -> str:
+    text = "-" if value is None else json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= WIDEST else f"{text[: WIDEST - 1]}…"

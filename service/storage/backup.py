@@ -1,0 +1,272 @@
+"""A copy of a home in one file, as of one moment, made beside the service that writes to it; and a home made of one.
+
+The database decides what there is: a file is complete before its row is committed, and deleted only after the row. So
+while nobody can commit, every row has its file. Most files are copied before that, without any lock; then writers wait
+for the milliseconds in which the few that came meanwhile are opened and the database's state is pinned, which is copied
+afterwards by SQLite's online backup. What is deleted after that moment is still open here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import sqlite3
+import tarfile
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import IO, Any
+from urllib.parse import quote
+
+from service import __version__
+from service.storage.database import now
+from service.storage.database.engine import FILE, PATIENCE_S
+from service.storage.files.local import remove, write_durably
+from service.storage.storage import HomeError, hold_home
+
+FORMAT, FORMAT_VERSION = "lipserve-backup", 1
+MANIFEST = "backup.json"
+"""The last member: what belongs to the moment, with the size and sha256 of each file."""
+FEW = 50
+"""Files that may be left for the moment in which writers wait."""
+MOST_ROUNDS = 20
+CHUNK = 1 << 20
+LOCK = ".lock"
+_NAMES = re.compile(
+    rf"{re.escape(FILE)}|{re.escape(MANIFEST)}|(datasets|learning)/[a-z]+_\w{{1,36}}\.safetensors"
+    r"|versions/mv_\w{1,36}/[a-z][\w.-]{0,40}",
+    re.ASCII,
+)
+_KINDS = {
+    "datasets": "SELECT 'datasets/' || id || '.safetensors' FROM datasets",
+    "versions": "SELECT 'versions/' || folder FROM versions",
+    "snapshots": "SELECT 'learning/' || id || '.safetensors' FROM snapshots",
+}
+"""Files and folders that rows name; the same columns in every release."""
+
+
+class BackupError(ValueError):
+    """A file is no backup, or is damaged; or the home that is copied is."""
+
+
+@dataclass(frozen=True)
+class Backup:
+    """What a backup holds. at: its moment, ISO 8601 in UTC; size: bytes of its files; the others count rows."""
+
+    at: str
+    size: int
+    datasets: int
+    versions: int
+    snapshots: int
+    observations: int
+
+
+def backup(home: Path, file: Path) -> Backup:
+    """Copy a home into a new file, durably, whole or not at all; what that holds is what was committed at one moment.
+
+    Raise FileNotFoundError where the home has no database, FileExistsError where the file is there, BackupError where
+    a file of the home is missing, and what SQLite and the disks raise.
+    """
+    if not (home / FILE).is_file():
+        raise FileNotFoundError(f"home is {str(home)!r}, expected a folder with the database of a service")
+    if file.exists():
+        raise FileExistsError(f"file is {str(file)!r}, expected a new one: there is one of that name")
+    draft = file.with_name(f"{file.name}.draft")
+    draft.unlink(missing_ok=True)
+    draft.touch(0o600)  # the database has hashes of keys in it
+    try:
+        return write_durably(file, lambda opened: _write(home, opened, file.parent), draft)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _write(home: Path, opened: IO[bytes], folder: Path) -> Backup:
+    with (
+        tarfile.open(mode="w|", fileobj=opened, format=tarfile.GNU_FORMAT) as tar,
+        closing(_connected(home / FILE)) as reader,
+        TemporaryDirectory(prefix=".backup-", dir=folder) as scratch,
+    ):
+        sums = dict[str, dict[str, Any]]()
+        for _ in range(MOST_ROUNDS):  # the first copies nearly all, the next what came meanwhile
+            pending = [key for key in _named(reader) if not _has(sums, key)]
+            for key in pending:
+                with _files(home, [key], missing_ok=True) as files:
+                    _add(tar, files, sums)
+            if len(pending) <= FEW:
+                break
+        with ExitStack() as held:
+            with closing(_connected(home / FILE)) as lock:
+                lock.execute("BEGIN IMMEDIATE")  # from here on nothing is committed, so nothing is deleted either
+                reader.execute("BEGIN")
+                keys, at = _named(reader), now()  # the reader stays with what it sees now
+                held.callback(reader.rollback)
+                files = held.enter_context(_files(home, [key for key in keys if not _has(sums, key)]))
+            _add(tar, files, sums)
+            counts = _counts(reader)
+            copy = Path(scratch) / FILE
+            with closing(sqlite3.connect(copy)) as target:
+                reader.backup(target)
+        with copy.open("rb") as database:
+            _add(tar, {FILE: database}, sums)
+        of_moment = {name: each for name, each in sums.items() if name == FILE or _key(name) in keys}
+        about = {"format": FORMAT, "format_version": FORMAT_VERSION, "software": __version__, "at": at}
+        text = json.dumps(about | {"files": of_moment}, indent=1).encode()
+        _add(tar, {MANIFEST: BytesIO(text)}, {}, len(text))
+        return Backup(at, sum(each["size"] for each in of_moment.values()), **counts)
+
+
+def _connected(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"file:{quote(str(path))}?mode=rw", PATIENCE_S, isolation_level=None, uri=True)
+
+
+def _named(reader: sqlite3.Connection) -> set[str]:
+    return {key for query in _KINDS.values() for (key,) in reader.execute(query)}
+
+
+def _counts(reader: sqlite3.Connection) -> dict[str, int]:
+    """How many rows there are, by the fields of `Backup`."""
+    queries = {**_KINDS, "observations": "SELECT number FROM events WHERE kind = 'batch'"}
+    return {kind: sum(1 for _ in reader.execute(query)) for kind, query in queries.items()}
+
+
+def _key(name: str) -> str:
+    """What a row names of a file: itself, or the folder of a version."""
+    return "/".join(name.split("/")[:2])
+
+
+def _has(sums: Iterable[str], key: str) -> bool:
+    return key in sums or f"{key}/manifest.json" in sums
+
+
+@contextmanager
+def _files(home: Path, keys: Iterable[str], missing_ok: bool = False) -> Iterator[dict[str, IO[bytes]]]:
+    """The files of keys, open by name; of those that are gone none, or BackupError."""
+    with ExitStack() as opened:
+        files = dict[str, IO[bytes]]()
+        for key in keys:
+            try:
+                path = home / key
+                names = [f"{key}/{name}" for name in sorted(os.listdir(path))] if path.is_dir() else [key]
+                files |= {name: opened.enter_context((home / name).open("rb")) for name in names}
+            except FileNotFoundError:
+                if not missing_ok:
+                    message = f"{key} is missing below {home}: `lipserve verify` tells all that is damaged"
+                    raise BackupError(message) from None
+        yield files
+
+
+def _add(
+    tar: tarfile.TarFile, files: dict[str, IO[bytes]], sums: dict[str, dict[str, Any]], size: int | None = None
+) -> None:
+    """Write files to the archive, and note size and sha256 of each."""
+    for name, file in files.items():
+        info = tarfile.TarInfo(name)
+        info.size = os.fstat(file.fileno()).st_size if size is None else size
+        info.mode = 0o600
+        read = _Hashed(file)
+        tar.addfile(info, read)
+        sums[name] = {"size": info.size, "sha256": read.digest.hexdigest()}
+
+
+class _Hashed:
+    """A file that hashes what is read of it."""
+
+    def __init__(self, file: IO[bytes]) -> None:
+        self.file, self.digest = file, hashlib.sha256()
+
+    def read(self, count: int = -1) -> bytes:
+        piece = self.file.read(count)
+        self.digest.update(piece)
+        return piece
+
+
+def restore(home: Path, file: Path) -> Backup:
+    """Make a home of a backup. Nothing is left of it where that fails; the database comes last, so that a service which
+    starts on a home that was being restored when the power went finds none of it.
+
+    Raise HomeError unless the home is empty, or is not there yet, and no service uses it; BackupError for a file that
+    is no backup or is damaged.
+    """
+    with file.open("rb") as opened, hold_home(home):
+        if any(path.name != LOCK for path in home.iterdir()):
+            raise HomeError(f"home is {str(home)!r}, expected an empty folder: nothing is restored over what is there")
+        try:
+            return _restored(home, opened)
+        except BaseException:
+            for path in home.iterdir():
+                if path.name != LOCK:
+                    remove(path)
+            raise
+
+
+def _restored(home: Path, opened: IO[bytes]) -> Backup:
+    draft, sums, about = home / f"{FILE}.draft", dict[str, dict[str, Any]](), dict[str, Any]()
+    try:
+        with tarfile.open(mode="r|", fileobj=opened) as tar:
+            for info in tar:
+                name, content = info.name, tar.extractfile(info) if info.isreg() else None
+                if content is None or info.issparse() or not _NAMES.fullmatch(name) or name in sums:
+                    raise BackupError(f"the file holds {name[:200]!r}, which no backup does, or twice")
+                if name == MANIFEST:
+                    about = json.loads(content.read())
+                    continue
+                path = draft if name == FILE else home / name
+                path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                sums[name] = {"size": info.size, "sha256": _extract(content, path)}
+    except (tarfile.TarError, EOFError, json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise BackupError(f"the file is no backup, or is damaged: {error}") from error
+    _check(about, sums)
+    for key in {_key(name) for name in sums.keys() - about["files"].keys()}:  # deleted while the backup was made
+        remove(home / key)
+    with closing(sqlite3.connect(f"file:{quote(str(draft))}?mode=ro&immutable=1", uri=True)) as database:
+        faults = [fault for (fault,) in database.execute("PRAGMA quick_check(1)")]
+        counts = _counts(database)
+        lacking = [key for key in _named(database) if not _has(sums, key)]
+    if faults != ["ok"] or lacking:
+        raise BackupError(f"the file is damaged: {', '.join(lacking) + ' is missing' if lacking else faults[0]}")
+    for folder in {(home / name).parent for name in sums} | {home / "versions", home}:
+        if folder.is_dir():
+            _sync(folder)
+    draft.rename(home / FILE)
+    _sync(home)
+    return Backup(about["at"], sum(each["size"] for each in about["files"].values()), **counts)
+
+
+def _extract(content: IO[bytes], path: Path) -> str:
+    digest = hashlib.sha256()
+    path.touch(0o600)
+    with path.open("wb") as file:
+        while piece := content.read(CHUNK):
+            file.write(piece)
+            digest.update(piece)
+        file.flush()
+        os.fsync(file.fileno())
+    return digest.hexdigest()
+
+
+def _check(about: Any, sums: dict[str, dict[str, Any]]) -> None:
+    """Raise BackupError unless everything that the manifest names has come as it was."""
+    if not isinstance(about, dict) or about.get("format") != FORMAT:
+        raise BackupError(f"the file is no backup, or is cut off: it has no {MANIFEST} at its end")
+    if about.get("format_version") != FORMAT_VERSION:
+        message = f"the backup has format_version {about.get('format_version')!r}, expected {FORMAT_VERSION}"
+        raise BackupError(f"{message}: a later release of LIPServe has made it")
+    files = about.get("files")
+    if not isinstance(files, dict):
+        raise BackupError(f"the backup is damaged: {MANIFEST} names no files")
+    for name, known in {FILE: None, **files}.items():
+        if sums.get(name) != known or known is None:
+            raise BackupError(f"the backup is damaged: {name} is not what {MANIFEST} says")
+
+
+def _sync(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

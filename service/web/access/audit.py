@@ -1,0 +1,132 @@
+"""The audit log: who changed what of which model, when, by which route or job, and from what to what.
+
+A line is written in the transaction of the change, so that there is none without the other, and never changed. It is
+deleted once it is older than `LIPSERVE_AUDIT_RETENTION_S`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from datetime import UTC, datetime, timedelta
+from typing import Any, Literal, get_args
+
+from anyio import to_thread
+from sqlalchemy import delete, select
+from sqlalchemy.orm import Session
+
+from service.foundation.settings import Settings
+from service.storage.database import ApiKeyRow, AuditRow, Database, JobRow, now
+from service.web.observability.logs import KEY_ID, asked, job_id, request_id
+from service.web.rows import Page, newest
+
+logger = logging.getLogger(__name__)
+
+Change = Literal[
+    "version added",
+    "version deleted",
+    "model deleted",
+    "alias moved",
+    "learning set",
+    "observations unlearnt",
+    "observations replayed",
+    "learning rolled back",
+    "learning held",
+    "change decided",
+    "candidate dismissed",
+    "payload declared",
+]
+CHANGES: tuple[str, ...] = get_args(Change)
+SERVICE = "service"
+"""Stands for a route where nobody asked: a version that comes with LIPServe, or that has proved better."""
+CLEAN_S = 3600.0
+"""Seconds between two searches for lines that are too old."""
+
+
+def note(
+    session: Session,
+    model: str,
+    change: Change,
+    version: int | None = None,
+    alias: str | None = None,
+    before: Any = None,
+    after: Any = None,
+) -> None:
+    """Add a line to the transaction of a change. before, after: JSON of what was, and of what is from then on.
+
+    Who and by what is known from the request that is answered, or the job that runs.
+    """
+    key, what, request = None, SERVICE, request_id.get()
+    scope, job = asked.get(), job_id.get()
+    if job is not None:
+        row = session.scalar(select(JobRow).where(JobRow.id == job))
+        what = f"job {job}"
+        key, request = (None, None) if row is None else (row.key, row.request_id)
+    elif scope is not None:
+        route = scope.get("route") or scope.get("endpoint")  # Starlette names no route of a WebSocket
+        path = getattr(route, "path", scope["path"])
+        key, what = scope.get(KEY_ID), f"{scope.get('method', 'WEBSOCKET')} {path}"
+    name = None if key is None else session.scalar(select(ApiKeyRow.name).where(ApiKeyRow.id == key))
+    details = {"version": version, "alias": alias, "before": before, "after": after}
+    who = {"key": key, "key_name": name, "what": what, "request_id": request}
+    session.add(AuditRow(at=now(), model=model, change=change, **who, **details))
+
+
+def page(
+    database: Database,
+    part: Page,
+    model: str | None = None,
+    key: str | None = None,
+    change: str | None = None,
+    since: datetime | None = None,
+    until: datetime | None = None,
+) -> tuple[list[AuditRow], str | None]:
+    """Lines of a page, newest first, and the cursor after it; of a model, a key or a kind of change where given, from a
+    moment on and before another."""
+    given = ((AuditRow.model, model), (AuditRow.key, key), (AuditRow.change, change))
+    conditions = [column == value for column, value in given if value is not None]
+    if since is not None:
+        conditions.append(AuditRow.at >= _text(since))
+    if until is not None:
+        conditions.append(AuditRow.at < _text(until))
+    with database.session() as session:
+        return newest(session, AuditRow, part, *conditions)
+
+
+def _text(moment: datetime) -> str:
+    """A moment as lines have it: texts of one form are in the order of time."""
+    return moment.astimezone(UTC).isoformat(timespec="milliseconds")
+
+
+def clean(database: Database, settings: Settings) -> int:
+    """Delete lines that are older than the setting says; return how many."""
+    oldest = datetime.now(UTC) - timedelta(seconds=settings.audit_retention_s)
+    too_old = AuditRow.at < _text(oldest)
+    with database.session() as session:
+        if session.scalar(select(AuditRow.seq).where(too_old).limit(1)) is None:
+            return 0
+    with database.transaction() as session:
+        gone = session.execute(delete(AuditRow).where(too_old).returning(AuditRow.seq))
+        return len(gone.all())
+
+
+@asynccontextmanager
+async def cleaned(database: Database, settings: Settings) -> AsyncIterator[None]:
+    """Delete what is too old, now and then, while the context lasts."""
+    task = asyncio.create_task(_clean(database, settings))
+    try:
+        yield
+    finally:
+        task.cancel()
+        await asyncio.wait((task,))
+
+
+async def _clean(database: Database, settings: Settings) -> None:
+    while True:
+        try:
+            await to_thread.run_sync(clean, database, settings)
+        except Exception as error:
+            logger.warning("old lines of the audit log cannot be deleted now: %s", error)
+        await asyncio.sleep(CLEAN_S)
