@@ -101,7 +101,7 @@ class JobRequest(BaseModel):
     holdout: Holdout | None = Field(
         default_factory=Holdout,
         description="What to hold out of the data sets, to evaluate the version on: its lineage keeps the figures. By "
-        f"default {_HOLDOUT.share:.0%}, as `{_HOLDOUT.kind}` chooses; null: nothing",
+        f"default {100 * _HOLDOUT.share:.0f} %, as `{_HOLDOUT.kind}` chooses; null: nothing",
     )
     promotion: PromotionOption | None = Field(
         None,

@@ -17,7 +17,8 @@ VALUES = st.recursive(
     lambda below: st.lists(below, max_size=4) | st.dictionaries(st.text(), below, max_size=4),
     max_leaves=12,
 )
-PAGES = {"/", "/docs", "/docs/oauth2-redirect", "/guide", "/guide/{page}", "/guide/files/{name}"}
+PLOTLY = {f"/dashboard/plotly/{name}.js" for name in ("cartesian", "gl3d", "{digest}")}
+PAGES = PLOTLY | {"/", "/docs", "/docs/oauth2-redirect", "/guide", "/guide/{page}", "/guide/files/{name}"}
 """What people look at: it takes no parameters that could be wrong."""
 
 

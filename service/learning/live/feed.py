@@ -36,6 +36,10 @@ MOST_LOOKED = 20
 """Rows of a stream that are looked at for one status: 14 ms of a thread at a thousand inducing outputs."""
 
 
+FARTHEST = 1e6
+"""rad or m: beyond it no robot is; nor is one where a number is none."""
+
+
 @dataclass(frozen=True)
 class Picked:
     """The rows that are shown, (N,), and their predictions before they were learnt, (N, n), NaN where there are none.
@@ -182,7 +186,7 @@ class Feed(Counted):
     def note(self, batch: Judged) -> None:
         """Take note of a batch that was logged: where its robot is, and what it shows to those who follow the model.
         From any thread."""
-        known = batch.rows.q[np.isfinite(batch.rows.q).all(axis=1)]
+        known = batch.rows.q[(np.abs(batch.rows.q) < FARTHEST).all(axis=1)]
         if len(known):
             self.positions[batch.served.name] = np.round(known[-1], DECIMALS).tolist()
         followed = self._followed.get(batch.served.name)

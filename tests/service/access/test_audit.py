@@ -40,6 +40,7 @@ UNLISTED = {
     (POST, "/v1/robots"): "robots are no models",
     (DELETE, "/v1/robots/{robot}"): "robots are no models",
     (POST, "/v1/jobs"): "the version that a job makes has the line, with the key that queued the job",
+    (POST, "/v1/jobs/check"): "asks",
     (POST, "/v1/jobs/{job}/cancel"): "a job that is cancelled makes no version",
     (POST, "/v1/jobs/{job}/retry"): "as the job",
     (POST, MODEL + "/refresh"): "as a job",

@@ -8,6 +8,7 @@ import pytest
 
 from lipserve import Client
 from lipserve.call import ROUTES
+from lipserve.wording import percent
 from service import cli
 from tests.service.cli.conftest import QUICKLY
 from tests.service.data import eventually
@@ -15,6 +16,7 @@ from tests.service.learning.lessons import lesson
 
 REASONS = {
     ("GET", "/metrics"): "for Prometheus, in its own format",
+    ("GET", "/health"): "what a service can do is said by the error that names the extra",
     (
         "GET",
         "/v1/overview",
@@ -123,7 +125,7 @@ def test_quality_stands_in_every_list(asked, server, recording):
     asked("train", path, "--model", "cli-listed", *QUICKLY)
     quality = server.client.get("/v1/models/cli-listed").json()["versions"][0]["quality"]
     error = f"{sum(quality['nmse']) / 2:.2e}"
-    inside = f"{sum(quality['coverage']) / 2:.0%}"
+    inside = percent(sum(quality["coverage"]) / 2)
     for command in (("models", "list"), ("models", "show", "cli-listed"), ("jobs", "list")):
         row = next(line for line in asked(*command).splitlines() if error in line)
         assert inside in row

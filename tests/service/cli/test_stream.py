@@ -98,7 +98,10 @@ def test_a_stream_that_does_not_fit_is_learnt_where_that_is_confirmed(lipserve, 
     code, _, err = lipserve("stream", steady, *off, "--learn", "--yes-learn")
     assert code == 0, err
     assert "it is learnt all the same, as --yes-learn says" in err
-    assert json.loads(lipserve("learning", "show", steady, "--url", server.url, "--json")[1])["status"]["held"] is None
+    assert (
+        json.loads(lipserve("learning", "show", steady, "--url", server.url, "--json")[1])["learning"]["status"]["held"]
+        is None
+    )
 
 
 def test_a_stream_that_fits_is_learnt_and_nothing_is_said(lipserve, server, steady):
