@@ -11,9 +11,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
-from multiprocessing import current_process, forkserver, parent_process
+from multiprocessing import current_process, forkserver, parent_process, popen_forkserver
+from multiprocessing.connection import wait
 from multiprocessing.context import ForkServerContext, ForkServerProcess
 from pathlib import Path
+from threading import Lock
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
@@ -21,6 +23,18 @@ from unittest.mock import patch
 PRELOADED = ["service.app", "service.cli", "service.training.worker", "service.learning.learner.worker", __name__]
 STARTERS = ("service.compute.process", "service.learning.learner.process")
 """Modules that start processes of the service."""
+
+
+class _Popen(popen_forkserver.Popen):
+    """A forked process whose exit code several threads may ask for: it can be read once, then it would be 255."""
+
+    reading = Lock()
+
+    def poll(self, flag: int = os.WNOHANG) -> int | None:
+        if self.returncode is None and wait([self.sentinel], 0 if flag == os.WNOHANG else None):
+            with self.reading:
+                super().poll(flag)
+        return self.returncode
 
 
 class _Process(ForkServerProcess):
@@ -36,6 +50,10 @@ class _Process(ForkServerProcess):
         **options: Any,
     ) -> None:
         super().__init__(group, _enter, name, (dict(os.environ), target, args, kwargs or {}), **options)
+
+    @staticmethod
+    def _Popen(process_obj: ForkServerProcess) -> _Popen:
+        return _Popen(process_obj)
 
 
 class _Context(ForkServerContext):
