@@ -23,6 +23,7 @@ from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.posterior.compression import linear
 from lipcore.posterior.misfit import Misfit
+from tests.clients.building import sanitizers
 from tests.lipcore.arm_oracles import arm, followed, pendulum_from_its_tip, recorded
 from tests.lipcore.test_arm_model import with_alternatives
 
@@ -229,7 +230,6 @@ def test_it_writes_nothing_but_what_it_is_given(make: Callable[[], TorqueModel],
     assert set(kinds.values()) <= set("TtRrU"), kinds
 
 
-SANITIZED = ("-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-O1")
 MAIN = '#include "lipserve_model.h"\nint main(void) { return lipserve_selftest(); }\n'
 
 
@@ -241,7 +241,8 @@ def test_compilers_and_sanitizers_find_nothing(name: str, compiler: str, tmp_pat
     (tmp_path / "main.c").write_text(MAIN)
     for file, text in c_files(MODELS[name](), ORIGIN).items():
         (tmp_path / file).write_text(text, encoding="ascii")
-    for more in ((), SANITIZED):
+    sanitized = sanitizers(compiler)
+    for more in ((), (*sanitized, "-O1")) if sanitized else ((),):
         command = [compiler, *FLAGS, *more, "main.c", SOURCE, "-o", "main", "-lm"]
         done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
