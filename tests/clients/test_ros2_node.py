@@ -176,7 +176,7 @@ def test_torques_at_accelerations_that_are_derived(driven, server, panda, cutoff
 
 def test_what_is_measured_is_taught_in_its_order(driven, server):
     motions, name = panda_rows(120), f"cell-{driven.parent.name}"
-    with Node(driven, motions, server.url, stream=name, **PANDA) as node:
+    with Node(driven, motions, server.url, stream=name, flush_s=DEADLINE, **PANDA) as node:
         eventually(lambda: node.do(f"state 0 {SOON}")["answered"])
         begun = node.do("states 0 1")
         for first in range(1, 120, 17):

@@ -54,6 +54,7 @@ class Feedforward : public rclcpp::Node {
         stream_(run_of(declare_parameter("stream", std::string{}))),
         deadline_s_(declare_parameter("deadline_s", 0.002)),
         cutoff_hz_(declare_parameter("cutoff_hz", 20.0)),
+        flush_s_(declare_parameter("flush_s", 1.0)),
         commanded_(is_commanded(declare_parameter("acceleration", std::string{"derived"}))),
         rows_(static_cast<std::size_t>(std::max<std::int64_t>(declare_parameter("rows", std::int64_t{256}), 1)),
               joints_.size()),
@@ -201,7 +202,7 @@ class Feedforward : public rclcpp::Node {
         if (rows_.at(k).has_tau) client.teach(query_of(rows_.at(k)));
       rows_.drop(waiting);
     }
-    if (!stream_.empty()) client.flush(Deadline::in(1.0));
+    if (!stream_.empty()) client.flush(Deadline::in(flush_s_));
     const lipserve::Learnt& learnt = client.learnt();
     RCLCPP_INFO(get_logger(),
                 "stream %s: taught %llu, learnt %llu, kept out %llu, refused %llu, not acknowledged %zu, dropped %llu",
@@ -255,7 +256,7 @@ class Feedforward : public rclcpp::Node {
 
   const std::vector<std::string> joints_;
   const std::string model_, url_, key_, stream_;
-  const double deadline_s_, cutoff_hz_;
+  const double deadline_s_, cutoff_hz_, flush_s_;
   const bool commanded_;
   Rows rows_;
   std::atomic<bool> stopping_{false};
