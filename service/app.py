@@ -210,7 +210,7 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners) -
     state.readiness = Readiness(looks, state.stopping)
     state.collectors = (
         Traffic(state.meters),
-        jobs_metrics.Work(storage.database),
+        jobs_metrics.JobMetrics(storage.database),
         learning_metrics.Learning(learners),
         System(storage, state.readiness),
     )

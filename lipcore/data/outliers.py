@@ -149,14 +149,14 @@ def corrupt(
             rows |= alone
         if (rows == before).all():
             break
-    found = Corrupt(rows, why)
+    corrupt_rows = Corrupt(rows, why)
     most = _most(count)
-    if found.count > most:
-        first = ", ".join(str(each + 1) for each in found.first)
+    if corrupt_rows.count > most:
+        first = ", ".join(str(each + 1) for each in corrupt_rows.first)
         raise CorruptError(
-            f"{found.count} corrupt ones of {count}: the first are {first}, counted from 1", f"at most {most}"
+            f"{corrupt_rows.count} corrupt ones of {count}: the first are {first}, counted from 1", f"at most {most}"
         )
-    return found
+    return corrupt_rows
 
 
 def of_samples(samples: Samples) -> Corrupt:
@@ -176,10 +176,10 @@ def of_long(rows: int, take: Callable[[int, int], Samples]) -> Corrupt:
         begin, end = max(0, first - OVERLAP), min(rows, first + BLOCK + OVERLAP)
         inner = slice(first - begin, min(first + BLOCK, rows) - begin)
         try:
-            found = of_samples(take(begin, end))
+            inner_rows = of_samples(take(begin, end))
         except CorruptError as error:
             raise CorruptError(f"from row {begin + 1} on {error.value}", error.expected) from None
-        parts.append(Corrupt(found.rows[inner], found.why[inner]))
+        parts.append(Corrupt(inner_rows.rows[inner], inner_rows.why[inner]))
     return Corrupt(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("rows", "why")))
 
 

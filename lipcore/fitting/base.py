@@ -21,7 +21,7 @@ class BaseMismatchError(ValueError):
 
 
 @dataclass(frozen=True)
-class Kind:
+class RobotKind:
     """What two units of one robot have in common: the names and types of their joints, and what their torque means."""
 
     joint_names: tuple[str, ...]
@@ -31,9 +31,9 @@ class Kind:
 
 def check_base(
     name: str,
-    base: Kind,
+    base: RobotKind,
     order: Sequence[int] | None,
-    data: Kind,
+    data: RobotKind,
     estimator: str,
     options: FitOptions,
     robot: str | None,
@@ -48,7 +48,7 @@ def check_base(
         raise BaseMismatchError("base", name, f"a version whose estimator has an arm, {' or '.join(ROBOT_ESTIMATORS)}")
     if estimator not in robots:
         raise BaseMismatchError("estimator", estimator, f"one of {', '.join(robots)} with a base")
-    for each in fields(Kind):
+    for each in fields(RobotKind):
         own, others = getattr(data, each.name), getattr(base, each.name)
         if own != others:
             own, others = (part if isinstance(part, str) else ", ".join(part) for part in (own, others))

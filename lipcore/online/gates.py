@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Limits:
+class RowLimits:
     """What a row may hold.
 
     position, velocity, acceleration: largest |q|, |dq|, |ddq| of any joint, SI. torque: (n,) largest |tau| of each
@@ -43,7 +43,7 @@ def check_rows(
     dq: Array,
     ddq: Array | None,
     tau: Array,
-    limits: Limits,
+    limits: RowLimits,
     after: float | None = None,
     before: float | None = None,
     derived: bool = False,
@@ -151,7 +151,7 @@ class Patience:
         return replace(self, elapsed=elapsed, rows=rows, contacts=contacts, last=last)
 
 
-def _check_shapes(t: Array | None, q: Array, dq: Array, ddq: Array | None, tau: Array, limits: Limits) -> None:
+def _check_shapes(t: Array | None, q: Array, dq: Array, ddq: Array | None, tau: Array, limits: RowLimits) -> None:
     if q.ndim != 2:
         raise ValueError(f"q has shape {q.shape}, expected (N, n)")
     for name, array in (("dq", dq), ("ddq", ddq), ("tau", tau)):

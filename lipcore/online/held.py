@@ -50,8 +50,8 @@ class Held:
     def of_rows(carrier: Carrier, rows: Rows, before: Rows) -> Held:
         """What rows show, beside those before them."""
         before = before.take(slice(None, None, max(1, -(-len(before) // BEFORE_ROWS))))
-        found, count = estimate(carrier, rows, before), len(rows)
-        return Held(float(rows.time[0]), False, rows, before, 1, count, GROWTH * count, ANY, found, count)
+        first, count = estimate(carrier, rows, before), len(rows)
+        return Held(float(rows.time[0]), False, rows, before, 1, count, GROWTH * count, ANY, first, count)
 
     @staticmethod
     def of_declaration(carrier: Carrier, body: Body, at: float) -> Held:
@@ -87,9 +87,9 @@ class Held:
                 since, values["declared"], nothing, nothing, 1, count, count + 1.0, prior, known(carrier, prior)
             )
         rows = rows.take(evenly(0, len(rows), MOST_ROWS))
-        found = replace(estimate(carrier, rows), eta=eta, covariance=covariance)
+        seen = replace(estimate(carrier, rows), eta=eta, covariance=covariance)
         every = max(1, round(count / len(rows)))
-        return Held(since, values["declared"], rows, nothing, every, count, GROWTH * count, ANY, found, count)
+        return Held(since, values["declared"], rows, nothing, every, count, GROWTH * count, ANY, seen, count)
 
     def more(self, carrier: Carrier, rows: Rows) -> Held:
         """The same with more rows."""
@@ -102,10 +102,10 @@ class Held:
         if count < self.due:
             return held
         anew = count >= ANEW * self.begun
-        found = estimate(carrier, kept, self.before, self.prior, self.estimate, anew)
-        if self.declared and np.abs((found.eta - self.prior.centre) / DECLARED).max() > WRONG:
-            held, found = replace(held, declared=False, prior=ANY), estimate(carrier, kept, self.before)
-        return replace(held, due=GROWTH * count, estimate=found, begun=count if anew else self.begun)
+        moved = estimate(carrier, kept, self.before, self.prior, self.estimate, anew)
+        if self.declared and np.abs((moved.eta - self.prior.centre) / DECLARED).max() > WRONG:
+            held, moved = replace(held, declared=False, prior=ANY), estimate(carrier, kept, self.before)
+        return replace(held, due=GROWTH * count, estimate=moved, begun=count if anew else self.begun)
 
 
 def evenly(first: int, last: int, most: int) -> NDArray[np.int64]:

@@ -184,12 +184,12 @@ class Watch:
         if self.held is None and len(self.recent) > after:  # rows with another payload tell another beginning
             before = Rows.concatenate(self.recent[:-after][-every * BEFORE :])
         held = Held.of_rows(carrier, rows, before)
-        found = held.estimate
-        vague = 1 / POSITIVE if found.gain < AT_ONCE else np.inf
+        estimate = held.estimate
+        vague = 1 / POSITIVE if estimate.gain < AT_ONCE else np.inf
         if after < LASTING or self.held is not None:
-            vague = PRECISE if found.gain - found.contact >= BETTER else 0.0
-        strange = np.abs((found.eta - ANY.centre) / WIDTH).max() > STRANGE
-        if strange or np.sqrt(found.covariance[0, 0]) > vague:
+            vague = PRECISE if estimate.gain - estimate.contact >= BETTER else 0.0
+        strange = np.abs((estimate.eta - ANY.centre) / WIDTH).max() > STRANGE
+        if strange or np.sqrt(estimate.covariance[0, 0]) > vague:
             return replace(self, state="contact")
         watch = replace(self, state="payload", since=held.since, held=held, recent=self.recent[-after:], off=0)
         return watch._around(carrier)
@@ -231,9 +231,9 @@ class Watch:
         first, count = len(window.cells), len(window.cells) + len(seen)
         choices = [[*range(first - after), *range(count - after, count)] for after in gains]
         loads = Window.among(self.around, [*window.cells, *seen], choices)
-        found = {after: each.density - window.density for after, each in zip(gains, loads, strict=True)}
-        after = max(found, key=lambda each: found[each])
-        return found[after], after
+        gained = {after: each.density - window.density for after, each in zip(gains, loads, strict=True)}
+        after = max(gained, key=lambda each: gained[each])
+        return gained[after], after
 
     def to_json(self) -> dict[str, Any]:
         """What a batch's report says of it; `from_json` gives back what is carried."""

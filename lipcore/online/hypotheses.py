@@ -135,9 +135,9 @@ class Window:
     def of_body(self, after: int, carried: Array) -> float:
         """Nats by which a body that can exist explains the last cells better than that which is carried, (10,), does:
         of ten free numbers seven torques are soon explained, of a real mass they are not."""
-        told, pull = self._of_payload(after)
-        total = pull + told @ carried
-        return most_likely(told, total, ANY, ANY.centre)[3] + float(0.5 * carried @ told @ carried - total @ carried)
+        gram, pull = self._of_payload(after)
+        total = pull + gram @ carried
+        return most_likely(gram, total, ANY, ANY.centre)[3] + float(0.5 * carried @ gram @ carried - total @ carried)
 
     def past_contact(self) -> float:
         """Nats by which a contact that began and ended within the cells explains them better than nothing, at most."""
@@ -152,9 +152,9 @@ class Window:
 
     def mass(self, after: int) -> tuple[float, float]:
         """Mean and standard deviation, kg, of the mass that is carried more for the last cells, of either sign."""
-        told, pull = self._of_payload(after)
+        gram, pull = self._of_payload(after)
         scale = MASSES[1] * SHAPE
-        spread = np.linalg.inv(np.eye(PARAMETERS) + scale[:, None] * told * scale)
+        spread = np.linalg.inv(np.eye(PARAMETERS) + scale[:, None] * gram * scale)
         return MASSES[1] * float(spread[0] @ (scale * pull)), MASSES[1] * float(np.sqrt(spread[0, 0]))
 
     def _evidence(self, features: Array, scales: Sequence[Array]) -> Array:

@@ -164,13 +164,13 @@ def _draws(
 
     # another revision of the training may know more, or less
     known = [each for each in known if len(each.noise) == len(at.residual) - problem.tau.size]
-    found = [sought(each) for each in known or [carrying(arm) for arm in arms(problem.carrier)]]
+    draws = [sought(each) for each in known or [carrying(arm) for arm in arms(problem.carrier)]]
     if anew:
-        out = _ruled_out(min([at, *(point for point, _ in found)], key=lambda each: each.energy))
-        for place, (point, _) in enumerate(found):
+        out = _ruled_out(min([at, *(point for point, _ in draws)], key=lambda each: each.energy))
+        for place, (point, _) in enumerate(draws):
             if point.energy > out:
-                found[place] = sought(carrying(problem.training.drawn(draw)), FIRST)
-    return found
+                draws[place] = sought(carrying(problem.training.drawn(draw)), FIRST)
+    return draws
 
 
 def _wider(std: Array, off: Sequence[Array]) -> Array:

@@ -110,12 +110,12 @@ def _quantile(
     s has, with Σ F_b(s) / B >= level; guaranteed is Σ F_b(s) / (B + 1) at that s.
     """
     count, weight = len(rows), np.repeat(1 / rows, rows)
-    wanted = level * (count + 1 if level * (count + 1) <= count else count)
+    needed = level * (count + 1 if level * (count + 1) <= count else count)
     scale, guaranteed = [], []
     for column in score.T:
         order = np.argsort(column)
         held = np.cumsum(weight[order])
-        place = min(int(np.searchsorted(held, wanted - 1e-9)), len(column) - 1)
+        place = min(int(np.searchsorted(held, needed - 1e-9)), len(column) - 1)
         scale.append(max(1.0, float(column[order[place]])))
         guaranteed.append(float(weight[column <= scale[-1]].sum()) / (count + 1))
     return tuple(scale), tuple(guaranteed)

@@ -160,7 +160,7 @@ def low_speed_variance(residual: Array, dq: Array) -> tuple[Array, Array, Array]
         value = 0.5 * (np.log(variance) + squares / variance).sum(axis=0)
         better = value < least
         least = np.where(better, value, least)
-        found = noise, rest, np.full_like(unit, speed)
-        best = tuple(np.where(better, new, old) for new, old in zip(found, best, strict=True))
+        candidate = noise, rest, np.full_like(unit, speed)
+        best = tuple(np.where(better, new, old) for new, old in zip(candidate, best, strict=True))
     noise, rest, slow = best
     return noise * unit, rest * unit, slow

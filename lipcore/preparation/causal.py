@@ -8,19 +8,19 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.data.signals import ORDER
-from lipcore.preparation.filtering import QUANTITIES, Read, Work, settle
+from lipcore.preparation.filtering import QUANTITIES, Filters, Read, settle
 from lipcore.preparation.recipe import PreparationError, Recipe
 from lipcore.preparation.resampling import BLOCK, SAME_RATE
 
 
 class CausalFilter:
-    """Low-pass and differences of evenly spaced rows, one after the other, as `Work` says; thins nothing.
+    """Low-pass and differences of evenly spaced rows, one after the other, as `Filters` says; thins nothing.
 
     All quantities pass one and the same filter, so that they stay those of one moment, `delay_s` before the last row.
     Differences are central, hence exact on quadratics and of the row before the last: two rows tell nothing yet.
     """
 
-    def __init__(self, work: Work, n_joints: int) -> None:
+    def __init__(self, work: Filters, n_joints: int) -> None:
         from scipy.signal import butter, sosfilt, sosfilt_zi  # noqa: PLC0415 - half a second
 
         self.work, self.n_joints = work, n_joints

@@ -30,7 +30,7 @@ off by 80 %, within the second by 11 %, within the third by 2.5 % and from then 
 
 
 @dataclass(frozen=True)
-class Work:
+class Filters:
     """What a recipe comes to at a rate.
 
     rate: Hz, of what is worked on; derived: of dq, ddq; cutoff: Hz of the low-pass, None where there is none;
@@ -72,7 +72,7 @@ def filters(given: tuple[str, ...], recipe: Recipe) -> bool:
     return recipe.filtering == "always" or (recipe.filtering == "derived" and bool(derived(given)))
 
 
-def settle(rate: float, given: tuple[str, ...], recipe: Recipe) -> Work:
+def settle(rate: float, given: tuple[str, ...], recipe: Recipe) -> Filters:
     """What the recipe comes to on signals at `rate` Hz; raise PreparationError where that is impossible.
 
     What is thinned is low-passed before, at ALIAS times the new rate where nothing lower is asked for: then all of it,
@@ -91,7 +91,7 @@ def settle(rate: float, given: tuple[str, ...], recipe: Recipe) -> Work:
         cutoff = min(cutoff or np.inf, ALIAS * asked_rate)
     everything = thins or recipe.filtering == "always" or recipe.form == "causal"
     low_passed = tuple(name for name in FILTERED if name in given and (name != "ddq" or everything))
-    return Work(
+    return Filters(
         rate,
         given,
         missing,
@@ -138,7 +138,7 @@ class ZeroPhase:
         return np.asarray(smooth[edge:-edge])
 
 
-def without_delay(read: Read, work: Work, low_pass: ZeroPhase | None) -> Iterator[tuple[str, Array]]:
+def without_delay(read: Read, work: Filters, low_pass: ZeroPhase | None) -> Iterator[tuple[str, Array]]:
     """q, dq, ddq, tau, in turn, of one contiguous part: `read` gives columns (N,), evenly sampled, N ≥ work.shortest.
 
     As in the paper: a Butterworth filter run forwards and backwards, central differences, and dq filtered once more

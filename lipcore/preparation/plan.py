@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.preparation import steps as record
 from lipcore.preparation.causal import CausalFilter
-from lipcore.preparation.filtering import QUANTITIES, Read, Work, ZeroPhase, derived, filters, settle, without_delay
+from lipcore.preparation.filtering import QUANTITIES, Filters, Read, ZeroPhase, derived, filters, settle, without_delay
 from lipcore.preparation.recipe import PreparationError, Recipe
-from lipcore.preparation.resampling import Clock, between, clock_of, grid, interpolate, thinned
+from lipcore.preparation.resampling import Sampling, between, clock_of, grid, interpolate, thinned
 
 BRIDGE = 0.3
 """Longest gap, in periods of the cut-off, that is bridged rather than split at where signals are low-passed.
@@ -27,7 +27,7 @@ and 0.6 N·m.
 
 
 @dataclass(frozen=True)
-class Part:
+class Stretch:
     """One contiguous part of a recording.
 
     rows: of those kept; at: even times it is put on, None where its own are even; inner: samples between the ends that
@@ -83,8 +83,8 @@ class Plan:
     edges: int
     _kept: NDArray[np.bool_] | None
     _times: Array
-    _parts: list[Part]
-    _work: Work | None
+    _parts: list[Stretch]
+    _work: Filters | None
     _causal: CausalFilter | None
     _low_pass: ZeroPhase | None
 
@@ -120,7 +120,7 @@ class Plan:
         for name in QUANTITIES:
             yield name, columns.pop(name)
 
-    def _of(self, part: Part, read: Read) -> Iterator[tuple[str, Array]]:
+    def _of(self, part: Stretch, read: Read) -> Iterator[tuple[str, Array]]:
         """Samples of one part, before its ends are cut off."""
 
         def samples(name: str) -> Array:
@@ -247,8 +247,8 @@ def _check_times_are_not_needed(given: tuple[str, ...], to_derive: tuple[str, ..
 def _lay_out(
     rows: _Rows,
     ends: NDArray[np.bool_],
-    clock: Clock | None,
-    work: Work | None,
+    clock: Sampling | None,
+    work: Filters | None,
     resamples: bool,
     to_derive: tuple[str, ...],
     steps: list[record.Step],
@@ -257,7 +257,7 @@ def _lay_out(
     causal = CausalFilter(work, 1) if work is not None and work.form == "causal" else None
     late, lag = (0.0, 0) if causal is None else (causal.delay_s, causal.lag)
     bounds = [0, *(np.flatnonzero(ends) + 1).tolist(), len(rows.t)]
-    parts: list[Part] = []
+    parts: list[Stretch] = []
     times: list[Array] = []
     out = edges = 0
     for begin, end in pairwise(bounds):
@@ -276,7 +276,7 @@ def _lay_out(
             t = (t[lag : len(t) - lag] - late + lag / work.rate)[first:last] if causal else t[first:last]
             taken = thinned(len(t), work.every) if work.every > 1 else None
             t = t if taken is None else taken_at(t, taken)
-        parts.append(Part(slice(begin, end), at, slice(first, last), taken, slice(out, out + len(t))))
+        parts.append(Stretch(slice(begin, end), at, slice(first, last), taken, slice(out, out + len(t))))
         times.append(t)
         out += len(t)
     if work is not None and not parts:
@@ -310,7 +310,7 @@ def _lay_out(
     )
 
 
-def _work_steps(work: Work, late: float, edges: int, rate: float) -> list[record.Step]:
+def _work_steps(work: Filters, late: float, edges: int, rate: float) -> list[record.Step]:
     steps = []
     if work.cutoff is not None:
         steps.append(record.low_passed(work, late))
@@ -323,7 +323,7 @@ def _work_steps(work: Work, late: float, edges: int, rate: float) -> list[record
     return steps
 
 
-def _long_enough(work: Work) -> str:
+def _long_enough(work: Filters) -> str:
     what = f"filter at {work.cutoff:g} Hz" if work.cutoff is not None else "use"
     least = f"{work.shortest} samples, {work.shortest / work.rate:.3g} s"
     return f"a contiguous part long enough to {what}: at least {least}"

@@ -23,7 +23,7 @@ NEAR = 0.5
 
 
 @dataclass(frozen=True)
-class Clock:
+class Sampling:
     """How times advance.
 
     usual: the median step, s; longest: the longest step that is no gap, s; ends: (N - 1,), where a part ends; gaps:
@@ -40,7 +40,7 @@ class Clock:
     even: bool
 
 
-def clock_of(t: Array, episode: Array, gap_steps: float, jitter: float, bridge_s: float = 0.0) -> Clock:
+def clock_of(t: Array, episode: Array, gap_steps: float, jitter: float, bridge_s: float = 0.0) -> Sampling:
     """Read the clock of a recording: t (N,) s, rising within an episode; episode (N,) numbers.
 
     A step longer than gap_steps usual ones and than bridge_s is a gap. The clock is even where steps within a part
@@ -63,7 +63,7 @@ def clock_of(t: Array, episode: Array, gap_steps: float, jitter: float, bridge_s
     single = ticks[deviation < NEAR]  # rows that are not there would make the clock seem slow
     mean = float(single.mean()) if len(single) else 1.0
     even = worst <= jitter and abs(mean - 1) <= SAME_RATE
-    return Clock(usual, most * usual, ~within | gap, int(gap.sum()), worst, 1 / (usual * mean), even)
+    return Sampling(usual, most * usual, ~within | gap, int(gap.sum()), worst, 1 / (usual * mean), even)
 
 
 def grid(first: float, last: float, rate: float) -> Array:

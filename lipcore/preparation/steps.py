@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lipcore.preparation.filtering import Work
+from lipcore.preparation.filtering import Filters
 
 Step = dict[str, Any]
 
@@ -44,7 +44,7 @@ def resampled(rate: float, worst: float, bridged_s: float) -> Step:
     }
 
 
-def low_passed(work: Work, delay_s: float) -> Step:
+def low_passed(work: Filters, delay_s: float) -> Step:
     """A Butterworth filter, run both ways or, as in a live stream, forwards only."""
     late = "without delay" if work.form == "acausal" else f"as in a live stream, {delay_s:.3g} s late"
     return {
@@ -58,13 +58,13 @@ def low_passed(work: Work, delay_s: float) -> Step:
     }
 
 
-def differentiated(work: Work) -> Step:
+def differentiated(work: Filters) -> Step:
     """Velocities or accelerations derived."""
     text = f"{' and '.join(work.derived)} derived by central differences"
     return {"step": "differentiate", "derived": list(work.derived), "rate_hz": work.rate, "text": text}
 
 
-def trimmed(work: Work, samples: int) -> Step:
+def trimmed(work: Filters, samples: int) -> Step:
     """Ends of parts cut off, and parts with nothing between them."""
     where = "at the filter's edges" if work.cutoff is not None else "at the ends of parts"
     return {
@@ -77,7 +77,7 @@ def trimmed(work: Work, samples: int) -> Step:
     }
 
 
-def thinned(work: Work, rate: float) -> Step:
+def thinned(work: Filters, rate: float) -> Step:
     """A lower rate."""
     return {"step": "thin", "rate_hz": rate, "every": work.every, "text": f"thinned to {rate:.4g} Hz"}
 

@@ -44,7 +44,7 @@ def choose(task: Task) -> TorqueModel:
 
     Raise FitCancelledError, or what the first estimator has failed with where all have failed.
     """
-    work = Work(task, Overall(task.on_progress))
+    work = Fits(task, Overall(task.on_progress))
     try:
         unseen = hold_out(task.samples, task.joint_types)
     except SplitError as error:
@@ -61,7 +61,7 @@ def choose(task: Task) -> TorqueModel:
     )
 
 
-def _of_all(work: Work, contest: Contest, chosen: str) -> TorqueModel:
+def _of_all(work: Fits, contest: Contest, chosen: str) -> TorqueModel:
     """The chosen model as it is when it has learnt all samples.
 
     An arm is followed from where it was learnt. Of the others hyperparameters stay; basis and posterior are made anew.
@@ -88,7 +88,7 @@ def _of_all(work: Work, contest: Contest, chosen: str) -> TorqueModel:
     )
 
 
-def _unjudged(work: Work, reason: str) -> TorqueModel:
+def _unjudged(work: Fits, reason: str) -> TorqueModel:
     """Of few samples the simplest estimator that can be trained learns all."""
     table: list[Candidate] = []
     errors: list[Exception] = []
@@ -129,7 +129,7 @@ class Overall:
 
 
 @dataclass(frozen=True)
-class Work:
+class Fits:
     """What all fits share: what the training is given, and its progress."""
 
     task: Task
@@ -157,7 +157,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Entry:
+class Contestant:
     """What became of an estimator: its model, what that answers of the held-out samples and the log density of these,
     nats a sample; or the error that it failed with. seconds: that it took."""
 
@@ -171,10 +171,10 @@ class Entry:
 class Contest:
     """One contest; training, held: the samples of both sides."""
 
-    def __init__(self, work: Work, training: Samples, held: Samples) -> None:
+    def __init__(self, work: Fits, training: Samples, held: Samples) -> None:
         self.work, self.training = work, training
         self.held = held.rows(np.unique(np.linspace(0, len(held) - 1, JUDGED).round().astype(np.int64)))
-        self.entries: dict[str, Entry] = {}
+        self.entries: dict[str, Contestant] = {}
         self.learnt: Learnt | None = None
 
     def run(self) -> None:
@@ -226,17 +226,17 @@ class Contest:
             rows.append(row)
         return rows
 
-    def _rigid(self, place: str, before: Learnt | None = None) -> tuple[Entry, Learnt | None]:
+    def _rigid(self, place: str, before: Learnt | None = None) -> tuple[Contestant, Learnt | None]:
         """Learn the arm and judge it alone."""
         began = time.monotonic()
         try:
             learnt = self.work.learn(self.training, place, before)
         except FAILURES as error:
-            return Entry(time.monotonic() - began, error=error), None
+            return Contestant(time.monotonic() - began, error=error), None
         entry = self._enter(RIGID, place, learnt)
         return replace(entry, seconds=time.monotonic() - began), learnt
 
-    def _enter(self, name: str, place: str, learnt: Learnt | None = None) -> Entry:
+    def _enter(self, name: str, place: str, learnt: Learnt | None = None) -> Contestant:
         """Train an estimator and judge it."""
         began = time.monotonic()
         if self.work.task.cancelled is not None and self.work.task.cancelled():
@@ -249,8 +249,8 @@ class Contest:
             if not np.isfinite(density):
                 raise ValueError("what it predicts is not finite")
         except FAILURES as error:
-            return Entry(time.monotonic() - began, error=error)
-        return Entry(time.monotonic() - began, model, answer, density)
+            return Contestant(time.monotonic() - began, error=error)
+        return Contestant(time.monotonic() - began, model, answer, density)
 
     def _chain_leads(self) -> bool:
         """Whether the chain predicts most joints better than the arm, by more than chance."""

@@ -9,7 +9,7 @@ from lipcore.data import outliers
 from lipcore.data.independence import recording_weights
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Samples
-from lipcore.fitting.base import Kind, check_base
+from lipcore.fitting.base import RobotKind, check_base
 from lipcore.fitting.estimators import check_estimator
 from lipcore.fitting.hyperparameters import Cancelled, Progress
 from lipcore.fitting.options import FitOptions
@@ -44,13 +44,13 @@ def train(
     Corrupt rows are left out before anything sees them, and the fit's report names them (`lipcore.data.outliers`).
     Raise ValueError for bad arguments, BaseMismatchError, CorruptError, FitCancelledError, or NotPositiveDefiniteError.
     """
-    found = outliers.of_samples(samples)
-    samples = samples.rows(~found.rows) if found.count else samples
+    corrupt = outliers.of_samples(samples)
+    samples = samples.rows(~corrupt.rows) if corrupt.count else samples
     types, options = check_joint_types(joint_types), options or FitOptions()
     sibling = None
     if base is not None:
-        of_base = Kind(base.joint_names, base.joint_types, base.torque_convention)
-        of_data = Kind(samples.joint_names, types, torque_convention)
+        of_base = RobotKind(base.joint_names, base.joint_types, base.torque_convention)
+        of_data = RobotKind(samples.joint_names, types, torque_convention)
         order = None if base.arm is None else base.arm.order.tolist()
         check_base(
             f"a model of {base.estimator.name}",
@@ -73,7 +73,7 @@ def train(
         sibling=sibling,
     )
     model = fit_model(task, estimator)
-    model = replace(model, fit={**model.fit, **found.in_fit()})
+    model = replace(model, fit={**model.fit, **corrupt.in_fit()})
     weights = recording_weights(samples.t, samples.episode)
     if not conditioning.should_condition(task.options, len(samples), float(weights.sum())):
         return model

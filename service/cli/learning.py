@@ -76,8 +76,8 @@ def set_(
     chosen = {name: value(text) for name, text in pairs("an option", option).items()}
     with connected(url) as client:
         learning = client.set_learning(model, **chosen)
-    said = ", ".join(f"{name} = {each}" for name, each in learning.options.as_dict().items() if name in chosen)
-    print_result(learning, as_json, f"{model} learns with {said}")
+    options = ", ".join(f"{name} = {each}" for name, each in learning.options.as_dict().items() if name in chosen)
+    print_result(learning, as_json, f"{model} learns with {options}")
 
 
 @app.command()
@@ -99,15 +99,15 @@ def batches(
 ) -> None:
     """List the batches of a model's log, newest first, with what became of their rows."""
     with connected(url) as client:
-        found = list(islice(client.observations(model, stream, rejected), limit))
+        batches_of_log = list(islice(client.observations(model, stream, rejected), limit))
     if as_json:
-        print_json(found)
+        print_json(batches_of_log)
         return
-    if not found:
+    if not batches_of_log:
         echo(f"no batch of {model}")
         return
     table = Table("stream", "sequence", "received", "state", "rows", "learnt", "kept out")
-    for each in found:
+    for each in batches_of_log:
         out_ = ", ".join(f"{count} {code}" for code, count in each.rejected.items()) or "-"
         at = each.received_at[:19].replace("T", " ")
         figures = (str(each.rows), str(each.accepted), out_)
@@ -188,11 +188,11 @@ def decide(
 def alarms(model: Model, limit: Limit = 20, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """List what the owner of a model should know: changes, payloads, motion beyond what is known; newest first."""
     with connected(url) as client:
-        found = list(islice(client.alarms(model), limit))
+        newest = list(islice(client.alarms(model), limit))
     if as_json:
-        print_json(found)
+        print_json(newest)
         return
-    if not found:
+    if not newest:
         echo(f"no alarm of {model}")
-    for each in found:
+    for each in newest:
         echo(f"{each.at[:19].replace('T', ' ')}  {each.kind}: {each.message}")

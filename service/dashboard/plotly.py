@@ -45,9 +45,9 @@ class Script:
 
 def scripts(bundles: Path = BUNDLES) -> dict[str, Script]:
     """The script of each bundle: of the folder, or else of the Python package; none where there is neither."""
-    found = {name: next(iter(sorted(bundles.glob(f"plotly-{name}-*.min.js"))), None) for name in NAMES}
-    if None not in found.values():
-        return {name: Script(path) for name, path in found.items() if path is not None}
+    bundled = {name: next(iter(sorted(bundles.glob(f"plotly-{name}-*.min.js"))), None) for name in NAMES}
+    if None not in bundled.values():
+        return {name: Script(path) for name, path in bundled.items() if path is not None}
     spec = find_spec("plotly")  # not imported, which takes a second
     if spec is None or spec.origin is None:
         return {}

@@ -135,8 +135,8 @@ def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: D
     t, episode, missing = _or_none(raw, TIME), _or_none(raw, EPISODE), raw.missing()
     numbers = np.zeros(raw.rows) if episode is None else episode
     try:
-        found = corrupt(t, numbers, raw.n_joints, lambda *which: raw.read(column(*which)), raw.quantities)
-        made = plan(t, episode, missing, raw.quantities, recipe, found.rows)
+        damaged = corrupt(t, numbers, raw.n_joints, lambda *which: raw.read(column(*which)), raw.quantities)
+        made = plan(t, episode, missing, raw.quantities, recipe, damaged.rows)
     except (CorruptError, PreparationError) as error:
         raise invalid_data(error.field, error.value, error.expected) from None
     if len(made) < min_samples:

@@ -33,19 +33,19 @@ class Known:
 
 
 @dataclass(frozen=True)
-class Held:
-    """What intervals of promised 95 %, as answered, held: `inside`, (n,), of `rows` measurements. Held add."""
+class HeldIntervals:
+    """What intervals of promised 95 %, as answered, held: `inside`, (n,), of `rows` measurements. HeldIntervals add."""
 
     rows: int
     inside: Array
 
     @staticmethod
-    def none(n: int) -> Held:
+    def none(n: int) -> HeldIntervals:
         """Of no rows of n joints."""
-        return Held(0, np.zeros(n))
+        return HeldIntervals(0, np.zeros(n))
 
-    def __add__(self, other: Held) -> Held:
-        return Held(self.rows + other.rows, self.inside + other.inside)
+    def __add__(self, other: HeldIntervals) -> HeldIntervals:
+        return HeldIntervals(self.rows + other.rows, self.inside + other.inside)
 
     def coverage(self) -> list[float | None]:
         """Share of measurements inside, per joint; None without rows."""
@@ -65,10 +65,10 @@ def follow(state: Adaptive, seen: Seen) -> dict[str, Any]:
     }
 
 
-def held(report: Mapping[str, Any]) -> Held | None:
+def held(report: Mapping[str, Any]) -> HeldIntervals | None:
     """What the report of a batch says that intervals held; None where it says nothing."""
     values = report.get("answered")
-    return None if values is None else Held(values["rows"], np.array(values["inside"], np.float64))
+    return None if values is None else HeldIntervals(values["rows"], np.array(values["inside"], np.float64))
 
 
 def known(event: EventRow) -> Known | None:

@@ -152,17 +152,17 @@ class Payloads:
             if watch.held is None:
                 out[stream_id] = Carried(None, None, received)
             else:
-                found = watch.held.estimate
-                out[stream_id] = Carried(self._answering(stream_id, found, carrier), found.mass, received)
+                estimate = watch.held.estimate
+                out[stream_id] = Carried(self._answering(stream_id, estimate, carrier), estimate.mass, received)
         return out
 
-    def _answering(self, stream_id: str, found: Estimate, carrier: Carrier) -> TorqueModel:
+    def _answering(self, stream_id: str, estimate: Estimate, carrier: Carrier) -> TorqueModel:
         known = self._models.get(stream_id)
-        if known is not None and known[0] is found and known[1] is carrier:
+        if known is not None and known[0] is estimate and known[1] is carrier:
             return known[2]
-        model = carrier.carrying(found.load)
+        model = carrier.carrying(estimate.load)
         model.answer(np.zeros((3, model.n_joints)))  # whoever asks next does not wait for it to be laid out
-        self._models[stream_id] = found, carrier, model
+        self._models[stream_id] = estimate, carrier, model
         return model
 
 

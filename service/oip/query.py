@@ -38,15 +38,15 @@ _STD = "_std"
 _TORQUES = ("gravity", "coriolis", "inertial", "friction")
 
 
-class Part(NamedTuple):
+class ComponentTensor(NamedTuple):
     """A component as a tensor: its mean, or its standard deviation."""
 
     component: ComponentName
     std: bool
 
 
-PARTS: dict[str, Part] = {
-    (f"tau_{name}" if name in _TORQUES else name) + suffix: Part(name, bool(suffix))
+PARTS: dict[str, ComponentTensor] = {
+    (f"tau_{name}" if name in _TORQUES else name) + suffix: ComponentTensor(name, bool(suffix))
     for name in COMPONENTS
     for suffix in ("", _STD)
 }

@@ -75,7 +75,7 @@ class SetSplit:
         return self.parts(episode, t).held_out
 
 
-class Clock(NamedTuple):
+class RowTimes(NamedTuple):
     """When the rows of a data set are from: their episodes and times, (N,) each."""
 
     episode: Numbers
@@ -130,7 +130,7 @@ def _check_stretches(rows: Sequence[DatasetRow], asked: Holdout) -> None:
 
 def hold_out(
     rows: Sequence[DatasetRow],
-    clocks: Sequence[Clock],
+    clocks: Sequence[RowTimes],
     asked: Holdout,
     unrepeated: Callable[[int], list[list[int]] | None],
 ) -> Divided:
@@ -154,7 +154,7 @@ def hold_out(
     return _divide(rows, clocks, splits)
 
 
-def hold_out_again(rows: Sequence[DatasetRow], clocks: Sequence[Clock], lineage: dict[str, Any]) -> Divided:
+def hold_out_again(rows: Sequence[DatasetRow], clocks: Sequence[RowTimes], lineage: dict[str, Any]) -> Divided:
     """Divide data sets of a version as they were for it, by its lineage; raise CannotHoldOutError."""
     splits = {row.id: split for row in rows if (split := remembered(row, lineage)) is not None}
     return _divide(rows, clocks, splits)
@@ -173,7 +173,7 @@ def remembered(row: DatasetRow, lineage: dict[str, Any]) -> SetSplit | None:
     return None
 
 
-def _divide(rows: Sequence[DatasetRow], clocks: Sequence[Clock], splits: dict[str, SetSplit]) -> Divided:
+def _divide(rows: Sequence[DatasetRow], clocks: Sequence[RowTimes], splits: dict[str, SetSplit]) -> Divided:
     train: list[Mask | None] = []
     held: list[Mask | None] = []
     sets: list[HeldOutSet] = []

@@ -11,7 +11,7 @@ from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
 from lipcore import extras
-from lipcore.fitting.base import BaseMismatchError, Kind, check_base
+from lipcore.fitting.base import BaseMismatchError, RobotKind, check_base
 from lipcore.fitting.estimators import UnknownEstimatorError, check_estimator
 from lipcore.fitting.options import FitOptions
 from lipcore.robots.library import ROBOTS
@@ -242,8 +242,8 @@ def _check_extra(request: JobRequest) -> None:
 def _check_base(base: VersionRow, request: JobRequest, data: DatasetRow, joint_types: list[str]) -> None:
     """Check that the training can start from a version."""
     manifest = base.manifest
-    of_base = Kind(tuple(manifest["joint_names"]), tuple(manifest["joint_types"]), manifest["torque_convention"])
-    of_data = Kind(tuple(data.joint_names), tuple(joint_types), data.torque_convention)
+    of_base = RobotKind(tuple(manifest["joint_names"]), tuple(manifest["joint_types"]), manifest["torque_convention"])
+    of_data = RobotKind(tuple(data.joint_names), tuple(joint_types), data.torque_convention)
     order = manifest["parameters"].get("geometry", {}).get("order")
     options, name = FitOptions(**request.options.model_dump()), f"{base.model}:{base.version}"
     try:
@@ -270,12 +270,12 @@ def represented(database: Database, rows: Sequence[JobRow]) -> list[Job]:
     made = {(row.model, row.version) for row in rows if row.version is not None}
     with database.session() as session:
         versions = registry.rows_of(session, made) if made else {}
-    shown = []
+    jobs = []
     for row in rows:
         version = None if row.version is None else versions.get((row.model, row.version))
         quality = None if version is None else registry.quality(version.manifest)
-        shown.append(represent(row).model_copy(update={"quality": quality}))
-    return shown
+        jobs.append(represent(row).model_copy(update={"quality": quality}))
+    return jobs
 
 
 Trigger = Literal["novelty", "linearisation", "asked"]

@@ -30,13 +30,13 @@ from service.storage.sample_file import ARRAYS
 from service.training import holding_out, refresh_data
 from service.training.holding_out import Divided
 from service.training.repeating import unrepeated
-from service.training.table import Part, Table, opened
+from service.training.table import Table, TablePart, opened
 
 CANDIDATES = 20_000
 """Rows that a fit chooses from: of more, so many of them, thinned evenly."""
 
 
-def sound(part: Part) -> Corrupt:
+def sound(part: TablePart) -> Corrupt:
     """The corrupt rows of a data set as a whole; raise CorruptError, naming it."""
 
     def take(first: int, last: int) -> Samples:
@@ -95,8 +95,8 @@ def recorded(settings: Settings, database: Database, files: Files, request: dict
         how, types = Holdout.model_validate(asked), request["joint_types"]
         clocks = [part.clock() for part in parts]
         divided = holding_out.hold_out(rows, clocks, how, lambda place: unrepeated(parts[place], types, how))
-    found = [sound(part) for part in parts]
-    table = _learnt(parts, divided, found)
+    corrupt = [sound(part) for part in parts]
+    table = _learnt(parts, divided, corrupt)
     names, robot = rows[0].joint_names, None
     if (asked_robot := request.get("robot")) is not None:
         robot = robots.resolve(database, asked_robot, names, request["joint_types"])
@@ -112,8 +112,8 @@ def recorded(settings: Settings, database: Database, files: Files, request: dict
         table,
         rows[0].torque_convention,  # type: ignore[arg-type]  # checked when it was stored
         robot,
-        {"datasets": named(rows), **base_lineage, **_holdout(divided.lineage), **_corrupt(rows, found)},
-        held_out=_held_out(settings, parts, divided, found),
+        {"datasets": named(rows), **base_lineage, **_holdout(divided.lineage), **_corrupt(rows, corrupt)},
+        held_out=_held_out(settings, parts, divided, corrupt),
         sibling=sibling,
     )
 
@@ -137,8 +137,8 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
     )
     parts = opened(files, rows)
     divided = holding_out.hold_out_again(rows, [part.clock() for part in parts], version.manifest["lineage"])
-    found = [sound(part) for part in parts]
-    table = _learnt([replace(part, factor=_aged(part.row, within)) for part in parts], divided, found)
+    corrupt = [sound(part) for part in parts]
+    table = _learnt([replace(part, factor=_aged(part.row, within)) for part in parts], divided, corrupt)
     if not table.parts and logged.rows < settings.min_samples:
         raise NothingToLearnError(f"the log has {logged.rows} rows to train on, expected {settings.min_samples}")
     log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.rows}
@@ -158,27 +158,27 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
             "datasets": named(rows),
             **({"base": lineage["base"]} if "base" in lineage else {}),
             **_holdout(divided.lineage),
-            **_corrupt(rows, found),
+            **_corrupt(rows, corrupt),
             "refresh": {**refresh, "left_out": left_out},
             "log": log_lineage,
         },
         weighted,
         seen,
-        _held_out(settings, parts, divided, found),
+        _held_out(settings, parts, divided, corrupt),
         () if base.arm is None else base.arm.geometries,
         arm_as_expected(base.arm) if base.arm is not None and "base" in lineage else None,
     )
 
 
-def _learnt(parts: list[Part], divided: Divided, found: list[Corrupt]) -> Table:
+def _learnt(parts: list[TablePart], divided: Divided, corrupt: list[Corrupt]) -> Table:
     """What is learnt from of data sets, those left out that nothing is learnt from."""
-    each = zip(parts, divided.train, found, strict=True)
+    each = zip(parts, divided.train, corrupt, strict=True)
     chosen = [replace(part, chosen=_without(mask, corrupt)) for part, mask, corrupt in each]
     return Table([part for part in chosen if len(part)])
 
 
 def _held_out(
-    settings: Settings, parts: list[Part], divided: Divided, found: list[Corrupt]
+    settings: Settings, parts: list[TablePart], divided: Divided, found: list[Corrupt]
 ) -> tuple[Samples, int] | None:
     """What is evaluated on, thinned to as much as an evaluation takes, and how much there is of it."""
     each = zip(parts, divided.held_out, found, strict=True)

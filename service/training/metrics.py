@@ -33,7 +33,7 @@ SILENT_S = 10.0
 OUTCOMES = (SUCCEEDED, FAILED, CANCELLED)
 
 
-class Work(Collector):
+class JobMetrics(Collector):
     """Training jobs of one service. Not for the event loop."""
 
     def __init__(self, database: Database) -> None:

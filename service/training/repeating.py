@@ -13,39 +13,39 @@ from service.models.schema import Holdout
 from service.storage.database import Database, DatasetRow
 from service.storage.files import Files
 from service.training import holding_out, refresh_data
-from service.training.table import Part, opened
+from service.training.table import TablePart, opened
 
 MOST = 20_000
 """Rows of a training that are looked at, thinned evenly."""
 
 
-def unrepeated(part: Part, joint_types: Sequence[str], asked: Holdout) -> list[list[int]] | None:
+def unrepeated(part: TablePart, joint_types: Sequence[str], asked: Holdout) -> list[list[int]] | None:
     """Rows of a data set to hold out in place of its last part, see `held_out.unrepeated`; None where that is right, or
     the data set has no times. First and last, exclusive, in order of episode and time."""
     if not part.timed:
         return None
     places, samples = part.motion(MOST)
-    found = held_out.unrepeated(samples, joint_types, asked.share, asked.seed)
-    if found is None:
+    spans = held_out.unrepeated(samples, joint_types, asked.share, asked.seed)
+    if spans is None:
         return None
     border = [*places.tolist(), len(part)]
-    return [[border[first], border[last]] for first, last in found]
+    return [[border[first], border[last]] for first, last in spans]
 
 
-def look(training: Sequence[Part], part: Samples, joint_types: Sequence[str]) -> dict[str, Any]:
+def look(training: Sequence[TablePart], part: Samples, joint_types: Sequence[str]) -> dict[str, Any]:
     """How much of some samples repeats what is trained on, as lineages and the API name it; nulls where there is
     nothing of that any more."""
     if not training:
         return {"repeats_training": None, "period_s": None, "warnings": []}
     rows = max(MOST, sum(map(len, training)))
     known = [each.motion(max(1, round(MOST * len(each) / rows)))[1] for each in training]
-    found = repetition(Samples.concatenate(known), part, joint_types)
+    repeated = repetition(Samples.concatenate(known), part, joint_types)
     if not all(each.timed for each in training):
-        found = found._replace(period=None)
-    return {"repeats_training": found.share, "period_s": found.period, "warnings": _warnings(found)}
+        repeated = repeated._replace(period=None)
+    return {"repeats_training": repeated.share, "period_s": repeated.period, "warnings": _warnings(repeated)}
 
 
-def trained_on(database: Database, files: Files, lineage: dict[str, Any]) -> list[Part]:
+def trained_on(database: Database, files: Files, lineage: dict[str, Any]) -> list[TablePart]:
     """What a version has learnt from of those of its data sets that are still there.
 
     Raise DamagedDataError, or CannotHoldOutError where one does not split as it did.
@@ -56,10 +56,10 @@ def trained_on(database: Database, files: Files, lineage: dict[str, Any]) -> lis
     return [part for part in parts if len(part)]
 
 
-def _learnt(part: Part, lineage: dict[str, Any]) -> Part:
+def _learnt(part: TablePart, lineage: dict[str, Any]) -> TablePart:
     row: DatasetRow = part.row
     split = holding_out.remembered(row, lineage)
-    return part if split is None else Part(row, part.reader, split.parts(*part.clock()).train)
+    return part if split is None else TablePart(row, part.reader, split.parts(*part.clock()).train)
 
 
 def _warnings(found: Repetition) -> list[str]:

@@ -52,11 +52,11 @@ async def _events(
         kind = None if last is None else _kind(last, now)
         if last is not None and kind is None:
             continue
-        shown = jobs.represent(now)
+        job = jobs.represent(now)
         if now.version is not None:  # who sees it succeed is answered by its version from then on
             await to_thread.run_sync(loaded.announce, [now.model])
-            [shown] = await to_thread.run_sync(jobs.represented, queue.database, [now])
-        yield ServerSentEvent(event=kind or "state", data=shown)
+            [job] = await to_thread.run_sync(jobs.represented, queue.database, [now])
+        yield ServerSentEvent(event=kind or "state", data=job)
         if now.state not in ACTIVE:
             return
         last = now

@@ -17,7 +17,7 @@ from lipcore.training.conditioning import SHARD
 from service.storage.database import DatasetRow
 from service.storage.files import Files
 from service.storage.sample_file import Reader
-from service.training.holding_out import Clock
+from service.training.holding_out import RowTimes
 
 STRETCHES, STRETCH = 40, 500
 """Contiguous rows that tell the white noise of a recording that is thinned, and how many of these there are at most."""
@@ -45,7 +45,7 @@ class Shard:
 
 
 @dataclass(frozen=True)
-class Part:
+class TablePart:
     """What of one data set belongs to a table. chosen: (rows,), all where None; factor: what each row counts."""
 
     row: DatasetRow
@@ -61,9 +61,9 @@ class Part:
         """Whether the times of its rows say how long each stands for."""
         return self.row.report.get("rate_hz") is not None
 
-    def clock(self) -> Clock:
+    def clock(self) -> RowTimes:
         """Episodes and times of all rows, chosen or not."""
-        return Clock(self.reader.array("episode"), self.reader.array("t"))
+        return RowTimes(self.reader.array("episode"), self.reader.array("t"))
 
     def take(self, places: Numbers) -> Samples:
         """Those of the chosen rows, by their places among them; a new episode begins where rows in between are not."""
@@ -107,7 +107,7 @@ class Part:
 class Table:
     """Parts of data sets with the same joints, as one sequence of rows."""
 
-    parts: list[Part]
+    parts: list[TablePart]
 
     def __len__(self) -> int:
         return sum(len(part) for part in self.parts)
@@ -147,6 +147,6 @@ class Table:
         return [shard for part in self.parts for shard in part.shards()]
 
 
-def opened(files: Files, rows: Sequence[DatasetRow]) -> list[Part]:
+def opened(files: Files, rows: Sequence[DatasetRow]) -> list[TablePart]:
     """Data sets as a whole; raise DamagedDataError."""
-    return [Part(row, Reader(files.samples_file(row.id, row.sha256))) for row in rows]
+    return [TablePart(row, Reader(files.samples_file(row.id, row.sha256))) for row in rows]

@@ -126,7 +126,7 @@ def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
     def fails(self, samples, place, before=None, search=True):
         raise NotPositiveDefiniteError("nothing can be\nlearnt")
 
-    monkeypatch.setattr(auto.Work, "learn", fails)
+    monkeypatch.setattr(auto.Fits, "learn", fails)
     model = train(recorded(), TYPES, options=OPTIONS)
     assert model.selection["chosen"] == model.estimator.name == "lip-chain"
     assert model.selection["reason"] == "no other could be trained"

@@ -8,12 +8,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lipcore.online.acceleration import RateError, derive, rate_of, window
-from lipcore.online.gates import LARGEST_TORQUE, Limits, Patience, check_rows, is_contact, time_span
+from lipcore.online.gates import LARGEST_TORQUE, Patience, RowLimits, check_rows, is_contact, time_span
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 from lipcore.vocabulary import CODES
 
-LIMITS = Limits(12.6, 50.0, 2000.0, None, 1.0, 1e-3)
+LIMITS = RowLimits(12.6, 50.0, 2000.0, None, 1.0, 1e-3)
 PANDA_TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
 N = 8
 
@@ -33,7 +33,7 @@ def names(codes: np.ndarray) -> list[str]:
     return [CODES[code] for code in codes]
 
 
-def jumps(t: list[float], limits: Limits = LIMITS, **bounds) -> list[int]:
+def jumps(t: list[float], limits: RowLimits = LIMITS, **bounds) -> list[int]:
     """Places of the rows rejected for their time; no row is rejected for anything else."""
     codes = names(check_rows(**batch(len(t)) | {"t": np.array(t)}, limits=limits, **bounds))
     assert set(codes) <= {"learnt", "time_jump"}

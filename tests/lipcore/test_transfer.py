@@ -9,7 +9,7 @@ import pytest
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
-from lipcore.fitting.base import BaseMismatchError, Kind, check_base
+from lipcore.fitting.base import BaseMismatchError, RobotKind, check_base
 from lipcore.kernels.arm import ArmKernel
 from lipcore.model.sibling import arm_as_expected, arm_of_sibling
 from lipcore.robots.library import Robot, another_unit
@@ -99,7 +99,7 @@ def test_a_transferred_version_keeps_what_was_expected(base: TorqueModel, few: S
         np.testing.assert_allclose(getattr(kept, name), getattr(expected, name), rtol=1e-9)
 
 
-PANDA = Kind(("a", "b"), ("revolute", "prismatic"), "gravity_included")
+PANDA = RobotKind(("a", "b"), ("revolute", "prismatic"), "gravity_included")
 
 
 @pytest.mark.parametrize(

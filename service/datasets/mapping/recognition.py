@@ -226,7 +226,7 @@ def is_episode(name: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Clock:
+class TimeColumn:
     """A time that a file holds: (index, unit) of the column, or of its whole seconds and the rest; rank: 0 is `t`."""
 
     name: str
@@ -234,24 +234,24 @@ class Clock:
     parts: tuple[tuple[int, str | None], ...]
 
 
-def clocks(names: Sequence[str]) -> list[Clock]:
+def clocks(names: Sequence[str]) -> list[TimeColumn]:
     """Times among the columns, best first: `t`, then stamps of messages, then all others."""
     out, halved = _halved(names)
     for index, name in enumerate(names):
         if name == "t":
-            out.append(Clock(name, 0, ((index, None),)))
+            out.append(TimeColumn(name, 0, ((index, None),)))
         elif index not in halved and len(name) <= _LONGEST:
             for before, unit in [*in_header(name), (name, None)]:
                 last = _PATHS.split(before.strip().lower())[-1].strip()
                 if _TIMES.fullmatch(last) and (unit is None or factor("t", unit) is not None):
                     # rostopic writes nanoseconds
                     stamp_unit = "ns" if unit is None and (name == "%time" or name.startswith("field.header")) else unit
-                    out.append(Clock(name, 1 if last == "stamp" else 2, ((index, stamp_unit),)))
+                    out.append(TimeColumn(name, 1 if last == "stamp" else 2, ((index, stamp_unit),)))
                     break
     return sorted(out, key=lambda clock: clock.rank)
 
 
-def _halved(names: Sequence[str]) -> tuple[list[Clock], set[int]]:
+def _halved(names: Sequence[str]) -> tuple[list[TimeColumn], set[int]]:
     """Stamps in two columns, whole seconds and nanoseconds, as ROS has them; and the indices of these columns."""
     halves: dict[str, dict[str, int]] = defaultdict(dict)
     for index, name in enumerate(names):
@@ -263,7 +263,7 @@ def _halved(names: Sequence[str]) -> tuple[list[Clock], set[int]]:
     for before, half in halves.items():
         if len(half) == 2 or (half.keys() == {"s"} and not before):
             parts = tuple((half[unit], unit) for unit in ("s", "ns") if unit in half)
-            out.append(Clock(names[half["s"]], 1 if "stamp" in before else 2, parts))
+            out.append(TimeColumn(names[half["s"]], 1 if "stamp" in before else 2, parts))
     return out, {index for clock in out for index, _ in clock.parts}
 
 

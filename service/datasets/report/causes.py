@@ -54,7 +54,7 @@ BASE = "Give a URDF with the base as it stands, or train with geometry=learn"
 
 
 @dataclass(frozen=True)
-class Work:
+class TorqueWork:
     """Work of all torques on the motion, ∫ Σ tau dq dt: kinetic and potential energy come back, friction's does not.
 
     power: of its trend, W; trend: how far that goes over the recording, over how far work is from it at most.
@@ -64,7 +64,7 @@ class Work:
     trend: float
 
     @classmethod
-    def of(cls, power: Array) -> Work:
+    def of(cls, power: Array) -> TorqueWork:
         """Judge Σ tau dq of rows evenly in time, (N,) W."""
         work = np.cumsum(power)
         along = np.linspace(-0.5, 0.5, len(work))
@@ -78,7 +78,7 @@ def causes(
     against: Against | None,
     signals: Signals,
     friction: Sequence[JointExcitation],
-    work: Work,
+    work: TorqueWork,
 ) -> list[Remedy]:
     """What is clearly wrong, at most one cause.
 
@@ -109,7 +109,7 @@ def _drag(joint: JointExcitation, dq: Array, tau: Array) -> int:
     return int(np.sign(drag)) if abs(drag) > max(CLEAR * std, NOTICED * tau.std()) else 0
 
 
-def _taken(upload: Upload, signals: Signals, work: Work) -> Remedy | None:
+def _taken(upload: Upload, signals: Signals, work: TorqueWork) -> Remedy | None:
     """Torques whose work on the motion is negative, which needs no robot to be known."""
     usual = float(np.sqrt(np.mean(signals.dq**2, axis=0)) @ np.sqrt(np.mean(signals.tau**2, axis=0)))
     if work.trend > -TREND or work.power > -NOTICED * usual:

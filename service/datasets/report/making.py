@@ -17,15 +17,15 @@ from service.datasets import schema
 from service.datasets.mapping.choice import WARNING
 from service.datasets.report.advice import advice, in_words, warnings
 from service.datasets.report.bodies import Against, Bodies, Signals, compare
-from service.datasets.report.causes import Work, causes
+from service.datasets.report.causes import TorqueWork, causes
 from service.datasets.report.excitation import SELDOM, RigidExcitation, joint_excitation, judge_rigid_bodies, weights
 from service.datasets.report.fit import make_fit
 from service.datasets.report.lag import Lags, clear, no_lags, shifts
 from service.datasets.report.remedies import Upload
 from service.datasets.report.robots import bodies_of, proposed, suggestion
 from service.datasets.report.signals import (
-    Clock,
     Limits,
+    RecordedTimes,
     against_limits,
     bounds,
     finite,
@@ -150,10 +150,10 @@ class _Samples:
     excitation: list[schema.JointExcitation]
     motion: tuple[Array, Array, Array]
     tau: Array
-    work: Work
+    work: TorqueWork
 
 
-def _look_at_raw(raw: Staged, clock: Clock, limits: Limits | None) -> _Recorded:
+def _look_at_raw(raw: Staged, clock: RecordedTimes, limits: Limits | None) -> _Recorded:
     out = _Recorded([], [], [])
     some_missing = bool(clock.missing.any())
     for joint, name in enumerate(raw.joint_names):
@@ -219,7 +219,9 @@ def _look_at_samples(prepared: Prepared, limits: Limits | None, most: int) -> _S
             for lag in (joint_lags[0], joint_lags[joint + 1]):
                 if clear(lag) and lags.lowers(torque, lag.seconds or 0.0):
                     lag.improves.append(name)
-    return _Samples(ranges, levels.tolist(), left, speeds, torques, joint_lags, excitation, motion, tau, Work.of(power))
+    return _Samples(
+        ranges, levels.tolist(), left, speeds, torques, joint_lags, excitation, motion, tau, TorqueWork.of(power)
+    )
 
 
 def _independent(prepared: Prepared) -> float:
@@ -273,14 +275,14 @@ def _against_robot(
 def _figures(bodies: Bodies, against: Against) -> schema.AgainstRobot:
     joints = []
     for joint, name in enumerate(bodies.names):
-        shown = [bool(visible > UNSEEN) for visible in against.visible[joint]]
+        visible_parts = [bool(visible > UNSEEN) for visible in against.visible[joint]]
         joints.append(
             schema.JointAgainstRobot(
                 joint=name,
-                gravity=finite(against.gravity[joint]) if shown[0] else None,
-                gravity_std=finite(against.gravity_std[joint]) if shown[0] else None,
-                inertia=finite(against.inertia[joint]) if shown[1] else None,
-                inertia_std=finite(against.inertia_std[joint]) if shown[1] else None,
+                gravity=finite(against.gravity[joint]) if visible_parts[0] else None,
+                gravity_std=finite(against.gravity_std[joint]) if visible_parts[0] else None,
+                inertia=finite(against.inertia[joint]) if visible_parts[1] else None,
+                inertia_std=finite(against.inertia_std[joint]) if visible_parts[1] else None,
                 explained=float(against.explained[joint]),
             )
         )

@@ -64,7 +64,7 @@ def spread(values: Array) -> float:
 
 
 @dataclass(frozen=True)
-class Clock:
+class RecordedTimes:
     """Times of a raw recording.
 
     part: number of the contiguous part that each row belongs to, (N,); missing: rows that lack a value, (N,).
@@ -75,7 +75,7 @@ class Clock:
     missing: NDArray[np.bool_]
 
 
-def look_at_clock(raw: Staged, gap_steps: float, repeated: int) -> Clock:
+def look_at_clock(raw: Staged, gap_steps: float, repeated: int) -> RecordedTimes:
     """Judge the times of a raw recording.
 
     gap_steps: a step of time longer than so many usual ones is a gap; repeated: stamps left out while it was read.
@@ -85,14 +85,14 @@ def look_at_clock(raw: Staged, gap_steps: float, repeated: int) -> Clock:
     if EPISODE in raw:
         breaks.append(np.diff(raw.read(EPISODE)) != 0)
     if TIME not in raw:
-        return Clock(_without_times(int(missing.sum())), number_parts(raw.rows, breaks), missing)
+        return RecordedTimes(_without_times(int(missing.sum())), number_parts(raw.rows, breaks), missing)
     t = raw.read(TIME)
     steps = np.diff(t)
     inside = ~np.logical_or.reduce(breaks) & np.isfinite(steps)
     inside &= steps > 0  # rows that repeat a stamp are counted by whoever leaves them out
     usual = float(np.median(steps[inside])) if inside.any() else 0.0
     if usual <= 0:
-        return Clock(_without_times(int(missing.sum())), number_parts(raw.rows, breaks), missing)
+        return RecordedTimes(_without_times(int(missing.sum())), number_parts(raw.rows, breaks), missing)
     gap = inside & (steps > gap_steps * usual)
     even = inside & ~gap
     deviation = np.abs(steps[even] / usual - 1)
@@ -107,7 +107,7 @@ def look_at_clock(raw: Staged, gap_steps: float, repeated: int) -> Clock:
         repeated_stamps=repeated,
         missing_rows=int(missing.sum()),
     )
-    return Clock(timing, number_parts(raw.rows, [*breaks, gap]), missing)
+    return RecordedTimes(timing, number_parts(raw.rows, [*breaks, gap]), missing)
 
 
 def _longest(t: Array, steps: Array, gaps: NDArray[np.intp]) -> list[Gap]:

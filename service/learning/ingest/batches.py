@@ -27,7 +27,7 @@ from service.journal.log import NewBatch, StreamKind, check_kind
 from service.learning.ingest import screening
 from service.learning.ingest.intake import Intake, enabled
 from service.learning.ingest.monitor import Monitor
-from service.learning.ingest.screening import Clock, Measured
+from service.learning.ingest.screening import Measured, StreamTime
 from service.learning.schema import Derivation, ExpiredError, ObservationRequest, ObservationResponse, State
 from service.models.loaded import Served
 from service.storage.database import EventRow
@@ -68,7 +68,7 @@ def _take(
             return answer
         bounds = screening.limits(served.model, options, intake.settings)
         before, after = log.neighbours(session, *key)
-        clock = Clock.of(source, sequence, before, after, received)
+        clock = StreamTime.of(source, sequence, before, after, received)
         previous = before.last if before is not None and clock.adjacent else None
         dated = screening.dated(batch, clock, bounds, previous)
         rows, own, derived = dated.rows, slice(0, len(batch)), None

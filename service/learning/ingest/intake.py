@@ -265,10 +265,12 @@ def _alarm(session: Session, served: Served, options: LearningOptions, verdict: 
     assert change is not None
     evidence = verdict.evidence(names) | {"stream_id": event.stream_id, "sequence": event.sequence}
     joints = ", ".join(names[joint] for joint in change.joints)
-    found = f"does not fit what was learnt any more: {evidence['suspect']}?"
+    finding = f"does not fit what was learnt any more: {evidence['suspect']}?"
     if verdict.departed is not None:
-        found = f"has left what version {verdict.departed.version} was trained on, step by step ({evidence['cause']}):"
-    message = f"the torque of {joints} {found} {CONSEQUENCES[options.on_change]}"
+        finding = (
+            f"has left what version {verdict.departed.version} was trained on, step by step ({evidence['cause']}):"
+        )
+    message = f"the torque of {joints} {finding} {CONSEQUENCES[options.on_change]}"
     if verdict.opened is not None:
         share = percent(verdict.opened.coverage.mean())
         message = (

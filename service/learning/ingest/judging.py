@@ -140,8 +140,8 @@ class Verdict:
         """Evidence of the change, for JSON."""
         assert self.change is not None
         evidence = self.change.evidence(joint_names, self.watch.innovations.friction(self.change.at))
-        shown = self.departed or self.opened
-        return evidence if shown is None else evidence | shown.evidence(joint_names)
+        reason = self.departed or self.opened
+        return evidence if reason is None else evidence | reason.evidence(joint_names)
 
 
 def judge(

@@ -25,7 +25,7 @@ from service.journal import log
 from service.learning import intervals
 from service.learning.ingest.judging import ContactGate, Innovations, Watch
 from service.learning.ingest.opening import Opening
-from service.learning.intervals import Held, Known
+from service.learning.intervals import HeldIntervals, Known
 from service.learning.payloads import Payloads
 from service.models.scales import Factor
 from service.storage.database import EventRow
@@ -44,12 +44,14 @@ class Window:
     def __init__(self, seconds: float, n_joints: int) -> None:
         self.seconds, self._n_joints = seconds, n_joints
         self._length = max(seconds / PARTS, 1.0)
-        self._buckets: tuple[tuple[int, Record, Counter[str], Held], ...] = ()
+        self._buckets: tuple[tuple[int, Record, Counter[str], HeldIntervals], ...] = ()
 
-    def add(self, record: Record | None, counts: Mapping[str, int], at: float, held: Held | None = None) -> None:
+    def add(
+        self, record: Record | None, counts: Mapping[str, int], at: float, held: HeldIntervals | None = None
+    ) -> None:
         """Add a batch's record and counts at a Unix time, s, and what intervals held. From one thread at a time."""
         number = int(at // self._length)
-        empty = number, Record.empty(self._n_joints), Counter[str](), Held.none(self._n_joints)
+        empty = number, Record.empty(self._n_joints), Counter[str](), HeldIntervals.none(self._n_joints)
         *rest, last = self._buckets or (empty,)
         if last[0] != number:
             rest, last = [*rest, last], empty
@@ -76,10 +78,10 @@ class Window:
         counts = (bucket[2] for bucket in self._buckets if self._holds(bucket[0], now))
         return reduce(add, counts, Counter[str]())
 
-    def held(self, now: float) -> Held:
+    def held(self, now: float) -> HeldIntervals:
         """What intervals, as answered, held of the rows within the window before a Unix time, s."""
         parts = (bucket[3] for bucket in self._buckets if self._holds(bucket[0], now))
-        return reduce(add, parts, Held.none(self._n_joints))
+        return reduce(add, parts, HeldIntervals.none(self._n_joints))
 
     def _holds(self, number: int, now: float) -> bool:
         return (number + 1) * self._length > now - self.seconds

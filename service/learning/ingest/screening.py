@@ -20,7 +20,7 @@ from lipcore.online import acceleration
 from lipcore.online.acceleration import JITTER, RateError
 from lipcore.online.adaptive import scores
 from lipcore.online.batch import Rows
-from lipcore.online.gates import Limits, check_rows, time_span
+from lipcore.online.gates import RowLimits, check_rows, time_span
 from lipcore.vocabulary import CODES, LEARNT
 from lipserve.wording import percent
 from service.foundation.errors import invalid_request
@@ -56,7 +56,7 @@ class Measured:
 
 
 @dataclass(frozen=True)
-class Clock:
+class StreamTime:
     """What is known of a stream's time when a batch arrives.
 
     offset: s, None while it is unknown. after, before: times, by the stream's clock, that the rows must lie between.
@@ -72,14 +72,14 @@ class Clock:
     @staticmethod
     def of(
         source: StreamRow | None, sequence: int, before: EventRow | None, after: EventRow | None, arrived: float
-    ) -> Clock:
+    ) -> StreamTime:
         """The clock of a stream, with the batches that are kept next below and above a sequence."""
         offset = None if source is None or source.offset == 0 else source.offset
         first, last = _span(after), _span(before)
         latest = None if offset is None else arrived + FAR_AHEAD - offset
         bounds = [bound for bound in (latest, None if first is None else first[0]) if bound is not None]
         adjacent = before is not None and before.last_sequence == sequence - 1
-        return Clock(offset, None if last is None else last[1], min(bounds, default=None), adjacent, arrived)
+        return StreamTime(offset, None if last is None else last[1], min(bounds, default=None), adjacent, arrived)
 
     def settled(self, t: Array | None, usable: NDArray[np.bool_], gap: float) -> float:
         """The offset, s, fixed now if these rows (times (N,), those to be believed) are the first that have times."""
@@ -189,14 +189,14 @@ class Screened:
         return float(self.rows.time[self.predicted].max()) if self.predicted.any() else None
 
 
-def limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> Limits:
+def limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> RowLimits:
     """What a row of a model may hold: its actuators' limits are those of its options, else those of its URDF."""
     torque = None if options.torque_limits is None else np.array(options.torque_limits)
     if torque is None and model.robot is not None:
         effort = np.asarray(model.robot.model.effortLimit, np.float64)[list(model.robot.order)]
         if (effort > 0).all():
             torque = effort
-    return Limits(
+    return RowLimits(
         settings.max_position,
         settings.max_velocity,
         settings.max_acceleration,
@@ -206,7 +206,7 @@ def limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> 
     )
 
 
-def dated(measured: Measured, clock: Clock, bounds: Limits, previous: float | None) -> Dated:
+def dated(measured: Measured, clock: StreamTime, bounds: RowLimits, previous: float | None) -> Dated:
     """Check, date and weigh rows. previous: event time of the row right before them, s, where it is known. Weights come
     from the batch itself where it has a spacing, so that they do not depend on the order of arrival."""
     t = measured.t
@@ -286,7 +286,7 @@ def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:
 
 
 def derive(
-    session: Session, model: str, stream_id: str, sequence: int, rows: Rows, t: Array, bounds: Limits
+    session: Session, model: str, stream_id: str, sequence: int, rows: Rows, t: Array, bounds: RowLimits
 ) -> tuple[Rows, slice, DerivedAcceleration]:
     """Derive the accelerations of a batch of rows, across the batches next to it in its stream.
 

@@ -51,8 +51,8 @@ def floor(database: Database, model: str, version: int, through: int, n_joints: 
         counts = EventRow.void.is_(False) | EventRow.number.in_(_undone_later(session, model, through))
         fitting = func.coalesce(EventRow.report["doubted"].as_boolean(), False).is_(False)
         latest = query.where(counts, fitting).limit(MOST_EVENTS)
-        found = session.execute(latest.execution_options(yield_per=READ_EVENTS))
-        for received, record in found:
+        events = session.execute(latest.execution_options(yield_per=READ_EVENTS))
+        for received, record in events:
             if record is None:
                 continue
             newest = received if newest is None else newest
@@ -60,7 +60,7 @@ def floor(database: Database, model: str, version: int, through: int, n_joints: 
                 break
             records.append(record)
             rows += record["rows"]
-        found.close()
+        events.close()
     total = Record.empty(n_joints)
     if rows:  # all of them at once, and only what the floor is made of: it is asked for twice a second
         figures = np.array([[record["squared"], record["noise"]] for record in records])

@@ -17,7 +17,7 @@ from service.storage.files import Files, new_id
 from service.storage.sample_file import Reader
 from service.training.material import CANDIDATES
 from service.training.summing import Context, packed, read, shard_statistics
-from service.training.table import STRETCHES, Part, Table, opened
+from service.training.table import STRETCHES, Table, TablePart, opened
 from tests.service.data import QUICK, stream
 
 ROWS = SHARD + 700
@@ -51,7 +51,7 @@ def model():
     return lipcore.train(stream(), ["revolute"] * 2, "lip-chain", lipcore.FitOptions(**QUICK, statistics="chosen"))
 
 
-def masked(part: Part) -> Part:
+def masked(part: TablePart) -> TablePart:
     """Some stretches of it, and none of the middle."""
     mask = np.arange(ROWS) % 50 < 30
     mask[1000:2000] = False

@@ -9,7 +9,7 @@ from sqlalchemy import delete
 
 from docs import metrics as table
 from service.storage.database import JobRow
-from service.training.metrics import DURATION, FINISHED, JOBS, Work
+from service.training.metrics import DURATION, FINISHED, JOBS, JobMetrics
 from tests.service.data import QUICK, queue, service_of, stream, upload
 from tests.service.observability.test_requests import QUERY
 
@@ -132,7 +132,7 @@ def jobs(api):
 def families(database):
     return {
         (sample.name, *sample.labels.values()): sample.value
-        for family in Work(database).collect()
+        for family in JobMetrics(database).collect()
         for sample in family.samples
     }
 

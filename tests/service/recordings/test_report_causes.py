@@ -20,7 +20,7 @@ from lipcore.robots.simulation import FAST, Stream, inverse_dynamics, simulate
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.datasets.options import upload_options
-from service.datasets.report.causes import Work
+from service.datasets.report.causes import TorqueWork
 from service.datasets.report.making import make_report
 from service.datasets.report.remedies import flags
 from service.datasets.schema import DatasetReport
@@ -193,9 +193,9 @@ def test_without_a_robot_the_work_of_the_torques_tells_their_sign(tmp_path: Path
 
 def test_work_that_comes_back_has_no_trend() -> None:
     t = np.arange(4000) / 100
-    stored = Work.of(5 * np.cos(3 * t) - 2 * np.cos(1.1 * t))
+    stored = TorqueWork.of(5 * np.cos(3 * t) - 2 * np.cos(1.1 * t))
     assert abs(stored.trend) < 0.3
-    lossy = Work.of(5 * np.cos(3 * t) - 2.0)
+    lossy = TorqueWork.of(5 * np.cos(3 * t) - 2.0)
     assert lossy.power == pytest.approx(-2.0, abs=0.1)
     assert lossy.trend < -10
 

@@ -40,9 +40,9 @@ def observe(
     for name, values in (("t", t), ("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau)):
         if values is not None:
             numbers = np.asarray(values, dtype=np.float64)
-            shown = numbers.astype(object)
-            shown[~np.isfinite(numbers)] = None  # JSON has no such numbers
-            body[name] = shown.tolist()
+            sendable = numbers.astype(object)
+            sendable[~np.isfinite(numbers)] = None  # JSON has no such numbers
+            body[name] = sendable.tolist()
     body |= given(joint_names=None if joint_names is None else list(joint_names))
     return at(record(ObservationResponse), names={"model": model}, json=body)
 
