@@ -18,15 +18,18 @@ RUN .ci/install-image ./clients/python '.'
 FROM sources AS build-full
 RUN .ci/install-image ./clients/python '.[train,robots,ingest,cluster,grpc,signing]'
 
-# the system, without what installs packages of Python: a layer can only add, so it is copied as it is in the end
+# the system, without what installs packages, Python's or Debian's, and without Perl: a layer can only add, so it is
+# copied as it is in the end
 FROM python:3.11-slim AS system
 # Pinocchio's OpenMP runtime, which slim images lack
 RUN apt-get update && apt-get install --yes --no-install-recommends libgomp1 \
     && useradd --system --uid 10001 --no-create-home --shell /usr/sbin/nologin lipserve \
     && mkdir --mode=700 /data && chown lipserve /data \
     && rm -rf /var/lib/apt/lists/* /var/cache/apt/* /usr/share/doc/* /usr/share/man/* /usr/share/locale/* \
+        /usr/lib/*/gconv /usr/lib/*/perl* /usr/bin/perl* /usr/share/perl* /usr/lib/apt /usr/lib/*/libapt-* /usr/bin/apt* \
+        /usr/share/zoneinfo/right /var/lib/dpkg/info \
     && for python in /usr/lib/python3* /usr/local/lib/python3*; do \
-        rm -rf "$python"/ensurepip "$python"/idlelib "$python"/test "$python"/lib2to3 \
+        rm -rf "$python"/ensurepip "$python"/idlelib "$python"/test "$python"/lib2to3 "$python"/pydoc_data \
             "$python"/*-packages/pip* "$python"/*-packages/setuptools* "$python"/*-packages/wheel*; \
     done; rm -rf /usr/share/python-wheels
 
