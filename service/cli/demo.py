@@ -23,7 +23,7 @@ from lipserve import ApiError, Client, Evaluation, Prediction
 from lipserve.asking import Reading
 from lipserve.progress import follow
 from lipserve.states import SUCCEEDED
-from lipserve.wording import percent
+from lipserve.wording import counted, percent
 from service.cli.consoles import out
 from service.cli.options import alone
 from service.cli.plotting import draw_torque
@@ -102,7 +102,7 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
         fit, process = version.fit, version.lineage["training_process"]
         console.print(
             f"  version {job.version} after {job.progress.elapsed_s:.0f} s: {fit['samples_posterior']} of "
-            f"{fit['samples_given']} samples kept, {fit['iterations']} iterations, "
+            f"{counted(fit['samples_given'], 'sample')} kept, {counted(fit['iterations'], 'iteration')}, "
             f"peak memory of the training process {process['peak_memory_mb']} MB"
         )
 
