@@ -149,7 +149,8 @@ def dataset_of(client: Client, data: str, **reading: Any) -> str:
     if not reading and (made := _made_of(client, path)) is not None:
         note(f"{path.name} is data set {made.id}")
         return made.id
-    hint = f"`lipserve data add {shlex.quote(data)}` takes options that say how to read it; then give its id here"
+    adding = f"`lipserve data add {shlex.quote(data)}`"
+    hint = f"{adding} takes options that say how to read it; then give the recording here again"
     with advised(hint):
         dataset = upload(client, [path], **reading)
     note(f"{path.name} is data set {dataset.id}")

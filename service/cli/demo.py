@@ -30,7 +30,7 @@ from service.cli.plotting import draw_torque
 from service.cli.simulate import write_recording
 
 MODEL = "panda-demo"
-START_SECONDS = 60.0
+START_SECONDS = 180.0
 PLOTTED = 150
 """Samples in the plot: fifteen seconds."""
 REGIMES = {"slow": 1.0, "fast": FAST}
@@ -78,7 +78,7 @@ class ServiceProcess:
 def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
     """Serve, simulate, upload, train, evaluate and ask; leave the service up unless `once`."""
     began = time.monotonic()
-    console.print("[bold]1. starting the service[/bold]")
+    console.print("[bold]1. starting the service[/bold] (the first time on a machine: up to a minute)")
     with ServiceProcess(port) as service, Client(service.url) as client, tempfile.TemporaryDirectory() as folder:
         seconds = service.wait_ready(client)
         console.print(f"  ready at {service.url} after {seconds:.1f} s: watch it there")

@@ -122,6 +122,14 @@ def test_mistakes_are_explained_in_one_line(lipserve, tmp_path, monkeypatch, com
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_port_that_is_taken_is_named_before_a_home_is_made(lipserve, server, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIPSERVE_HOME", str(tmp_path / "home"))
+    code, out, err = lipserve("serve", "--port", server.port)
+    assert (code, out) == (1, "")
+    assert f"error: port is {server.port}, expected one that is free at 127.0.0.1: Address already in use" in err
+    assert not (tmp_path / "home").exists()
+
+
 def test_address_of_the_dashboard(asked, server):
     assert asked("open") == f"{server.url}/#/\n"
     assert asked("open", "my-arm", "--live", "--json") == {"url": f"{server.url}/#/live/my-arm"}
