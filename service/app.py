@@ -13,6 +13,7 @@ from fastapi_offline import FastAPIOffline
 from starlette.routing import BaseRoute
 from threadpoolctl import threadpool_limits
 
+from lipserve.wording import counted
 from service import __version__
 from service.dashboard import routes as dashboard
 from service.datasets import routes as datasets
@@ -185,7 +186,7 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     start_sweeping(database, files)
     registry.install_shipped(database, files)
     loaded = LoadedModels(storage, LearntVersions(database, files))
-    logger.info("loaded %d models", loaded.preload())
+    logger.info("loaded %s of %s", counted(loaded.preload(), "model"), settings.home)
     jobs = queue_of(settings)(storage, lambda model, _: loaded.changed(model))
     if recovered := jobs.recover():
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))

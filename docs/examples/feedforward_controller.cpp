@@ -2,7 +2,8 @@
 //
 //     lipserve models export panda-sim --c .
 //     cc -O2 -c lipserve_model.c
-//     c++ -std=c++17 -O2 feedforward_controller.cpp lipserve_model.o -o controller && ./controller
+//     c++ -std=c++17 -O2 feedforward_controller.cpp lipserve_model.o -o controller
+//     ./controller 5000 0 0 0 -1.8 0 1.6 0     cycles, and the posture to move about, zero by default
 //
 // In ROS 2 the class derives from controller_interface::ControllerInterface: on_configure and update are its methods of
 // these names, references and commands its interfaces. Nothing here stands between a wrong torque and your hardware:
@@ -108,5 +109,7 @@ int main(int count, char **arguments)
         // here the effort goes to the drives, beside the feedback
     }
     std::printf("used %ld of %ld, the longest cycle took %.1f us\n", used, cycles, longest);
+    if (used == 0)
+        std::puts("none was used: name a posture that the training saw, lipserve_model.h says between which positions");
     return 0;
 }

@@ -12,6 +12,7 @@ from rich.table import Table
 from lipcore.vocabulary import COMPONENTS
 from lipserve.address import DEFAULT_URL
 from lipserve.call import given
+from lipserve.wording import counted
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, out, print_json, print_warnings
 from service.cli.options import Alias, Data, Json, Model, Url, Version, alone, group, names, numbers
@@ -171,7 +172,13 @@ def latency(
     if as_json:
         print_json({"model": model, "version": version.version, "queries": queries, "milliseconds": figures})
         return
-    table = Table("ms a query", "p50", "p99", "largest", title=f"{model} version {version.version}, {queries} queries")
+    table = Table(
+        "ms a query",
+        "p50",
+        "p99",
+        "largest",
+        title=f"{model} version {version.version}, {counted(queries, 'query', 'queries')}",
+    )
     for name, each in figures.items():
         table.add_row(name, *(f"{value:.2f}" for value in each.values()))
     out.print(table)

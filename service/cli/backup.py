@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from lipserve.wording import counted
 from service.cli.consoles import CommandError, print_result
 from service.cli.options import Json, alone, settings_of
 from service.foundation.settings import Settings
@@ -55,6 +56,7 @@ def _say(done: str, made: Backup, as_json: bool) -> None:
     print_result(
         made,
         as_json,
-        f"{done} {made.datasets} data sets, {made.versions} versions, {made.snapshots} snapshots and "
-        f"{made.observations} batches as of {made.at}, {made.size / 1e6:.1f} MB",
+        f"{done} {counted(made.datasets, 'data set')}, {counted(made.versions, 'version')}, "
+        f"{counted(made.snapshots, 'snapshot')} and {counted(made.observations, 'batch', 'batches')} as of {made.at}, "
+        f"{made.size / 1e6:.1f} MB",
     )

@@ -16,6 +16,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http.client import HTTPException
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote, urlsplit
@@ -145,11 +146,41 @@ def dataset_of(client: Client, data: str, **reading: Any) -> str:
         raise CommandError(f"data is {data!r} beside {', '.join(FLAGS[name] for name in reading)}, {expected}")
     if path is None:
         return data
-    hint = f"`lipserve data add {shlex.quote(data)}` takes options that say how to read it; then give its id here"
+    if not reading and (made := _made_of(client, path)) is not None:
+        note(f"{path.name} is data set {made.id}")
+        return made.id
+    adding = f"`lipserve data add {shlex.quote(data)}`"
+    hint = f"{adding} takes options that say how to read it; then give the recording here again"
     with advised(hint):
         dataset = upload(client, [path], **reading)
     note(f"{path.name} is data set {dataset.id}")
     return dataset.id
+
+
+MOST_READINGS = 50
+"""Data sets of one file that are told apart, at most."""
+
+
+def _made_of(client: Client, path: Path) -> Dataset | None:
+    """The data set that a file was made before, however it was read; None where there is none. Raise CommandError where
+    it was read in several ways."""
+    with path.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    found = list(islice(client.datasets(digest), MOST_READINGS))
+    alike = {(each.sha256, *each.joint_names, each.torque_convention, each.report.robot): each for each in found[::-1]}
+    if len(alike) > 1:
+        listed = ", ".join(f"{each.id} ({_reading_of(each)})" for each in reversed(alike.values()))
+        raise CommandError(
+            f"{path.name} was uploaded before, read in {len(alike)} ways: expected the id of one of them: {listed}",
+            "`lipserve data show ID` tells how a data set was read; `lipserve data delete ID` forgets one",
+        )
+    return next(iter(alike.values()), None)
+
+
+def _reading_of(dataset: Dataset) -> str:
+    robot = dataset.report.robot
+    told = "no robot" if robot is None else f"robot {robot}"
+    return f"{told}, {dataset.created_at[:16].replace('T', ' ')}"
 
 
 @contextmanager

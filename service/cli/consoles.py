@@ -140,6 +140,8 @@ def hint_of(code: str, status: int | None = None) -> str | None:
         return "try again in a moment: the service says that it is busy"
     if code == "unreachable":
         return START
+    if code == "closed":
+        return "open the stream again once the service is back: what it has acknowledged is kept"
     return None
 
 

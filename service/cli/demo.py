@@ -23,14 +23,14 @@ from lipserve import ApiError, Client, Evaluation, Prediction
 from lipserve.asking import Reading
 from lipserve.progress import follow
 from lipserve.states import SUCCEEDED
-from lipserve.wording import percent
+from lipserve.wording import counted, percent
 from service.cli.consoles import out
 from service.cli.options import alone
 from service.cli.plotting import draw_torque
 from service.cli.simulate import write_recording
 
 MODEL = "panda-demo"
-START_SECONDS = 60.0
+START_SECONDS = 180.0
 PLOTTED = 150
 """Samples in the plot: fifteen seconds."""
 REGIMES = {"slow": 1.0, "fast": FAST}
@@ -78,7 +78,7 @@ class ServiceProcess:
 def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
     """Serve, simulate, upload, train, evaluate and ask; leave the service up unless `once`."""
     began = time.monotonic()
-    console.print("[bold]1. starting the service[/bold]")
+    console.print("[bold]1. starting the service[/bold] (the first time on a machine: up to a minute)")
     with ServiceProcess(port) as service, Client(service.url) as client, tempfile.TemporaryDirectory() as folder:
         seconds = service.wait_ready(client)
         console.print(f"  ready at {service.url} after {seconds:.1f} s: watch it there")
@@ -102,7 +102,7 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
         fit, process = version.fit, version.lineage["training_process"]
         console.print(
             f"  version {job.version} after {job.progress.elapsed_s:.0f} s: {fit['samples_posterior']} of "
-            f"{fit['samples_given']} samples kept, {fit['iterations']} iterations, "
+            f"{counted(fit['samples_given'], 'sample')} kept, {counted(fit['iterations'], 'iteration')}, "
             f"peak memory of the training process {process['peak_memory_mb']} MB"
         )
 

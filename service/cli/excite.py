@@ -31,7 +31,7 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 from lipserve import ApiError, Client
 from lipserve.address import DEFAULT_URL, URL_VARIABLE
-from lipserve.wording import percent
+from lipserve.wording import counted, percent
 from service.cli import plotting
 from service.cli.consoles import err, print_json
 from service.cli.options import Json, alone
@@ -315,7 +315,7 @@ def summary(made: Plan, known: str) -> str:
     """In words: what was planned, for what, and from where the robot starts."""
     start = ", ".join(f"{value:.3f}" for value in made.series.at(np.zeros(1))[0][0])
     options = made.options
-    ended = f"{made.iterations} iterations in {made.seconds:.0f} s"
+    ended = f"{counted(made.iterations, 'iteration')} in {made.seconds:.0f} s"
     if made.out_of_time:
         ended += ", which the budget ended"
     return (

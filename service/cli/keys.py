@@ -63,8 +63,10 @@ def create(
     if given is None:
         typer.echo(secret)
     until = f"until {row.expires_at}" if row.expires_at else "until it is revoked"
+    where = settings.home if settings.database_url is None else "the database LIPSERVE_DATABASE_URL"
     note(
-        f"{row.id} may {', '.join(row.scopes)} {until}; a running service knows it after {settings.keys_refresh_s:g} s"
+        f"{row.id} may {', '.join(row.scopes)} {until}; a service that runs on {where} knows it after "
+        f"{settings.keys_refresh_s:g} s"
     )
 
 

@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
+from lipserve.wording import counted
 from service.cli.connecting import connected
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result
 from service.cli.options import Json, Limit, Model, Url, Yes, alone, confirm, group, pairs, value
@@ -57,7 +58,7 @@ def _print_quality(quality: Quality) -> None:
     if not seen.rows:
         echo(f"nothing has come in the last {seen.seconds:.0f} s")
         return
-    title = f"{seen.rows} rows of the last {seen.seconds:.0f} s, each predicted before it was learnt"
+    title = f"{counted(seen.rows, 'row')} of the last {seen.seconds:.0f} s, each predicted before it was learnt"
     figures = {"nmse": seen.nmse, "rmse": seen.rmse, "coverage": seen.coverage, "nlpd": seen.nlpd}
     out.print(figures_table(title, quality.joint_names, figures))
 
@@ -131,7 +132,10 @@ def batch(
     lines = [
         f"{stream} {sequence} to {seen.last_sequence}: {seen.state}, {seen.accepted} of {seen.rows} rows teach",
         f"  kept out: {kept}",
-        *(f"  {each.replayed_at[:19].replace('T', ' ')}  {each.rows} rows replayed" for each in seen.replays),
+        *(
+            f"  {each.replayed_at[:19].replace('T', ' ')}  {counted(each.rows, 'row')} replayed"
+            for each in seen.replays
+        ),
     ]
     print_result(seen, as_json, *lines)
 
@@ -159,7 +163,7 @@ def replay(
     """Learn rows of a batch after all that were kept out, such as contacts."""
     with connected(url) as client:
         done = client.replay(model, stream, sequence, code)
-    print_result(done, as_json, f"{done.rows} rows of batch {sequence} of {stream} are learnt now")
+    print_result(done, as_json, f"learnt now: {counted(done.rows, 'row')} of batch {sequence} of {stream}")
 
 
 @app.command()
@@ -181,7 +185,9 @@ def decide(
         raise CommandError(f"decision is {decision!r}, expected {' or '.join(DECISIONS)}")
     with connected(url) as client:
         decided = client.decide(model, cast(Literal["adapt", "ignore"], decision), replay)
-    print_result(decided, as_json, f"{model} learns again; {decided.rows} rows that were kept out are learnt")
+    print_result(
+        decided, as_json, f"{model} learns again; of what was kept out {counted(decided.rows, 'row')} learnt now"
+    )
 
 
 @alarms_app.command()

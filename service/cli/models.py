@@ -287,7 +287,7 @@ def print_held_out(version: VersionRecord) -> None:
     from service.cli.tables import figures_table  # noqa: PLC0415 - takes long to import; help needs none
 
     held = version.lineage["holdout"]
-    out.print(figures_table(f"on {held['samples']} samples held out", version.joint_names, held))
+    out.print(figures_table(f"on {counted(held['samples'], 'sample')} held out", version.joint_names, held))
     print_warnings(held.get("warnings", ()))
 
 
@@ -323,7 +323,7 @@ def _print_version(version: VersionRecord) -> None:
     if sets:
         echo(f"  trained on {', '.join(map(str, sets))}")
     if (independent := version.fit.get("independent_samples")) is not None:
-        echo(f"  {version.fit['samples_given']} samples, worth {round(independent)} independent ones")
+        echo(f"  {counted(version.fit['samples_given'], 'sample')}, worth {round(independent)} independent ones")
     if version.conformal is not None:
         _print_guarantee(version.conformal)
     if lineage.get("holdout") is not None:

@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
+from lipserve.wording import counted
 from service.cli.connecting import connected
 from service.cli.consoles import CommandError, echo, out, print_json
 from service.cli.options import Json, Model, Url, alone, numbers
@@ -106,7 +107,7 @@ def _print_stream(stream: StreamPayload) -> None:
             echo(f"  at the tip      {_vector(stream.payload.com_tip)} m")
     echo(f"  since           {_since(stream)}")
     if stream.payload is not None:
-        echo(f"  seen on         {stream.rows:,} rows")
+        echo(f"  seen on         {counted(stream.rows, 'row')}")
 
 
 def _mass(body: PayloadBody | None) -> str:

@@ -238,13 +238,15 @@ def play(
     deadline: float,
     stop: Stop,
     each_second: Callable[[int, Tally], None],
-) -> Tally:
+    total: Tally,
+) -> None:
     """Ask for the torque at each row when it is due, and send what was measured there where it is to be learnt.
 
     A row that is refused is counted and the next one is sent; rows that are due already follow without a pause. Raise
     StreamError where the stream is lost. each_second: is told which second of the playing has ended, and its figures.
+    total: gets the figures of all rows, also where the stream is lost.
     """
-    total, part = Tally(stream.hello.noise_std), Tally(stream.hello.noise_std)
+    part = Tally(stream.hello.noise_std)
     due = motion.t - motion.t[0]
     begin, second = time.perf_counter(), 1
     for row in range(len(motion)):
@@ -263,6 +265,7 @@ def play(
             answer = stream.ask(motion.q[row], motion.dq[row], motion.ddq[row], deadline=deadline, tau=tau)
         except StreamError as error:
             if error.sequence is None:
+                total.merge(part)
                 raise
             part.refused[error.code] += 1
             continue
@@ -270,4 +273,3 @@ def play(
     if part.rows or part.refused:
         each_second(second, part)
         total.merge(part)
-    return total

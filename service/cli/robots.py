@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
+from lipserve.wording import counted
 from service.cli.connecting import connected
 from service.cli.consoles import CommandError, echo, out, print_json, print_result
 from service.cli.options import Json, Limit, Url, Yes, confirm, group
@@ -45,7 +46,7 @@ def show(robot: Robot, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     if as_json:
         print_json({"profile": known, "uploaded": uploaded})
         return
-    echo(f"{known.name}: {known.title}, {len(known.joints)} joints")
+    echo(f"{known.name}: {known.title}, {counted(len(known.joints), 'joint')}")
     if uploaded is not None:
         echo(f"  uploaded {uploaded.created_at[:19].replace('T', ' ')}, sha256 {uploaded.sha256}")
     table = Table("joint", "type", "lower", "upper", "speed", "torque")

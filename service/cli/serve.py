@@ -30,6 +30,7 @@ def serve(
 ) -> None:
     """Serve models and run training jobs."""
     settings = settings_of(host=host, port=port, grpc_port=grpc_port, uds=uds)
+    sockets.check_port(settings.host, settings.port)
     keep_little()
     logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
     check_home(settings)  # before the app opens it for good: what is wrong is said without a traceback

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -99,7 +100,7 @@ def stream(
     second lies outside the model's band is not learnt until that is confirmed. Ctrl-C ends it.
     """
     # takes long to import; help needs none of it
-    from service.cli.playing import Stop, play, recorded, simulated  # noqa: PLC0415
+    from service.cli.playing import Stop, Tally, play, recorded, simulated  # noqa: PLC0415
     from service.cli.simulate import described  # noqa: PLC0415
 
     if (file is None) == (simulate is None):
@@ -131,11 +132,14 @@ def stream(
             _print_second(second, part, opened, learn, as_json)
             doubt.look(second, part, opened)
 
-        total = play(opened, played, learn, step, stop, each_second)
-        if learn:
-            opened.flush()
-            doubt.decide(opened)
-        _print_all(total, opened, learn, as_json)
+        total = Tally(opened.hello.noise_std)
+        try:
+            play(opened, played, learn, step, stop, each_second, total)
+            if learn:
+                opened.flush()
+                doubt.decide(opened)
+        finally:  # also of a stream that the service has closed
+            _print_all(total, opened, learn, as_json)
     if stop.asked:
         raise typer.Exit(INTERRUPTED)
     if doubt.held:
@@ -150,7 +154,7 @@ class Doubt:
 
     def __init__(self, client: Client, model: str, source: str | None, confirmed: bool) -> None:
         self._client, self._model, self._source, self._confirmed = client, model, source, confirmed
-        self._told, self.held = False, False
+        self._told, self._looks, self.held = False, 0, False
 
     def look(self, second: int, part: Tally, stream: StreamClient) -> None:
         """Look at a second that has ended: at the answers of the first, and at what became of the torques."""
@@ -162,6 +166,8 @@ class Doubt:
 
     def decide(self, stream: StreamClient) -> None:
         """Say that learning is held for how the stream began; confirm that it is meant where that was asked for."""
+        if self._looks:
+            self._looks -= not self._own()
         if self._told or not stream.learnt.rejected.get("change"):
             return
         held = self._client.learning(self._model).status.held
@@ -170,7 +176,7 @@ class Doubt:
         self._told = True
         evidence = held.evidence
         if evidence.get("stream_id") != self._source or evidence.get("kind") != "opening":
-            self.held = True
+            self.held, self._looks = True, LOOKS
             hint = f"`lipserve alarms {self._model}` tells why; `lipserve learning decide {self._model} …` ends it"
             print_error(Explained(f"learning of {self._model} is held: rows are kept, and not learnt", hint))
             return
@@ -190,7 +196,22 @@ class Doubt:
         )
         print_error(Explained(f"{text}: nothing of it is learnt", hint))
 
+    def _own(self) -> bool:
+        """Whether the service says that this stream does not fit either, while learning is held; then say so."""
+        alarms = islice(self._client.alarms(self._model), NEWEST)
+        shown = (each.evidence for each in alarms if each.evidence.get("stream_id") == self._source)
+        evidence = next((each for each in shown if each.get("kind") == "opening"), None)
+        if evidence is None:
+            return False
+        self._looks = 0
+        share = percent(evidence["coverage"])
+        text = f"only {share} of this stream's first second lies within the 95 % band of {self._model}, too"
+        print_error(Explained(text, CHECK))
+        return True
 
+
+LOOKS, NEWEST = 3, 20
+"""Seconds in which an alarm of the stream itself is looked for while learning is held, and alarms looked at."""
 CHECK = "check that it is this robot, with the friction, the payload and the units that were learnt"
 
 
@@ -213,7 +234,7 @@ def _fitting(motion: Motion, stream: StreamClient) -> Motion:
 
 def _announce(motion: Motion, stream: StreamClient, source: str | None) -> None:
     hello, taught = stream.hello, "" if source is None else f", which it learns from as stream {source}"
-    length = f"{len(motion)} rows in {motion.t[-1] - motion.t[0]:.3g} s ({1 / motion.step:.4g} Hz)"
+    length = f"{counted(len(motion), 'row')} in {motion.t[-1] - motion.t[0]:.3g} s ({1 / motion.step:.4g} Hz)"
     note(f"{length} to {hello.model} version {hello.version}{taught}")
 
 

@@ -111,7 +111,7 @@ def _pairs(means: ArrayLike, stds: ArrayLike) -> list[str]:
 
 def comparison_table(comparison: Comparison) -> Table:
     """Figures of two versions, joint by joint."""
-    title = f"{comparison.model} on {comparison.samples_used} samples of {comparison.dataset}"
+    title = f"{comparison.model} on {counted(comparison.samples_used, 'sample')} of {comparison.dataset}"
     numbers = [f"version {each.version}" for each in comparison.versions]
     heads = [f"{figure}, {number}" for figure in ("nMSE", "RMSE N·m", "in 95 %") for number in numbers]
     table = Table("joint", *heads, title=title)

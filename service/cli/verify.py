@@ -17,6 +17,7 @@ import lipcore
 from lipcore.files import persistence
 from lipcore.files.probing import probe
 from lipcore.online import transfer as state
+from lipserve.wording import counted
 from service.cli.consoles import echo, err, print_json
 from service.cli.options import Json, alone
 from service.foundation.errors import DamagedDataError
@@ -215,7 +216,7 @@ def verify(as_json: Json = False) -> None:
     else:
         for damage in findings.damages:
             err.print(f"[red]damaged:[/red] {escape(str(damage))}", highlight=False, soft_wrap=True)
-        counts = ", ".join(f"{count} {kind}" for kind, count in findings.read.items())
+        counts = ", ".join(counted(count, kind.removesuffix("s"), kind) for kind, count in findings.read.items())
         echo(f"read {counts}: {len(findings.damages) or 'nothing'} damaged")
     if findings.damages:
         raise typer.Exit(1)

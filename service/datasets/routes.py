@@ -77,9 +77,15 @@ async def upload(
 
 
 @router.get("", summary="List data sets, newest first")
-def list_datasets(storage: StorageDep, page: PageQuery) -> DatasetPage:
+def list_datasets(
+    storage: StorageDep,
+    page: PageQuery,
+    upload_sha256: Annotated[
+        str | None, Query(pattern="^[0-9a-f]{64}$", description="Only those of files with this sha256, however read")
+    ] = None,
+) -> DatasetPage:
     """One page of data sets with their reports."""
-    return store.page(storage.database, page)
+    return store.page(storage.database, page, upload_sha256)
 
 
 @router.get("/{dataset}", summary="One data set and its report", responses=responses(NotFoundError))

@@ -199,6 +199,7 @@ class DatasetReport(BaseModel):
         None, description="Of the robot's joints: what a training job takes where it says nothing else"
     )
     robot: str | None = Field(None, description="Robot whose limits the data were compared with")
+    upload_sha256: str | None = Field(None, description="Hash of the uploaded file; null for those of earlier releases")
     timing: Timing | None = None
     saturation: list[JointSaturation] | None = None
     limits: list[JointLimits] | None = None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
@@ -60,6 +61,8 @@ def add(
         report = make_report(
             recording.staged, prepared, profile, recording.noted, settings, options.recipe, gravity, recording.facts
         )
+        with upload.open("rb") as file:
+            report["upload_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
         report["joint_types"] = None if profile is None else _joint_types(profile, recording.staged.joint_names)
         staged = prepared.staged
         disk.take(sample_file.size(staged.rows, staged.n_joints))
@@ -128,10 +131,11 @@ def preview(storage: Storage, dataset: str, quantities: Sequence[str], points: i
     return preview_file(storage.files.samples_file(row.id, row.sha256), row.joint_names, quantities, points)
 
 
-def page(database: Database, part: Page) -> DatasetPage:
-    """List data sets, newest first."""
+def page(database: Database, part: Page, upload_sha256: str | None = None) -> DatasetPage:
+    """List data sets, newest first; upload_sha256: only those of files with this hash."""
+    of_file = () if upload_sha256 is None else (DatasetRow.report["upload_sha256"].as_string() == upload_sha256,)
     with database.session() as session:
-        rows, following = newest(session, DatasetRow, part)
+        rows, following = newest(session, DatasetRow, part, *of_file)
     return DatasetPage(items=[_show(row) for row in rows], next_cursor=following)
 
 

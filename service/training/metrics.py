@@ -11,6 +11,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from lipserve.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, PartState
+from lipserve.wording import counted
 from service.storage.database import Database, JobRow
 from service.training.queue import JobQueue
 from service.web.observability.meters import Durations, MetricKind
@@ -63,7 +64,7 @@ def look(queue: JobQueue, lasting: Lasting) -> tuple[PartState, str]:
     with queue.database.session() as session:
         counts = _counts(session)
     waiting, running = counts.get(QUEUED, 0), counts.get(RUNNING, 0)
-    words = f"{waiting} jobs wait, {running} run"
+    words = f"{counted(waiting, 'job')} waiting, {running} running"
     if (cluster := queue.cluster) is not None:  # what serves can do without
         if cluster.problem is not None:
             return "warning", f"{cluster.problem}; {words}"
@@ -75,7 +76,7 @@ def look(queue: JobQueue, lasting: Lasting) -> tuple[PartState, str]:
         if silent_s > SILENT_S:
             return "warning", f"{words}; a training process has given no sign of life for {silent_s:.0f} s"
         return "ok", words
-    return "failed", f"{waiting} jobs wait, though no more than {running} have run for {stuck:.0f} s"
+    return "failed", f"{counted(waiting, 'job')} waiting, though no more than {running} have run for {stuck:.0f} s"
 
 
 def _counts(session: Session) -> dict[str, int]:

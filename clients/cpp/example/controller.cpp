@@ -88,5 +88,7 @@ int main(int count, char** arguments) {
   std::printf("%ld torques taught: %llu learnt, %llu kept out, %llu refused, %zu torques not acknowledged\n", kept,
               static_cast<unsigned long long>(learnt.accepted), static_cast<unsigned long long>(learnt.rejected),
               static_cast<unsigned long long>(learnt.refused), client.unsettled());
+  if (learnt.rejected)
+    std::printf("why: lipserve alarms %s; lipserve learning batches %s --rejected\n", arguments[1], arguments[1]);
   if (*client.error().code) std::printf("last error: %s\n", client.error().message);
 }

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from lipcore.profiles import Profile
+from lipserve.wording import counted
 from service.datasets.mapping.choice import Torque, choose, source, source_or_none, torque
 from service.datasets.mapping.joints import Joint, arrange
 from service.datasets.mapping.recognition import CANONICAL, Family, clocks, is_episode
@@ -86,7 +87,8 @@ def resolve(
     unused = tuple(name for index, name in enumerate(names) if index not in used)
     notes = [*order.notes, *_notes(chosen, quantities, times, episode), *families.notes(chosen), *meaning.notes]
     if unused:
-        notes.append(f"{len(unused)} columns are not used: {_listed(unused)}")
+        are = "is" if len(unused) == 1 else "are"
+        notes.append(f"{counted(len(unused), 'column')} {are} not used: {_listed(unused)}")
     return ColumnMap(
         times,
         episode,

@@ -22,7 +22,7 @@ from service.datasets.report.excitation import SELDOM, RigidExcitation, joint_ex
 from service.datasets.report.fit import make_fit
 from service.datasets.report.lag import Lags, clear, no_lags, shifts
 from service.datasets.report.remedies import Upload
-from service.datasets.report.robots import bodies_of, proposed, suggestion
+from service.datasets.report.robots import bodies_of, proposed, suggestion, unnamed
 from service.datasets.report.signals import (
     Limits,
     RecordedTimes,
@@ -90,6 +90,8 @@ def make_report(
     against, remedies = _against_robot(known, upload, signals, samples, excitation)
     proposal = suggestion(upload, candidates, best)
     suggested = [] if proposal is None else [proposal]
+    unknown = unnamed(len(names)) if profile is None and proposal is None else None
+    named = [each.text for each in suggested] + ([] if unknown is None else [unknown])
     report = schema.DatasetReport(
         rows_uploaded=raw.rows,
         rows=prepared.staged.rows,
@@ -120,7 +122,7 @@ def make_report(
         excitation=excitation,
         against_robot=against,
         remedies=remedies + suggested,
-        advice=[each.text for each in suggested] + advice(clock.timing, excitation, recorded.limits, recorded.noise),
+        advice=named + advice(clock.timing, excitation, recorded.limits, recorded.noise),
     )
     return report.model_dump(mode="json")
 

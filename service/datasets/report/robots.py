@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lipcore.extras import MissingExtraError
-from lipcore.profiles import Profile, profile, recognise
+from lipcore.profiles import Profile, profile, profiles, recognise
 from service.datasets.report.advice import listed
 from service.datasets.report.bodies import Against, Bodies, Signals, compare
 from service.datasets.report.remedies import Upload, remedy
@@ -18,6 +18,7 @@ LIKE = (0.6, 1.7)
 """Factors that count as 1: URDFs are wrong by as much, and loads are not in them."""
 ALIKE, UNLIKE = 1.3, 1.5
 """Factors of gravity up to which a robot is taken for the right one, and from which on for a wrong one."""
+MOST_NAMED = 3
 TRUSTED = 0.6
 """Share of a joint's torque that has to be explained before a factor is believed."""
 
@@ -72,6 +73,18 @@ def suggestion(upload: Upload, candidates: Sequence[str], best: str | None) -> R
     if len(candidates) > 1:
         text += f", and the torque is that of {best}"
     return remedy("robot", (), f"{text}; limits and torque can be compared with its", upload.robot(best))
+
+
+def unnamed(n_joints: int) -> str | None:
+    """What to add where neither the upload nor its joints' names tell a robot; None where none of so many is known."""
+    known = [each.name for each in profiles() if each.n_joints == n_joints]
+    if not known:
+        return None
+    return (
+        "no robot is named, and the names of the joints suggest none: is it one of `lipserve robots list`, such as "
+        f"{listed(known[:MOST_NAMED])}? Then upload it with `--robot`, and friction, limits and torque are judged "
+        "beside its own"
+    )
 
 
 def other_robot(upload: Upload, bodies: Bodies, against: Against, signals: Signals) -> Remedy | None:

@@ -32,6 +32,8 @@ from service.learning.schema import Derivation, ExpiredError, ObservationRequest
 from service.models.loaded import Served
 from service.storage.database import EventRow
 
+ONCE = "a sequence is used once, so a new run needs a stream_id of its own, or higher sequences"
+
 
 def observe_batch(intake: Intake, model: str, request: ObservationRequest) -> ObservationResponse:
     """Take a batch; once this returns it is durable. Raise NotFoundError, LearningDisabledError, InvalidRequestError,
@@ -152,9 +154,7 @@ def acknowledged(
         check_kept(session, model, stream_id, sequence)
         return None
     if event.digest != content:
-        raise ConflictError(
-            f"batch {sequence} of stream {stream_id!r} has come before with other content: a sequence is used once"
-        )
+        raise ConflictError(f"batch {sequence} of stream {stream_id!r} has come before with other content: {ONCE}")
     return ObservationResponse.model_validate(
         {**(event.report or {}), "duplicate": True, "state": state(session, event)}
     )
@@ -270,8 +270,7 @@ def _repeated(session: Session, frames: Frames, old: NDArray[np.bool_]) -> Repea
         for name in QUANTITIES:
             if not np.array_equal(getattr(frames, name)[place], getattr(rows, name)[there], equal_nan=True):
                 raise ConflictError(
-                    f"frame {sequence} of stream {frames.stream_id!r} has come before with another {name}: a sequence "
-                    "is used once"
+                    f"frame {sequence} of stream {frames.stream_id!r} has come before with another {name}: {ONCE}"
                 )
     assert event is not None
     start = log.start_of(session, frames.model, frames.served.version)

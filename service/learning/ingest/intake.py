@@ -44,6 +44,7 @@ PAYLOAD_ALARM_S = 60.0
 """A robot that picks and places does so all day: of a model, payloads raise no more than one alarm in so long, s."""
 CONSEQUENCES = {
     "hold": "nothing is learnt until its owner has decided",
+    "waits": "learning is held already, and none of this is learnt until its owner has decided",
     "adapt": "a new regime begins, in which what was learnt before counts less",
     "learn": "learning goes on as before",
 }
@@ -131,7 +132,7 @@ class Intake:
             new = log.stream(session, model, batch.stream_id) is None
             known = monitor.watch(batch.stream_id, new)
             verdict = judging.judge(screened, known, held, options, usual, since, served.base.scale)
-            if verdict.change is not None and options.on_change == "adapt":
+            if verdict.change is not None and options.on_change == "adapt" and not held:
                 log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
             adaptive = {}
             if options.adaptive_intervals and screened.seen is not None:
@@ -151,7 +152,7 @@ class Intake:
             if verdict.opened is not None and verdict.held:
                 _take_back(session, event)
             if verdict.change is not None:
-                _alarm(session, served, options, verdict, event)
+                _alarm(session, served, "waits" if held else options.on_change, verdict, event)
             if watch is not None and handled and batch.received - monitor.told_payload >= PAYLOAD_ALARM_S:
                 monitor.told_payload = batch.received
                 _tell(session, served, watch, event)
@@ -259,8 +260,11 @@ def _take_back(session: Session, event: EventRow) -> None:
         log.unlearn(session, event.model, each, event.received)
 
 
-def _alarm(session: Session, served: Served, options: LearningOptions, verdict: Verdict, event: EventRow) -> None:
-    """Raise the alarm of a change, and hold learning where the owner is to decide about it."""
+def _alarm(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
+    """Raise the alarm of a change, and hold learning where the owner is to decide about it.
+
+    follows: one of CONSEQUENCES.
+    """
     change, names = verdict.change, served.model.joint_names
     assert change is not None
     evidence = verdict.evidence(names) | {"stream_id": event.stream_id, "sequence": event.sequence}
@@ -270,17 +274,17 @@ def _alarm(session: Session, served: Served, options: LearningOptions, verdict: 
         finding = (
             f"has left what version {verdict.departed.version} was trained on, step by step ({evidence['cause']}):"
         )
-    message = f"the torque of {joints} {finding} {CONSEQUENCES[options.on_change]}"
+    message = f"the torque of {joints} {finding} {CONSEQUENCES[follows]}"
     if verdict.opened is not None:
         share = percent(verdict.opened.coverage.mean())
         message = (
             f"stream {event.stream_id} does not fit the model: {share} of its first second lies within the 95 % band; "
-            f"is it this robot, with the friction and the payload that were learnt? {CONSEQUENCES[options.on_change]}"
+            f"is it this robot, with the friction and the payload that were learnt? {CONSEQUENCES[follows]}"
         )
     owner.raise_alarm(session, served.name, "change", message, evidence)
     known = {"at": change.at, "event": event.number}
-    if options.on_change == "hold":
+    if follows == "hold":
         owner.hold(session, served.name, known | {"evidence": evidence})
         audit.note(session, served.name, "learning held", served.version, after=known)
-    elif options.on_change == "adapt":
+    elif follows == "adapt":
         audit.note(session, served.name, "change decided", served.version, before=known, after={"decision": "adapt"})

@@ -123,8 +123,9 @@ class Verdict:
     surprise: mean of e²/s² of the same rows, (n,), with s less the floor of past errors, which would
     hide a change from the detector.
 
-    change: detected with these rows. held: whether these rows had to wait for a decision. departed, opened: what shows
-    the change where that is the distance from the version as trained, or how the stream began.
+    change: detected with these rows; while learning waits already, how a stream began is all that is. held: whether
+    these rows had to wait for a decision. departed, opened: what shows the change where that is the distance from the
+    version as trained, or how the stream began.
     """
 
     rows: Rows
@@ -165,8 +166,8 @@ def judge(
     counted = np.ones(len(rows), np.bool_) if passing else ~contact
     detector, change, record, surprise = watch.detector, None, None, None
     departure, departed = watch.departure, None
-    opening, opened = watch.opening, None
-    if opening is not None and not held:
+    opening, opened, waiting = watch.opening, None, held
+    if opening is not None:
         opening = _begun(opening, batch, rows, carried, scale)
         opened, opening = (opening if opening.misfit else None), (None if opening.over else opening)
     if counted.any():
@@ -176,16 +177,16 @@ def judge(
         detector, change = detector.step(replace(record, standardised=surprise), float(rows.time.max()))
         if not held and not watch.gate.open and batch.trained is not None:
             departure = _followed(departure, batch.trained, rows, counted, batch.noise_std)
-    if held or watch.gate.open:
-        change = None  # the consequence of a change that is known
-    elif opened is not None and opened.since is not None:
+    if opened is not None and opened.since is not None and not watch.gate.open:
         change = Change(opened.since, opened.joints, usual(), _everything(batch, rows), "sudden")
+    elif held or watch.gate.open:
+        change = None  # the consequence of a change that is known
     elif change is None and gate.exhausted:
         change = _lasting(gate, _everything(batch, rows), usual(), rows)
     elif change is None and departure is not None and departure.joints:
         departed = departure
         change = Change(departure.began, departure.joints, usual(), _everything(batch, rows), "departure")
-    followed = change is not None and not (opened is not None and options.on_change == "learn")
+    followed = change is not None and not waiting and not (opened is not None and options.on_change == "learn")
     if change is not None and options.on_change == "hold":
         held = True
     elif followed and departed is None:

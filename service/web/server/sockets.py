@@ -30,6 +30,17 @@ class SocketError(OSError):
     """There can be no socket at the path; the message says why and what would do."""
 
 
+def check_port(host: str, port: int) -> None:
+    """Look before the service starts whether it can listen at an address; raise SocketError."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        socket.create_server((host, port), family=family).close()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        expected = f"one that is free at {host}: {reason}; --port names another, 0 takes any"
+        raise SocketError(f"port is {port}, expected {expected}") from error
+
+
 class UnixSocket:
     """A listening socket in the file system; who connects before the service has started waits for it.
 

@@ -15,7 +15,7 @@ from service.datasets.formats.opening import open_table
 from service.datasets.mapping.mapping import resolve
 from service.datasets.options import ReadOptions, UploadOptions
 from service.foundation.settings import Settings
-from tests.service.data import arrays, stream
+from tests.service.data import arrays, ended, stream
 
 
 def read(path):
@@ -78,6 +78,23 @@ def test_the_same_recording_is_the_same_data_set(asked, recording, tmp_path):
     assert asked("data", "add", path, "--name", "another", "--json")["id"] != first["id"]
     asked("data", "delete", first["id"], "--yes")
     assert asked("data", "add", path, "--json")["id"] != first["id"]  # what was deleted is stored anew
+
+
+def test_a_file_is_the_data_set_that_it_was_made_before(lipserve, asked, refused, server, recording):
+    path = recording(90, "read-before.csv", samples=60)
+    made = asked("data", "add", path, "--name", "otherwise", "--joint-names", "shoulder,elbow", "--json")
+    job = asked("train", path, "--model", "cli-of-file", "--estimator", "se", "--no-wait", "--json")
+    assert job["datasets"] == [made["id"]]
+    server.client.post(f"/v1/jobs/{job['id']}/cancel")
+    assert ended(server.client, job["id"])["state"]
+    code, _, err = lipserve("data", "add", path, "--name", "plain", "--url", server.url)
+    assert code == 0, err
+    message, hint = refused("evaluate", "panda-sim", path).splitlines()
+    assert "read-before.csv was uploaded before, read in 2 ways: expected the id of one of them: ds_" in message
+    assert f"{made['id']} (no robot, " in message
+    assert "`lipserve data show ID`" in hint
+    asked("data", "delete", "plain", "--yes")
+    assert "the joints shoulder, elbow" in refused("evaluate", "panda-sim", path)
 
 
 def test_data_sets_are_known_by_their_names(asked, refused, arm, recording):

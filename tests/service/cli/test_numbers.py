@@ -18,6 +18,11 @@ WRITTEN = [
     if path.name != "wording.py"
 ]
 
+SHELL = sorted((ROOT / "service/cli").glob("*.py"))
+THINGS = "versions|models|data sets|batches|rows|samples|joints|jobs|snapshots|queries|iterations"
+MANY = re.compile(rf"(?<! of )(?<!has )\{{(?!counted\()[^{{}}]*\}} (?:{THINGS})\b")
+"""A number before several things, which may be one: `counted` knows. Of `3 of 5 rows` the last is never one."""
+
 
 def test_shares_are_written_with_a_space():
     assert [percent(0.953), percent(0.953, 1), percent(1.0)] == ["95 %", "95.3 %", "100 %"]
@@ -36,6 +41,11 @@ def test_no_message_writes_a_share_in_another_way(path):
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
 def test_no_page_writes_a_share_in_another_way(page):
     assert WITHOUT_SPACE.findall(re.sub(r"`[^`]*`", "", prose(page))) == []
+
+
+@pytest.mark.parametrize("path", SHELL, ids=lambda path: path.stem)
+def test_commands_count_in_singular_and_plural(path):
+    assert MANY.findall(path.read_text("utf-8")) == []
 
 
 def test_a_report_counts_what_it_tells(asked, recording):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import typer
 
-from lipserve import StreamClient
+from lipserve import StreamClient, StreamError
 from lipserve.exchange import StreamAnswer
 from service.cli.playing import Tally, recorded
 from service.cli.simulate import app as simulating
@@ -73,6 +73,10 @@ def test_a_stream_that_does_not_fit_is_said_so_and_not_learnt(lipserve, server, 
     alarm = json.loads(lipserve("alarms", steady, "--url", server.url, "--json")[1])[0]
     assert "stream other-arm does not fit the model: " in alarm["message"]
     assert "learning is held" in lipserve("learning", "show", steady, "--url", server.url)[1]
+    code, out, err = lipserve("stream", steady, *off, "--learn", "--stream-id", "another")
+    assert (code, f"learning of {steady} is held: rows are kept, and not learnt" in err) == (1, True)
+    assert f"of this stream's first second lies within the 95 % band of {steady}, too" in err
+    assert "learning is held already" in lipserve("alarms", steady, "--url", server.url)[1]
     seen = eventually(lambda: settled(server, steady))
     assert seen == pytest.approx(before, abs=1e-9)
     code, out, err = lipserve("stream", steady, *off)
@@ -136,6 +140,22 @@ def test_ctrl_c_ends_a_stream_with_its_figures(lipserve, arm, server, monkeypatc
     assert (code, len(asked)) == (130, 5)
     assert lines(out)[-1]["summary"]["rows"] == 5
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_a_stream_that_the_service_closes_ends_with_its_figures(lipserve, arm, server, monkeypatch):
+    asked, ask = [], StreamClient.ask
+
+    def ask_or_end(self, *arguments, **options):
+        asked.append(arguments)
+        if len(asked) == 5:
+            raise StreamError("the service closed the stream: the service stops", "closed")
+        return ask(self, *arguments, **options)
+
+    monkeypatch.setattr(StreamClient, "ask", ask_or_end)
+    code, out, err = lipserve("stream", arm[0], "--simulate", "double-pendulum", "--url", server.url, "--json")
+    assert (code, lines(out)[-1]["summary"]["rows"]) == (1, 4)
+    assert "error: the service closed the stream: the service stops (closed)" in err
+    assert "hint: open the stream again once the service is back" in err
 
 
 def test_recordings_are_prepared_as_uploads_are(recording):

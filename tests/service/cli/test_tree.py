@@ -122,6 +122,25 @@ def test_mistakes_are_explained_in_one_line(lipserve, tmp_path, monkeypatch, com
     assert list(tmp_path.iterdir()) == []
 
 
+def test_status_says_what_works_and_what_is_not_installed(lipserve, asked, server):
+    text, document = asked("status"), asked("status", "--json")
+    assert f"{server.url} is ready: LIPServe {__version__}" in text
+    assert [each["name"] for each in document["checks"]] == ["database", "home", "models", "learner", "training"]
+    assert all(f"{each['name']} " in text and each["message"] in text for each in document["checks"])
+    assert document["can"] == server.client.get("/health").json()["can"]
+    assert text.count("not installed there: pip install") == len(document["missing"])
+    code, out, err = lipserve("status", "--url", f"http://127.0.0.1:{free_port()}")
+    assert (code, out, "start one with `lipserve serve`" in err) == (1, "", True)
+
+
+def test_a_port_that_is_taken_is_named_before_a_home_is_made(lipserve, server, tmp_path, monkeypatch):
+    monkeypatch.setenv("LIPSERVE_HOME", str(tmp_path / "home"))
+    code, out, err = lipserve("serve", "--port", server.port)
+    assert (code, out) == (1, "")
+    assert f"error: port is {server.port}, expected one that is free at 127.0.0.1: Address already in use" in err
+    assert not (tmp_path / "home").exists()
+
+
 def test_address_of_the_dashboard(asked, server):
     assert asked("open") == f"{server.url}/#/\n"
     assert asked("open", "my-arm", "--live", "--json") == {"url": f"{server.url}/#/live/my-arm"}

@@ -47,7 +47,7 @@ def test_the_clients_have_the_same_methods():
 
 def test_help_shows_arguments_results_and_what_they_are():
     assert str(inspect.signature(Client.job)) == "(self, /, job: 'str') -> 'Job'"
-    assert str(inspect.signature(Client.datasets)) == "(self, /) -> 'Iterator[Dataset]'"
+    assert str(inspect.signature(Client.robots)) == "(self, /) -> 'Iterator[Robot]'"
     assert str(inspect.signature(AsyncClient.live)) == "(self, /, model: 'str') -> 'AsyncIterator[Live]'"
     for client in (Client, AsyncClient):
         for name in public(client):

@@ -269,7 +269,7 @@ def test_commands_copy_a_home_and_bring_it_back(lipserve, arm, tmp_path, monkeyp
     file = tmp_path / "b.tar"
     code, out, _ = lipserve("backup", file)
     assert code == 0
-    assert "copied 0 data sets, 1 versions, 1 snapshots and 2 batches as of 20" in out
+    assert "copied 0 data sets, 1 version, 1 snapshot and 2 batches as of 20" in out
     assert file.stat().st_mode & 0o777 == 0o600
     assert [path for path in tmp_path.iterdir() if path.name.startswith((".backup", "b.tar."))] == []
     code, _, err = lipserve("backup", file)

@@ -48,7 +48,7 @@ def test_the_service_knows_of_a_process_that_is_silent(bench, monkeypatch):
     jobs.running(jobs.submit("frozen"))
     monkeypatch.setattr(metrics, "SILENT_S", 0.1)
     seen = eventually(lambda: (now := metrics.look(jobs.queue, lambda wrong: None))[0] == "warning" and now)
-    assert seen[1].startswith("0 jobs wait, 1 run; a training process has given no sign of life for ")
+    assert seen[1].startswith("0 jobs waiting, 1 running; a training process has given no sign of life for ")
 
 
 def test_a_job_whose_process_cannot_start_fails_in_the_end_and_the_service_knows(bench, monkeypatch):

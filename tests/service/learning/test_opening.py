@@ -120,6 +120,25 @@ def test_a_stream_that_fits_goes_on_though_another_one_did_not(school):
     assert drive(pupil, range(4, 5), stream_id="fits")[0]["accepted"] == BATCH
 
 
+def test_another_stream_that_does_not_fit_is_said_so_while_learning_is_held(school):
+    """Its errors widen no answers of others, and a decision about the first is no blind one about it."""
+    pupil = school.enrol("second", **WATCHFUL, on_change="hold")
+    drive(pupil, range(3), push=OFF)
+    before = pupil.settled(pupil.get("learning")["status"]["revision"])
+    held = pupil.get("learning")["status"]["held"]
+    said = drive(pupil, range(4), push=20 * OFF, stream_id="other")
+    assert all(each["held"] and each["accepted"] == 0 for each in said)
+    newest, first = pupil.get("alarms")["items"]
+    assert "stream other does not fit the model: " in newest["message"]
+    assert "learning is held already" in newest["message"]
+    assert (newest["evidence"]["kind"], newest["evidence"]["stream_id"]) == ("opening", "other")
+    assert first["evidence"]["stream_id"] == "arm"
+    assert pupil.get("learning")["status"]["held"] == held
+    after = pupil.settled(pupil.get("learning")["status"]["revision"])
+    assert apart(after, before) < 1e-9
+    assert after["scale"] == before["scale"]
+
+
 def test_where_learning_goes_on_as_before_it_is_only_said(school):
     pupil = school.enrol("told-only", **WATCHFUL, on_change="learn")
     said = drive(pupil, range(3), push=OFF)

@@ -150,7 +150,7 @@ def test_observations_that_wait_for_long_are_found(api, trained, look, clock, mo
 def test_jobs_that_nobody_starts_are_found(no_worker, look, clock):
     service = service_of(no_worker)
     job = queue(no_worker, "waits-for-health", upload(no_worker, stream())["id"], options=FEW)["id"]
-    assert look(service)["training"] == ("ok", "1 jobs wait, 0 run")
+    assert look(service)["training"] == ("ok", "1 job waiting, 0 running")
     clock.now += START_S + 1.0
     assert look(service)["training"][0] == "failed"
     assert no_worker.post(f"/v1/jobs/{job}/cancel").json()["state"] == "cancelled"

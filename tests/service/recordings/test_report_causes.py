@@ -253,6 +253,8 @@ def test_friction_is_judged_beside_the_robot_that_names_suggest(tmp_path: Path) 
     other = report_on(unknown, tuple(f"axis{joint}" for joint in range(1, 8)), columns)
     assert other.excitation.friction_beside == "any motion"
     assert any("constant torque" in each for each in other.advice)
+    assert "such as panda, fr3 and xarm7? Then upload it with `--robot`" in other.advice[0]
+    assert not any("no robot is named" in each for each in (*report.advice, *with_robot.advice))
 
 
 def test_the_robot_of_another_size_is_not_taken(tmp_path: Path) -> None:

@@ -47,9 +47,9 @@ def upload(
 
 
 @route("GET", "/v1/datasets")
-def datasets(at: Route) -> Call[Page[Dataset]]:
-    """All data sets, newest first."""
-    return at(page(Dataset), names={})
+def datasets(at: Route, upload_sha256: str | None = None) -> Call[Page[Dataset]]:
+    """All data sets, newest first; upload_sha256: only those of files with this sha256, however they were read."""
+    return at(page(Dataset), names={}, params=given(upload_sha256=upload_sha256))
 
 
 @route("GET", "/v1/datasets/{dataset}")

@@ -268,6 +268,7 @@ class DatasetReport(Record, frozen=True, kw_only=True):
     steps: The steps of `preparation` with their parameters
     joint_types: Of the robot's joints: what a training job takes where it says nothing else
     robot: Robot whose limits the data were compared with
+    upload_sha256: Hash of the uploaded file; null for those of earlier releases
     lag: All joints together first, then joint by joint
     against_robot: Null without a robot's URDF
     remedies: What `warnings` and `advice` say of the upload's options, to act on
@@ -290,6 +291,7 @@ class DatasetReport(Record, frozen=True, kw_only=True):
     steps: list[dict[str, Any]] = field(default_factory=list)
     joint_types: list[Literal["revolute", "prismatic"]] | None = None
     robot: str | None = None
+    upload_sha256: str | None = None
     timing: Timing | None = None
     saturation: list[JointSaturation] | None = None
     limits: list[JointLimits] | None = None

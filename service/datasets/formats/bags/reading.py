@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
+from lipserve.wording import counted
 from service.datasets.formats.bags import files
 from service.datasets.formats.bags.container import Bag, Channel, JoinedBags
 from service.datasets.formats.bags.states import (
@@ -89,7 +90,7 @@ def read_channel(bag: Bag, channel: Channel, joint_names: tuple[str, ...] | None
     start = int(times[np.argmax(kept)])
     facts = [
         *bag.facts,
-        f"topic {channel.topic}: {len(kept)} messages of type {channel.type}",
+        f"topic {channel.topic}: {counted(len(kept), 'message')} of type {channel.type}",
         *describe(survey.kinds, counts, joints, holding),
         f"times are {why}, counted from {start // NS}.{start % NS:09d} s",
     ]
