@@ -40,8 +40,6 @@ class Film:
             return
         from PIL import Image
 
-        from tests.browser.visitor import compress
-
         frames = [Image.open(io.BytesIO(each)).convert("RGB") for each in self._frames]
         height = round(frames[0].height * WIDTH / frames[0].width)
         small = [each.resize((WIDTH, height), Image.Resampling.LANCZOS) for each in frames]
@@ -50,6 +48,5 @@ class Film:
         times = [SLOW if number in slow else 1 for number in range(len(small) - 1)] + [REST]
         lasting = [round(1000 * seconds * each) for each in times]
         small[0].save(path, save_all=True, append_images=small[1:], duration=lasting, loop=0, quality=QUALITY, method=4)
-        small[still].save(path.with_suffix(".png"))
-        compress(path.with_suffix(".png"))
+        small[still].save(path.with_suffix(".png"), optimize=True)  # made smaller, it has more colours than others
         assert path.stat().st_size <= LARGEST, f"{path} has {path.stat().st_size} bytes"
