@@ -46,9 +46,10 @@ test-all: install
 	$(TEST) --backend shared --tb=native $(addprefix tests/service/,$(SHARED)) || failed=1; \
 	exit $$failed
 
-# pictures of the dashboard for the README, made by its tests
+# pictures of the dashboard for README and guide, made by its tests; `pytest tests/browser/test_pages.py --pictures FOLDER`
+# makes one of every page
 screenshots: install
-	LIPSERVE_SCREENSHOTS=docs/screenshots $(TEST) tests/browser/test_journey.py tests/browser/test_states.py tests/browser/test_arm.py
+	LIPSERVE_SCREENSHOTS=docs/screenshots $(TEST) tests/browser/test_journey.py tests/browser/test_arm.py tests/browser/test_payload.py
 
 # the C++ client: its example and its test; needs CMake and a compiler of C++17, and nothing else here does
 cpp:

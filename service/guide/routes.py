@@ -49,6 +49,9 @@ ORDER = (
 """Pages beside the index, as the guide lists them. What is not listed here is not a page."""
 SLUGS = {"reproduction/results.md": "reproduction"}
 """Addresses of pages that are not called as their file is."""
+KINDS = {".png": "image/png", ".svg": "image/svg+xml", ".webp": "image/webp"}
+"""What pictures are, by their endings: not every machine's own list knows all. One that moves is a .webp and has a
+picture of the same name that does not."""
 _COMMENT = re.compile(r"^<!--.*?-->\n?", re.MULTILINE)
 _SCROLLED = '<div class="scroll" role="region" aria-label="Table, may be scrolled" tabindex="0"><table>\n'
 _ELSEWHERE = re.compile(r"[a-z][a-z0-9+.-]*:|//|#", re.IGNORECASE)
@@ -88,7 +91,7 @@ def pages() -> dict[str, Page]:
 @lru_cache(1)
 def images() -> dict[str, Path]:
     """Every picture by the name that the guide gives it: its path with dashes, which no other file can be named by."""
-    paths = sorted(path for kind in ("*.png", "*.svg") for path in folder().rglob(kind))
+    paths = sorted(path for kind in KINDS for path in folder().rglob(f"*{kind}"))
     return {_flat(path.relative_to(folder()).as_posix()): path for path in paths}
 
 
@@ -135,6 +138,7 @@ def _markdown() -> MarkdownIt:
     made.core.ruler.push("guide", _adapt)
     made.add_render_rule("table_open", lambda *_: _SCROLLED)
     made.add_render_rule("table_close", lambda *_: "</table></div>\n")
+    made.add_render_rule("image", lambda self, *arguments: _stoppable(self.image(*arguments)))
     made.add_render_rule("fence", lambda self, *arguments: _reached(self.fence(*arguments)))
     made.add_render_rule("code_block", lambda self, *arguments: _reached(self.code_block(*arguments)))
     return made
@@ -145,12 +149,23 @@ def _reached(block: str) -> str:
     return block.replace("<pre>", '<pre tabindex="0">', 1)
 
 
+def _stoppable(picture: str) -> str:
+    """A picture that moves in a frame that hides it, and at rest where motion is not wanted (WCAG 2.2, 2.2.2)."""
+    moving = re.search(r'src="([^"]+)\.webp"', picture)
+    if moving is None:
+        return picture
+    still = f'<source srcset="{moving[1]}.png" media="(prefers-reduced-motion: reduce)">'
+    return f"<details open><summary>Moving picture</summary><picture>{still}{picture}</picture></details>"
+
+
 def _adapt(state: Any) -> None:
     """Give headings their anchors, and links and pictures their addresses in the guide."""
     tokens: Sequence[Token] = state.tokens
     for index, token in enumerate(tokens):
         if token.type == "heading_open":
             token.attrSet("id", anchor(_text(tokens[index + 1])))
+        if token.type == "inline" and token.content.startswith("![") and token.content.endswith(".webp)"):
+            tokens[index - 1].hidden = tokens[index + 1].hidden = True  # no paragraph may hold its frame
         for child in token.children or ():
             _redirect(child, state.env["file"])
 
@@ -204,7 +219,7 @@ def file(name: str) -> Response:
     path = STYLE if name == STYLE.name else images().get(name)
     if path is None:
         return Response(status_code=404, headers=HEADERS)
-    return FileResponse(path, headers=HEADERS)
+    return FileResponse(path, headers=HEADERS, media_type=KINDS.get(path.suffix, "text/css"))
 
 
 def _framed(title: str, content: str, current: str | None, status: int = 200) -> HTMLResponse:

@@ -86,3 +86,20 @@ def test_joints_are_told_apart_by_all_eyes(windows: Visit, dashboard: Dashboard,
     for colour in joints:
         dim, bright = sorted([luminance(colour), luminance(surface)])
         assert (bright + 0.05) / (dim + 0.05) >= CONTRAST, colour
+
+
+SCALE = {14, 15, 16, 18, 24}
+"""Sizes of the dashboard's text, px."""
+SIZES = """() => {
+  const said = [...document.querySelectorAll("body *")].filter((each) => !each.closest("svg, .js-plotly-plot, option")
+    && each.checkVisibility() && [...each.childNodes].some((child) => child.nodeType === 3 && child.data.trim()));
+  return said.map((each) => [parseFloat(getComputedStyle(each).fontSize), each.outerHTML.slice(0, 100)]);
+}"""
+
+
+def test_text_has_the_sizes_of_one_scale(windows: Visit, dashboard: Dashboard) -> None:
+    visitor = windows(dashboard.server.url)
+    pages = ["#/", "#/data", f"#/data/{dashboard.dataset['id']}", "#/jobs", "#/train", "#/models", "#/live"]
+    for route in [*pages, f"#/models/{dashboard.model}?tab=lineage", f"#/live/{dashboard.model}"]:
+        odd = [each for each in visitor.open(route).evaluate(SIZES) if each[0] not in SCALE]
+        assert odd == [], route

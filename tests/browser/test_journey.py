@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,7 @@ from lipcore.data.samples import Samples
 from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard
 from tests.browser.robot import playing
-from tests.browser.visitor import DESKTOP, PHONE, Visitor
+from tests.browser.visitor import Visitor
 from tests.service.data import arrays, npz, stream, train
 
 if TYPE_CHECKING:
@@ -49,17 +48,6 @@ def bumping(samples: Samples) -> Iterator[tuple[np.ndarray, ...]]:
         yield samples.q[row], samples.dq[row], samples.ddq[row], tau
 
 
-def phone(visitor: Visitor, name: str) -> None:
-    """For pictures: see the page on a phone, in the dark."""
-    if not PICTURES:
-        return
-    visitor.page.set_viewport_size({"width": PHONE[0], "height": PHONE[1]})
-    visitor.page.emulate_media(color_scheme="dark")
-    visitor.shot(name, 1700)
-    visitor.page.emulate_media(color_scheme="light")
-    visitor.page.set_viewport_size({"width": DESKTOP[0], "height": DESKTOP[1]})
-
-
 def uploaded(visitor: Visitor, samples: Samples) -> None:
     """Upload a recording, and look at its report and plots."""
     page = visitor.page
@@ -84,7 +72,6 @@ def trained(visitor: Visitor) -> None:
     page.get_by_label("Name of the model").fill("my-arm")
     expect(page.get_by_label(f"Train on {NAME}")).to_be_checked()
     assert audit(page) == []
-    visitor.shot("train", 1100)
     page.get_by_text("More estimators").click()
     page.locator('input[type=radio][value="lip-chain"]').check()
     page.get_by_text("Advanced options").click()
@@ -94,9 +81,6 @@ def trained(visitor: Visitor) -> None:
 
     expect(page.get_by_role("heading", level=1, name="Training my-arm")).to_be_visible()
     drawn(page.get_by_role("region", name="Objective"))
-    if PICTURES:
-        expect(page.locator("main")).to_contain_text(re.compile(r"Iteration[345]\d of"), timeout=LONG_MS)
-        visitor.shot("job", 1000)
     version = page.get_by_role("link", name="Look at version 1")
     expect(version).to_be_visible(timeout=LONG_MS)
     expect(page.get_by_text("samples that were held out")).to_be_visible()
@@ -116,14 +100,12 @@ def judged(visitor: Visitor) -> None:
     expect(page.get_by_text("These samples flatter")).to_have_count(0)
     assert audit(page) == []
     visitor.shot("model", 1500)
-    phone(visitor, "model-phone-dark")
     page.get_by_label("Part", exact=True).select_option("all")
     expect(page.get_by_text("flatter").first).to_be_visible()
 
     page.get_by_role("tab", name="Parts and friction").click()
     drawn(page.locator("main"))
     assert audit(page) == []
-    visitor.shot("parts", 1500)
     page.get_by_role("tab", name="Ask").click()
     page.get_by_role("button", name="Ask", exact=True).click()
     expect(page.get_by_role("columnheader", name="95 % of measurements")).to_be_visible()
@@ -153,7 +135,6 @@ def promoted(visitor: Visitor, dashboard: Dashboard, dataset: str) -> None:
     page.get_by_role("button", name="Compare", exact=True).click()
     expect(page.get_by_text("blocks; ±")).to_be_visible()
     assert audit(page) == []
-    visitor.shot("versions", 1300)
     page.get_by_role("button", name="Serve: version 1").click()
     page.get_by_role("dialog").get_by_role("button", name="Serve version 1").click()
     visitor.until(lambda: serving() == 1)
@@ -179,11 +160,7 @@ def followed(visitor: Visitor, dashboard: Dashboard) -> None:
         expect(page.get_by_role("region", name="Learning").get_by_role("row", name="contact")).to_be_visible()
         learning = page.get_by_role("region", name="Learning")
         visitor.until(lambda: "revision 0" not in learning.inner_text())  # answers contain what was streamed
-        if PICTURES:
-            page.wait_for_timeout(25_000)
         assert audit(page) == []
-        visitor.shot("live", 1900)
-        phone(visitor, "live-phone-dark")
         page.get_by_role("button", name="Pause plots").click()
         expect(state).to_contain_text("paused")
     expect(state).to_contain_text("no new rows")
@@ -197,5 +174,3 @@ def test_from_a_recording_to_a_model_that_is_followed_live(visitor: Visitor, das
     judged(visitor)
     promoted(visitor, dashboard, dataset)
     followed(visitor, dashboard)
-    visitor.open("#/")
-    visitor.shot("overview")

@@ -115,11 +115,13 @@ def test_the_joint_that_is_farthest_off_is_drawn_large_unless_another_is_chosen(
         drawn(page)
         assert audit(page) == []
 
+        forces.get_by_text("How to read it").click()
         button = page.get_by_role("button", name="Show joint1 large")
         button.click()
         expect(large).to_have_text("joint1")
         expect(button).to_have_attribute("aria-pressed", "true")
         expect(page.get_by_label("Shown large")).to_have_value("joint1")
+        expect(forces.get_by_text("Measured − predicted")).to_be_visible()  # drawn again since, and still open
         page.get_by_label("Time shown").select_option("120")
         expect(page).to_have_url(re.compile(r"window=120&joint=joint1$"))
         page.reload()

@@ -1,7 +1,10 @@
 """A model's page: what is drawn of a long recording, where there is nothing to draw, aliases, lineage and a query."""
 
+from __future__ import annotations
+
 import re
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -10,6 +13,9 @@ from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard, Visit
 from tests.browser.visitor import DESKTOP, PHONE, Visitor
 from tests.service.data import QUICK, stream, train, upload
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Route
 
 pytestmark = pytest.mark.slow
 
@@ -39,7 +45,7 @@ def test_a_long_recording_is_thinned_and_said_to_be_and_seen_in_full_where_asked
     expect(page.get_by_role("img", name=re.compile("residual.* of joint2 along"))).to_be_visible()
     expect(page.get_by_role("img", name=re.compile("of joint1 along"))).to_have_count(0)
 
-    page.get_by_text("Show certain rows").click()
+    page.get_by_text("Choose the rows to show").click()
     page.get_by_label("From row").fill("100")
     page.get_by_label("to row").fill("299")
     page.get_by_role("button", name="Show these rows").click()
@@ -54,7 +60,34 @@ def test_a_long_recording_is_thinned_and_said_to_be_and_seen_in_full_where_asked
     assert audit(page) == []
 
 
+def test_one_cursor_goes_through_the_plots_of_all_joints(visitor: Visitor, model: str, long: str) -> None:
+    page = visitor.open(f"#/models/{model}?dataset={long}")
+    plots = page.get_by_role("region", name="Measured and predicted torque").locator(".js-plotly-plot")
+    cursors = plots.locator(".linked .cursor")
+    expect(cursors).to_have_count(2)
+    expect(cursors.first).to_be_hidden()
+    plots.last.hover()
+    expect(cursors.first).to_be_visible()
+    places = {each.evaluate("(cursor) => cursor.style.left") for each in cursors.all()}
+    assert len(places) == 1
+
+
+@pytest.mark.parametrize("tab", ["learning", "ask"])
+def test_the_tab_that_is_shown_is_seen_on_a_phone(windows: Visit, dashboard: Dashboard, model: str, tab: str) -> None:
+    page = windows(dashboard.server.url, size=PHONE, touch=True).open(f"#/models/{model}?tab={tab}")
+    shown = page.locator(".tabs [aria-selected=true]")
+    expect(shown).to_have_attribute("data-name", tab)
+    expect(shown).to_be_in_viewport(ratio=0.95)
+
+
 def test_without_a_recording_of_its_robot_a_page_says_what_to_do(visitor: Visitor) -> None:
+
+    def others(route: Route) -> None:
+        body = route.fetch().json()
+        body["items"] = [each for each in body["items"] if each["joint_names"][0] != "panda_joint1"]
+        route.fulfill(json=body)
+
+    visitor.page.route("**/v1/datasets?*", others)  # other tests upload recordings of Pandas
     page = visitor.open("#/models/panda-sim")
     expect(page.get_by_text("has the joints of this model (panda_joint1")).to_be_visible()
     expect(page.get_by_role("link", name="Upload a recording")).to_be_visible()

@@ -65,6 +65,10 @@ def test_a_card_tells_how_well_a_model_predicts_joint_by_joint(visitor: Visitor,
     bars = place.locator(".bars.nmse b").all()
     colours = [each.evaluate("(bar) => getComputedStyle(bar).backgroundColor") for each in bars]
     assert len(set(colours)) == 2, "each joint has its colour"
+    charts = [place.locator(f".bars.{kind}").bounding_box() for kind in ("nmse", "coverage")]
+    assert charts[0] is not None
+    assert charts[1] is not None
+    assert charts[0]["height"] == charts[1]["height"]
     heights = [each.evaluate("(bar) => bar.getBoundingClientRect().height") for each in bars]
     assert (heights[0] < heights[1]) == (judged["quality"]["nmse"][0] < judged["quality"]["nmse"][1])
 
@@ -120,7 +124,9 @@ def test_a_robot_that_streams_is_live_and_its_last_hour_is_drawn(visitor: Visito
         expect(place.get_by_text("live", exact=True)).to_be_visible()
         expect(place.locator(".course path")).to_have_count(2)
         expect(place).to_contain_text("In the last hour.")
-        expect(page.get_by_role("region", name="Models").locator("li").first).to_have_attribute("data-key", "glanced")
+        cards = page.get_by_role("region", name="Models").locator("li").all()
+        order = [each.get_attribute("data-key") for each in cards]
+        assert order.index("glanced") < order.index("panda-sim"), "those that are live come before those that are not"
         assert audit(page) == []
     seen = glance(dashboard, "glanced")
     assert seen["recent"]["rows"] > 0
@@ -141,7 +147,8 @@ def test_what_needs_somebody_is_said_first(visitor: Visitor, windows: Visit, das
     expect(place).to_contain_text("cell-1 carries 1.25 ± 0.05\u00a0kg.")
     expect(place).to_contain_text("Version 4 waits.")
     expect(place.get_by_role("link", name="Decide")).to_have_attribute("href", f"#/live/{name}")
-    expect(page.get_by_role("region", name="Models").locator("li").first).to_have_attribute("data-key", name)
+    order = [each.get_attribute("data-key") for each in page.get_by_role("region", name="Models").locator("li").all()]
+    assert order.index(name) < order.index(dashboard.model), "what is held comes before what is quiet"
     assert audit(page) == []
     page.unroute_all(behavior="wait")
     changed(page, name, alarm=alarm)

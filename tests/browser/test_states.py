@@ -89,7 +89,6 @@ def test_an_empty_service_says_what_to_do_next(windows: Visit, locked: Locked) -
     page = visitor.open("#/")
     expect(page.get_by_role("link", name="Upload a recording").first).to_be_visible()
     expect(page.get_by_text("lipserve simulate panda panda.csv")).to_be_visible()
-    visitor.shot("overview-empty-phone-dark")
     for route in ("#/data", "#/jobs", "#/train"):
         page = visitor.open(route)
         expect(page.locator("main .empty").first).to_be_visible()

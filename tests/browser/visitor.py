@@ -7,7 +7,7 @@ import re
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 from urllib.parse import urlsplit
 
 if TYPE_CHECKING:
@@ -139,5 +139,12 @@ def compress(path: Path) -> None:
     """Store a picture with at most 256 colours, which plots and text do well with."""
     from PIL import Image
 
-    with Image.open(path) as picture:
-        picture.convert("RGB").quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+    with Image.open(path) as opened:
+        picture = opened.convert("RGB")
+    counted = picture.getcolors(picture.width * picture.height)
+    assert counted is not None
+    # the most frequent ones as they are: colours of joints and of what lies behind cards are no mixtures of others
+    kept = [colour for _, colour in sorted(counted, reverse=True)[:256]]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([part for colour in kept for part in cast("tuple[int, int, int]", colour)])
+    picture.quantize(palette=palette, dither=Image.Dither.NONE).save(path, optimize=True)

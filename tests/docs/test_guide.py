@@ -55,8 +55,19 @@ def test_a_page_that_there_is_not_is_said_so_and_marks_of_the_tests_are_not_show
 )
 def test_pictures_and_the_style_sheet_are_served_and_no_other_file(guide, name):
     assert guide.get("/guide/files/demo.png").headers["content-type"] == "image/png"
+    assert guide.get("/guide/files/screenshots--live.webp").headers["content-type"] == "image/webp"
     assert guide.get("/guide/files/guide.css").headers["content-type"].startswith("text/css")
     assert guide.get(f"/guide/files/{name}").status_code == 404
+
+
+def test_a_picture_that_moves_can_be_hidden_and_stands_still_for_who_wants_that(guide):
+    shown = guide.get("/guide").text
+    frame = re.search(r"<details open><summary>.*?</summary><picture>(.*?)</picture></details>", shown)
+    assert frame is not None
+    assert '<source srcset="/guide/files/screenshots--live.png" media="(prefers-reduced-motion: reduce)">' in frame[1]
+    assert 'src="/guide/files/screenshots--live.webp"' in frame[1]
+    assert "<p><details" not in shown
+    assert "<details" not in guide.get("/guide/own-robot").text  # its pictures do not move
 
 
 def test_html_in_markdown_is_text(monkeypatch, tmp_path):

@@ -123,7 +123,7 @@ def test_the_wheel_of_the_service_serves_its_model_pages_and_guide(server):
     assert server.client.get("/openapi.json").json()["info"]["version"] == __version__
     for page, shown in {"/": "LIPServe", "/guide/operations": "Leave it running"}.items():
         assert shown in server.client.get(page).text
-    assert server.client.get("/guide/files/demo.png").headers["content-type"] == "image/png"
+    assert server.client.get("/guide/files/screenshots--live.webp").headers["content-type"] == "image/webp"
 
 
 @pytest.mark.skipif("torch" in BASE, reason="torch is part of the base")

@@ -75,7 +75,8 @@ function mend(old, fresh) {
     if (old.data !== fresh.data) old.data = fresh.data;
     return;
   }
-  for (const { name } of [...old.attributes]) if (!fresh.hasAttribute(name)) old.removeAttribute(name);
+  const readers = old.nodeName === "DETAILS" ? "open" : null; // who reads has opened it
+  for (const { name } of [...old.attributes]) if (!fresh.hasAttribute(name) && name !== readers) old.removeAttribute(name);
   for (const { name, value } of fresh.attributes) if (old.getAttribute(name) !== value) old.setAttribute(name, value);
   refresh(old, ...fresh.childNodes);
 }

@@ -64,6 +64,18 @@ export function when(time) {
   return Number.isNaN(at.getTime()) ? NONE : at.toLocaleString("en-GB", { dateStyle: "medium", timeStyle: "medium" });
 }
 
+/** A mass as it is known: 1.48 ± 0.03 kg, 1.498 ± 0.004 kg; null: none. */
+export function kilograms(mass) {
+  if (mass === null) return "nothing";
+  const digits = mass.std < 0.005 ? 3 : 2;
+  return `${mass.mean.toFixed(digits)} ± ${mass.std.toFixed(digits)}\u00a0kg`;
+}
+
+/** A time as `when` has it, without the day where that is today. */
+export function moment(time) {
+  return date(time).toDateString() === new Date().toDateString() ? date(time).toLocaleTimeString("en-GB") : when(time);
+}
+
 /** A size: 12 kB, 3.4 MB. */
 export function bytes(x) {
   if (!known(x)) return NONE;

@@ -4,6 +4,7 @@ import { h, replace } from "./dom.js";
 import { plotly } from "./plots.js";
 
 const LEAST = 4; // px, below which a drag was a click
+const FULL = 80; // % of a plot's width, beyond which a mark's word stands before it
 
 /**
  * Plots that belong together. moved(x): the cursor was moved to x; chosen([from, to]): a stretch was dragged, null: a
@@ -86,6 +87,7 @@ export class Linked {
     const made = this.#marks.map(({ x, word, kind }) => {
       const mark = h("div", { class: `mark ${kind}`, "data-word": word });
       stand(mark, element, x, x);
+      mark.classList.toggle("late", parseFloat(mark.style.left) > FULL);
       return mark;
     });
     replace(marks, made);

@@ -41,6 +41,11 @@ export function facts(pairs) {
   return h("dl", { class: "facts" }, pairs.map(([name, what]) => h("div", {}, h("dt", {}, name), h("dd", {}, what))));
 }
 
+/** An explanation that is there for who asks for it; first: what everybody is to see of it. */
+export function explained(text, first = "") {
+  return h("details", { class: "hint" }, h("summary", {}, first, "How to read it"), h("p", {}, text));
+}
+
 /** What a page shows where there is nothing yet, and what to do about it. */
 export function empty(text, ...actions) {
   return h("div", { class: "empty" }, h("p", {}, text), actions.length ? h("div", { class: "actions" }, actions) : null);
@@ -182,11 +187,18 @@ export function tabs(options, show, chosen = options[0]?.[0]) {
       const here = tab.dataset.name === name;
       tab.setAttribute("aria-selected", String(here));
       tab.tabIndex = here ? 0 : -1;
+      if (here) requestAnimationFrame(() => bring(list, tab));
     }
     show(name);
   }
   if (chosen !== undefined) choose(chosen);
   return list;
+}
+
+/** Scroll a row of tabs so that one of them is seen, and nothing else. */
+function bring(list, tab) {
+  const [all, one] = [list.getBoundingClientRect(), tab.getBoundingClientRect()];
+  list.scrollLeft += Math.min(one.left - all.left, 0) + Math.max(one.right - all.right, 0);
 }
 
 /** Do something now and every so many seconds while the page is seen, one at a time, until the signal aborts. */

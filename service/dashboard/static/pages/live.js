@@ -14,7 +14,7 @@ import { moving } from "./live/moving.js";
 import { quiet } from "./live/quiet.js";
 import { address, robots } from "./live/robots.js";
 import { Rows } from "./live/rows.js";
-import { answersCard, learningFacts, qualityCard } from "./live/standing.js";
+import { learningFacts, qualityCard, vitals } from "./live/standing.js";
 import { switches } from "./live/switches.js";
 import { toolbar } from "./live/toolbar.js";
 import { torque } from "./live/torque.js";
@@ -83,10 +83,11 @@ async function followed(view, name, models, query, signal) {
   const tell = () => {
     said(page, seen, name);
     if (!seen.status) return;
+    page.standing.hidden = false;
     refresh(page.carried, carriedCard(seen.status));
     refresh(page.learning, learningFacts(seen.status));
     refresh(page.quality, qualityCard(seen.status));
-    refresh(page.answers, answersCard(seen.status));
+    refresh(page.vitals, vitals(seen.status));
     alarms(page, seen.status, name, signal);
     const names = seen.rows.streams();
     refresh(page.streams, names.length < 2 ? null : offer(stream, names, seen.rows.chosen));
@@ -101,7 +102,7 @@ async function followed(view, name, models, query, signal) {
       page.plots.hidden = false; // a plot takes its width from a place that is seen
       const shown = seen.rows.shown(choice.window);
       const joint = await plots.torque.draw(shown);
-      linked.mark(alarmMarks(seen.status.alarms, seen.rows.newest()));
+      linked.mark(alarmMarks(seen.status.alarms, seen.rows.chosen, seen.rows.newest()));
       refresh(page.external, externalCard(shown, seen.rows.joints, seen.status.joint_types));
       await plots.arm.draw(seen.status, joint);
       await plots.innovation.draw(shown, seen.status, joint);
@@ -133,7 +134,7 @@ async function followed(view, name, models, query, signal) {
 
 /** The places of the page. */
 function parts(name, models, learning) {
-  const places = ["about", "quiet", "held", "carried", "external", "learning", "quality", "answers", "alarms", "tools", "torque", "arm", "innovation"];
+  const places = ["about", "quiet", "held", "carried", "external", "learning", "quality", "vitals", "alarms", "tools", "torque", "arm", "innovation"];
   const page = Object.fromEntries(places.map((each) => [each, h("div")]));
   page.state = h("p", { role: "status", class: "actions" });
   page.about.className = "hint";
@@ -142,10 +143,11 @@ function parts(name, models, learning) {
   const choice = select(models.includes(name) ? models : [name, ...models], name, (chosen) => (location.hash = address(chosen)));
   choice.setAttribute("aria-label", "Model to follow");
   choice.style.width = "auto";
-  const stage = h("div", { class: "stage" }, h("div", {}, page.torque, page.innovation), h("div", { class: "aside" }, page.arm, page.external));
-  const standing = h("div", { class: "grid wide" }, card("Learning", learning, page.learning), page.quality);
-  page.plots = h("div", { hidden: true }, page.tools, stage);
-  page.all = [heading(`${name} live`, choice, page.streams, page.pause), page.state, page.about, page.held, page.quiet, page.plots, page.carried, standing, page.answers, page.alarms];
+  page.plots = h("div", { hidden: true }, page.tools, page.torque, page.innovation);
+  const stage = h("div", { class: "stage" }, page.plots, h("div", { class: "aside" }, page.arm, page.carried, page.external));
+  page.standing = h("div", { class: "grid wide", hidden: true }, card("Learning", learning, page.learning), page.quality);
+  const top = h("div", { class: "now" }, h("div", {}, page.state, page.about), page.vitals);
+  page.all = [heading(`${name} live`, choice, page.streams, page.pause), top, page.held, page.quiet, stage, page.standing, page.alarms];
   return page;
 }
 
@@ -163,7 +165,7 @@ function said(page, seen, name) {
   if (seen.pausedAt !== null) words.push(["warn", "! plots paused, rows still come"]);
   refresh(page.state, ...words.map(([kind, text]) => h("span", { class: `badge ${kind}`, style: "white-space: normal" }, text)));
   page.pause.hidden = !rows?.came;
-  page.torque.style.opacity = page.innovation.style.opacity = lost || age > STALE_S ? "0.75" : "";
+  page.plots.classList.toggle("old", lost || age > STALE_S);
   refresh(page.quiet, rows?.came || lost ? null : quiet(name, status));
   refresh(page.about, rows?.came ? about(seen, age) : null);
 }

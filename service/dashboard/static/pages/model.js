@@ -3,7 +3,7 @@
 import { get, pages, path, put } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
 import { when } from "../format.js";
-import { badge, button, errorBox, facts, heading, link, loading, notice, tabs } from "../ui.js";
+import { badge, button, errorBox, heading, link, loading, notice, tabs } from "../ui.js";
 import { warned } from "./data/prose.js";
 import { accuracy } from "./model/accuracy.js";
 import { arm } from "./model/arm.js";
@@ -107,11 +107,8 @@ function header(state, reload) {
     const { word, kind, why } = mayAnswer(version);
     promote.title = `${why}.`;
     refresh(actions, shown === serving ? badge("serving") : [badge(word, kind), promote], follow, train);
-    refresh(about, facts([
-      ["Answers now", `version ${serving}`],
-      ["Shown here", `version ${shown}, ${version.estimator}, made ${when(version.created_at)}`],
-      ...(names.length ? [["Aliases", names.join(", ")]] : []),
-    ]), shown === serving || promoted(version)?.matches(".banner") ? promoted(version) : h("p", { class: "hint" }, `${why}.`), warned(version.warnings));
+    const answers = shown === serving ? `Version ${shown} answers` : `You look at version ${shown}, version ${serving} answers`;
+    refresh(about, h("p", { class: "muted" }, [answers, version.estimator, `made ${when(version.created_at)}`, ...names].join(" · ")), shown === serving || promoted(version)?.matches(".banner") ? promoted(version) : h("p", { class: "hint" }, `${why}.`), warned(version.warnings));
   };
   return [h("div", {}, heading(name, actions), about), update];
 }

@@ -11,7 +11,7 @@ import { ESTIMATORS, estimatorChoice } from "./train/estimators.js";
 import { holdoutChoice } from "./train/holdout.js";
 
 const PROMOTION = [
-  ["", "as the service is set"],
+  ["", "as the service’s settings say"],
   ["ask", "only if it does well on what was held out"],
   ["always", "in any case"],
 ];

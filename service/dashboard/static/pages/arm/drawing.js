@@ -8,12 +8,13 @@ import { add, centres, frames, scaled, times, upright } from "./kinematics.js";
 const AXIS = 0.12; // half an axis' length, of the arm's size
 const ROUND = 24; // corners of a disc
 const MARGIN = 0.15;
+const EYE = { x: 1.1, y: -1.1, z: 0.5 }; // far enough to see all of the arm
 const THICK = 20; // px, of a joint that is pointed out
 const SMALLEST = 7, LARGEST = 24; // of a mass, px
 
 /** What both pages say beside the drawing. */
 export const CANNOT = "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.";
-export const LEGEND = "Coloured segments are joint axes, grey lines links, balls masses at their centres. A disc across an axis is one standard deviation of its place, the thin segments are one of its direction, both relative to the joint before. Pale discs and hollow balls: torque does not tell.";
+export const LEGEND = "Coloured: joint axes. Grey: links. Balls: masses at their centres. Discs show one standard deviation of an axis’ place, thin lines one of its direction, both from the joint before. Pale discs, hollow balls: torque does not tell.";
 
 /** Whether the browser can draw in 3-D. */
 export function drawable() {
@@ -25,7 +26,7 @@ export async function drawing(element, { joint_names: names, parameters, trainin
   const arm = new Arm(names, parameters, range);
   const label = `The arm in 3-D, ${names.length} joints from base to tip: ${arm.names.join(", ")}. The tables hold the same numbers.`;
   let last = q;
-  const layout = (shown) => ({ ...arm.layout(shown), height, ...(legend ? {} : { showlegend: false }) });
+  const layout = (shown) => arm.layout(shown, height, legend);
   const first = arm.at(last);
   const made = await plot(element, arm.traces(first), layout(first), { label, signal });
   const draw = (positions, thick = arm.thick) => {
@@ -95,18 +96,19 @@ class Arm {
     ];
   }
 
-  layout({ turned }) {
+  /** height: px; legend: false leaves out what names joints and metres, where there is little room. */
+  layout({ turned }, height, legend) {
     const span = [0, 1, 2].map((k) => this.reach[1][k] - this.reach[0][k]);
     const room = Math.max(MARGIN * Math.max(...span), AXIS * this.size);
     const sides = span.map((each) => each + 2 * room), longest = Math.max(...sides);
     const [x, y, z] = sides.map((each) => each / longest); // as long as they are, within a cube that the camera sees all of
     const axis = (k) => ({
-      range: [this.reach[0][k] - room, this.reach[1][k] + room], title: { text: "xyz"[k] + " m" }, color: css("muted"), gridcolor: css("line"),
+      range: [this.reach[0][k] - room, this.reach[1][k] + room], title: { text: legend ? "xyz"[k] + " m" : "" }, showticklabels: legend, color: css("muted"), gridcolor: css("line"),
       zerolinecolor: css("line-strong"), showbackground: false, showspikes: false, nticks: 5,
     });
     return {
-      hovermode: "closest", showlegend: turned.length <= 10, legend: { orientation: "h", y: 0, yanchor: "top" }, margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "arm",
-      scene: { aspectmode: "manual", aspectratio: { x, y, z }, uirevision: "arm", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: { eye: { x: 1.1, y: -1.1, z: 0.5 } } },
+      height, hovermode: "closest", showlegend: legend && turned.length <= 10, legend: { orientation: "h", y: 0, yanchor: "top" }, margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "arm",
+      scene: { aspectmode: "manual", aspectratio: { x, y, z }, uirevision: "arm", xaxis: axis(0), yaxis: axis(1), zaxis: axis(2), camera: { eye: EYE } },
     };
   }
 

@@ -1,5 +1,6 @@
 // The arm that a version has learnt in numbers: where its joints lie, what they carry, and what torque does not tell.
 
+import { h } from "../../dom.js";
 import { number, shortNames } from "../../format.js";
 import { table } from "../../ui.js";
 import { centres, frames } from "./kinematics.js";
@@ -20,7 +21,7 @@ export function jointTable({ joint_names: names, parameters: { geometry } }) {
     { label: "± shift, mm", numeric: true, cell: (place) => stds(geometry.joints[place].shift_std, 1000) },
     { label: "Torque does not tell", cell: (place) => geometry.joints[place].undetermined.join(", ") || "–" },
   ];
-  return table(columns, geometry.joints.map((_joint, place) => place), { caption: "Where the joints lie, base to tip, with all positions at zero, in the base’s frame; ± one standard deviation, about and along two directions across the axis" });
+  return table(columns, geometry.joints.map((_joint, place) => place), { caption: "Joint axes from base to tip, in the base’s frame, all positions at zero; ±: one standard deviation in two directions across the axis" });
 }
 
 /** What the joints carry: masses with their centres, rotors and friction, base to tip. */
@@ -34,14 +35,14 @@ export function massTable({ joint_names: names, joint_types: types, parameters }
     { label: "Joint", cell: (joint) => short[joint] },
     { label: "Mass, kg", numeric: true, cell: (joint) => `${number(inertia.bodies[joint].plausible.mass)} ± ${number(inertia.bodies[joint].std.mass, 2)}` },
     { label: "Centre of mass, m", numeric: true, cell: (joint) => vector(centre[joint]) },
-    { label: "± of the centre, mm", numeric: true, cell: (joint) => spread(inertia.bodies[joint], centre[joint]).map((each) => number(1000 * each, 2)).join(", ") },
+    { label: "±, mm", numeric: true, cell: (joint) => spread(inertia.bodies[joint], centre[joint]).map((each) => number(1000 * each, 2)).join(", ") },
     ...(rotor ? [{ label: "Rotor, kg·m²", numeric: true, cell: (joint) => pair(rotor, joint) }] : []),
-    { label: "Viscous, N·m·s/rad", numeric: true, cell: (joint) => pair(friction.viscous, joint) },
+    { label: "Viscous, N·m·s", numeric: true, cell: (joint) => pair(friction.viscous, joint) },
     { label: "Coulomb, N·m", numeric: true, cell: (joint) => pair(friction.coulomb, joint) },
-    ...(friction.stribeck ? [{ label: "At low speed, N·m", numeric: true, cell: (joint) => pair(friction.stribeck, joint) }] : []),
+    ...(friction.stribeck ? [{ label: "Slow, N·m", numeric: true, cell: (joint) => pair(friction.stribeck, joint) }] : []),
     { label: "Torque does not tell", cell: (joint) => (inertia.bodies[joint].undetermined ?? []).map((each) => each.replace("_", " ")).join(", ") || "–" },
   ];
-  return table(columns, geometry.order, { caption: `What the joints carry, centres in the joints’ own frames; ± one standard deviation${sliding}` });
+  return h("div", { class: "dense" }, table(columns, geometry.order, { caption: `What the joints carry, in the joints’ own frames, and their friction; slow: what it is more at low speed; ±: one standard deviation${sliding}` }));
 }
 
 // of first moment over mass, to first order

@@ -86,7 +86,7 @@ function friction(found, joints) {
   };
   const beside = found.friction_beside === "rigid bodies" ? "the robot’s rigid bodies" : "any smooth function of the motion";
   return card(
-    "How well friction can be told",
+    "Can friction be told?",
     table(
       [
         short(joints),
@@ -95,7 +95,7 @@ function friction(found, joints) {
         { label: "Constant torque", cell: weight("offset") },
       ],
       found.joints,
-      { caption: `Beside ${beside}; ± is the standard deviation that the data leave` },
+      { caption: `Told apart from ${beside}; ±: one standard deviation` },
     ),
   );
 }
@@ -119,7 +119,7 @@ function againstRobot(found, joints) {
 }
 
 function limits(rows, joints) {
-  if (!rows?.length) return null;
+  if (!rows?.some((row) => [row.range_used, row.speed_used, row.torque_used].some((share) => share !== null))) return null;
   const used = (share, beyond) => (row) => {
     return row[beyond] > 0 ? badge(`${percent(row[share], 0)}, beyond in ${percent(row[beyond], 2)}`, "bad") : bar(row[share]);
   };

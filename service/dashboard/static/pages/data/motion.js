@@ -13,7 +13,7 @@ const POINTS = 1000;
 const ALL = "all joints";
 const SAID = { q: "Position", dq: "Velocity", ddq: "Acceleration", tau: "Torque" };
 const AXES = { t: "time", rows: "sample number" };
-const DRAGS = { zoom: "zooms into all plots", hold: "chooses what is held out" };
+const DRAGS = { zoom: "zooms all plots", hold: "holds that part out" };
 
 /**
  * Draw the signals of a data set into an element.

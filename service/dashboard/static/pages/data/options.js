@@ -103,7 +103,7 @@ export function uploadOptions() {
       field("Cut-off, Hz", inputs.cutoff),
       field("Form of the filter", inputs.form),
       field("Rate of the samples, Hz", inputs.rate),
-      field("A gap is longer than (usual steps)", inputs.gap),
+      field("Steps longer than so many usual ones are gaps", inputs.gap),
       field("Cut off at both ends, s", inputs.trim),
       field("Torque convention", inputs.torque_convention),
       field("Topic", inputs.topic, "Of a bag, where several could be read."),

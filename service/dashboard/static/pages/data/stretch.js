@@ -32,7 +32,7 @@ export function holdOut(preview, dataset, rows, axis, { chosen }) {
     const found = stretch();
     inputs.forEach((input, side) => (input.value = found === null ? "" : String(Number(found[side].toPrecision(6)))));
     if (state.rows === null) {
-      replace(said, "Nothing is chosen. Choose what “Dragging over a plot” does, and drag; or type.");
+      replace(said, "Nothing yet. Choose “holds that part out” above and drag, or type.");
       replace(actions);
       return;
     }

@@ -14,7 +14,7 @@ const ENDINGS = ".csv,.tsv,.txt,.npz,.parquet,.pq,.ndjson,.jsonl,.json,.db3,.bag
 export function uploader({ onUploaded, signal }) {
   const options = uploadOptions();
   const name = h("input", { type: "text", name: "name", maxlength: "200", autocomplete: "off" });
-  const named = field("Name", name, "For people; the file's by default.");
+  const named = field("Name", name, "What people will call it; the file’s name if empty.");
   const input = h("input", { type: "file", multiple: true, accept: ENDINGS, "aria-label": "Recordings to upload", hidden: true });
   const choose = button("Choose files", () => input.click());
   const zone = h(

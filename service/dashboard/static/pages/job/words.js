@@ -35,7 +35,7 @@ export function heldOut(holdout) {
   const guard = holdout.guard_s === null ? "" : `, with a guard of ${holdout.guard_s} s`;
   const what = {
     last: `the last ${share} of each data set`,
-    auto: `${share}: the last part, or motion that nothing else repeats`,
+    auto: `${share}: the last part, unless it repeats the rest`,
     episodes: `${share}, in whole episodes chosen by seed ${holdout.seed}`,
     blocks: `${share}, in some of ${holdout.blocks} blocks chosen by seed ${holdout.seed}`,
   };

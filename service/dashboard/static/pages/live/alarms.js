@@ -6,8 +6,8 @@ import { counted, when } from "../../format.js";
 import { badge, button, confirm, field, notice } from "../../ui.js";
 
 const WORDS = {
-  adapt: "Use this if the robot has a payload or a new tool. What was learnt before counts less, and the robot is learnt anew. Adapt?",
-  ignore: "Use this if the robot is the same as before. If it has changed, going on ruins what the model knows. Go on?",
+  adapt: "Choose this if the robot has a payload or a new tool: it is learnt anew, and what was learnt before counts less.",
+  ignore: "Choose this if the robot is the same as before. If it has changed, going on ruins what the model knows.",
 };
 
 /** Show alarms, and buttons where learning is held; the buttons stay while they are needed. */
@@ -22,9 +22,10 @@ export function alarms(page, status, name, signal) {
 
 const MARKS = { promotion: "good", payload: "good", change: "bad" };
 
-/** Alarms as marks of the plots' time axis, whose zero is the newest row's time, Unix seconds. */
-export function alarmMarks(found, newest) {
-  return found.map(({ at, kind }) => ({ x: Date.parse(at) / 1000 - newest, word: kind, kind: MARKS[kind] ?? "warn" }));
+/** Alarms of a stream as marks of the plots' time axis, whose zero is the newest row's time, Unix seconds: where it began, by the rows' own clock, if that is known. */
+export function alarmMarks(found, stream, newest) {
+  const own = found.filter(({ evidence }) => (evidence.stream_id ?? stream) === stream);
+  return own.map(({ at, kind, evidence }) => ({ x: (evidence.at ?? Date.parse(at) / 1000) - newest, word: kind, kind: MARKS[kind] ?? "warn" }));
 }
 
 function decision({ held, alarms }, name, signal) {

@@ -4,7 +4,7 @@ import { css } from "../../colours.js";
 import { h, replace } from "../../dom.js";
 import { shortNames } from "../../format.js";
 import { line, plot } from "../../plots.js";
-import { card } from "../../ui.js";
+import { card, explained } from "../../ui.js";
 import { CODES, NOVEL } from "./codes.js";
 import { score } from "./scores.js";
 import { broken, HALF_WIDTH, span, thin } from "./torque.js";
@@ -19,7 +19,7 @@ export function innovation(place, joints, view, linked, signal) {
   const short = shortNames(joints);
   const element = h("div", { style: `height: ${HEIGHT}px` });
   const hint = `Measured minus predicted torque, in standard deviations of a measurement. 95 % of the rows should lie between the dotted lines at ± ${HALF_WIDTH}. Symbols mark rows kept out of learning, and motion beyond what this version was trained on. A symbol stands at the joint with the largest error. Values beyond ± ${MOST} are drawn at ± ${MOST}.`;
-  replace(place, card("Innovation", element, h("details", { class: "hint" }, h("summary", {}, "How to read it"), h("p", {}, hint))));
+  replace(place, card("Innovation", element, explained(hint)));
   let made = null;
   return {
     async draw(rows, status, shown) {

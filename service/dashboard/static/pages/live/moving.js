@@ -2,10 +2,10 @@
 
 import { get, path } from "../../api.js";
 import { h, replace } from "../../dom.js";
-import { card } from "../../ui.js";
+import { card, explained } from "../../ui.js";
 import { CANNOT, drawable, drawing } from "../arm/drawing.js";
 
-const HEIGHT = 340;
+const HEIGHT = 256;
 
 /** The arm in a place; draw(status, joint) moves it to pose(), the newest positions, where it can be seen; joint: thick. */
 export function moving(place, name, pose, signal) {
@@ -23,7 +23,7 @@ export function moving(place, name, pose, signal) {
     const found = await shown(name, number, signal);
     if (!found?.parameters?.geometry || !drawable()) return replace(place);
     const figure = h("div", { style: `height: ${HEIGHT}px` });
-    replace(place, card("The arm", figure, h("p", { class: "hint" }, `At the positions of the newest row; the joint that is shown large is thick. ${CANNOT}`)));
+    replace(place, card("The arm", figure, explained(`At the positions of the newest row; the joint that is shown large is thick. ${CANNOT}`)));
     watch.disconnect();
     watch.observe(figure);
     made = await drawing(figure, found, q, { height: HEIGHT, legend: false, signal: left.signal });

@@ -2,7 +2,7 @@
 
 import { get, pages, path } from "../../api.js";
 import { h, refresh, replace } from "../../dom.js";
-import { ago, percent, scientific } from "../../format.js";
+import { ago, kilograms, percent, scientific } from "../../format.js";
 import { badge, card, empty, every, heading, link, table } from "../../ui.js";
 
 const EVERY_S = 3;
@@ -96,7 +96,7 @@ function state({ model, stream, heard }) {
 
 function carries({ model, stream }) {
   const mass = model.payloads?.find((each) => each.stream_id === stream)?.mass;
-  return mass ? `${mass.mean.toFixed(2)} ± ${mass.std.toFixed(2)}\u00a0kg` : "–";
+  return mass ? kilograms(mass) : "–";
 }
 
 function figure({ recent }, name, worst, format) {

@@ -55,20 +55,20 @@ export function qualityCard({ windows: [latest], joint_names: names, joint_types
   );
 }
 
-/** How fast streams were answered since the last status. */
-export function answersCard({ answers }) {
-  if (answers === null) return panel("Answers of streams", h("p", { class: "muted" }, "Not known yet."));
-  const at_most = (bound) => (bound === null ? (answers.count ? "more than 30 s" : "–") : `at most ${seconds(bound)}`);
-  return panel(
-    "Answers of streams",
+/** How fast all streams were answered since the last status, inside the service: a line; nothing where none was. */
+export function vitals({ answers }) {
+  if (!answers?.count) return null;
+  const within = (bound) => (bound === null ? "more than 30 s" : `at most ${seconds(bound)}`);
+  return h(
+    "section",
+    { class: "vitals", "aria-label": "Answers of streams", title: "All streams of this model in the last second: time inside the service, without the network" },
     facts([
-      ["Answers", `${count(answers.count / answers.seconds)} a second`],
-      ["Half within", at_most(answers.p50_at_most_s)],
-      ["99 % within", at_most(answers.p99_at_most_s)],
-      ["Late", answers.late ? badge(`${count(answers.late)} late`, "warn") : "none"],
-      ["Refused", answers.refused ? badge(`${count(answers.refused)} refused`, "bad") : "none"],
+      ["Answers a second", count(answers.count / answers.seconds)],
+      ["Half of them", within(answers.p50_at_most_s)],
+      ["99 % of them", within(answers.p99_at_most_s)],
+      ...(answers.late ? [["Late", badge(`${count(answers.late)} late`, "warn")]] : []),
+      ...(answers.refused ? [["Refused", badge(`${count(answers.refused)} refused`, "bad")]] : []),
     ]),
-    h("p", { class: "hint" }, "All streams of this model in the last second: time inside the service, without the network."),
   );
 }
 

@@ -29,12 +29,13 @@ export async function accuracy(view, state, { signal }) {
   // the plot first: an evaluation asks for up to five times as many rows
   const evaluated = post(`${state.where}/evaluate`, request, signal);
   evaluated.catch(() => {}); // it is awaited below, unless drawing fails before
-  const along = h("div", {}), table = h("div", {}), spread = h("div", {}), reliable = h("div", {});
+  const along = h("div", {}), table = h("div", {}), all = h("div", {}), spread = h("div", {}), reliable = h("div", {});
   replace(
     view,
     flattery(trace),
     table,
     card("Measured and predicted torque", along),
+    all,
     h(
       "div",
       { class: "grid wide" },
@@ -42,7 +43,7 @@ export async function accuracy(view, state, { signal }) {
       card("Reliability", reliable),
     ),
   );
-  for (const place of [table, spread, reliable]) replace(place, loading("Evaluating"));
+  for (const place of [table, all, spread, reliable]) replace(place, loading("Evaluating"));
   await joints(along, {
     first: trace,
     fetch,
@@ -57,7 +58,8 @@ export async function accuracy(view, state, { signal }) {
   });
   const evaluation = await evaluated;
   if (signal.aborted) return;
-  replace(table, verdicts(evaluation), figures(evaluation));
+  replace(table, verdicts(evaluation));
+  replace(all, figures(evaluation));
   await boxes(spread, evaluation, signal);
   await reliability(reliable, evaluation, signal);
 }

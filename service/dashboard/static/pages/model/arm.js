@@ -95,7 +95,7 @@ function latest(work) {
 }
 
 function off({ plausible_deviation: deviation }) {
-  return deviation ? `; their torque differs by at most ${number(Math.max(...deviation), 2)} N·m (root mean square, worst joint)` : "";
+  return deviation?.some(Boolean) ? `; their torque differs by at most ${number(Math.max(...deviation), 2)} N·m (root mean square, worst joint)` : "";
 }
 
 function upturned(gravity) {

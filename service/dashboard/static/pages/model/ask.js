@@ -12,7 +12,7 @@ const QUANTITIES = [["q", "q, rad"], ["dq", "dq, rad/s"], ["ddq", "ddq, rad/s²"
 export async function ask(view, { where, version }, { signal }) {
   const { joint_names: names, training_range: range } = version;
   const short = shortNames(names);
-  const middle = (joint) => Number((0.5 * (range.q.min[joint] + range.q.max[joint])).toPrecision(3));
+  const middle = (joint) => Number((0.5 * (range.q.min[joint] + range.q.max[joint])).toFixed(3));
   const inputs = Object.fromEntries(QUANTITIES.map(([quantity]) => [
     quantity,
     names.map((name, joint) => h("input", { type: "number", step: "any", required: true, value: String(quantity === "q" ? middle(joint) : 0), "aria-label": `${quantity} of ${name}`, style: "min-width: 4.6rem" })),

@@ -135,6 +135,6 @@ function byJoint(said) {
   ];
   return [
     table(columns, said.joint_names.map((_name, joint) => joint), { caption: `${count(said.samples_used)} of ${count(said.samples)} samples in ${counted(said.blocks, "block")}; ± is half of a 95\u00a0% interval` }),
-    h("p", { class: "hint" }, "NLPD is the negative log predictive density, in nats a sample: small errors and true uncertainty make it small. Below zero, the second version is better."),
+    h("p", { class: "hint" }, "NLPD, the negative log predictive density, is small where errors are small and bands are true. A difference below zero: the second version is better."),
   ];
 }

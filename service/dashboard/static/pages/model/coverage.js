@@ -42,7 +42,7 @@ export function verdicts(figures) {
       h("span", { class: "numeric" }, `${percent(figures.coverage[joint])} inside`),
       badge(...coverageVerdict(figures, joint)),
     ))),
-    h("p", { class: "hint" }, "Bars: the share of measurements inside the 95 % band. It should reach the mark at 95 %. The thin line is how far that share is known, as neighbouring errors are alike (95 % confidence). nMSE: mean squared error / variance of the torque; 0 is best."),
+    h("p", { class: "hint" }, "Bars: the share of measurements inside the 95 % band; it should end at the mark. Thin lines: where that share lies with 95 % confidence, as neighbouring errors are alike. nMSE: mean squared error / variance of the torque; 0 is best."),
   );
 }
 
@@ -54,7 +54,7 @@ function bar(figures, joint) {
   const told = bounds ? `; known to be ${known(figures, joint)} independent errors` : "";
   return h(
     "span",
-    { class: `coverage ${coverageVerdict(figures, joint)[1]}`, role: "img", "aria-label": `${percent(share)} of the measurements inside the 95 % band${told}` },
+    { class: `inside ${coverageVerdict(figures, joint)[1]}`, role: "img", "aria-label": `${percent(share)} of the measurements inside the 95 % band${told}` },
     h("i", { class: "filled", style: `width: ${at(share)}%` }),
     bounds ? h("i", { class: "known", style: `left: ${at(bounds[0])}%; width: ${at(bounds[1]) - at(bounds[0])}%` }) : null,
     h("i", { class: "due", style: `left: ${at(DUE)}%` }),

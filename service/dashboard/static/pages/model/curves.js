@@ -19,7 +19,7 @@ export function column(rows, joint) {
 /** What a trace is drawn against: its times, or row numbers where episodes have clocks of their own. */
 export function axis(trace) {
   const orderly = trace.t.every((value, index) => index === 0 || value >= trace.t[index - 1]);
-  return orderly ? { x: trace.t, label: "t, s" } : { x: trace.rows, label: "sample number" };
+  return orderly ? { x: trace.t, suffix: " s" } : { x: trace.rows, suffix: "" };
 }
 
 /** A line through values that breaks where the trace breaks. */

@@ -34,7 +34,7 @@ export async function boxes(element, { joint_names: joints, stretches }, signal)
   replace(
     element,
     place,
-    h("p", { class: "hint" }, `Each point is the nMSE of one of ${what}. A box holds the middle half, its line is the median. If a box reaches far up, some motion is predicted much worse than the rest.`),
+    h("p", { class: "hint" }, `Each point is the nMSE of one of ${what}. A box holds the middle half, its line is the median. Points far up: motion that is predicted much worse.`),
   );
   const traces = stretches.nmse.map((values, joint) => ({
     type: "box", y: values, name: names[joint], colour: joint, boxpoints: "all", jitter: 0.5, pointpos: 0, marker: { size: 4, opacity: 0.7 }, hovertemplate: "%{y:.3g}",
@@ -49,7 +49,7 @@ export async function reliability(element, { joint_names: joints, reliability: c
   replace(
     element,
     place,
-    h("p", { class: "hint" }, "The share of measurements that each interval promised to hold, against the share that it held. On the diagonal is right. Below it intervals are too narrow: the model is surer than it should be."),
+    h("p", { class: "hint" }, "How many measurements each band holds, against how many it should hold. The diagonal is right. Below it bands are too narrow: the model is too sure."),
   );
   const whole = { range: [0, 1], tickformat: ".0%", dtick: 0.2 };
   const traces = [

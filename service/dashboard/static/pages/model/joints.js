@@ -3,6 +3,7 @@
 import { jointVar } from "../../colours.js";
 import { h, replace } from "../../dom.js";
 import { count, shortNames, torqueUnit } from "../../format.js";
+import { Linked } from "../../linked.js";
 import { plot, plotly } from "../../plots.js";
 import { button, errorBox, field, select } from "../../ui.js";
 import { axis } from "./curves.js";
@@ -21,24 +22,25 @@ export async function joints(element, { first, fetch, views, about, signal }) {
   const plots = new Map();
   let asked = 0, painting = false;
   const places = first.joint_names.map(() => h("div", {}));
-  const grid = h("div", { class: "grid wide" }, places), said = h("p", { class: "hint" }), note = h("p", { class: "hint" }), key = h("p", { class: "actions" });
+  const linked = new Linked({ stays: false });
+  const grid = h("div", { class: "grid" }, places), said = h("span", {}), note = h("span", {}), key = h("p", { class: "actions" });
   const problem = h("div", {});
   const start = h("input", { type: "number", min: "0", step: "1" }), stop = h("input", { type: "number", min: "1", step: "1" });
 
   const draw = async () => {
     const { trace } = shown;
-    const { x, label } = axis(trace);
+    const { x, suffix } = axis(trace);
     painting = true;
     for (const [joint, place] of places.entries()) {
       place.hidden = shown.joint !== ALL && shown.joint !== first.joint_names[joint];
       if (place.hidden) continue;
       const layout = {
         title: names[joint],
-        x: label,
         y: torqueUnit(trace.joint_types?.[joint]),
-        height: shown.joint === ALL ? 270 : 420,
+        height: shown.joint === ALL ? 210 : 420,
+        margin: { l: 52, r: 8, t: 32, b: 26 },
         showlegend: false, // one key above all plots takes less room than a legend in each
-        xaxis: { autorange: true },
+        xaxis: { autorange: true, ticksuffix: suffix, automargin: false },
         hovermode: "x unified",
       };
       const text = `${shown.view} of ${first.joint_names[joint]} along the recording, ${trace.shown} of ${trace.in_range} rows`;
@@ -48,7 +50,9 @@ export async function joints(element, { first, fetch, views, about, signal }) {
       if (plots.has(joint)) await plots.get(joint).react(traces, layout);
       else {
         plots.set(joint, await plot(place, traces, layout, { label: text, signal }));
+        if (signal.aborted) return;
         place.on("plotly_relayout", zoomed);
+        linked.add(place);
       }
       if (signal.aborted) return;
     }
@@ -105,12 +109,11 @@ export async function joints(element, { first, fetch, views, about, signal }) {
       field("Joint", select([ALL, ...first.joint_names], ALL, (joint) => { shown.joint = joint; draw(); })),
       labels.length > 1 ? field("Show", select(labels, shown.view, (view) => { shown.view = view; draw(); })) : null,
     ),
-    note,
-    said,
+    h("p", { class: "hint" }, note, " ", said),
     key,
     problem,
     grid,
-    h("details", {}, h("summary", {}, "Show certain rows"), h("p", { class: "hint" }, "Dragging over a plot does the same."), form),
+    h("details", {}, h("summary", {}, "Choose the rows to show"), h("p", { class: "hint" }, "Dragging over a plot does the same."), form),
   );
   await plotly();
   await draw();

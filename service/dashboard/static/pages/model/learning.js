@@ -2,7 +2,7 @@
 
 import { get } from "../../api.js";
 import { h, refresh, replace } from "../../dom.js";
-import { ago, count, counted, number, percent, scientific, shortNames, when } from "../../format.js";
+import { ago, count, counted, number, percent, scientific, seconds, shortNames, when } from "../../format.js";
 import { badge, card, empty, every, facts, link, loading, table } from "../../ui.js";
 
 /** The tab of learning; it looks again every five seconds. */
@@ -19,7 +19,7 @@ export async function learning(view, { where, name }, { signal }) {
     if (signal.aborted) return;
     refresh(stale);
     const now = JSON.stringify([said, quality, alarms]);
-    if (now !== seen) refresh(place, status(said, name), qualityCard(quality), alarmsCard(alarms.items), options(said.options));
+    if (now !== seen) refresh(place, status(said, name), qualityCard(quality), alarmsCard(alarms.items), options(said.options, name));
     seen = now;
   };
   await look(); // what goes wrong the first time is shown in the page's place
@@ -83,7 +83,22 @@ function alarmsCard(alarms) {
   return card("Latest alarms", table(columns, alarms));
 }
 
-function options(said) {
-  const text = (value) => (value === null ? "none" : Array.isArray(value) ? value.join(", ") : String(value));
-  return card("Settings", facts(Object.entries(said).map(([name, value]) => [name.replaceAll("_", " "), text(value)])), h("p", { class: "hint" }, "Change them over the API: ", h("code", {}, "PUT /v1/models/{model}/learning"), "."));
+const yes = (value) => (value ? "yes" : "no");
+const after = (value) => (value === null ? "never" : `after ${seconds(value)}`);
+const SETTINGS = {
+  enabled: ["Learns from streams", yes],
+  on_change: ["When the robot changes", (value) => ({ hold: "waits for your decision", adapt: "adapts to it", learn: "learns on as before" })[value] ?? value],
+  forgetting_s: ["Forgets", after],
+  friction_walk_s: ["Friction may drift", (value) => (value === null ? "no" : `over ${seconds(value)}`)],
+  torque_limits: ["Torque limits, N·m", (value) => value?.join(", ") ?? "none"],
+  contact_threshold: ["A contact is beyond", (value) => `${number(value)} σ`],
+  adaptive_intervals: ["Bands follow errors", yes],
+  payloads: ["Weighs payloads", yes],
+  auto_refresh: ["Trains again when needed", yes],
+  auto_promote: ["Better versions answer", yes],
+};
+
+function options(said, name) {
+  const pairs = Object.entries(SETTINGS).map(([key, [label, text]]) => [label, text(said[key])]);
+  return card("Settings", facts(pairs), h("p", { class: "hint" }, "The live page has switches for the first three. All can be changed with ", h("code", {}, `lipserve learning set ${name}`), "."));
 }

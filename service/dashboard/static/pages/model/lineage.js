@@ -19,7 +19,7 @@ export async function lineage(view, { version, datasets }) {
     rangeCard(version),
     card(
       "Options and software",
-      facts(Object.entries({ ...version.options, ...from.software }).map(([name, value]) => [name.replaceAll("_", " "), String(value)])),
+      facts(Object.entries({ ...version.options, ...from.software }).map(([name, value]) => [name.replaceAll("_", " "), String(value).replace(/^([0-9a-f]{12})[0-9a-f]{28}/, "$1")])), // a commit in short
     ),
     h("details", {}, h("summary", {}, "All of it as JSON"), h("pre", { tabindex: "0" }, h("code", {}, JSON.stringify({ lineage: from, fit: version.fit, compact: version.compact, calibration: version.calibration, robot: version.robot && { ...version.robot, urdf: undefined } }, null, 2)))),
   );
@@ -32,7 +32,7 @@ function origin(version) {
     ["Made", when(version.created_at)],
     ["Made by", version.job ? link("a training job", `#/jobs/${version.job}`) : from.imported ? "import" : "LIPServe, which it came with"],
     ["Estimator", version.estimator],
-    ["Joints", version.joint_names.join(", ")],
+    ["Joints", version.joint_names.length < 3 ? version.joint_names.join(", ") : `${version.joint_names.length}, ${version.joint_names[0]} to ${version.joint_names.at(-1)}`],
     ["Torque", version.torque_convention.replace("_", " ")],
     ["Noise of the measurement, N·m", version.noise_std.map((each) => number(each, 2)).join(", ")],
   ];
@@ -92,21 +92,21 @@ function fit({ fit: said, compact, calibration, conformal, lineage: from }) {
     ["Samples given", count(said.samples_given)],
     ["Samples for the hyperparameters", count(said.samples_hyperparameters)],
     ["Samples of the posterior", count(said.samples_posterior)],
-    ["Worth so many independent ones", count(said.independent_samples)],
-    ["Standard deviations multiplied by", number(calibration.function_std_factor)],
+    ["Independent samples among them", count(said.independent_samples)],
+    ["Model’s std multiplied by", number(calibration.function_std_factor)],
   ];
   if (conformal) {
     found.push(
       ["Blocks left out to check the intervals", count(conformal.blocks)],
       ["Intervals widened by", conformal.scale.map((each) => number(each, 3)).join(", ")],
-      ["They guarantee so many of 95 %", conformal.guaranteed.map((each) => percent(each)).join(", ")],
+      ["Guaranteed of their 95 %", conformal.guaranteed.map((each) => percent(each)).join(", ")],
     );
   }
   if (compact) {
     found.push(
       ["Inducing outputs", count(compact.inducing_outputs)],
-      ["Largest deviation of the mean from the exact posterior", `${percent(compact.mean_max)} of its std`],
-      ["Largest deviation of the std", percent(compact.std_max)],
+      ["Mean, farthest from the exact one", `${percent(compact.mean_max)} of its std`],
+      ["Std, farthest from the exact one", percent(compact.std_max)],
       ["Tolerance reached", badge(compact.tolerance_reached ? "yes" : "no: tau_std is larger than the data would allow", compact.tolerance_reached ? "good" : "warn")],
     );
   }

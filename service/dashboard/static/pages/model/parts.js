@@ -29,12 +29,12 @@ export async function parts(view, state, { signal }) {
   };
   const trace = await fetch(0, null);
   const along = h("div", {});
-  const only = offered.length > 1 ? null : h("p", { class: "hint" }, `The estimator ${state.version.estimator} tells only friction apart. Gravity, inertia and Coriolis need an estimator that learns energies.`);
+  const only = offered.length > 1 ? null : h("p", { class: "hint" }, `The estimator ${state.version.estimator} tells friction from the rest, and no more. For gravity, inertia and Coriolis train rigid-body or lip-chain.`);
   replace(view, flattery(trace), card("Parts of the torque", only, along), cards);
   const names = Object.keys(SAID).filter((name) => offered.includes(name));
   const views = names.length > 1 ? { "all parts": (...given) => names.flatMap((name, index) => part(name, index, ...given)) } : {};
   for (const [index, name] of names.entries()) views[SAID[name]] = (...given) => part(name, index, ...given);
-  const note = "No sensor measures these, so nothing here checks the bands: they are the model’s own 95 % intervals of the function.";
+  const note = "No sensor measures these parts, so nobody can check their bands: they are the model’s own 95 % intervals.";
   const sum = names.length > 1 ? " They add up to the predicted torque." : "";
   await joints(along, { first: trace, fetch, views, about: Object.fromEntries(Object.keys(views).map((view_) => [view_, note + sum])), signal });
 }
@@ -43,8 +43,8 @@ function part(name, index, trace, joint, x) {
   const values = trace.components[name];
   const mean = column(values.mean, joint);
   return [
-    around(x, mean, column(values.std, joint), trace.breaks, `${SAID[name]}, 95 % of the function`, index, { showlegend: false }),
-    broken(x, mean, trace.breaks, SAID[name], index),
+    around(x, mean, column(values.std, joint), trace.breaks, `${SAID[name]}, 95 % of the function`, `version-${index + 1}`, { showlegend: false }),
+    broken(x, mean, trace.breaks, SAID[name], `version-${index + 1}`), // joints’ colours are joints’
   ];
 }
 
@@ -72,11 +72,12 @@ function frictionCard({ joint_names: names, joint_types: types, parameters }) {
   );
 }
 
-function bodiesCard({ parameters }) {
+function bodiesCard({ joint_names: names, parameters }) {
+  const short = shortNames(names);
   const inertia = parameters?.inertia;
   if (!inertia) return null;
   const columns = [
-    { label: "Joint that moves the body", cell: (body) => body.joint },
+    { label: "Joint that moves the body", cell: (body) => short[names.indexOf(body.joint)] },
     { label: "Mass, kg", numeric: true, cell: (body) => `${number(body.mean.mass)} ± ${number(body.std.mass, 2)}` },
     { label: "Nearest possible mass, kg", numeric: true, cell: (body) => number(body.plausible.mass) },
   ];
@@ -85,6 +86,6 @@ function bodiesCard({ parameters }) {
     table(columns, inertia.bodies, { caption: "Mean ± one standard deviation, as trained" }),
     h("p", { class: "hint" },
       inertia.mean_is_plausible ? "These masses are physically possible. " : "The means are not physically possible together; the nearest possible masses are. ",
-      "Torque tells many inertial parameters only in combinations; the rest comes from the prior. So a small standard deviation does not prove that the data tell this mass. Moments and inertias: ", h("code", {}, "parameters"), " of the version in the API."),
+      "Torque depends on sums of masses and rarely on one alone. What it leaves open comes from the prior, so a small ± does not prove that the recording told this mass. Moments and inertias: ", h("code", {}, "parameters"), " of the version in the API."),
   );
 }

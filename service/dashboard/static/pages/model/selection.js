@@ -15,7 +15,7 @@ export function selectionCard({ selection }) {
     held.repeats ? h("p", { class: "banner" }, "The held-out motion repeats the training motion: these figures flatter.") : null,
     held.blocks ? judged(selection, held) : null,
     failed.map((each) => h("p", { class: "hint" }, `${each.estimator} could not be trained: ${each.error}`)),
-    held.blocks ? h("p", { class: "hint" }, "A higher log density means better predictions and truer uncertainty. An estimator that knows more of the arm is taken if it is within one standard error of the best, or errs no more. Afterwards it learnt the held-out samples too.") : null,
+    held.blocks ? h("p", { class: "hint" }, "A higher log density means better predictions and truer uncertainty. An estimator that knows more of the arm wins if it is within one standard error of the best, or its errors are no larger. It was then trained on the held-out samples, too.") : null,
   );
 }
 

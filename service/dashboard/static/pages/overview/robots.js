@@ -2,7 +2,7 @@
 
 import { innovationCourse, qualityCharts } from "../../charts.js";
 import { h, refresh } from "../../dom.js";
-import { ago, number, seconds, shortNames } from "../../format.js";
+import { ago, kilograms, seconds, shortNames } from "../../format.js";
 import { badge, link } from "../../ui.js";
 import { chain, sketch } from "../arm/sketch.js";
 
@@ -43,12 +43,13 @@ function robotCard(first) {
   const state = h("span", {}), about = h("p", { class: "hint" }), charts = h("div", { class: "charts" });
   const lately = h("div", { class: "robot-course" }), news = h("div", { class: "robot-news" });
   const figure = h("a", { class: "robot-arm", href: `#/models/${address}?tab=arm`, "aria-label": `The arm of ${first.name}` });
+  const body = h("div", { class: "robot-body" }, figure, charts);
   const element = h(
     "li",
     { class: "card robot", "data-key": first.name },
     h("div", { class: "robot-head" }, h("h2", {}, link(first.name, `#/models/${address}`)), state),
     about,
-    h("div", { class: "robot-body" }, figure, charts),
+    body,
     lately,
     news,
     h("div", { class: "actions robot-foot" }, h("a", { href: `#/live/${address}`, "aria-label": `Follow live: ${first.name}` }, "Follow live"), h("a", { href: `#/train?model=${address}`, "aria-label": `Train again: ${first.name}` }, "Train again")),
@@ -70,6 +71,7 @@ function robotCard(first) {
       posture = JSON.stringify(model.position);
       arm?.glide(model.position);
     }
+    body.classList.toggle("unjudged", !model.quality && !model.recent?.rows);
     refresh(charts, quality(model, names));
     refresh(lately, course(model, names));
     refresh(news, items(model, address));
@@ -105,10 +107,11 @@ function items(model, address) {
   if (model.held) found.push([badge("held"), " The robot seems to have changed, and learning waits. ", link("Decide", `#/live/${address}`)]);
   if (model.failure) found.push([badge("error"), ` It does not learn: ${model.failure}`]);
   for (const { stream_id: stream, mass } of model.payloads ?? []) {
-    if (mass) found.push([badge("payload", "plain"), ` ${stream} carries ${number(mass.mean)} ± ${number(mass.std, 2)}\u00a0kg.`]);
+    if (mass) found.push([badge("payload", "plain"), ` ${stream} carries ${kilograms(mass)}.`]);
   }
   const { alarm } = model;
-  if (alarm && !model.held && Date.now() - new Date(alarm.at).getTime() < NEW_MS) {
+  const told = alarm?.kind === "payload" && found.length > 0; // by what the arm carries
+  if (alarm && !told && !model.held && Date.now() - new Date(alarm.at).getTime() < NEW_MS) {
     found.push([badge(NEWS[alarm.kind] ?? "warning", NEWS[alarm.kind] ? "plain" : "warn"), ` ${alarm.message} `, h("span", { class: "muted" }, ago(alarm.at))]);
   }
   return found.map((each) => h("p", {}, each));

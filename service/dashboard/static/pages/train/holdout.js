@@ -4,14 +4,14 @@ import { h } from "../../dom.js";
 import { field } from "../../ui.js";
 
 const KINDS = [
-  ["auto", "the last part, or motion that nothing else repeats"],
+  ["auto", "the last part, unless it repeats the rest"],
   ["last", "the last part of each recording"],
   ["episodes", "whole episodes"],
   ["blocks", "some of many equal blocks"],
   ["", "nothing: learn from all of it"],
 ];
 const SAID = {
-  auto: "Usually the last part. If that only repeats earlier motion, a part that does not.",
+  auto: "If the last part only repeats earlier motion, one that does not is taken instead.",
   last: "This does not test other kinds of motion: evaluate on another recording for that.",
   episodes: "The seed chooses which. Of recordings with one episode each, whole recordings are held out.",
   blocks: "The seed chooses which. Blocks resemble their neighbours, so figures look better than on a new recording.",
