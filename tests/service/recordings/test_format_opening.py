@@ -15,7 +15,7 @@ from service.datasets.mapping.reading import read as read_columns
 from service.datasets.staging import prepare, staging
 from service.foundation.errors import InvalidDataError, TooLargeError
 from service.foundation.settings import Settings
-from service.storage.storage import Disk
+from service.storage.disk import Disk
 from tests.service.recordings.mapping_tables import options
 from tests.service.recordings.reading import read, refused
 from tests.service.recordings.test_format_lerobot import dataset, zipped
@@ -140,3 +140,9 @@ def test_damaged_files_are_read_or_refused(tmp_path, kind):
             outcomes["refused"] += 1
     assert min(outcomes.values()) > 5, outcomes
     assert {each.name for each in tmp_path.iterdir()} == {"upload"}
+
+
+@pytest.mark.parametrize("body", ["#\n\n\r\n#\n\n", "%\n#\n%%\n", "#\n#\n1"])
+def test_lines_of_marks_alone_are_nothing(tmp_path, body):
+    """Found by fuzzing."""
+    refused(tmp_path, body.encode(), "csv")
