@@ -34,8 +34,8 @@ def few():
 
 @pytest.fixture
 def none_open(few):
-    """The same, once nobody is connected any more."""
-    eventually(lambda: few.connections == 0)
+    """The same, once nobody is connected any more, and what was asked is not counted as being answered."""
+    eventually(lambda: few.connections == 0 and few.app.asking == 0)
     return few
 
 
