@@ -166,8 +166,8 @@ def _made_of(client: Client, path: Path) -> Dataset | None:
     it was read in several ways."""
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    found = list(islice(client.datasets(digest), MOST_READINGS))
-    alike = {(each.sha256, *each.joint_names, each.torque_convention, each.report.robot): each for each in found[::-1]}
+    made = list(islice(client.datasets(digest), MOST_READINGS))
+    alike = {(each.sha256, *each.joint_names, each.torque_convention, each.report.robot): each for each in made[::-1]}
     if len(alike) > 1:
         listed = ", ".join(f"{each.id} ({_reading_of(each)})" for each in reversed(alike.values()))
         raise CommandError(
@@ -178,9 +178,8 @@ def _made_of(client: Client, path: Path) -> Dataset | None:
 
 
 def _reading_of(dataset: Dataset) -> str:
-    robot = dataset.report.robot
-    told = "no robot" if robot is None else f"robot {robot}"
-    return f"{told}, {dataset.created_at[:16].replace('T', ' ')}"
+    robot = "no robot" if dataset.report.robot is None else f"robot {dataset.report.robot}"
+    return f"{robot}, {dataset.created_at[:16].replace('T', ' ')}"
 
 
 @contextmanager

@@ -17,13 +17,15 @@ def status(url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     Ends with 1 where it is not ready.
     """
     with connected(url) as client:
-        found, extras = client.health(), client.abilities()
+        health, extras = client.health(), client.abilities()
     if as_json:
-        print_json({**found.as_dict(), "can": dict(extras.can), "missing": [each.as_dict() for each in extras.missing]})
+        print_json(
+            {**health.as_dict(), "can": dict(extras.can), "missing": [each.as_dict() for each in extras.missing]}
+        )
         return
-    echo(f"{url} is ready: LIPServe {found.version}")
-    wide = max((len(each.name) for each in found.checks), default=0)
-    for each in found.checks:
+    echo(f"{url} is ready: LIPServe {health.version}")
+    wide = max((len(each.name) for each in health.checks), default=0)
+    for each in health.checks:
         echo(f"  {each.name:{wide}}  {each.state:7}  {each.message}")
     for extra in extras.missing:
         echo(f"not installed there: {extra.install} to {extra.gives}")

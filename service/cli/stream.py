@@ -199,8 +199,8 @@ class Doubt:
     def _own(self) -> bool:
         """Whether the service says that this stream does not fit either, while learning is held; then say so."""
         alarms = islice(self._client.alarms(self._model), NEWEST)
-        shown = (each.evidence for each in alarms if each.evidence.get("stream_id") == self._source)
-        evidence = next((each for each in shown if each.get("kind") == "opening"), None)
+        own = (each.evidence for each in alarms if each.evidence.get("stream_id") == self._source)
+        evidence = next((each for each in own if each.get("kind") == "opening"), None)
         if evidence is None:
             return False
         self._looks = 0

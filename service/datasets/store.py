@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import pairwise
@@ -61,8 +60,7 @@ def add(
         report = make_report(
             recording.staged, prepared, profile, recording.noted, settings, options.recipe, gravity, recording.facts
         )
-        with upload.open("rb") as file:
-            report["upload_sha256"] = hashlib.file_digest(file, "sha256").hexdigest()
+        report["upload_sha256"] = sample_file.sha256(upload)
         report["joint_types"] = None if profile is None else _joint_types(profile, recording.staged.joint_names)
         staged = prepared.staged
         disk.take(sample_file.size(staged.rows, staged.n_joints))

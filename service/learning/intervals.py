@@ -34,7 +34,7 @@ class Known:
 
 @dataclass(frozen=True)
 class HeldIntervals:
-    """What intervals of promised 95 %, as answered, held: `inside`, (n,), of `rows` measurements. HeldIntervals add."""
+    """What intervals of promised 95 %, as answered, held: `inside`, (n,), of `rows` measurements. They add."""
 
     rows: int
     inside: Array
