@@ -183,6 +183,7 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     sys.setswitchinterval(SWITCH_INTERVAL)
     storage = Storage.open(settings)
     database, files = storage.database, storage.files
+    database.adapter.settle()
     start_sweeping(database, files)
     registry.install_shipped(database, files)
     loaded = LoadedModels(storage, LearntVersions(database, files))

@@ -20,6 +20,7 @@ from safetensors.numpy import save as save_tensors
 
 from lipcore.data.motion import Array, Indices, Motion
 from lipcore.files.arm import arm_tensors, is_of_arm, read_arm, read_mode
+from lipcore.files.durable import make_folder, sync
 from lipcore.files.manifest import (
     DEFAULT_LIMITS,
     FORMAT,
@@ -216,16 +217,16 @@ def write(folder: Path, files: Mapping[str, bytes]) -> None:
     """
     if folder.exists():
         raise FileExistsError(f"{folder} exists: a saved model is never overwritten")
-    folder.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(folder.parent)
     # its name tells whose draft it is, where nobody comes to remove it
     draft = Path(tempfile.mkdtemp(prefix=f".draft-{folder.name}-", dir=folder.parent))
     try:
         for name, content in files.items():
             _write(draft / name, content)
         draft.chmod(0o755)
-        _sync(draft)
+        sync(draft)
         os.rename(draft, folder)
-        _sync(folder.parent)
+        sync(folder.parent)
     except BaseException:
         shutil.rmtree(draft, ignore_errors=True)
         raise
@@ -339,11 +340,3 @@ def _write(path: Path, content: bytes) -> None:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _sync(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

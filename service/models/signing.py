@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from lipcore.files.durable import sync
 from service.foundation.errors import InvalidDataError, invalid_data
 from service.foundation.settings import SIGNER, Settings
 
@@ -67,6 +68,7 @@ def make_key(path: Path) -> Ed25519PrivateKey:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())
+    sync(path.parent)
     return key
 
 

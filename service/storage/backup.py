@@ -23,6 +23,7 @@ from tempfile import TemporaryDirectory
 from typing import IO, Any
 from urllib.parse import quote
 
+from lipcore.files.durable import sync
 from service import __version__
 from service.storage.database import now
 from service.storage.database.engine import FILE, PATIENCE_S
@@ -231,9 +232,9 @@ def _restored(home: Path, opened: IO[bytes]) -> Backup:
         raise BackupError(f"the file is damaged: {', '.join(lacking) + ' is missing' if lacking else faults[0]}")
     for folder in {(home / name).parent for name in sums} | {home / "versions", home}:
         if folder.is_dir():
-            _sync(folder)
+            sync(folder)
     draft.rename(home / FILE)
-    _sync(home)
+    sync(home)
     return Backup(about["at"], sum(each["size"] for each in about["files"].values()), **counts)
 
 
@@ -262,11 +263,3 @@ def _check(about: Any, sums: dict[str, dict[str, Any]]) -> None:
     for name, known in {FILE: None, **files}.items():
         if sums.get(name) != known or known is None:
             raise BackupError(f"the backup is damaged: {name} is not what {MANIFEST} says")
-
-
-def _sync(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -21,6 +21,7 @@ from lipserve.states import ACTIVE
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow, ReplicaRow, now
 from service.storage.files import new_id
+from service.storage.files.local import write_durably
 
 logger = logging.getLogger(__name__)
 
@@ -134,6 +135,5 @@ def identity(home: Path) -> str:
     if re.fullmatch(r"svc_[0-9a-z_]+", known):
         return known
     made = new_id("svc")
-    home.mkdir(parents=True, exist_ok=True, mode=0o700)
-    path.write_text(made + "\n")
+    write_durably(path, lambda file: file.write(f"{made}\n".encode()))
     return made

@@ -20,6 +20,7 @@ from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
 from lipcore.extras import MissingExtraError
+from lipcore.files.durable import make_folder
 from lipserve.states import PartState
 from service.foundation.errors import StorageFullError
 from service.foundation.fields import of_app
@@ -178,7 +179,7 @@ def hold_home(home: Path) -> ExitStack:
     """
     with ExitStack() as held:
         try:
-            home.mkdir(parents=True, exist_ok=True, mode=0o700)
+            make_folder(home, 0o700)
             folder = os.open(home, os.O_RDONLY | os.O_DIRECTORY)
             held.callback(os.close, folder)
             file = held.enter_context((home / ".lock").open("w"))

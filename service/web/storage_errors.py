@@ -1,8 +1,8 @@
 """What failing storage means to a client: errors of the database and of the operating system as those of the service.
 
-Nothing was stored where one of these comes: files are written whole or not at all, rows in transactions. Only where the
-connection to a database server is lost in the middle of a commit nobody knows (`undecided`): sent again, a batch is
-known by its number, and what has an idempotency key by that.
+Nothing was stored where one of these comes: files are written whole or not at all, rows in transactions. Only where a
+commit is interrupted, as the connection to a database server is lost or a disk cannot sync, nobody knows (`undecided`):
+sent again, a batch is known by its number, and what has an idempotency key by that.
 """
 
 from __future__ import annotations
@@ -58,15 +58,20 @@ def translated(error: BaseException) -> ServiceError | None:
 
 
 def undecided(error: BaseException) -> bool:
-    """Whether what a transaction was to store may be stored all the same, so that its files have to stay."""
-    return isinstance(error, DBAPIError) and error.connection_invalidated
+    """Whether what a transaction was to store may be stored all the same, so that its files have to stay.
+
+    A commit that could not be synced is in SQLite's log, whole, and is found there by the next start unless another one
+    has taken its place.
+    """
+    if not isinstance(error, DBAPIError):
+        return False
+    return error.connection_invalidated or _code(error) == sqlite3.SQLITE_IOERR
 
 
 def _of_database(error: DBAPIError) -> ServiceError | None:
     if error.orig is not None and hasattr(error.orig, "sqlstate"):
         return _of_postgresql(error, error.orig.sqlstate)
-    code = getattr(error.orig, "sqlite_errorcode", None)
-    primary = None if code is None else code & 0xFF  # the rest of an extended code says where it came up
+    primary = _code(error)
     if primary in _BUSY:
         return StorageUnavailableError(_LOCKED, headers=RETRY_AFTER)
     if primary == sqlite3.SQLITE_FULL:
@@ -76,6 +81,12 @@ def _of_database(error: DBAPIError) -> ServiceError | None:
     if primary in _FAILING:
         return StorageUnavailableError(f"the database cannot be used now: {error.orig}", headers=RETRY_AFTER)
     return None
+
+
+def _code(error: DBAPIError) -> int | None:
+    """SQLite's primary code; the rest of an extended one says where it came up."""
+    code: int | None = getattr(error.orig, "sqlite_errorcode", None)
+    return None if code is None else code & 0xFF
 
 
 def _of_postgresql(error: DBAPIError, state: str | None) -> ServiceError | None:

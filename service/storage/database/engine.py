@@ -6,6 +6,7 @@ There a transaction tells the others of which model it has changed what: Postgre
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from itertools import chain
@@ -19,12 +20,15 @@ from sqlalchemy import Connection, CursorResult, Select, create_engine, event, t
 from sqlalchemy.orm import Session, sessionmaker
 
 from lipcore.extras import need
+from lipcore.files.durable import make_folder
 from service.foundation.settings import CONNECTIONS, Settings
 from service.storage.database import tables
 from service.storage.database.migrations import migrate
 
 if TYPE_CHECKING:
     from service.storage.database.postgresql import Postgresql
+
+logger = logging.getLogger(__name__)
 
 FILE = "lipserve.sqlite3"
 MOST_CONNECTIONS = 64
@@ -37,7 +41,7 @@ class Sqlite:
     shared = False
 
     def __init__(self, home: Path, timeout_s: float) -> None:
-        home.mkdir(parents=True, exist_ok=True, mode=0o700)
+        make_folder(home, 0o700)
         self.path = home / FILE
         self.path.touch(0o600)  # for its owner alone, as what SQLite puts beside it
         self.engine = create_engine(
@@ -67,6 +71,17 @@ class Sqlite:
         with closing(connect(f"file:{quote(str(self.path))}?mode=rw", seconds, isolation_level=None, uri=True)) as own:
             own.execute("BEGIN IMMEDIATE")
             own.execute("ROLLBACK")
+
+    def settle(self) -> None:
+        """Bring what an earlier run has left in SQLite's log into the database and begin the log anew, on the disk.
+
+        What is read of a log need not be on the disk: a sync may have failed. Commits that were added behind such a gap
+        would be lost with it at the next power cut. To be called by the first process, before it answers.
+        """
+        with self.engine.connect() as connection:
+            busy, _, _ = connection.execute(text("PRAGMA wal_checkpoint(TRUNCATE)")).one()
+        if busy:
+            logger.warning("another process reads the database: the log of its writes is kept until it is full")
 
     def close(self) -> None:
         """Close all connections."""

@@ -87,6 +87,9 @@ class Postgresql:
                 raise OSError("the PostgreSQL server is a standby, which cannot be written")
             _take(connection, "pg_advisory_xact_lock_shared", WRITERS, ALL)
 
+    def settle(self) -> None:
+        """Nothing: PostgreSQL ends where a sync of its log fails."""
+
     def close(self) -> None:
         """Close all connections."""
         self.engine.dispose()

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TypeVar
 
+from lipcore.files.durable import make_folder, sync
 from service.storage import sample_file
 
 Result = TypeVar("Result")
@@ -44,11 +45,7 @@ def write_durably(path: Path, write: Callable[[IO[bytes]], Result], draft: Path 
     except (OSError, ValueError):
         draft.unlink(missing_ok=True)  # on a full disk, room for what comes next
         raise
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)  # the new name, before a row tells of it
-    finally:
-        os.close(folder)
+    sync(path.parent)  # the new name, before a row tells of it
     return result
 
 
@@ -64,7 +61,7 @@ class Local:
         self._home = home
         self.datasets, self.versions, self.snapshots = home / "datasets", home / "versions", home / "learning"
         for folder in (self.datasets, self.versions, self.snapshots):
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
 
     @property
     def kinds(self) -> Mapping[str, Path]:

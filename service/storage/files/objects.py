@@ -18,6 +18,7 @@ from typing import NamedTuple, Protocol, TypeVar
 from urllib.parse import unquote, urlsplit
 
 from lipcore.extras import need
+from lipcore.files.durable import make_folder
 from service.storage.files import local
 
 logger = logging.getLogger(__name__)
@@ -130,7 +131,8 @@ class Mounted:
         target = self.root / key
         with _of_folder():
             self.check()
-            target.parent.mkdir(parents=True, exist_ok=True)
+            if not target.parent.is_dir():
+                make_folder(target.parent)
             with path.open("rb") as file:
                 draft = target.parent / f"{DRAFT}{secrets.token_hex(8)}"
                 local.write_durably(target, lambda out: shutil.copyfileobj(file, out, 1 << 20), draft)

@@ -22,6 +22,7 @@ from sqlalchemy import select
 
 from lipcore.data.samples import Samples
 from lipcore.files import persistence
+from lipcore.files.durable import make_folder
 from lipcore.files.manifest import ModelFormatError
 from lipcore.model.torque_model import TorqueModel
 from service.foundation.errors import DamagedDataError
@@ -64,7 +65,7 @@ class Files:
     ) -> None:
         self.uploads, self.learning = home / "uploads", home / "learning"
         for folder in (self.uploads, self.learning):
-            folder.mkdir(parents=True, exist_ok=True)
+            make_folder(folder)
         self._place: Local | Shared
         if url is None:
             self._place = Local(home)
