@@ -20,14 +20,16 @@ class Server:
     """`lipserve serve` on a home; settings are environment variables.
 
     warm: forked from a process that has imported it already, for a service that is shared and nothing else; port: to
-    listen on, a free one where None.
+    listen on, a free one where None; log: what it prints goes there, beside the home where None.
     """
 
     patience = DEADLINE
     """Seconds that it may take to start."""
 
-    def __init__(self, home: Path, warm: bool = False, port: int | None = None, **settings: str) -> None:
-        self.home, self.log = home, home.with_name(home.name + ".log")
+    def __init__(
+        self, home: Path, warm: bool = False, port: int | None = None, log: Path | None = None, **settings: str
+    ) -> None:
+        self.home, self.log = home, home.with_name(home.name + ".log") if log is None else log
         self.port = free_port() if port is None else port
         self.url = f"http://127.0.0.1:{self.port}"
         self.client = httpx.Client(base_url=self.url, timeout=DEADLINE)
