@@ -15,7 +15,8 @@ from service.storage.database import AliasMoveRow, AliasRow, ModelRow, VersionRo
 
 def page(loaded: LoadedModels, model: str) -> AliasList:
     """Every alias of a model, `serving` first; raise NotFoundError."""
-    with loaded.moving, loaded.database.session() as session:  # all of it as of one moment
+    # nothing is listed here that does not answer yet; and other services move and remove aliases meanwhile
+    with loaded.moving, loaded.database.moment() as session:
         _check_model(session, model)
         return AliasList(items=[_show(loaded, session, model, name) for name in (SERVING, *names(session, model))])
 

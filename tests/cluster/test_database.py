@@ -1,11 +1,14 @@
 """The database on a PostgreSQL server: its tables, its writers one after the other, what its failures are called."""
 
+import os
+import socket
 import sys
+from contextlib import closing
 
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
-from sqlalchemy import inspect, select, text
+from sqlalchemy import delete, inspect, select, text
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from typer.testing import CliRunner
 
@@ -15,6 +18,7 @@ from service.foundation.settings import Settings
 from service.storage.database import Base, Database, LearningRow, ModelRow, now
 from service.storage.storage import HomeError, check_home
 from service.web.storage_errors import translated
+from tests.histories.proxy import Proxy
 from tests.service.database.starting import check_starts_together
 from tests.service.server import free_port
 
@@ -55,6 +59,33 @@ def test_migrations_end_in_the_tables_of_the_release(database):
 def test_services_that_start_together_migrate_once(postgres, tmp_path):
     url = postgres.url_of(postgres.create_empty())
     check_starts_together(lambda: Database(tmp_path, url=url))
+
+
+def test_what_is_read_as_of_one_moment_does_not_change_on_the_way(database, other):
+    with database.transaction() as session:
+        add(session, "one")
+    with database.moment() as session:
+        assert session.scalars(select(ModelRow.name)).all() == ["one"]
+        with other.transaction() as theirs:
+            theirs.execute(delete(ModelRow))
+            add(theirs, "two")
+        assert session.scalars(select(ModelRow.name)).all() == ["one"]
+    assert names(database) == ["two"]
+
+
+def test_a_network_that_is_silent_is_noticed(shared):
+    """Without a word from the server: by default a request would hang for a quarter of an hour, or for two."""
+    proxy = Proxy(shared.database_url)
+    settings = shared.settings(database_url=proxy.url)
+    try:
+        with closing(Database.of(settings, 1.0)) as opened, opened.engine.connect() as connection:
+            connection.execute(text("SELECT 1"))
+            line = socket.socket(fileno=os.dup(connection.connection.fileno()))
+            with line:
+                for name, most in (("TCP_USER_TIMEOUT", 30_000), ("TCP_KEEPIDLE", 15), ("TCP_KEEPINTVL", 10)):
+                    assert 0 < line.getsockopt(socket.IPPROTO_TCP, getattr(socket, name)) <= most
+    finally:
+        proxy.close()
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from service import replication
 from service.app import create_app
 from service.learning import refresh
 from service.learning.learner.publication import Contested
+from service.models import aliases
 from service.storage.database import AlarmRow, Database, EventRow, LearnerRow, ServingRow
 from tests.cluster.pairs import HARMLESS, Pair, answers, both, folder_store, made, train
 from tests.cluster.servers import S3, Postgres, Shared, sharing
@@ -151,6 +152,24 @@ def test_an_alias_that_is_moved_or_removed_at_one_is_at_the_other(pair, arm):
         )
     assert first.client.delete(first.url("aliases/stable")).status_code == 204
     eventually(lambda: second.client.post(second.url("predict"), json=QUERIES | {"alias": "stable"}).status_code == 404)
+
+
+def test_aliases_are_listed_as_of_one_moment(pair, arm, monkeypatch):
+    """One that another service removes meanwhile is in the list or not, and nothing fails."""
+    first, second = arm
+    for alias in ("stable", "trial"):
+        first.put(f"aliases/{alias}", {"version": 1})
+    names = aliases.names
+
+    def names_and_then(session, model):
+        found = names(session, model)
+        monkeypatch.setattr(aliases, "names", names)
+        assert second.client.delete(second.url("aliases/stable")).status_code == 204
+        return found
+
+    monkeypatch.setattr(aliases, "names", names_and_then)
+    for expected in (["serving", "stable", "trial"], ["serving", "trial"]):
+        assert [each["alias"] for each in first.get("aliases")["items"]] == expected
 
 
 def test_a_version_that_is_published_or_taken_back_to_at_one_answers_at_the_other(pair, arm):

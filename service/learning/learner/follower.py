@@ -146,7 +146,8 @@ class Follower:
             with self.database.session() as session:
                 last = snapshots.last_stored(session, self.model, self.version)
             since = None if last is None or last[0] == self._snapshot else time.time() - last[1]
-            if since is not None and since < self.settings.snapshot_every_s:
+            # one from the future shows that clocks differ, or that one was set back: it says nothing of when
+            if since is not None and 0 <= since < self.settings.snapshot_every_s:
                 self._stored_at = time.monotonic()
                 return
         self.store()

@@ -56,6 +56,10 @@ class Sqlite:
         """Take the write lock, of which there is one: what is read from now on cannot change before it is written."""
         connection.execute(text("BEGIN IMMEDIATE"))
 
+    def pin(self, connection: Connection) -> None:
+        """Let all that is read from now on be of the moment of the first look; writers are not kept."""
+        connection.execute(text("BEGIN"))
+
     @contextmanager
     def turn(self, model: str) -> Iterator[None]:
         """Nothing to wait for: no other service has this file."""
@@ -214,6 +218,13 @@ class Database:
     def session(self) -> Iterator[Session]:
         """Session for reading: every statement sees what was committed before it."""
         with self._sessions() as session:
+            yield session
+
+    @contextmanager
+    def moment(self) -> Iterator[Session]:
+        """Session for reading: everything as of one moment. Nobody waits for it."""
+        with self._sessions() as session:
+            self.adapter.pin(session.connection())
             yield session
 
     @contextmanager

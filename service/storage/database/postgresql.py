@@ -29,15 +29,15 @@ OPTIONS = {
     "tcp_keepalives_interval": "5",
     "tcp_keepalives_count": "3",
 }
-LISTENING: dict[str, Any] = {
-    "application_name": "lipserve notices",
-    "connect_timeout": 5,
-    # a server that is gone without a word is noticed within half a minute
+NOTICED: dict[str, Any] = {
     "keepalives_idle": 10,
     "keepalives_interval": 5,
     "keepalives_count": 3,
     "tcp_user_timeout": 25_000,
 }
+"""A server that is gone without a word, as behind a network that is silent, is noticed within half a minute; the
+system's own times are a quarter of an hour, and two hours."""
+LISTENING: dict[str, Any] = {"application_name": "lipserve notices", "connect_timeout": 5, **NOTICED}
 
 
 class Postgresql:
@@ -58,6 +58,10 @@ class Postgresql:
             return
         _take(connection, "pg_advisory_xact_lock_shared", WRITERS, ALL)
         _take(connection, "pg_advisory_xact_lock", WRITERS, _key(model))
+
+    def pin(self, connection: Connection) -> None:
+        """Let all that is read from now on be of the moment of the first look."""
+        connection.execute(text("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ, READ ONLY"))
 
     @contextmanager
     def turn(self, model: str) -> Iterator[None]:
@@ -112,6 +116,7 @@ def _engine(url: str, timeout_s: float, most: int) -> Engine:
             "options": " ".join(f"-c {name}={value}" for name, value in options.items()),
             "connect_timeout": max(2, round(timeout_s)),
             "application_name": "lipserve",
+            **NOTICED,
         },
         pool_pre_ping=True,  # connections do not outlive a restart of the server
         pool_size=min(5, most),

@@ -13,6 +13,7 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import IO, TypeVar
 
@@ -133,9 +134,10 @@ class Shared:
 
     def sweep(self, datasets: Collection[str], versions: Collection[str], snapshots: Collection[str]) -> int:
         """Delete what is none of these and a day old, in one place for all services; return how many."""
-        left = [each for each in self._old("datasets/") if _name(each).removesuffix(SUFFIX) not in datasets]
-        left += [each for each in self._old("versions/") if each.key.split("/")[1] not in versions]
-        left += [each for each in self._old("learning/") if _name(each).removesuffix(SUFFIX) not in snapshots]
+        old = partial(self._old, self._now() - DAY_S)
+        left = [each for each in old("datasets/") if _name(each).removesuffix(SUFFIX) not in datasets]
+        left += [each for each in old("versions/") if each.key.split("/")[1] not in versions]
+        left += [each for each in old("learning/") if _name(each).removesuffix(SUFFIX) not in snapshots]
         for each in left:
             self.objects.delete(each.key)
         return len(left)
@@ -193,8 +195,19 @@ class Shared:
         except OSError as error:
             logger.warning("files of a version that was not made are left for a day: %s", error)
 
-    def _old(self, prefix: str) -> Iterator[Entry]:
-        return (each for each in self.objects.list(prefix) if each.modified < time.time() - DAY_S)
+    def _old(self, before: float, prefix: str) -> Iterator[Entry]:
+        return (each for each in self.objects.list(prefix) if each.modified < before)
+
+    def _now(self) -> float:
+        """The time by the clock of the store, s, which has dated its objects: this host's may be days ahead of it."""
+        with self._draft("probe") as draft:
+            key = f"probes/{draft.name}"
+            (draft / "probe").touch()
+            self.objects.put(draft / "probe", key)
+            try:
+                return next(each.modified for each in self.objects.list("probes/") if each.key == key)
+            finally:
+                self.objects.delete(key)
 
     def _trim(self) -> None:
         """Delete the copies that were not used for the longest time, down to the bytes allowed; and old drafts."""

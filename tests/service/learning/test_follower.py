@@ -1,5 +1,6 @@
 """A version that follows its log: what it learns, publishes and stores, and how several take turns."""
 
+import time
 from math import inf
 
 import numpy as np
@@ -121,6 +122,18 @@ def test_one_of_several_services_stores_for_all(arm, follower, monkeypatch):
     arm.batches(3)
     caught_up(other).store()  # at the end all of it, whoever was the last
     assert stored(arm) == [2, 3, 4]
+
+
+def test_a_clock_that_is_set_back_keeps_no_state_from_being_stored(arm, follower, monkeypatch):
+    monkeypatch.setattr(arm.database.adapter, "shared", True)
+    other = Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base)
+    arm.batches(0)
+    caught_up(other).store()
+    arm.batches(1)
+    real = time.time
+    monkeypatch.setattr(time, "time", lambda: real() - 3600.0)
+    caught_up(follower).store_in_turn()
+    assert stored(arm) == [1, 2]
 
 
 def test_watchers_see_batches_before_they_are_learnt(arm, follower):
