@@ -8,7 +8,7 @@ TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 3
 SHARE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test warm-lip warm-chain bytecode test-all screenshots cpp lint install serve image image-serve docs dist sbom clean
+.PHONY: demo test warm-lip warm-chain bytecode test-all nightly screenshots cpp lint install serve image image-serve docs dist sbom clean
 
 demo: $(VENV)/.running
 	$(BIN)/lipserve demo
@@ -39,12 +39,19 @@ SHARED := models/test_aliases.py models/test_deletion.py access/test_keys.py tes
 	observability/test_metrics_of_service.py learning/test_observations.py learning/test_learning_routes.py \
 	learning/test_undoing.py learning/test_inspection.py learning/test_log.py
 
+# seconds of recorded histories (tests/histories): half on SQLite, half on three services
+HISTORY_S ?= 3600
+
 # (pytest's own tracebacks run into a limit of Python's parser on rewritten assertions of this depth)
 test-all: install
 	failed=0; \
-	$(TEST) $(SHARE) --hypothesis-profile thorough || failed=1; \
+	LIPSERVE_HISTORY_S=$$(( $(HISTORY_S) / 2 )) $(TEST) $(SHARE) --hypothesis-profile thorough || failed=1; \
 	$(TEST) --backend shared --tb=native $(addprefix tests/service/,$(SHARED)) || failed=1; \
 	exit $$failed
+
+# the same with histories of ten minutes
+nightly:
+	$(MAKE) test-all HISTORY_S=600
 
 # pictures of the dashboard for README and guide, made by its tests; `pytest tests/browser/test_pages.py --pictures FOLDER`
 # makes one of every page

@@ -1,12 +1,10 @@
-"""Clients that write down what they ask and what they are told, and what disturbs the services meanwhile."""
+"""Clients that write down what they ask and what they are told."""
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,8 +12,9 @@ import httpx
 import numpy as np
 
 from tests.histories.checker import UNKNOWN, Operation
-from tests.service.data import DEADLINE
-from tests.service.learning.lessons import QUERIES, lesson
+from tests.histories.rules import Answer
+from tests.service.data import QUICK
+from tests.service.learning.lessons import LESSON, QUERIES, lesson
 from tests.service.server import Server
 
 PATIENCE_S = 4.0
@@ -23,16 +22,27 @@ PATIENCE_S = 4.0
 ABSENT_S = 0.05
 """After which a service that does not listen is asked again."""
 ALIASES = ("production", "candidate")
+WORK = "work"
+"""The model that jobs train."""
+ENDED = ("succeeded", "failed", "cancelled")
+ACTS = {"move": 0.15, "remove": 0.05, "read": 0.2, "named": 0.2, "teach": 0.25, "ask": 0.15}
+"""How often each is done."""
+JOBS = 0.05
+"""How often a client sees to its job instead, where there are jobs."""
 
 
 @dataclass
 class Book:
-    """Operations of all clients, in the order that they ended in."""
+    """What all clients did, in the order in which it ended. named: versions that services answered through an alias."""
 
     operations: list[Operation] = field(default_factory=list)
+    answers: list[Answer] = field(default_factory=list)
+    named: list[Operation] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def write(self, client: int, key: str, call: tuple[Any, ...], ask: Callable[[], Any]) -> Any:
+    def write(
+        self, client: int, key: str, call: tuple[Any, ...], ask: Callable[[], Any], into: list[Operation] | None = None
+    ) -> Any:
         """Ask, write down what came of it, and return it: UNKNOWN where no answer came, or none that says.
 
         Nothing is written where no service listened: then nothing can have come of it.
@@ -47,11 +57,16 @@ class Book:
             result = UNKNOWN
         operation = Operation(client, key, call, result, began, time.monotonic())
         with self._lock:
-            self.operations.append(operation)
+            (self.operations if into is None else into).append(operation)
         return result
 
+    def answered(self, answer: Answer) -> None:
+        """Write down what a query was answered."""
+        with self._lock:
+            self.answers.append(answer)
+
     def of(self, kind: str) -> list[Operation]:
-        """Those about keys that begin so."""
+        """Operations about keys that begin so."""
         return [each for each in self.operations if each.key.startswith(kind)]
 
 
@@ -60,47 +75,70 @@ class Unsettled(Exception):
 
 
 class Client:
-    """Asks one of several services, by chance, until it is told to stop."""
+    """Asks one of several services, by chance, until it is told to stop.
 
-    def __init__(self, number: int, servers: Sequence[Server], model: str, book: Book, seed: int) -> None:
+    headers: of every request; dataset: that jobs are trained on, None where there are to be none.
+    """
+
+    def __init__(
+        self,
+        number: int,
+        servers: Sequence[Server],
+        model: str,
+        book: Book,
+        seed: int,
+        headers: dict[str, str] | None = None,
+        dataset: str | None = None,
+    ) -> None:
         self.number, self.servers, self.model, self.book = number, servers, model, book
+        self.headers, self.dataset = headers or {}, dataset
         self.rng = np.random.default_rng([seed, number])
-        self.sequence = 0
+        self.sequence = self.acknowledged = self.jobs = 0
+        self.job: str | None = None
         self.errors: list[str] = []
 
     def run(self, stop: threading.Event) -> None:
         """Ask until then; what is neither an answer nor a failure of the service is kept in `errors`."""
-        with httpx.Client(timeout=PATIENCE_S) as self._http:
+        with httpx.Client(timeout=PATIENCE_S, headers=self.headers) as self._http:
             while not stop.is_set():
                 try:
                     self.once()
                 except Exception as error:
-                    self.errors.append(f"{type(error).__name__}: {error}")
+                    self.errors.append(f"client {self.number}: {type(error).__name__}: {error}")
                     return
 
     def once(self) -> None:
         """One operation, by chance."""
+        if self.dataset is not None and self.rng.random() < JOBS:
+            self._see_to_job()
+            return
         alias = ALIASES[self.rng.integers(len(ALIASES))]
-        act = self.rng.choice(["move", "remove", "read", "answer", "teach"], p=[0.2, 0.05, 0.25, 0.25, 0.25])
-        if act == "move":
-            version = int(self.rng.integers(1, 4))
-            self.book.write(self.number, f"alias {alias}", ("move", version), lambda: self._move(alias, version))
-        elif act == "remove":
-            self.book.write(self.number, f"alias {alias}", ("remove",), lambda: self._remove(alias))
-        elif act == "read":
-            self.book.write(self.number, f"alias {alias}", ("read",), lambda: self._read(alias))
-        elif act == "answer":
-            self.book.write(self.number, f"answer {alias}", ("read",), lambda: self._answer(alias))
-        else:
-            call = (self.number, self.sequence)
-            result = self.book.write(self.number, "journal", call, self._teach)
-            # a batch whose answer was lost is sent again, as clients do; now and then one that was answered is, too
-            if result != UNKNOWN and self.rng.random() < 0.9:
-                self.sequence += 1
+        key = f"alias {alias}"
+        match self.rng.choice(list(ACTS), p=list(ACTS.values())):
+            case "move":
+                version = int(self.rng.integers(1, 4))
+                self.book.write(self.number, key, ("move", version), lambda: self._move(alias, version))
+            case "remove":
+                self.book.write(self.number, key, ("remove",), lambda: self._remove(alias))
+            case "read":
+                self.book.write(self.number, key, ("read",), lambda: self._read(alias))
+            case "named":
+                self.book.write(self.number, key, ("read",), lambda: self._named(alias), self.book.named)
+            case "ask":
+                self._answer()
+            case _:
+                call = (self.number, self.sequence)
+                result = self.book.write(self.number, "journal", call, self._teach)
+                # a batch whose answer was lost is sent again, as clients do; now and then one that was answered is, too
+                if result != UNKNOWN and self.rng.random() < 0.9:
+                    self.sequence += 1
 
     def _ask(self, method: str, path: str, **request: Any) -> httpx.Response:
         server = self.servers[self.rng.integers(len(self.servers))]
-        answer = self._http.request(method, f"{server.url}/v1/models/{self.model}/{path}", **request)
+        return self._ask_of(server, method, f"/v1/models/{self.model}/{path}", **request)
+
+    def _ask_of(self, server: Server, method: str, path: str, **request: Any) -> httpx.Response:
+        answer = self._http.request(method, f"{server.url}{path}", **request)
         if answer.status_code in (429, 500, 503, 504):
             if answer.status_code == 500:
                 self.errors.append(f"{method} {path}: {answer.text}")
@@ -123,7 +161,7 @@ class Client:
         assert answer.status_code == 200, answer.text
         return next((each["version"] for each in answer.json()["items"] if each["alias"] == alias), None)
 
-    def _answer(self, alias: str) -> int | None:
+    def _named(self, alias: str) -> int | None:
         answer = self._ask("POST", "predict", json={**QUERIES, "alias": alias})
         assert answer.status_code in (200, 404), answer.text
         return int(answer.json()["version"]) if answer.status_code == 200 else None
@@ -134,51 +172,52 @@ class Client:
         body["t"] = [each + 10.0 * (self.sequence // 40) for each in body["t"]]
         answer = self._ask("POST", "observations", json=body)
         assert answer.status_code == 200, answer.text
-        return bool(answer.json()["duplicate"]), int(answer.json()["revision"])
+        said = answer.json()
+        assert said["accepted"] == LESSON, said  # whatever the clock shows
+        self.acknowledged = max(self.acknowledged, int(said["revision"]))
+        return bool(said["duplicate"]), int(said["revision"])
 
-
-class Killer:
-    """Kills services outright and starts them again, or stops them for a while, by chance."""
-
-    def __init__(self, servers: list[Server], again: Callable[[int], Server], seed: int) -> None:
-        self.servers, self.again, self.rng = servers, again, np.random.default_rng([seed, 99])
-        self.done: dict[str, int] = {"kill": 0, "stop": 0}
-        self.errors: list[str] = []
-
-    def run(self, stop: threading.Event, every_s: float) -> None:
-        """Until then, one deed about every so many seconds."""
+    def _answer(self) -> None:
+        """Ask what is served, now and then what contains all that this client has taught."""
+        place = int(self.rng.integers(len(self.servers)))
+        server, least = self.servers[place], self.acknowledged if self.rng.random() < 0.5 else 0
+        life = f"{place}:{server.process.pid}"
         try:
-            while not stop.wait(self.rng.uniform(0.5, 1.5) * every_s):
-                self.once(int(self.rng.integers(len(self.servers))), str(self.rng.choice(["kill", "stop"])))
-        except Exception as error:
-            self.errors.append(f"{type(error).__name__}: {error}")
+            path = f"/v1/models/{self.model}/predict"
+            answer = self._ask_of(server, "POST", path, json={**QUERIES, "min_revision": least})
+        except (httpx.TransportError, Unsettled):
+            return
+        assert answer.status_code == 200, answer.text
+        said = answer.json()
+        tau = tuple(float(each) for row in said["tau"] for each in row)
+        self.book.answered(Answer(self.number, life, said["version"], said["revision"], least, tau))
 
-    def once(self, number: int, deed: str) -> None:
-        """One deed to one service."""
-        server = self.servers[number]
-        self.done[deed] += 1
-        if deed == "kill":
-            server.kill()
-            server.client.close()
-            self.servers[number] = self.again(number)
-        else:
-            server.process.send_signal(signal.SIGSTOP)
-            try:
-                time.sleep(float(self.rng.uniform(0.1, 0.5 * PATIENCE_S)))  # how long it stands still, not a wait
-            finally:
-                with suppress(ProcessLookupError):
-                    server.process.send_signal(signal.SIGCONT)
+    def _see_to_job(self) -> None:
+        """Queue a job until that is acknowledged, then look at it or cancel it until it has ended."""
+        key = f"job {self.number}-{self.jobs}"
+        if self.job is None:
+            self.book.write(self.number, key, ("queue",), lambda: self._queue(key.replace(" ", "-")))
+            return
+        call = "cancel" if self.rng.random() < 0.1 else "read"
+        ask = self._cancel if call == "cancel" else self._look
+        if self.book.write(self.number, key, (call,), ask) in ENDED:
+            self.job, self.jobs = None, self.jobs + 1
 
+    def _of_jobs(self, method: str, path: str, *expected: int, **request: Any) -> httpx.Response:
+        server = self.servers[self.rng.integers(len(self.servers))]
+        answer = self._ask_of(server, method, f"/v1/jobs{path}", **request)
+        assert answer.status_code in expected, answer.text
+        return answer
 
-def disturbed(clients: Sequence[Client], killer: Killer, seconds: float, every_s: float) -> list[str]:
-    """Let clients ask for so long, disturbed; return what went wrong with them."""
-    stop = threading.Event()
-    threads = [threading.Thread(target=each.run, args=(stop,)) for each in clients]
-    threads.append(threading.Thread(target=killer.run, args=(stop, every_s)))
-    for each in threads:
-        each.start()
-    stop.wait(seconds)
-    stop.set()
-    for each in threads:
-        each.join(DEADLINE)
-    return [error for each in (*clients, killer) for error in each.errors]
+    def _queue(self, name: str) -> str:
+        body = {"model": WORK, "datasets": [self.dataset], "estimator": "lip-chain", "options": QUICK, "holdout": None}
+        said = self._of_jobs("POST", "", 202, json=body, headers={"Idempotency-Key": name}).json()
+        self.job = said["id"]
+        return str(said["state"])
+
+    def _look(self) -> str:
+        return str(self._of_jobs("GET", f"/{self.job}", 200).json()["state"])
+
+    def _cancel(self) -> str:
+        answer = self._of_jobs("POST", f"/{self.job}/cancel", 200, 409)
+        return str(answer.json()["state"]) if answer.status_code == 200 else "ended"

@@ -7,6 +7,7 @@ not tried again.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from math import inf
@@ -36,52 +37,80 @@ class Operation:
         return self.result != UNKNOWN
 
 
+@dataclass(frozen=True)
+class _Done:
+    """Operations that are put in order: the certain ones before `first`, those of `beyond` (bits from `first` on), and
+    of those without an answer the bits of `unknown`."""
+
+    first: int = 0
+    beyond: int = 0
+    unknown: int = 0
+
+    def with_certain(self, index: int) -> _Done:
+        beyond = self.beyond | 1 << (index - self.first)
+        run = (~beyond & (beyond + 1)).bit_length() - 1  # how many follow each other from `first` on
+        return _Done(self.first + run, beyond >> run, self.unknown)
+
+    def with_unknown(self, index: int) -> _Done:
+        return _Done(self.first, self.beyond, self.unknown | 1 << index)
+
+
+class _Search:
+    def __init__(self, history: Sequence[Operation], step: Step) -> None:
+        ordered = sorted(history, key=lambda each: each.began)
+        self.certain = [each for each in ordered if each.certain]
+        self.unknown = [each for each in ordered if not each.certain]
+        self.begins = [each.began for each in self.unknown]
+        self.step = step
+
+    def following(self, done: _Done, state: State) -> Iterator[tuple[Operation, _Done, State]]:
+        """Operations that may come next and what they lead to: those that began before any of the rest ended. Those
+        without an answer come last, the latest of them first: few of them are needed."""
+        limit, waiting = inf, []
+        for index in range(done.first, len(self.certain)):
+            if done.beyond >> (index - done.first) & 1:
+                continue
+            if self.certain[index].began > limit:
+                break
+            limit = min(limit, self.certain[index].ended)
+            waiting.append(index)
+        for index in waiting:
+            if self.certain[index].began <= limit:
+                for after in self.step(state, self.certain[index]):
+                    yield self.certain[index], done.with_certain(index), after
+        for index in range(bisect_right(self.begins, limit) - 1, -1, -1):
+            if not done.unknown >> index & 1:
+                for after in self.step(state, self.unknown[index]):
+                    if after != state:  # else it need not have happened
+                        yield self.unknown[index], done.with_unknown(index), after
+
+
 def explained(history: Sequence[Operation], initial: State, step: Step) -> list[Operation] | None:
     """An order that explains a history, operations without an answer left out where they need not have happened.
 
     None where there is no such order. history: of one key; initial: state before it.
     """
-    operations = sorted(history, key=lambda each: each.began)
-    ends = [each.ended if each.certain else inf for each in operations]
-    needed = sum(1 << index for index, each in enumerate(operations) if each.certain)
-    seen: set[tuple[int, State]] = set()
-    done, order = 0, []
-    levels = [_next(operations, ends, 0, done, initial, step)]
+    search = _Search(history, step)
+    seen: set[tuple[_Done, State]] = set()
+    order: list[Operation] = []
+    if not search.certain:
+        return []
+    levels = [search.following(_Done(), initial)]
     while levels:
-        if done & needed == needed:
-            return [operations[index] for index in order]
-        for index, state in levels[-1]:
-            now = done | 1 << index
-            if (now, state) not in seen:
-                seen.add((now, state))
-                done = now
-                order.append(index)
-                levels.append(_next(operations, ends, 0, done, state, step))
-                break
+        for operation, done, state in levels[-1]:
+            if (done, state) in seen:
+                continue
+            seen.add((done, state))
+            order.append(operation)
+            if done.first == len(search.certain):
+                return order
+            levels.append(search.following(done, state))
+            break
         else:
             levels.pop()
             if order:
-                done &= ~(1 << order.pop())
+                order.pop()
     return None
-
-
-def _next(
-    operations: Sequence[Operation], ends: Sequence[float], first: int, done: int, state: State, step: Step
-) -> Iterator[tuple[int, State]]:
-    """Operations that may come next, and the states after them: those that began before any of the rest ended."""
-    limit = inf
-    waiting = []
-    for index in range(first, len(operations)):
-        if done >> index & 1:
-            continue
-        if operations[index].began > limit:
-            break
-        limit = min(limit, ends[index])
-        waiting.append(index)
-    for index in waiting:
-        if operations[index].began <= limit:
-            for after in step(state, operations[index]):
-                yield index, after
 
 
 def contradictions(history: Iterable[Operation], initial: State, step: Step) -> list[str]:

@@ -1,14 +1,15 @@
 """The checker against histories that are known good, and known bad; and against a slow one that tries every order."""
 
+from dataclasses import replace
 from itertools import permutations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.histories.checker import UNKNOWN, Operation, contradictions, explained
-from tests.histories.rules import ABSENT, alias, job, journal
+from tests.histories.checker import UNKNOWN, Operation, State, Step, contradictions, explained
+from tests.histories.rules import ABSENT, Answer, alias, faults, job, journal
 
 
 def at(began: float, ended: float, *call: object, result: object = "moved", client: int = 0) -> Operation:
@@ -90,26 +91,99 @@ def test_a_job_ends_once() -> None:
         assert explained(seen(*states), "queued", job) is None
 
 
+def test_a_job_is_queued_once_and_a_cancel_says_whether_it_had_ended() -> None:
+    def done(*calls: tuple[str, object]) -> bool:
+        history = [Operation(0, "job", (kind,), result, 2 * k, 2 * k + 1) for k, (kind, result) in enumerate(calls)]
+        return explained(history, ABSENT, job) is not None
+
+    assert done(("queue", "queued"), ("queue", "running"), ("cancel", "running"), ("read", "cancelled"))
+    assert done(("queue", UNKNOWN), ("read", "running"), ("cancel", "ended"), ("read", "failed"))
+    assert done(("queue", "queued"), ("cancel", UNKNOWN), ("read", "queued"), ("read", "cancelled"))
+    assert not done(("read", "queued"))
+    assert not done(("queue", "queued"), ("cancel", "cancelled"), ("read", "succeeded"))
+    assert not done(("queue", "queued"), ("read", "succeeded"), ("cancel", "cancelled"))
+    assert not done(("queue", "queued"), ("cancel", "ended"), ("read", "running"))
+
+
+def test_answers_are_those_of_the_log_and_do_not_go_back() -> None:
+    def expected(revision: int) -> tuple[float, float]:
+        return 1.0, float(revision)
+
+    def answer(revision: int, life: str = "0:7", least: int = 0, off: float = 0.0) -> Answer:
+        return Answer(0, life, 3, revision, least, (1.0 + off, float(revision)))
+
+    good = [answer(0), answer(4), answer(4), answer(2, life="1:8"), answer(5, least=5)]
+    assert faults(good, expected) == []
+    for bad in (answer(3), answer(9, off=1e-6), answer(9, least=10)):
+        assert len(faults([*good, bad], expected)) == 1
+
+
+RULES = {"alias": (ABSENT, alias), "journal": ((-1, -1, 0), journal), "job": (ABSENT, job)}
+
+
+def asked(rule: str, rng: np.random.Generator) -> tuple[object, ...]:
+    if rule == "alias":
+        return [("move", int(rng.integers(1, 3))), ("read",), ("remove",)][rng.integers(3)]
+    if rule == "journal":
+        return int(rng.integers(2)), int(rng.integers(3))
+    return [("queue",), ("read",), ("cancel",)][rng.integers(3)]
+
+
+def results(rule: str, call: tuple[object, ...]) -> list[object]:
+    """All that may be answered to a call."""
+    if rule == "alias":
+        return {"move": ["moved"], "read": [ABSENT, 1, 2], "remove": ["removed", "absent"]}[str(call[0])]
+    if rule == "journal":
+        return [(known, revision) for known in (False, True) for revision in range(1, 6)]
+    return ["queued", "running", "succeeded", "cancelled", *(["ended"] if call[0] == "cancel" else [])]
+
+
+@pytest.mark.parametrize("rule", RULES)
 @given(st.integers(0, 10**6))
-def test_it_agrees_with_trying_every_order(seed: int) -> None:
+@settings(max_examples=40)
+def test_what_happened_in_an_order_is_explained(rule: str, seed: int) -> None:
+    """Each call takes effect at a moment within it; of those without an answer some do, and some never."""
     rng = np.random.default_rng(seed)
+    state, step = RULES[rule]
+    history: list[Operation] = []
+    for moment in range(60):
+        call = asked(rule, rng)
+        began, ended = moment - rng.exponential(4.0), moment + rng.exponential(4.0)
+        operations = [Operation(moment, rule, call, each, began, ended) for each in results(rule, call)]
+        possible = [(each, after) for each in operations for after in step(state, each)]
+        if not possible:  # nobody asks so: to look at a job that is not there
+            continue
+        chosen, after = possible[rng.integers(len(possible))]
+        if rng.random() < 0.2:
+            chosen = replace(chosen, result=UNKNOWN)
+            # what it leads to has to be what one without an answer may lead to
+            after = state if rng.random() < 0.5 else ([*step(state, chosen)] or [state])[-1]
+        history.append(chosen)
+        state = after
+    assert explained(history, RULES[rule][0], step) is not None
+
+
+@pytest.mark.parametrize("rule", RULES)
+@given(st.integers(0, 10**6))
+@settings(max_examples=40)
+def test_it_agrees_with_trying_every_order(rule: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    initial, step = RULES[rule]
     history = []
     for client in range(5):
-        began, length = rng.uniform(0, 10), rng.uniform(0, 6)
-        version = int(rng.integers(1, 3))
-        call, result = (("move", version), "moved") if rng.random() < 0.5 else (("read",), version)
-        if call[0] == "move" and rng.random() < 0.2:
-            result = UNKNOWN
-        history.append(Operation(client, "production", call, result, began, began + length))
-    assert (explained(history, ABSENT, alias) is not None) == slowly(history)
+        call = asked(rule, rng)
+        began, told = rng.uniform(0, 10), results(rule, call)
+        result = UNKNOWN if rng.random() < 0.25 else told[rng.integers(len(told))]
+        history.append(Operation(client, rule, call, result, began, began + rng.uniform(0, 6)))
+    assert (explained(history, initial, step) is not None) == slowly(history, initial, step)
 
 
-def slowly(history: list[Operation]) -> bool:
+def slowly(history: list[Operation], initial: State, step: Step) -> bool:
     """By every order of every set of the operations that holds all with an answer."""
     needed = {each.client for each in history if each.certain}
     for size in range(len(needed), len(history) + 1):
         for order in permutations(history, size):
-            if needed <= {each.client for each in order} and in_time(order) and holds(order):
+            if needed <= {each.client for each in order} and in_time(order) and holds(order, initial, step):
                 return True
     return False
 
@@ -123,11 +197,27 @@ def in_time(order: tuple[Operation, ...]) -> bool:
     )
 
 
-def holds(order: tuple[Operation, ...]) -> bool:
-    state = ABSENT
+def holds(order: tuple[Operation, ...], initial: State, step: Step) -> bool:
+    states = {initial}
     for each in order:
-        after = list(alias(state, each))
-        if not after:
-            return False
-        (state,) = after
-    return True
+        states = {after for state in states for after in step(state, each)}
+    return bool(states)
+
+
+def test_long_histories_are_explained_too() -> None:
+    """Thousands of operations, hundreds of them without an answer: what a run of minutes leaves."""
+    rng = np.random.default_rng(1)
+    version, history = ABSENT, []
+    for moment in range(3_000):
+        moves = rng.random() < 0.4
+        call = ("move", int(rng.integers(1, 4))) if moves else ("read",)
+        result = "moved" if moves else version
+        happens = True
+        if rng.random() < 0.05:
+            result, happens = UNKNOWN, rng.random() < 0.5
+        version = call[1] if moves and happens else version
+        began, ended = moment - rng.exponential(3.0), moment + rng.exponential(3.0)
+        history.append(Operation(0, "production", call, result, began, ended))
+    assert explained(history, ABSENT, alias) is not None
+    wrong = [*history, at(3_100, 3_101, "read", result=7)]
+    assert explained(wrong[-500:], 1, alias) is None
