@@ -46,9 +46,14 @@ def post(path: str, body: bytes, media_type: str = "application/json", headers: 
     return "\r\n".join(lines).encode() + _END + body
 
 
-def get(path: str) -> bytes:
+def get(path: str, headers: dict[str, str] | None = None) -> bytes:
     """Return the bytes of a GET request."""
-    return f"GET {path} HTTP/1.1\r\nhost: localhost\r\n\r\n".encode()
+    lines = [
+        f"GET {path} HTTP/1.1",
+        "host: localhost",
+        *(f"{name}: {value}" for name, value in (headers or {}).items()),
+    ]
+    return "\r\n".join(lines).encode() + _END
 
 
 class GoneError(BadAnswerError):

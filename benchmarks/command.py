@@ -32,6 +32,7 @@ from benchmarks.online.running import PARTS
 from benchmarks.online.scene import Scene
 from benchmarks.scale import running as scale_running
 from benchmarks.scale.running import PARTS as SCALE_PARTS
+from benchmarks.soak import hours as soak_hours
 from benchmarks.soak import running as soak_running
 from benchmarks.soak import table as soak_table
 from benchmarks.workload import BenchError, Source, model_folder
@@ -208,6 +209,33 @@ def load(
     if json_file is not None:
         results.write(json_file, _judged(found))
     _tell(soak_table.grids(results), [], found, console, markdown, strict)
+
+
+@app.command()
+def soak(
+    hours: Annotated[float, typer.Option(min=0.05, max=24, help="Of a busy arm, sent as fast as it goes.")] = 8.0,
+    rate: Annotated[int, typer.Option(min=5, max=1000, help="At which it is observed, Hz.")] = 100,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.5, help="End it after so long, however far it has come.")
+    ] = None,
+    seed: Seed = 0,
+    plot: Annotated[Path | None, typer.Option(dir_okay=False, help="Also draw what was held, .png or .svg.")] = None,
+    json_file: JsonFile = None,
+    markdown: Markdown = None,
+) -> None:
+    """Do all that a busy arm does in hours: every route, streams, training, refreshes, backups, with retention on.
+
+    Exit with 1 where memory, descriptors, threads, processes or disk grow after the first tenth, or anything fails.
+    """
+    options = soak_hours.Options(hours, rate, minutes, seed)
+    console = _begin()
+    results = soak_hours.run(options, console)
+    found = soak_hours.targets(results)
+    if json_file is not None:
+        results.write(json_file, _judged(found))
+    if plot is not None:
+        soak_hours.draw(results, plot)
+    _tell(soak_hours.grids(results), [], found, console, markdown, strict=True)
 
 
 @app.command()

@@ -48,7 +48,14 @@ class _Answer(msgspec.Struct):
     rejected: dict[str, int]
 
 
-def batch_request(model: str, stream_id: str, sequence: int, samples: Samples, time_scale: float = 1.0) -> bytes:
+def batch_request(
+    model: str,
+    stream_id: str,
+    sequence: int,
+    samples: Samples,
+    time_scale: float = 1.0,
+    headers: dict[str, str] | None = None,
+) -> bytes:
     """One batch as an HTTP request. time_scale: multiplies its times, for a stream that is sent faster than it ran."""
     body = {
         "stream_id": stream_id,
@@ -56,7 +63,7 @@ def batch_request(model: str, stream_id: str, sequence: int, samples: Samples, t
         "t": (time_scale * samples.t).tolist(),
         **{name: getattr(samples, name).tolist() for name in ("q", "dq", "ddq", "tau")},
     }
-    return post(f"/v1/models/{model}/observations", msgspec.json.encode(body))
+    return post(f"/v1/models/{model}/observations", msgspec.json.encode(body), headers=headers)
 
 
 def batch_requests(

@@ -179,7 +179,7 @@ class Uploading(Connection):
 
     def __init__(self, number: int, url: str, samples: Samples) -> None:
         super().__init__(number)
-        self._http, self._body, self._rows = httpx.Client(base_url=url, timeout=60.0), _npz(samples), len(samples)
+        self._http, self._body, self._rows = httpx.Client(base_url=url, timeout=60.0), npz(samples), len(samples)
 
     def work(self, turn: int) -> None:
         """Upload one, list some, delete one."""
@@ -228,7 +228,8 @@ def _said(answer: httpx.Response, status: int) -> Any:
     return answer.json() if answer.content else None
 
 
-def _npz(samples: Samples) -> bytes:
+def npz(samples: Samples) -> bytes:
+    """A recording as a file of NumPy."""
     file = io.BytesIO()
     np.savez(file, **{name: getattr(samples, name) for name in ("t", "q", "dq", "ddq", "tau")})
     return file.getvalue()

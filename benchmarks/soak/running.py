@@ -6,7 +6,7 @@ import json
 import tempfile
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from benchmarks.soak import accounting, clients
 from benchmarks.soak.accounting import Account
 from benchmarks.soak.clients import PROCESSES, Mix, Work
 from benchmarks.soak.connections import BATCH_PERIOD, BATCH_ROWS, STEADY, TAUGHT, Expected, Log
-from benchmarks.soak.memory import MemoryWatch
+from benchmarks.soak.resources import ResourceWatch, series
 from benchmarks.timing import Timing
 from lipcore.data.samples import Samples
 from lipcore.model.torque_model import TorqueModel
@@ -75,7 +75,9 @@ class Results:
 
     def write(self, path: Path, targets: list[dict[str, Any]]) -> None:
         """Write all figures as JSON."""
-        path.write_text(json.dumps({**asdict(self), "targets": targets}, indent=2) + "\n")
+        errors = {kind: dict(found) for kind, found in self.errors.items()}
+        whole = replace(self, errors={})  # asdict makes pairs of a Counter's keys
+        path.write_text(json.dumps({**asdict(whole), "errors": errors, "targets": targets}, indent=2) + "\n")
 
 
 def run(options: Options, console: Console) -> Results:
@@ -128,9 +130,9 @@ def _load(
         first += part.observe
         url = bed.client.url
         works.append(Work(bed.tcp, url, part, 1000 * number, options.seconds, options.pause, expected, recording, mine))
-    with MemoryWatch(bed.pid) as watch:
+    with ResourceWatch(bed.pid) as watch:
         logs = clients.run(works)
-    results.service, results.children = watch.service, watch.children
+    results.service, results.children = (series(watch.looks, name) for name in ("service", "learner"))
     for kind in KINDS:
         of_kind = [log for log in logs if log.kind == kind]
         times = [time for log in of_kind for time in log.times]

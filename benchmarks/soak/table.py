@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.latency.table import NOTHING, Grid, promises
 from benchmarks.latency.targets import Target
 from benchmarks.soak.accounting import Account
-from benchmarks.soak.memory import growth
+from benchmarks.soak.resources import growth
 from benchmarks.soak.running import Results
 
 GROWTH = 5.0
@@ -35,8 +35,8 @@ def targets(results: Results) -> list[Target]:
             "≤",
             TOLERANCE,
         ),
-        Target("memory of the service, growth", None if grown is None else 100 * grown, "%", "≤", GROWTH),
-        Target("memory of its learner, growth (not promised)", None if below is None else 100 * below, "%"),
+        Target("memory of the service, growth", None if grown is None else 100 * grown.share, "%", "≤", GROWTH),
+        Target("memory of its learner, growth (not promised)", None if below is None else 100 * below.share, "%"),
     ]
 
 

@@ -1,6 +1,9 @@
-"""`python -m benchmarks load` and `scale`: what they count and conclude, where things go wrong on purpose."""
+"""`python -m benchmarks load`, `soak` and `scale`: what they count and conclude, where things go wrong on purpose."""
 
+import json
+import threading
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,10 +12,12 @@ from rich.console import Console
 from benchmarks.online.sending import Ack
 from benchmarks.scale import passes
 from benchmarks.scale import running as scaling
-from benchmarks.soak import accounting, running, table
+from benchmarks.soak import accounting, hours, running, table
 from benchmarks.soak.accounting import Account
 from benchmarks.soak.clients import Mix
 from benchmarks.soak.connections import TAUGHT, Log, stream_of
+from benchmarks.soak.day import APART_S, Clock
+from benchmarks.soak.resources import Look
 from benchmarks.soak.running import Options, Results
 from benchmarks.timing import Timing
 
@@ -105,6 +110,94 @@ def test_a_run_measures_everything():
     assert found.before.batches > 10
     assert found.before.datasets > 5
     assert [each.name for each in table.targets(found) if each.met is False and "memory" not in each.name] == []
+
+
+def _looks(**rising):
+    """A run of a thousand looks in which some figures rise, linearly and after the first tenth, by so much in all."""
+    rng = np.random.default_rng(0)
+    usual = {"service": 300.0, "learner": 150.0, "jobs": 200.0, "disk": 40.0}
+    usual |= {"descriptors": 50.0, "threads": 22.0, "processes": 3.0}
+    found = []
+    for turn in range(1000):
+        share = max(0.0, (turn - 100) / 900)
+        warm = min(1.0, turn / 80)  # at first everything grows
+        figures = {name: value * warm + rising.get(name, 0.0) * share for name, value in usual.items()}
+        figures["jobs"] += 300.0 if turn % 100 < 5 else 0.0  # a training now and then
+        figures["service"] += rng.normal(0.0, 3.0)
+        found.append(Look(at=float(turn), **figures))
+    return found
+
+
+LEAKS = {
+    "service": 25.0,
+    "learner": 12.0,
+    "jobs": 15.0,
+    "disk": 3.0,
+    "descriptors": 5.0,
+    "threads": 3.0,
+    "processes": 1.0,
+}
+
+
+def _day(**changes):
+    return replace(hours.Results({"processor": "two cores"}, 8.0, looks=_looks(), done={"keep": 8}), **changes)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"errors": {"move: TimeoutError": 1}},
+        {"unasked": ["GET /v2"]},
+        *(
+            {"looks": _looks(**{name: value})}
+            for name, value in {"service": 25.0, "learner": 12.0, "jobs": 15.0}.items()
+        ),
+        *(
+            {"looks": _looks(**{name: value})}
+            for name, value in {"disk": 3.0, "descriptors": 5.0, "threads": 3.0}.items()
+        ),
+        {"looks": _looks(processes=1.0)},
+    ],
+)
+def test_every_leak_breaks_a_promise(wrong):
+    assert [each.name for each in hours.targets(_day()) if not each.met] == []
+    assert sum(each.met is False for each in hours.targets(_day(**wrong))) == 1
+
+
+def test_a_soak_is_drawn_and_written(tmp_path):
+    found = _day(errors={"move: TimeoutError": 1})
+    found.write(tmp_path / "soak.json", [])
+    assert json.loads((tmp_path / "soak.json").read_text())["looks"][0]["service"] == pytest.approx(0, abs=20)
+    hours.draw(found, tmp_path / "soak.png")
+    assert (tmp_path / "soak.png").read_bytes().startswith(b"\x89PNG")
+    assert [grid.title for grid in hours.grids(found)][1].startswith("8 hours")
+
+
+def test_the_arm_waits_for_those_who_follow_it():
+    clock, seen = Clock(300), []
+
+    def follow():
+        for at in range(0, 300, 10):
+            clock.follow("slow", at)
+            seen.append((at, clock.now))
+        clock.leave("slow")
+
+    thread = threading.Thread(target=follow)
+    thread.start()
+    for _ in range(300):
+        clock.tick()
+    thread.join()
+    assert len(seen) == 30
+    assert all(at <= now <= at + APART_S + 1 for at, now in seen)
+
+
+@pytest.mark.slow
+def test_a_short_day_goes_well():
+    found = hours.run(hours.Options(0.1, rate=20), Console(quiet=True))
+    assert found.errors == {}
+    assert found.done["batch of 40 rows"] == 180
+    assert {"train", "archive", "keep", "record"} <= found.done.keys()
+    assert found.looks[-1].learner > 0
 
 
 def test_a_ratio_is_that_of_pairs():

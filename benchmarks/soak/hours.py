@@ -1,0 +1,226 @@
+"""`python -m benchmarks soak`: what a busy arm asks for in hours, as fast as it goes; nothing may grow meanwhile."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import httpx
+from matplotlib.figure import Figure
+from rich.console import Console
+
+import lipcore
+from benchmarks import facts
+from benchmarks.latency.table import Grid, promises
+from benchmarks.latency.targets import Target
+from benchmarks.online.bed import install, serving, train
+from benchmarks.online.scene import Scene
+from benchmarks.soak import day as days
+from benchmarks.soak import errands
+from benchmarks.soak.day import ARM, LOOP, Clock, Day, Tally
+from benchmarks.soak.errands import ERRANDS, SLOW, Desk
+from benchmarks.soak.resources import WARMING, Growth, Look, ResourceWatch, growth, series
+from service.learning.schema import LearningOptions
+from service.models import signing
+from service.storage.database import Database
+from service.web.access import keys
+
+MOTION_S = 600.0
+"""Of the arm, repeated all day."""
+SHORTER = 20.0
+"""By which the service's own times are divided, as the day is."""
+SETTINGS = {
+    "snapshot_every_s": 30.0 / SHORTER,
+    "quality_windows_s": json.dumps([60.0 / SHORTER, 600.0 / SHORTER, 3600.0 / SHORTER]),
+    "refresh_pause_s": 600.0 / SHORTER,
+    "promotion_patience_s": 3600.0 / SHORTER,
+    "keys": "on",
+    "max_loaded_models": 8,
+}
+"""Of the service."""
+RETAINED_S, ROW_BYTES = 2400, 250
+"""Seconds of the loop for which its log is kept, less than a tenth of eight hours; and roughly what a row takes."""
+LEARNING = LearningOptions(on_change="learn")
+FIT = {"posterior_samples": 500, "search_seconds": 10.0}
+MEMORY_SHARE, DISK_SHARE = 5.0, 5.0
+"""Percent by which memory and disk may rise, by the line through all that comes after the first tenth."""
+DESCRIPTORS, THREADS, PROCESSES = 3.0, 2.0, 0.5
+"""How many of them may be more by then."""
+UNITS = {
+    "service": "memory of the service, MiB",
+    "learner": "memory of its learner, MiB",
+    "jobs": "memory of training processes, MiB",
+    "descriptors": "descriptors of both",
+    "threads": "threads of both",
+    "processes": "processes below the service",
+    "disk": "disk of the home, MiB",
+}
+
+
+@dataclass(frozen=True)
+class Options:
+    """How much. hours: of the arm; rate: at which it is observed, Hz; minutes: after which it is ended in any case;
+    seed: of motion."""
+
+    hours: float = 8.0
+    rate: int = 100
+    minutes: float | None = None
+    seed: int = 0
+
+
+@dataclass
+class Results:
+    """What was done and seen. seconds: that it took; looks: at the service; unasked: routes that nobody asked."""
+
+    facts: dict[str, str]
+    hours: float
+    seconds: float = 0.0
+    done: dict[str, int] = field(default_factory=dict)
+    errors: dict[str, int] = field(default_factory=dict)
+    looks: list[Look] = field(default_factory=list)
+    unasked: list[str] = field(default_factory=list)
+
+    def write(self, path: Path, found: list[dict[str, Any]]) -> None:
+        """Write all figures as JSON."""
+        path.write_text(json.dumps({**asdict(self), "targets": found}, indent=2) + "\n")
+
+
+def run(options: Options, console: Console) -> Results:
+    """Serve a day; raise BenchError where a step fails."""
+    scene = Scene("panda", rate=float(options.rate), seed=options.seed)
+    results = Results(facts.machine(), options.hours)
+    with tempfile.TemporaryDirectory(prefix="lipserve-bench-") as name:
+        folder = Path(name)
+        home = folder / "home"
+        console.print("training a model of panda", highlight=False)
+        base, _ = train(scene.history(50.0, 10.0), scene.arm.joint_types, FIT, "rigid-body")
+        lipcore.save(base, folder / "model")
+        install(home, folder / "model", {ARM: LEARNING, LOOP: LEARNING}, base.n_joints)
+        signer = signing.signer_of(signing.make_key(folder / "signing.pem"))
+        with closing(Database(home)) as database:
+            _, key = keys.create(database, "soak", ["admin"], None, max_requests_per_s=1e6)
+        signed = {"signing_key_file": folder / "signing.pem", "trusted_signers": signer, "require_signed": True}
+        clock = Clock(round(3600 * options.hours))
+        samples = scene.more(MOTION_S)
+        retained = {"observation_retention_bytes": RETAINED_S * days.FRAMES * ROW_BYTES}
+        with serving(home, {**SETTINGS, **retained, **signed}) as bed:
+            day = Day(clock, Tally(), bed.tcp, bed.client.url, key, samples, options.rate)
+            began = time.monotonic()
+            http = httpx.Client(base_url=day.url, headers=day.headers, timeout=120.0)
+            with http, ResourceWatch(bed.pid, home, lambda: float(clock.now)) as watch:
+                desk = Desk(day, http, home, folder, scene, [])
+                _work(desk, options.minutes, console)
+                results.hours = clock.now / 3600
+                results.unasked = errands.unasked(desk)
+            results.seconds, results.looks = time.monotonic() - began, watch.looks
+        results.done, results.errors = dict(day.tally.done.most_common()), dict(day.tally.errors)
+    return results
+
+
+def _work(desk: Desk, minutes: float | None, console: Console) -> None:
+    """Let everybody work until the day is over."""
+    day = desk.day
+    work = [partial(each, day) for each in (days.teach, days.ask, days.loop)]
+    work += [partial(errands.run, desk, period, each) for period, each in ERRANDS.items()]
+    work += [partial(errands.run, desk, period, each, False) for period, each in SLOW.items()]
+    threads = [threading.Thread(target=each, daemon=True) for each in work]
+    began = time.monotonic()
+    for thread in threads:
+        thread.start()
+    known: set[str] = set()
+    while any(thread.is_alive() for thread in threads):
+        for thread in threads:
+            thread.join(30.0 / len(threads))
+        seconds = time.monotonic() - began
+        console.print(f"{seconds:.0f} s: {day.clock.now / 3600:.2f} hours of the arm", highlight=False)
+        for text in day.tally.errors.keys() - known:
+            console.print(text, highlight=False, markup=False)
+            known.add(text)
+        if minutes is not None and seconds > 60 * minutes:
+            day.clock.end()
+
+
+def targets(results: Results) -> list[Target]:
+    """What is promised, and what was seen."""
+    at = series(results.looks, "at")
+    lines = {name: growth(series(results.looks, name), at) for name in UNITS}
+
+    def share(line: Growth | None) -> float | None:
+        return None if line is None else 100 * line.share
+
+    def rise(line: Growth | None) -> float | None:
+        return None if line is None else line.rise
+
+    return [
+        Target("requests and errands that went wrong", sum(results.errors.values()), "", "≤", 0),
+        Target("routes that were never asked", len(results.unasked), "", "≤", 0),
+        Target("memory of the service, growth", share(lines["service"]), "%", "≤", MEMORY_SHARE),
+        Target("memory of its learner, growth", share(lines["learner"]), "%", "≤", MEMORY_SHARE),
+        Target("memory of training processes, growth", share(lines["jobs"]), "%", "≤", MEMORY_SHARE),
+        Target("disk of the home, growth", share(lines["disk"]), "%", "≤", DISK_SHARE),
+        Target("descriptors, more", rise(lines["descriptors"]), "", "≤", DESCRIPTORS),
+        Target("threads, more", rise(lines["threads"]), "", "≤", THREADS),
+        Target("processes, more", rise(lines["processes"]), "", "≤", PROCESSES),
+    ]
+
+
+def grids(results: Results) -> list[Grid]:
+    """Every table, in order; those without rows are left out."""
+    found = [
+        Grid("machine", ("", ""), list(results.facts.items()), texts=True),
+        Grid(
+            f"{results.hours:.3g} hours of a busy arm in {results.seconds / 60:.0f} minutes",
+            ("", "times"),
+            [(name, f"{count:,}") for name, count in results.done.items()],
+        ),
+        Grid("what went wrong", ("", "times"), [(text, f"{count:,}") for text, count in results.errors.items()]),
+        Grid("never asked", ("",), [(route,) for route in results.unasked]),
+        _held(results),
+        replace(promises(targets(results)), columns=("", "promised", "measured", "")),
+    ]
+    return [grid for grid in found if grid.rows]
+
+
+def _held(results: Results) -> Grid:
+    """Each figure's median in each fifth of what comes after the first tenth."""
+    end = results.looks[-1].at if results.looks else 0.0
+    edges = [end * (WARMING + (1 - WARMING) * fifth / 5) for fifth in range(6)]
+    fifths = [[look for look in results.looks if a <= look.at <= b] for a, b in pairwise(edges)]
+    rows = []
+    for name, unit in UNITS.items():
+        parts = [_median(series(fifth, name)) for fifth in fifths]
+        rows.append((unit, *(f"{part:,.0f}" for part in parts), f"{max(series(results.looks, name), default=0):,.0f}"))
+    columns = ("median of each fifth after the first tenth", "1", "2", "3", "4", "5", "largest")
+    return Grid("what was held", columns, rows if results.looks else [])
+
+
+def _median(values: Sequence[float]) -> float:
+    ordered = sorted(values)
+    return ordered[len(ordered) // 2] if ordered else 0.0
+
+
+def draw(results: Results, path: Path) -> None:
+    """Draw memory, disk, descriptors and threads over the hours of the arm."""
+    figure = Figure((8.0, 4.2), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    hours = [look.at / 3600 for look in results.looks]
+    for name, label in (("service", "service"), ("learner", "learner"), ("jobs", "training"), ("disk", "disk")):
+        above.plot(hours, series(results.looks, name), label=label, linewidth=0.8)
+    for name in ("descriptors", "threads"):
+        below.plot(hours, series(results.looks, name), label=name, linewidth=0.8)
+    for axes, unit in ((above, "MiB"), (below, "number")):
+        axes.axvspan(0.0, WARMING * results.hours, color="0.9", linewidth=0)
+        axes.set_ylim(bottom=0.0)
+        axes.set_ylabel(unit)
+        axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    below.set_xlabel("hours of the arm (grey: the first tenth)")
+    figure.savefig(path, dpi=110)
