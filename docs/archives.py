@@ -11,7 +11,8 @@ from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from service.models import archive, signing
+from service.models import archive_reading as archive
+from service.models import signing
 from service.storage import backup
 from service.storage.database.engine import FILE
 

@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 
 from lipserve.wording import counted
 from service import __version__
+from service.compute.confinement import protections
 from service.dashboard import routes as dashboard
 from service.datasets import routes as datasets
 from service.foundation import errors
@@ -113,7 +114,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         routes=hot,
         telemetry=requests.telemetry(settings),
     )
-    app.state.stopping, app.state.meters = stopping, meters
+    app.state.stopping, app.state.meters, app.state.confined = stopping, meters, protections()
     errors.install(app)
     storage_errors.install(app)
     _add_middleware(app, settings, keyring, meters, hot)

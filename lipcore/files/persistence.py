@@ -127,10 +127,7 @@ def decode(files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS) -> Torqu
 
     What it costs in time and memory is bounded by the limits, which are checked before anything is computed.
     """
-    manifest = _manifest(files, limits)
-    n = len(manifest["joint_names"])
-    tensors = read_tensors(_verified(files, TENSORS, manifest["tensors"]), n, limits)
-    robot = _robot(files, manifest, limits)
+    manifest, tensors, robot = parse(files, limits)
     try:
         # what numbers of strangers overflow to is refused by the checks that follow
         with np.errstate(over="ignore", invalid="ignore"):
@@ -139,6 +136,16 @@ def decode(files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS) -> Torqu
         raise
     except Exception as error:  # whatever numerics make of numbers that no training has made
         raise ModelFormatError(f"the tensors do not make a valid model: {_text(error)}", TENSORS) from error
+
+
+def parse(
+    files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS
+) -> tuple[dict[str, Any], dict[str, Array], RigidBody | None]:
+    """The manifest, the tensors and the robot that these files hold, before a model is made of them; raise
+    ModelFormatError."""
+    manifest = _manifest(files, limits)
+    tensors = read_tensors(_verified(files, TENSORS, manifest["tensors"]), len(manifest["joint_names"]), limits)
+    return manifest, tensors, _robot(files, manifest, limits)
 
 
 def load(

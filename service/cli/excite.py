@@ -35,7 +35,7 @@ from lipserve.wording import counted, percent
 from service.cli import plotting
 from service.cli.consoles import err, print_json
 from service.cli.options import Json, alone
-from service.models import archive
+from service.models import archive_reading as archive
 
 MAX_URDF_BYTES = 16 * 1024 * 1024
 
@@ -157,7 +157,7 @@ def fetch(name: str, url: str) -> TorqueModel:
     with TemporaryDirectory(prefix="lipserve-excite-") as folder, Client(url) as client:
         path = client.export(name, Path(folder) / "model.tar")
         try:
-            files = archive.read(path, MEMBER_LIMITS)
+            files = archive.members(path, MEMBER_LIMITS)
         except archive.ArchiveError as error:
             raise ModelFormatError(str(error), error.member) from None
         for each in (archive.EXPORT, archive.CHECKSUMS):

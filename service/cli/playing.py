@@ -32,7 +32,7 @@ from service.datasets.staging import Staged, prepare
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
 from service.learning.ingest.opening import BAND, LENGTH, Opening
-from service.storage.storage import Disk
+from service.storage.disk import Disk
 
 
 class Tally:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -18,7 +19,7 @@ from lipcore.data.samples import Array
 from lipcore.preparation.plan import plan
 from lipcore.preparation.recipe import PreparationError, Recipe
 from service.foundation.errors import invalid_data
-from service.storage.storage import Disk
+from service.storage.disk import Disk, Room
 
 TIME, EPISODE = "t", "episode"
 QUANTITIES = ("q", "dq", "ddq", "tau")
@@ -37,10 +38,29 @@ class Staged:
     joint_names: of joints 1..n. Whoever makes one removes its folder, see `staging`.
     """
 
-    def __init__(self, folder: Path, joint_names: tuple[str, ...], disk: Disk) -> None:
+    def __init__(self, folder: Path, joint_names: tuple[str, ...], disk: Disk | Room) -> None:
         self.folder, self.joint_names, self.disk = folder, joint_names, disk
         self._rows: dict[str, int] = {}
         self._missing: NDArray[np.bool_] | None = None
+
+    @classmethod
+    def of_others(cls, folder: Path, joint_names: tuple[str, ...], lengths: Mapping[str, int], disk: Disk) -> Staged:
+        """Columns that another process has written, which may have come to harm; raise InvalidDataError where one is
+        not there, or no plain file of its own: a link would show what else the service can read."""
+        staged = cls(folder, joint_names, disk)
+        known = {TIME, EPISODE, *(column(each, joint) for each in QUANTITIES for joint in range(len(joint_names)))}
+        for name, rows in lengths.items():
+            path = folder / f"{name}.f64"
+            status = path.lstat() if name in known and path.exists() else None
+            if status is None or not stat.S_ISREG(status.st_mode) or status.st_nlink > 1 or status.st_size != 8 * rows:
+                raise invalid_data("file", f"one whose reader left no column {name}", "an undamaged one")
+        staged._rows = dict(lengths)
+        return staged
+
+    @property
+    def lengths(self) -> dict[str, int]:
+        """Rows of each column."""
+        return dict(self._rows)
 
     @property
     def n_joints(self) -> int:
@@ -126,7 +146,7 @@ class Prepared:
     repeated: int
 
 
-def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: Disk | None = None) -> Prepared:
+def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: Disk | Room | None = None) -> Prepared:
     """Prepare staged columns, NaN where a value is missing, in a folder of their own below `folder`.
 
     A few columns are in memory at a time. Raise InvalidDataError where the recording does not allow what the recipe

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -18,7 +19,8 @@ from lipcore.data.samples import Array, Samples
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
 from lipserve.states import ACTIVE
-from service.datasets.mapping.reading import read
+from service.compute import cage
+from service.datasets.mapping.reading import Recording
 from service.datasets.options import UploadOptions
 from service.datasets.report.making import make_report
 from service.datasets.schema import MOST_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
@@ -33,6 +35,7 @@ from service.storage.storage import Storage
 from service.web.rows import Identity, Page, done, mark, newest
 from service.web.storage_errors import undecided
 
+READER = "service.datasets.caged:read_upload"
 MOST_NAMED = 5
 """Ids that are listed where several data sets have one name."""
 
@@ -40,28 +43,30 @@ MOST_NAMED = 5
 def add(
     storage: Storage, upload: Path, kind: str, name: str, options: UploadOptions, named: Identity | None = None
 ) -> Dataset:
-    """Read, check and prepare an upload, then store it: samples first, the row that makes them visible last.
+    """Read an upload, which goes with that, check and prepare it, then store it: samples first, the row that makes them
+    visible last.
 
     Columns lie on disk meanwhile, below the uploads. named: the request, which is not done again where it was before.
     Raise InvalidDataError, InvalidRequestError, TooLargeError, StorageFullError or ConflictError.
     """
-    from service.datasets.formats.opening import open_table  # noqa: PLC0415 - pyarrow is 35 MiB, for uploads only
-
     with storage.database.session() as session:
         if (before := done(session, DatasetRow, named)) is not None:
             return _show(before)
     settings, disk = storage.settings, storage.disk
     profile = None if options.robot is None else profile_of(storage.database, options.robot)
     with staging(storage.files.uploads) as folder:
-        with open_table(upload, kind, options.read, settings) as table:
-            recording = read(table, folder, options, profile, settings, disk)
-        prepared = prepare(recording.staged, folder, options.recipe, settings.min_samples, disk)
+        upload = upload.rename(folder / upload.name)
+        robot = None if profile is None else replace(profile, urdf=None)
+        arguments = upload, kind, options, robot, disk.usage(), folder, settings
+        recording = cage.run(READER, Recording, *arguments, settings=settings, folder=folder)
+        raw = Staged.of_others(folder, recording.joint_names, recording.lengths, disk)
+        prepared = prepare(raw, folder, options.recipe, settings.min_samples, disk)
         gravity = recording.torque_convention == "gravity_included"
         report = make_report(
-            recording.staged, prepared, profile, recording.noted, settings, options.recipe, gravity, recording.facts
+            raw, prepared, profile, recording.noted, settings, options.recipe, gravity, recording.facts
         )
         report["upload_sha256"] = sample_file.sha256(upload)
-        report["joint_types"] = None if profile is None else _joint_types(profile, recording.staged.joint_names)
+        report["joint_types"] = None if profile is None else _joint_types(profile, raw.joint_names)
         staged = prepared.staged
         disk.take(sample_file.size(staged.rows, staged.n_joints))
         dataset = new_id("ds")

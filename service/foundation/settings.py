@@ -81,6 +81,12 @@ class Settings(BaseSettings):
 
     max_upload_bytes: Count = Field(256 * MiB, description="Largest upload of a data set.")
     max_unpacked_bytes: Count = Field(1024 * MiB, description="Largest data set once unpacked.")
+    parser_memory_bytes: Count = Field(
+        1024 * MiB,
+        description="Memory that reading one upload may take, beside its programs; not limited on macOS.",
+    )
+    parser_cpu_s: Count = Field(300, description="Processor time in s that reading one upload may take.")
+    parser_s: float = Field(600.0, gt=0, description="Longest that reading one upload may take, s.")
     max_bag_part_bytes: Count = Field(64 * MiB, description="Largest chunk or message of a bag, once unpacked.")
     max_columns: Count = Field(2000, description="Most columns of a recording's file, lists taken apart.")
     max_zip_members: Count = Field(20_000, description="Most files in an archive of recordings.")

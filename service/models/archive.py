@@ -1,9 +1,5 @@
 """A version for use elsewhere: an archive with its files, their checksums and what made them, as C, or its arm as a
-URDF.
-
-An archive is a tar file of a few plain files, by exact name and of limited size. Of `tarfile` only what makes and reads
-a single header is used: the rest follows links, sparse files, extended headers and numbers of any size, of which an
-archive of a model has none, and which have been the way in for many an attack.
+URDF. What reads an archive: `archive_reading`.
 """
 
 from __future__ import annotations
@@ -13,93 +9,23 @@ import tarfile
 import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from io import SEEK_CUR
 from pathlib import Path
 from typing import IO, Any
 
 from lipcore.files import persistence
 from lipcore.files.c_writer import SUPPORTED, Origin, c_files
-from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, ModelFormatError
+from lipcore.files.manifest import MANIFEST, TENSORS, ModelFormatError
 from lipcore.files.urdf_writer import urdf_of_parameters
 from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, problem
 from service.models import registry, signing
+from service.models.archive_reading import BLOCK, CHECKSUMS, EXPORT, FORMAT, FORMAT_VERSION, padding
 from service.models.lineage import software
 from service.models.loaded import LoadedModels
 from service.models.signing import SIGNATURE
 from service.storage.database import VersionRow, now
 
-EXPORT, CHECKSUMS = "export.json", "checksums.json"
-MEMBERS = (EXPORT, CHECKSUMS, MANIFEST, TENSORS, ROBOT, SIGNATURE)
-OPTIONAL = frozenset({ROBOT, SIGNATURE})
-FORMAT, FORMAT_VERSION = "lipserve-archive", 1
 MEDIA_TYPE = "application/x-tar"
-BLOCK = 512
 CHUNK = 1 << 20
-_KINDS = {
-    tarfile.LNKTYPE: "a hard link",
-    tarfile.SYMTYPE: "a symbolic link",
-    **dict.fromkeys((tarfile.CHRTYPE, tarfile.BLKTYPE), "a device"),
-    tarfile.DIRTYPE: "a folder",
-    tarfile.FIFOTYPE: "a pipe",
-    tarfile.GNUTYPE_SPARSE: "a sparse file",
-    **dict.fromkeys((tarfile.XHDTYPE, tarfile.XGLTYPE), "an extended header"),
-    **dict.fromkeys((tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK), "a long name"),
-}
-
-
-class ArchiveError(ValueError):
-    """The file is no archive that can be taken. member: where that is; given, expected: what is wrong there."""
-
-    def __init__(self, member: str, given: str, expected: str) -> None:
-        super().__init__(f"{member} is {given}, expected {expected}")
-        self.member, self.given, self.expected = member, given, expected
-
-
-def read(path: Path, limits: Mapping[str, int]) -> dict[str, bytes]:
-    """The members of an archive by name. limits: most bytes of each. Raise ArchiveError for anything but plain files
-    with these names, each once, complete and within its limit."""
-    files: dict[str, bytes] = {}
-    length = path.stat().st_size
-    with path.open("rb") as file:
-        while any(header := file.read(BLOCK)) or len(header) < BLOCK:
-            if len(header) < BLOCK:
-                raise ArchiveError("archive", f"cut off at byte {length}", "a complete tar file")
-            name, count = _header(header)
-            if name not in limits:
-                raise ArchiveError(name, "a file that no model has", f"one of {', '.join(limits)}")
-            if name in files:
-                raise ArchiveError(name, "there twice", "each file once")
-            if count > limits[name]:
-                raise ArchiveError(name, f"a file of {count} bytes", f"at most {limits[name]}")
-            if file.tell() + count + _padding(count) > length:
-                raise ArchiveError(name, f"cut off at byte {length - file.tell()}", f"{count} bytes")
-            files[name] = file.read(count)
-            file.seek(_padding(count), SEEK_CUR)
-        rest = file.read()
-    if any(rest):
-        raise ArchiveError("archive", "followed by more data", "nothing after its end")
-    if len(rest) < BLOCK:
-        raise ArchiveError("archive", "without its end", "a complete tar file")
-    return files
-
-
-def _padding(count: int) -> int:
-    return -count % BLOCK
-
-
-def _header(header: bytes) -> tuple[str, int]:
-    """Name and size of a plain file; raise ArchiveError."""
-    try:
-        info = tarfile.TarInfo.frombuf(header, "ascii", "backslashreplace")
-    except tarfile.HeaderError as error:
-        raise ArchiveError("archive", f"not a tar file, or damaged: {error}", "a tar file") from None
-    name = ascii(info.name)[1:-1]
-    if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or info.linkname:
-        raise ArchiveError(name, _KINDS.get(info.type, f"of the kind {info.type!r}"), "a plain file")
-    size = header[124:136].strip(b" \0")  # which TarInfo takes in other forms too, and below zero
-    if not size.isdigit():
-        raise ArchiveError(name, f"of the size {header[124:136]!r}", "an octal number of bytes")
-    return name, info.size
 
 
 @dataclass(frozen=True)
@@ -198,7 +124,7 @@ def _packed(loaded: LoadedModels, files: Mapping[str, bytes]) -> IO[bytes]:
         for name, content in files.items():
             info = tarfile.TarInfo(name)
             info.size = len(content)
-            file.write(info.tobuf(tarfile.USTAR_FORMAT) + content + bytes(_padding(info.size)))
+            file.write(info.tobuf(tarfile.USTAR_FORMAT) + content + bytes(padding(info.size)))
         file.write(bytes(2 * BLOCK))
     except BaseException:
         file.close()

@@ -48,7 +48,7 @@ async def upload(
     """Check a URDF and store it, or say what is wrong with it. No file that it names is opened."""
     _, content = await receive(request, KINDS)
     await to_thread.run_sync(storage.disk.take, len(content))
-    robot = await to_thread.run_sync(store.add, storage.database, content, name)
+    robot = await to_thread.run_sync(store.add, storage.database, content, name, storage.settings)
     response.headers["Location"] = f"/v1/robots/{robot.id}"
     return robot
 

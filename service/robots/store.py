@@ -14,36 +14,33 @@ from lipcore import profiles
 from lipcore.data.motion import Array
 from lipcore.profiles import Profile
 from lipcore.profiles.names import is_number
-from lipcore.profiles.profile import read_limits
 from lipcore.robots.library import ROBOTS, UnknownRobotError, profile_urdf
-from lipcore.robots.urdf import RigidBody, describe
+from lipcore.robots.urdf import Description, RigidBody
 from lipcore.robots.urdf_text import MOVABLE, UrdfError
 from lipserve.states import ACTIVE
+from service.compute import cage
 from service.foundation.errors import (
     ConflictError,
-    InvalidDataError,
     InvalidRequestError,
     invalid_request,
     not_found,
-    problem,
 )
 from service.foundation.fields import LONGEST, for_people
+from service.foundation.settings import Settings
+from service.robots.caged import invalid_urdf
 from service.robots.schema import ProfileJoint, Robot, RobotPage, RobotProfile
 from service.storage.database import Database, JobRow, RobotRow, now
 from service.storage.files import new_id
 from service.web.rows import Page, newest
 
 
-def add(database: Database, content: bytes, name: str | None) -> Robot:
+def add(database: Database, content: bytes, name: str | None, settings: Settings) -> Robot:
     """Check a URDF and store it; raise InvalidDataError saying what is wrong with it."""
     try:
         urdf = content.decode("utf-8-sig")
-        described = describe(urdf)
-        read_limits(urdf, described.joint_names)
     except UnicodeDecodeError as error:
-        raise _invalid(f"the URDF is not text in UTF-8: {error.reason} at byte {error.start}") from None
-    except UrdfError as error:
-        raise _invalid(str(error)) from None
+        raise invalid_urdf(f"the URDF is not text in UTF-8: {error.reason} at byte {error.start}") from None
+    described = cage.run("service.robots.caged:read_urdf", Description, urdf, settings=settings, field="urdf")
     row = RobotRow(
         id=new_id("urdf"),
         name=name or for_people("robot name", described.name[:LONGEST] or "unnamed"),
@@ -127,7 +124,7 @@ def profile_of(database: Database, robot: str) -> Profile:
     try:
         return profiles.from_urdf(row.urdf, row.name)
     except UrdfError as error:  # an earlier release has taken it
-        raise _invalid(f"robot {robot} cannot be used any more: {error}") from None
+        raise invalid_urdf(f"robot {robot} cannot be used any more: {error}") from None
 
 
 def _of_profile(robot: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:
@@ -142,10 +139,6 @@ def _of_profile(robot: str, joint_names: Sequence[str], joint_types: Sequence[st
 def _find(database: Database, robot: str) -> RobotRow | None:
     with database.session() as session:
         return session.scalar(select(RobotRow).where(RobotRow.id == robot).options(undefer(RobotRow.urdf)))
-
-
-def _invalid(message: str) -> InvalidDataError:
-    return InvalidDataError(message, [problem("urdf", message, "a URDF of an arm with a fixed base")])
 
 
 def _show(row: RobotRow) -> Robot:

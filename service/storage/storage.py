@@ -1,16 +1,12 @@
-"""What a service keeps things in: a database, a store of files, a disk, a home folder; how these are; how much of the
-disk it may take, by a quota of its home and by space that it leaves free. The home belongs to one running service at a
-time, and has to be whole before one starts on it."""
+"""What a service keeps things in: a database, a store of files, a disk, a home folder; how these are. The home belongs
+to one running service at a time, and has to be whole before one starts on it."""
 
 from __future__ import annotations
 
 import fcntl
 import os
-import shutil
-import threading
-import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -22,94 +18,12 @@ from sqlalchemy.exc import SQLAlchemyError
 from lipcore.extras import MissingExtraError
 from lipcore.files.durable import make_folder
 from lipserve.states import PartState
-from service.foundation.errors import StorageFullError
 from service.foundation.fields import of_app
 from service.foundation.settings import Settings
 from service.storage.database.engine import FILE, Database
 from service.storage.database.migrations import DatabaseVersionError
+from service.storage.disk import Disk
 from service.storage.files import Files, FilesUnreachableError
-
-MEASURE_S = 10.0
-"""Seconds after which the home is measured again: the database and other processes write to it too."""
-AGAIN_S = 1.0
-"""Seconds after which a home that seems full is measured again: something may have been deleted."""
-
-
-@dataclass(frozen=True)
-class Usage:
-    """Bytes: used by the home, free on its disk for this user; the limits of both. quota: None where there is none."""
-
-    used: int
-    free: int
-    quota: int | None
-    floor: int
-
-    def shortage(self, size: int = 0) -> str | None:
-        """Say why `size` more bytes find no room, None where they do."""
-        if self.free - size < self.floor:
-            return (
-                f"the disk of the service has {_amount(self.free)} free, of which {_amount(self.floor)} stay so "
-                "(LIPSERVE_MIN_FREE_BYTES)"
-            )
-        if self.quota is not None and self.used + size > self.quota:
-            return f"the service has stored {_amount(self.used)} of {_amount(self.quota)} (LIPSERVE_MAX_HOME_BYTES)"
-        return None
-
-
-class Disk:
-    """The disk that the home lies on; safe from several threads. Each process that writes has one of its own.
-
-    What is written between two measurements is known from those who ask before they write.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        self.home, self.quota, self.floor = settings.home, settings.max_home_bytes, settings.min_free_bytes
-        self._lock = threading.Lock()
-        self._used, self._measured = 0, -float("inf")
-
-    def require(self, size: int = 0) -> None:
-        """Make sure that there is room for `size` bytes; raise StorageFullError. Not for the event loop."""
-        if self.usage().shortage(size) is None:
-            return
-        reason = self.usage(AGAIN_S).shortage(size)
-        if reason is not None:
-            raise StorageFullError(f"{reason}, which leaves no room for more: delete data sets or versions of models")
-
-    def take(self, size: int) -> None:
-        """Make sure of room for `size` bytes that are written right after this; raise as `require`."""
-        self.require(size)
-        self._used += size  # where another thread adds at the same time, the next measurement puts it right
-
-    def usage(self, age: float = MEASURE_S) -> Usage:
-        """What is used and free; the home is measured where that was done `age` s ago. Not for the event loop."""
-        if time.monotonic() - self._measured >= age and self._lock.acquire(blocking=self._measured < 0):
-            try:
-                self._used, self._measured = measure(self.home), time.monotonic()
-            finally:
-                self._lock.release()
-        return Usage(self._used, shutil.disk_usage(self.home).free, self.quota, self.floor)
-
-
-def measure(folder: Path) -> int:
-    """Bytes of all files below a folder, links not followed; what vanishes meanwhile does not count."""
-    total, folders = 0, [os.fspath(folder)]
-    while folders:
-        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folders.pop()) as entries:
-            for entry in entries:
-                with suppress(FileNotFoundError):
-                    if entry.is_dir(follow_symlinks=False):
-                        folders.append(entry.path)
-                    else:
-                        total += entry.stat(follow_symlinks=False).st_size
-    return total
-
-
-def _amount(size: int) -> str:
-    """Bytes for people."""
-    amount, units = float(size), ["bytes", "KiB", "MiB", "GiB", "TiB"]
-    while amount >= 1024 and len(units) > 1:
-        amount, units = amount / 1024, units[1:]
-    return f"{amount:.4g} {units[0]}"
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,8 @@ from service.models import registry
 from service.models.lineage import MOST_SAMPLES, figures, software
 from service.models.schema import Promotion
 from service.storage.database import Database, JobRow, LearnerRow, now
+from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
-from service.storage.storage import Disk
 from service.training import lifecycle, promotion, refresh_data, repeating
 from service.training.holding_out import CannotHoldOutError
 from service.training.material import CANDIDATES, Material, observed, recorded

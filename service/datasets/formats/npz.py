@@ -176,7 +176,7 @@ class _Reader:
         with _named(array.name):
             for part in range(self.parts):
                 file = files.enter_context(archive.open(array.member))
-                _skip(file, array.offset + part * array.shape[0] * array.dtype.itemsize)
+                file.seek(array.offset + part * array.shape[0] * array.dtype.itemsize)
                 self.files.append(file)
 
     def read(self, rows: int) -> Array:
@@ -200,15 +200,6 @@ class _Reader:
         with _named(self.array.name):
             while self.files[-1].read(1024 * 1024):
                 pass
-
-
-def _skip(file: IO[bytes], count: int) -> None:
-    """Read over bytes: zipfile's own `seek` takes 16 MiB of memory for that."""
-    while count > 0:
-        piece = len(file.read(min(count, 1024 * 1024)))
-        if not piece:
-            return
-        count -= piece
 
 
 def _step(archive: zipfile.ZipFile, array: Stored) -> float:

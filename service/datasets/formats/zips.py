@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import io
 import re
 import zipfile
 import zlib
@@ -18,8 +17,6 @@ from service.datasets.formats.table import first_line
 from service.foundation.errors import ServiceError, TooLargeError, invalid_data
 from service.foundation.settings import Settings
 
-READ_BYTES = 16 * 1024 * 1024
-"""Largest single read from the file: no list of members is longer, whatever the archive says."""
 PIECE = 1024 * 1024
 ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError, ValueError)
 """What zipfile raises of a damaged archive: RuntimeError of a password, NotImplementedError of other compressions."""
@@ -31,9 +28,9 @@ _COMPLETE = "a complete zip archive"
 @contextmanager
 def open_zip(path: Path, settings: Settings, expected: str) -> Iterator[zipfile.ZipFile]:
     """Open an archive whose members have plain names, each once; raise InvalidDataError of any other."""
-    with path.open("rb", buffering=0) as raw:
+    with path.open("rb") as file:
         try:
-            archive = zipfile.ZipFile(_Bounded(raw))
+            archive = zipfile.ZipFile(file)
         except ERRORS as error:
             text = first_line(error)
             raise invalid_data("file", "no zip archive" if "not a zip file" in text else text, expected) from None
@@ -137,15 +134,3 @@ def _bag_members(archive: zipfile.ZipFile, settings: Settings) -> list[zipfile.Z
     return sorted(
         members, key=lambda each: (by_numbers(PurePosixPath(each.filename).name.split(".")[0])[-1:], each.filename)
     )
-
-
-class _Bounded(io.BufferedReader):
-    """A file of which no read takes more than READ_BYTES."""
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        """As of any file; raise ValueError where too much is asked for."""
-        if size is None or size < 0:  # the end of the file, as far as a comment may reach
-            size = READ_BYTES
-        if size > READ_BYTES:
-            raise ValueError(f"a list of members of {size} bytes")
-        return super().read(size)

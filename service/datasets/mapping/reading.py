@@ -22,7 +22,18 @@ from service.datasets.options import UploadOptions
 from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
-from service.storage.storage import Disk
+from service.storage.disk import Disk, Room
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A `Read` as it is told to another process. joint_names and lengths: of its columns."""
+
+    joint_names: tuple[str, ...]
+    lengths: dict[str, int]
+    torque_convention: TorqueConvention
+    facts: dict[str, Any]
+    noted: list[str]
 
 
 @dataclass(frozen=True)
@@ -40,7 +51,7 @@ class Read:
 
 
 def read(
-    table: Table, folder: Path, options: UploadOptions, robot: Profile | None, settings: Settings, disk: Disk
+    table: Table, folder: Path, options: UploadOptions, robot: Profile | None, settings: Settings, disk: Disk | Room
 ) -> Read:
     """Read a table's columns to files in a folder; raise InvalidDataError, StorageFullError.
 

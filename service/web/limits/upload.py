@@ -18,7 +18,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 
 from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem
 from service.foundation.fields import LONGEST, for_people
-from service.storage.storage import Disk
+from service.storage.disk import Disk
 
 if TYPE_CHECKING:
     from python_multipart.multipart import MultipartCallbacks

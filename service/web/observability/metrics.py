@@ -15,7 +15,8 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
 from service import __version__
-from service.storage.storage import Storage, measure
+from service.storage.disk import measure
+from service.storage.storage import Storage
 from service.web.observability.meters import Durations, Kind, Meters, MetricKind, merged
 from service.web.observability.readiness import Readiness
 from service.web.route import Route

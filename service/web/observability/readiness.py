@@ -150,15 +150,21 @@ class Health(BaseModel):
         examples=[{"train": True, "robots": True, "ingest": False}],
     )
     missing: list[Missing] = Field(description="Of what is not installed")
+    confined: dict[str, bool] = Field(
+        {},
+        description="What this system has to keep the process in which an upload is read from harm: limits of `memory` "
+        "and `processor`; `landlock`, from files; `seccomp`, from the network and other processes",
+        examples=[{"memory": True, "processor": True, "landlock": True, "seccomp": True}],
+    )
 
 
 router = APIRouter(prefix="/health", tags=["health"], route_class=Route)
 
 
 @router.get("", summary="What can the service do?")
-async def health() -> Health:
+async def health(confined: Annotated[dict[str, bool], Depends(of_app("confined"))]) -> Health:
     """Answer which extras are installed. Who asks for what needs another one is answered 501 `not_installed`."""
-    return Health(version=__version__, can=dict(_can()), missing=list(_missing()))
+    return Health(version=__version__, can=dict(_can()), missing=list(_missing()), confined=confined)
 
 
 @cache

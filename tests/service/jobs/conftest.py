@@ -11,8 +11,9 @@ from sqlalchemy import select
 from lipserve.states import ACTIVE, QUEUED
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow, now
+from service.storage.disk import Disk
 from service.storage.files import Files
-from service.storage.storage import Disk, Storage
+from service.storage.storage import Storage
 from service.training import queue
 from service.training.queue import JobQueue
 from tests.service.data import eventually

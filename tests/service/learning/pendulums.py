@@ -27,8 +27,9 @@ from service.learning.learner.restore import Restored, advance, restore
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import Database, EventRow
+from service.storage.disk import Disk
 from service.storage.files import Files
-from service.storage.storage import Disk, Storage
+from service.storage.storage import Storage
 from tests.service.data import QUICK, stream
 
 ARM = "arm"

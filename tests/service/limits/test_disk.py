@@ -11,9 +11,9 @@ import lipcore
 from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings, shipped_models
 from service.models import registry
-from service.storage import storage as measuring
+from service.storage import disk as measuring
+from service.storage.disk import Disk, measure
 from service.storage.files import new_id
-from service.storage.storage import Disk, measure
 from service.web.limits.upload import WRITE_BYTES
 from tests.service.data import QUICK, arrays, error, npz, post, service_of, stream
 

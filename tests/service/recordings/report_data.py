@@ -15,7 +15,7 @@ from service.datasets.report.making import make_report
 from service.datasets.schema import DatasetReport
 from service.datasets.staging import Staged, column, prepare
 from service.foundation.settings import Settings
-from service.storage.storage import Disk
+from service.storage.disk import Disk
 
 
 @dataclass(frozen=True)

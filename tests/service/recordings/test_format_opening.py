@@ -15,7 +15,7 @@ from service.datasets.mapping.reading import read as read_columns
 from service.datasets.staging import prepare, staging
 from service.foundation.errors import InvalidDataError, TooLargeError
 from service.foundation.settings import Settings
-from service.storage.storage import Disk
+from service.storage.disk import Disk
 from tests.service.recordings.mapping_tables import options
 from tests.service.recordings.reading import read, refused
 from tests.service.recordings.test_format_lerobot import dataset, zipped

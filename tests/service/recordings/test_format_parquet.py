@@ -10,10 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from service.datasets.formats import parquet as module
-from service.datasets.formats.parquet import check_pages
-from service.foundation.errors import InvalidDataError, TooLargeError
-from service.foundation.settings import Settings
+from service.foundation.errors import TooLargeError
 from tests.service.recordings.reading import read, refused
 
 RNG = np.random.default_rng(11)
@@ -123,61 +120,9 @@ def test_units_of_a_field_are_told(tmp_path):
     assert result.units == {"q[0]": "deg", "q[1]": "deg"}
 
 
-def huge_page(body, size):
-    """The first page's uncompressed size replaced in its header, by one of as many bytes as a varint."""
-    start = pq.ParquetFile(io.BytesIO(body)).metadata.row_group(0).column(0).data_page_offset
-    assert body[start : start + 3] == b"\x15\x00\x15"  # field 1, a data page; field 2 follows
-    end = start + 3
-    while body[end] & 128:
-        end += 1
-    zigzag, out = 2 * size, b""
-    while len(out) < end - start - 2:
-        out += bytes([zigzag & 127 | (128 if len(out) < end - start - 3 else 0)])
-        zigzag >>= 7
-    return body[: start + 3] + out + body[end + 1 :]
-
-
-def test_a_page_that_unpacks_to_too_much_is_refused_before_it_is_read(tmp_path, monkeypatch):
-    body = parquet({"t": np.zeros(100_000)}, compression="zstd", use_dictionary=False)
-    assert len(body) < 3_000
-    monkeypatch.setattr(module, "MAX_PAGE", 100_000)
-    field, value, expected = refused(tmp_path, body, "parquet")
-    assert field == "t"
-    assert value.startswith("page 1 of 1600")
-    assert "100000" in expected
-
-
-@pytest.mark.parametrize(
-    "again",
-    [
-        pytest.param(b"\x06\x04\x80\x01", id="the size once more as a number of 64 bits, which Arrow passes over"),
-        pytest.param(b"\x05\x84\x80\x08\xfe\xff\xff\xff\x0f", id="field 65538, which Arrow counts as the second"),
-        pytest.param(b"", id="two gigabytes, once"),
-    ],
-)
-def test_a_header_that_says_its_size_twice_counts_as_arrow_reads_it(tmp_path, again):
-    body = parquet({"t": RNG.normal(size=200_000)}, use_dictionary=False, compression="none")
-    page = pq.ParquetFile(io.BytesIO(body)).metadata.row_group(0).column(0).data_page_offset
-    first = b"\x80\x01" if again[:1] == b"\x05" else b"\xfe\xff\xff\xff\x0f"
-    header = b"\x15\x00\x15" + first + b"\x15\x80\x01" + again + b"\x00"
-    reply = refused(tmp_path, body[:page] + header + body[page + len(header) :], "parquet")
-    assert reply[:2] == ("t", "page 1 of 2147483647 bytes")
-
-
 def test_many_pages_that_unpack_to_too_much_are_refused(tmp_path):
     body = parquet({"t": np.zeros(1_000_000)}, compression="zstd", use_dictionary=False)
     assert "at most 1000000" in refused(tmp_path, body, "parquet", error=TooLargeError, max_unpacked_bytes=1_000_000)
-
-
-def test_a_page_that_lies_about_its_size_is_refused(tmp_path):
-    body = parquet({"t": RNG.normal(size=100_000)}, use_dictionary=False)
-    path = tmp_path / "lie"
-    for size in (100, 1_000_000):
-        path.write_bytes(huge_page(body, size))
-        with path.open("rb") as file:
-            check_pages(file, Settings(home=tmp_path))
-        assert refused(tmp_path, path.read_bytes(), "parquet", error=InvalidDataError)[0] == "file"
-    path.unlink()
 
 
 def test_an_extension_type_is_what_it_is_stored_as(tmp_path):

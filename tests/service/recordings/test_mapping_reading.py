@@ -12,7 +12,7 @@ from service.datasets.mapping.vocabulary import factor
 from service.datasets.staging import staging
 from service.foundation.errors import InvalidDataError, StorageFullError
 from service.foundation.settings import Settings
-from service.storage.storage import Disk
+from service.storage.disk import Disk
 from tests.service.recordings.mapping_tables import RATE, Arm, canonical, motion, options, table
 
 

@@ -9,7 +9,7 @@ from lipcore.profiles import profile
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.foundation.settings import Settings
-from service.storage.storage import Disk
+from service.storage.disk import Disk
 from tests.service.recordings.mapping_tables import options
 from tests.service.recordings.test_mapping_names import mapped
 from tests.service.test_real_data import PANDA, SCHUNK

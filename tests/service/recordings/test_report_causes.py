@@ -26,7 +26,7 @@ from service.datasets.report.remedies import flags
 from service.datasets.schema import DatasetReport
 from service.datasets.staging import prepare
 from service.foundation.settings import Settings
-from service.storage.storage import Disk
+from service.storage.disk import Disk
 from tests.choosing import few
 from tests.service.recordings.report_data import report_on
 

@@ -18,7 +18,7 @@ from service.datasets.staging import QUANTITIES, Staged, column, prepare
 from service.foundation.settings import Settings
 from service.storage import sample_file
 from service.storage.database import JobRow
-from service.storage.storage import Disk
+from service.storage.disk import Disk
 from tests.service.data import arrays, npz, post, queue, service_of, stream
 from tests.service.recordings.test_format_parquet import parquet
 from tests.service.test_uploads import created

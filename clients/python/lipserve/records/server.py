@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+from msgspec import field
+
 from lipserve.records import Record
 
 
@@ -28,12 +30,15 @@ class Health(Record, frozen=True, kw_only=True):
         share PostgreSQL, S3 and a Dask cluster; `grpc`, to answer over gRPC; `signing`, to sign archives and check
         their signatures; `opentelemetry`, to send traces; `plot`, to draw pictures
     missing: Of what is not installed
+    confined: What this system has to keep the process in which an upload is read from harm: limits of `memory` and
+        `processor`; `landlock`, from files; `seccomp`, from the network and other processes
     """
 
     status: Literal["alive"] = "alive"
     version: str
     can: dict[str, bool]
     missing: list[Missing]
+    confined: dict[str, bool] = field(default_factory=dict)
 
 
 class Live(Record, frozen=True, kw_only=True):

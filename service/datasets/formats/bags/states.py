@@ -17,8 +17,6 @@ from service.foundation.errors import InvalidDataError, invalid_data, readable
 ENCODINGS = ("cdr", "ros1")
 MOST_LAYOUTS = 64
 """Layouts that are remembered of a channel; most have one."""
-MOST_FIELDS = 50_000_000
-"""Fields of a channel that are looked at one by one, because the layouts keep changing: about a minute of them."""
 MOST_KINDS = 1000
 """Sets of joints that the messages of a channel may tell of."""
 _SECONDS = ((1, "int32"), (1, "uint32"))
@@ -132,7 +130,6 @@ class Decoder:
             raise invalid_data(f"definition of {channel.type}", ", ".join(fields)[:200], " or ".join(self.source.last))
         self.last = ends[-1]
         self._forms: list[Form] = []
-        self._fields = 0
 
     def form(self, data: bytes, number: int) -> Form:
         """Form of the channel's message `number`, counted from 1; raise InvalidDataError."""
@@ -151,9 +148,6 @@ class Decoder:
             layout = lay_out(data, self.types, channel.type, self.last, channel.encoding)
         except ValueError as error:  # that of text which is not UTF-8, too
             raise self._wrong(number, str(error), f"a {channel.type}") from None
-        self._fields += layout.fields
-        if self._fields > MOST_FIELDS:
-            raise self._wrong(number, "yet another layout", "messages that are alike")
         numbers = layout.numbers
         ways = [(way, _counts(numbers, way)) for way in self.source.quantities]
         way, counts = max(ways, key=lambda each: ("position" in each[1], len(each[1])))

@@ -1,0 +1,60 @@
+"""Reading an upload where it can do no harm: `service.compute.cage` calls this in a process of its own."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import suppress
+from importlib import import_module
+from importlib.abc import MetaPathFinder
+from pathlib import Path
+from typing import Any
+
+from lipcore.extras import need
+from lipcore.profiles import Profile
+from service.datasets.formats.opening import open_table
+from service.datasets.mapping.reading import Recording, read
+from service.datasets.options import UploadOptions
+from service.foundation.settings import Settings
+from service.storage.disk import Room, Usage
+
+
+def warm() -> None:
+    """Import all readers; raise MissingExtraError where they are not installed."""
+    sys.meta_path.insert(0, _WithoutPandas)
+    for name in ("numpy.ma", "encodings.utf_8_sig", "dateutil.relativedelta"):
+        with suppress(ImportError):
+            import_module(name)
+    need("pyarrow", "ingest")
+    for name in ("csv", "parquet", "bags.reading", "lerobot", "joined"):
+        need(f"service.datasets.formats.{name}", "ingest")
+    # Arrow looks its functions up when they are first called, for 50 ms: once here, not in each process that is forked
+    arrow = import_module("service.datasets.formats.arrow")
+    cells = import_module("pyarrow").array(["1", "1.5", "a"])
+    arrow.NumberColumn("", decimal_comma=True).share(cells)
+    arrow.NumberColumn("", decimal_comma=True).read(cells[:2], 1)
+    arrow.StampColumn.of("", cells)
+
+
+class _WithoutPandas(MetaPathFinder):
+    """Arrow would import pandas where it is installed, for half a second, and for nothing."""
+
+    @staticmethod
+    def find_spec(fullname: str, *_: Any) -> None:
+        """Raise ModuleNotFoundError for pandas; other modules are for others to find."""
+        if fullname == "pandas":
+            raise ModuleNotFoundError(fullname, name=fullname)
+
+
+def read_upload(
+    upload: Path,
+    kind: str,
+    options: UploadOptions,
+    robot: Profile | None,
+    usage: Usage,
+    folder: Path,
+    settings: Settings,
+) -> Recording:
+    """Read an upload to columns in a folder; raise as `open_table` and `read` do. usage: of the disk, before."""
+    with open_table(upload, kind, options.read, settings) as table:
+        made = read(table, folder, options, robot, settings, Room(usage))
+    return Recording(made.staged.joint_names, made.staged.lengths, made.torque_convention, made.facts, made.noted)

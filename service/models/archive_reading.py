@@ -1,0 +1,211 @@
+"""Reading the archive of a version, which may come from a stranger.
+
+An archive is a tar file of a few plain files, by exact name and of limited size. Of `tarfile` only what makes and reads
+a single header is used: the rest follows links, sparse files, extended headers and numbers of any size, of which an
+archive of a model has none, and which have been the way in for many an attack.
+"""
+
+from __future__ import annotations
+
+import tarfile
+from collections.abc import Mapping
+from io import SEEK_CUR
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from lipcore.files import persistence, strict_json
+from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, Limits, ModelFormatError
+from service.foundation.errors import InvalidDataError, invalid_data, problem
+from service.foundation.settings import Settings
+from service.models import signing
+from service.models.schema import ModelName
+from service.models.signing import SIGNATURE, Signature
+
+EXPORT, CHECKSUMS = "export.json", "checksums.json"
+MEMBERS = (EXPORT, CHECKSUMS, MANIFEST, TENSORS, ROBOT, SIGNATURE)
+OPTIONAL = frozenset({ROBOT, SIGNATURE})
+FORMAT, FORMAT_VERSION = "lipserve-archive", 1
+BLOCK = 512
+_KINDS = {
+    tarfile.LNKTYPE: "a hard link",
+    tarfile.SYMTYPE: "a symbolic link",
+    **dict.fromkeys((tarfile.CHRTYPE, tarfile.BLKTYPE), "a device"),
+    tarfile.DIRTYPE: "a folder",
+    tarfile.FIFOTYPE: "a pipe",
+    tarfile.GNUTYPE_SPARSE: "a sparse file",
+    **dict.fromkeys((tarfile.XHDTYPE, tarfile.XGLTYPE), "an extended header"),
+    **dict.fromkeys((tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK), "a long name"),
+}
+
+
+SMALL = 64 * 1024
+"""Most bytes of the members that only describe the others."""
+MANIFEST_BYTES = 1024 * 1024
+
+
+class About(BaseModel):
+    """What `export.json` says: where an archive comes from."""
+
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    format: str = Field(pattern=f"^{FORMAT}$")
+    format_version: int = Field(ge=FORMAT_VERSION, le=FORMAT_VERSION)
+    model: ModelName
+    version: int = Field(ge=1, lt=2**31)
+    revision: int = Field(ge=0, lt=2**63)
+    learnt: bool
+    created_at: str = Field(max_length=40)
+    exported_at: str = Field(max_length=40)
+    software: dict[str, str | int] = Field(max_length=20)
+
+
+class ArchiveError(ValueError):
+    """The file is no archive that can be taken. member: where that is; given, expected: what is wrong there."""
+
+    def __init__(self, member: str, given: str, expected: str) -> None:
+        super().__init__(f"{member} is {given}, expected {expected}")
+        self.member, self.given, self.expected = member, given, expected
+
+
+def members(path: Path, limits: Mapping[str, int]) -> dict[str, bytes]:
+    """The members of an archive by name. limits: most bytes of each. Raise ArchiveError for anything but plain files
+    with these names, each once, complete and within its limit."""
+    files: dict[str, bytes] = {}
+    length = path.stat().st_size
+    with path.open("rb") as file:
+        while any(header := file.read(BLOCK)) or len(header) < BLOCK:
+            if len(header) < BLOCK:
+                raise ArchiveError("archive", f"cut off at byte {length}", "a complete tar file")
+            name, count = _header(header)
+            if name not in limits:
+                raise ArchiveError(name, "a file that no model has", f"one of {', '.join(limits)}")
+            if name in files:
+                raise ArchiveError(name, "there twice", "each file once")
+            if count > limits[name]:
+                raise ArchiveError(name, f"a file of {count} bytes", f"at most {limits[name]}")
+            if file.tell() + count + padding(count) > length:
+                raise ArchiveError(name, f"cut off at byte {length - file.tell()}", f"{count} bytes")
+            files[name] = file.read(count)
+            file.seek(padding(count), SEEK_CUR)
+        rest = file.read()
+    if any(rest):
+        raise ArchiveError("archive", "followed by more data", "nothing after its end")
+    if len(rest) < BLOCK:
+        raise ArchiveError("archive", "without its end", "a complete tar file")
+    return files
+
+
+def padding(count: int) -> int:
+    """Bytes that follow so many in a tar file."""
+    return -count % BLOCK
+
+
+def _header(header: bytes) -> tuple[str, int]:
+    """Name and size of a plain file; raise ArchiveError."""
+    try:
+        info = tarfile.TarInfo.frombuf(header, "ascii", "backslashreplace")
+    except tarfile.HeaderError as error:
+        raise ArchiveError("archive", f"not a tar file, or damaged: {error}", "a tar file") from None
+    name = ascii(info.name)[1:-1]
+    if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or info.linkname:
+        raise ArchiveError(name, _KINDS.get(info.type, f"of the kind {info.type!r}"), "a plain file")
+    size = header[124:136].strip(b" \0")  # which TarInfo takes in other forms too, and below zero
+    if not size.isdigit():
+        raise ArchiveError(name, f"of the size {header[124:136]!r}", "an octal number of bytes")
+    return name, info.size
+
+
+def read(upload: Path, settings: Settings) -> tuple[About, dict[str, bytes], str | None]:
+    """Where an archive comes from, the files of its model by name, which have their checksums, and who has signed
+    these, None: nobody; raise InvalidDataError naming the member that is wrong and what is wrong with it."""
+    limits = {
+        EXPORT: SMALL,
+        CHECKSUMS: SMALL,
+        SIGNATURE: SMALL,
+        MANIFEST: MANIFEST_BYTES,
+        TENSORS: settings.max_archive_bytes,
+        ROBOT: settings.max_urdf_bytes,
+    }
+    try:
+        files = members(upload, limits)
+    except ArchiveError as error:
+        raise invalid_data(error.member, error.given, error.expected) from None
+    for name in MEMBERS:
+        if name not in files and name not in OPTIONAL:
+            raise invalid_data(name, "missing", "a file of that name in the archive")
+    try:
+        signature = Signature.model_validate(_json(SIGNATURE, files.pop(SIGNATURE))) if SIGNATURE in files else None
+    except ValidationError as error:
+        raise invalid_member(SIGNATURE, error) from None
+    checksums = files.pop(CHECKSUMS)
+    signer = signing.verify(settings, signature, checksums)
+    sums = _json(CHECKSUMS, checksums)
+    if not isinstance(sums, dict) or sums.keys() != files.keys():
+        given = f"of {', '.join(map(strict_json.quote, sums))}" if isinstance(sums, dict) else strict_json.quote(sums)
+        raise invalid_data(CHECKSUMS, given, f"the sha256 of each of {', '.join(files)}")
+    for name, content in files.items():
+        if persistence.sha256(content) != sums[name]:
+            raise invalid_data(name, "not what its sha256 in checksums.json says", "an undamaged file")
+    try:
+        return About.model_validate(_json(EXPORT, files.pop(EXPORT))), files, signer
+    except ValidationError as error:
+        raise invalid_member(EXPORT, error) from None
+
+
+def limits_of(settings: Settings) -> Limits:
+    """How large a model may be that is imported."""
+    return Limits(
+        joints=settings.max_joints,
+        inducing_samples=settings.max_posterior_samples,
+        inducing_torques=settings.max_archive_torques,
+        inducing_outputs=settings.max_inducing_outputs,
+        manifest_bytes=MANIFEST_BYTES,
+        robot_bytes=settings.max_urdf_bytes,
+    )
+
+
+def try_out(upload: Path, settings: Settings) -> None:
+    """Read an archive and all that its model is made of; raise InvalidDataError. For a process that may come to harm:
+    it keeps nothing, and who has called it reads what has been read well."""
+    _, files, _ = read(upload, settings)
+    try:
+        persistence.parse(files, limits_of(settings))
+    except ModelFormatError as error:
+        raise invalid_model(error) from None
+
+
+def invalid_model(error: ModelFormatError) -> InvalidDataError:
+    """Error for files that make no model."""
+    return InvalidDataError(f"{error.file}: {error}", [problem(error.file, str(error), "a valid model")])
+
+
+def check_texts(value: Any) -> None:
+    """Raise ModelFormatError for a text that a terminal or a log would not show as it is. The depth is limited."""
+    if isinstance(value, str):
+        if not all(each.isprintable() or each == "\N{NO-BREAK SPACE}" for each in value):
+            raise ModelFormatError(f"{strict_json.quote(value)} has a character that cannot be printed")
+    elif isinstance(value, dict):
+        for name, each in value.items():
+            check_texts(name)
+            check_texts(each)
+    elif isinstance(value, list):
+        for each in value:
+            check_texts(each)
+
+
+def _json(member: str, content: bytes) -> Any:
+    try:
+        value = strict_json.read(content, SMALL)
+        check_texts(value)
+    except (strict_json.StrictJsonError, ModelFormatError) as error:
+        raise invalid_data(member, str(error), "JSON as an export writes it") from None
+    return value
+
+
+def invalid_member(member: str, error: ValidationError) -> InvalidDataError:
+    """Error for what a member says."""
+    first = error.errors()[0]
+    where = ".".join([member, *map(str, first["loc"])])
+    return invalid_data(where, first.get("input"), first["msg"].removeprefix("Input should be "))
