@@ -8,7 +8,7 @@ TEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 3
 SHARE := -n $(WORKERS) --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test warm-lip warm-chain bytecode test-all nightly screenshots cpp lint install serve image image-serve docs dist sbom clean
+.PHONY: demo test warm-lip warm-chain bytecode test-all nightly screenshots fuzz cpp lint install serve image image-serve docs dist sbom clean
 
 demo: $(VENV)/.running
 	$(BIN)/lipserve demo
@@ -57,6 +57,13 @@ nightly:
 # makes one of every page
 screenshots: install
 	LIPSERVE_SCREENSHOTS=docs/screenshots $(TEST) tests/browser/test_journey.py tests/browser/test_arm.py tests/browser/test_payload.py
+
+# readers of uploads, fuzzed with Atheris, one after the other for so many seconds: findings go to build/fuzz
+FUZZ := csv json json_lines npz parquet rosbag1 rosbag2 mcap zip urdf archive manifest tensors
+SECONDS ?= 60
+fuzz: install
+	$(BIN)/python -m pip install --disable-pip-version-check --quiet -e '.[fuzz]'
+	failed=0; for each in $(FUZZ); do $(BIN)/python -m tests.fuzz $$each $(SECONDS) || failed=1; done; exit $$failed
 
 # the C++ client: its example and its test; needs CMake and a compiler of C++17, and nothing else here does
 cpp:

@@ -247,8 +247,6 @@ class _Spawner:
         return ours
 
     def _start(self) -> socket.socket:
-        if self._process is not None and self._owner == os.getpid():
-            self._process.wait()
         self._owner = os.getpid()
         self._control, theirs = socket.socketpair()
         with theirs:

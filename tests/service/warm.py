@@ -5,6 +5,7 @@ A service that tests share, and training and learning of all services in this pr
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +21,14 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
-PRELOADED = ["service.app", "service.cli", "service.training.worker", "service.learning.learner.worker", __name__]
+PRELOADED = [
+    "service.app",
+    "service.datasets.caged",
+    "service.cli",
+    "service.training.worker",
+    "service.learning.learner.worker",
+    __name__,
+]
 STARTERS = ("service.compute.process", "service.learning.learner.process")
 """Modules that start processes of the service."""
 
@@ -78,8 +86,27 @@ def _enter(
 @contextmanager
 def warm_processes() -> Iterator[None]:
     """Let services of this process fork theirs."""
-    with patch.multiple(STARTERS[0], multiprocessing=_shim()), patch.multiple(STARTERS[1], multiprocessing=_shim()):
+    with (
+        patch.multiple(STARTERS[0], multiprocessing=_shim()),
+        patch.multiple(STARTERS[1], multiprocessing=_shim()),
+        patch("service.compute.cage.start", _start),
+    ):
         yield
+
+
+def _start(control: socket.socket) -> ForkServerProcess:
+    """Start a process that reads uploads, of which each service has one."""
+    process = _context().Process(target=_serve_calls, args=(control,))
+    process.start()
+    return process
+
+
+def _serve_calls(control: socket.socket) -> None:
+    from service.compute import cage
+
+    os.environ.clear()
+    os.environ.update(cage.ENVIRONMENT)
+    cage.serve(control.detach())
 
 
 def _shim() -> SimpleNamespace:
@@ -129,6 +156,7 @@ def _serve(arguments: list[str], environment: dict[str, str], log: Path, address
     forkserver._forkserver.ensure_running = lambda: None  # type: ignore[attr-defined]
     for module in STARTERS:
         import_module(module).multiprocessing = _shim()  # type: ignore[attr-defined]
+    import_module("service.compute.cage").start = _start  # type: ignore[attr-defined]
     current_process().name = "MainProcess"  # as logs have it
     sys.argv = ["lipserve", *arguments]
     from service.__main__ import main

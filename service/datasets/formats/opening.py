@@ -145,7 +145,8 @@ def _text(head: bytes) -> str | None:
         if rest.strip():
             return "json_lines"
         return "json" if any(isinstance(value, list | dict) for value in row.values()) else "json_lines"
-    while rest and (not (row := rest.partition("\n")[0].strip()) or line[0] in "#%"):
+    # (of a line of marks nothing is left)
+    while rest and (not (row := rest.partition("\n")[0].strip()) or line[:1] in "#%"):
         line, _, rest = (row or line).lstrip("#%"), None, rest.partition("\n")[2]
     marks = [mark for mark in ",;\t| " if mark in line and mark in row] if rest else []
     return "csv" if marks and any(each.isdigit() for each in row) else None

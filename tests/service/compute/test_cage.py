@@ -9,6 +9,7 @@ import pytest
 
 from lipcore.extras import MissingExtraError
 from service.compute import cage
+from service.compute.cage import start
 from service.compute.confinement import FORBIDDEN, OF_ITSELF, calls, protections
 from service.foundation.errors import InvalidDataError, NotReadyError, TooLargeError
 from service.foundation.settings import Settings
@@ -20,6 +21,15 @@ HERE = "tests.service.compute.inmates"
 memory_is_limited = pytest.mark.skipif(not protections()["memory"], reason="this system does not limit memory")
 landlocked = pytest.mark.skipif(not protections()["landlock"], reason="a kernel without Landlock")
 filtered = pytest.mark.skipif(not protections()["seccomp"], reason="a system without seccomp, or an unknown processor")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _as_a_service_does():
+    """Start processes as a service does, not as its tests."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(cage, "start", start)
+        patched.setattr(cage, "_spawner", cage._Spawner())
+        yield
 
 
 @pytest.fixture

@@ -140,3 +140,9 @@ def test_damaged_files_are_read_or_refused(tmp_path, kind):
             outcomes["refused"] += 1
     assert min(outcomes.values()) > 5, outcomes
     assert {each.name for each in tmp_path.iterdir()} == {"upload"}
+
+
+@pytest.mark.parametrize("body", ["#\n\n\r\n#\n\n", "%\n#\n%%\n", "#\n#\n1"])
+def test_lines_of_marks_alone_are_nothing(tmp_path, body):
+    """Found by fuzzing."""
+    refused(tmp_path, body.encode(), "csv")

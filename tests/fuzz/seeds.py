@@ -1,0 +1,130 @@
+"""The files that fuzzing starts from, small ones as our own writers and those of others make them: `python -m
+tests.fuzz.seeds` writes them into the corpus."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from lipcore.files import persistence
+from lipcore.files.manifest import MANIFEST, TENSORS
+from service.models.archive_reading import EXPORT, FORMAT, FORMAT_VERSION
+from tests.fuzz.targets import JOINTS
+from tests.service.archives.packing import pack, vouched
+from tests.service.recordings import bag_writers as bags
+
+ROWS = 24
+T = np.arange(ROWS) / 50
+ANGLE = np.outer(T, np.arange(1, JOINTS + 1))
+ARRAYS = {"q": np.sin(ANGLE), "dq": np.cos(ANGLE), "ddq": -np.sin(ANGLE), "tau": 2 * np.cos(ANGLE)}
+COLUMNS = {"t": T} | {f"{name}{j + 1}": values[:, j] for name, values in ARRAYS.items() for j in range(JOINTS)}
+URDF = """<robot name="two"><link name="base"/>{}<joint name="tool" type="fixed"><parent link="l2"/><child link="tool"/>
+<origin xyz="0 0 0.1" rpy="0 0 0"/></joint><link name="tool"/></robot>"""
+LINK = """<link name="l{1}"><inertial><origin xyz="0 0 0.1" rpy="0 0 0"/><mass value="1.5"/>
+<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
+<joint name="j{1}" type="revolute"><parent link="{0}"/><child link="l{1}"/><axis xyz="0 1 0"/>
+<limit lower="-2" upper="2" effort="10" velocity="3"/></joint>"""
+
+
+def seeds() -> Iterator[tuple[str, bytes]]:
+    """Target and content of each."""
+    rows = [dict(zip(COLUMNS, map(float, row), strict=True)) for row in np.column_stack(list(COLUMNS.values()))]
+    table = [",".join(COLUMNS), *(",".join(f"{each:.5g}" for each in row.values()) for row in rows)]
+    text = "\n".join(table) + "\n"
+    yield "csv", text.encode()
+    yield "csv", text.replace(",", ";").replace(".", ",").encode()
+    yield "csv", ("# " + text.replace(",", " \t")).encode()
+    yield "csv", _dated(table).encode()
+    yield "json", json.dumps(rows).encode()
+    yield "json", json.dumps({name: values.tolist() for name, values in COLUMNS.items()}).encode()
+    yield "json", json.dumps({"columns": list(COLUMNS), "data": [list(row.values()) for row in rows]}).encode()
+    nested = [{"t": float(t), "arm": {"q": q.tolist(), "tau": q.tolist()}} for t, q in zip(T, ARRAYS["q"], strict=True)]
+    yield "json_lines", "".join(f"{json.dumps(row)}\n" for row in nested).encode()
+    for save in (np.savez, np.savez_compressed):
+        yield "npz", _written(lambda file, save=save: save(file, t=T, **ARRAYS))
+    other = {"joint_names": np.array(["a", "b"]), "dt": np.float64(0.02), "picture": np.zeros((ROWS, 2, 2), np.uint8)}
+    yield "npz", _written(lambda file: np.savez(file, **{k: np.asfortranarray(v) for k, v in ARRAYS.items()}, **other))
+    flat = pa.table(COLUMNS)
+    lists = pa.table({"t": T, "q": ARRAYS["q"].tolist(), "tau": ARRAYS["tau"].tolist(), "s": [{"a": 1.0}] * ROWS})
+    for compression, entries, dictionary in (("none", flat, False), ("zstd", lists, True)):
+        yield "parquet", _parquet(entries, compression=compression, use_dictionary=dictionary)
+    with tempfile.TemporaryDirectory() as given:
+        folder = Path(given)
+        written = bags.states(12, ("a", "b"))
+        for compression in (None, "bz2"):
+            yield "rosbag1", bags.write_rosbag1(folder / f"{compression}.bag", written, compression).read_bytes()
+        recorded = bags.write_rosbag2(folder / "two", written)
+        yield "rosbag2", bags.bare(recorded, folder / "two.db3").read_bytes()
+        yield "zip", bags.zipped(recorded, folder / "two.zip").read_bytes()
+        for compression in ("NONE", "ZSTD"):
+            yield "mcap", bags.write_mcap(folder / f"{compression}.mcap", written, compression).read_bytes()
+    yield "zip", _zip({"positions.txt": _text("q"), "velocities.txt": _text("dq"), "torques.txt": _text("tau")})
+    yield "zip", _lerobot()
+    yield "urdf", URDF.format(LINK.format("base", 1) + LINK.format("l1", 2)).encode()
+    yield from _models()
+
+
+def _models() -> Iterator[tuple[str, bytes]]:
+    from tests.service.learning.pendulums import trained
+
+    _, content = persistence.encode(trained(), {"datasets": []})
+    about = {"format": FORMAT, "format_version": FORMAT_VERSION, "model": "m", "version": 1, "revision": 0}
+    about |= {"learnt": False, "created_at": "", "exported_at": "", "software": {}}
+    yield "archive", pack(vouched({EXPORT: json.dumps(about).encode(), **content}))
+    yield "manifest", content[MANIFEST]
+    yield "tensors", content[TENSORS]
+
+
+def _written(write: Any) -> bytes:
+    out = io.BytesIO()
+    write(out)
+    return out.getvalue()
+
+
+def _parquet(table: pa.Table, **options: Any) -> bytes:
+    return _written(lambda file: pq.write_table(table, file, store_schema=False, **options))
+
+
+def _zip(files: dict[str, bytes]) -> bytes:
+    def write(file: io.BytesIO) -> None:
+        with zipfile.ZipFile(file, "w") as archive:
+            for name, content in files.items():
+                archive.writestr(name, content)
+
+    return _written(write)
+
+
+def _text(quantity: str) -> bytes:
+    return _written(lambda file: np.savetxt(file, ARRAYS[quantity], "%.4f"))
+
+
+def _dated(table: list[str]) -> str:
+    lines = [f"2026-01-01 00:00:{row:09.6f}{line[line.index(',') :]}" for row, line in enumerate(table[1:])]
+    return "\n".join([table[0], *lines])
+
+
+def _lerobot() -> bytes:
+    joints = ["a.pos", "b.pos"]
+    features = {"observation.state": {"dtype": "float32", "shape": [2], "names": joints}}
+    info = {"codebase_version": "v3.0", "robot_type": "arm", "fps": 50, "features": features}
+    state = pa.array(ARRAYS["q"].tolist(), pa.list_(pa.float32()))
+    rows = {"observation.state": state, "action": state, "timestamp": T, "episode_index": [0] * ROWS}
+    names = {"meta/info.json": json.dumps(info).encode()}
+    return _zip({**names, "data/chunk-000/file-000.parquet": _parquet(pa.table(rows))})
+
+
+if __name__ == "__main__":
+    for target, content in seeds():
+        path = Path(__file__).parent / "corpus" / target / hashlib.sha256(content).hexdigest()[:40]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)

@@ -1,0 +1,100 @@
+"""What is fuzzed: each reader of strangers' files, given bytes. Right is any answer but an error that is none of ours.
+
+Sums that files have over themselves are not compared here: nearly every change of a file would end at them.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import patch
+
+from lipcore.files.manifest import DEFAULT_LIMITS, ModelFormatError, read_manifest_bytes
+from lipcore.files.tensors import read_tensors
+from lipcore.profiles import from_urdf
+from service.datasets.caged import read_upload
+from service.datasets.formats.bags import files
+from service.datasets.options import UploadOptions
+from service.foundation.errors import ServiceError
+from service.foundation.settings import Settings
+from service.models.archive_reading import try_out
+from service.robots.caged import read_urdf
+from service.storage.disk import Usage
+
+MiB = 1024 * 1024
+SETTINGS = Settings(
+    min_samples=10,
+    max_samples=5000,
+    max_columns=200,
+    max_zip_members=50,
+    max_unpacked_bytes=16 * MiB,
+    max_bag_part_bytes=4 * MiB,
+    max_json_bytes=MiB,
+    max_json_line_bytes=64 * 1024,
+)
+USAGE = Usage(0, 1 << 40, None, 0)
+JOINTS = 2
+"""Of the models whose tensors are read."""
+
+
+class _Sum(int):
+    """A sum that is as it should be."""
+
+    def __ne__(self, other: object) -> bool:
+        return False
+
+
+_without_sums = patch.object(files, "zlib", SimpleNamespace(crc32=lambda data: _Sum()))
+
+
+def _recording(kind: str) -> Callable[[bytes], None]:
+    """A reader of recordings that are sent as a kind, whatever they turn out to be."""
+
+    def read(data: bytes) -> None:
+        with tempfile.TemporaryDirectory() as folder, patch.object(zipfile.ZipExtFile, "_update_crc", lambda *_: None):
+            path = Path(folder) / "upload"
+            path.write_bytes(data)
+            with _without_sums:
+                read_upload(path, kind, UploadOptions(), None, USAGE, Path(folder), SETTINGS)
+
+    return read
+
+
+def _urdf(data: bytes) -> None:
+    text = data.decode("utf-8-sig", "replace")
+    read_urdf(text)
+    from_urdf(text, "fuzzed")  # what has been taken can be used
+
+
+def _archive(data: bytes) -> None:
+    with tempfile.NamedTemporaryFile() as file:
+        file.write(data)
+        file.flush()
+        try_out(Path(file.name), SETTINGS)
+
+
+def _tensors(data: bytes) -> None:
+    read_tensors(data, JOINTS, DEFAULT_LIMITS)
+
+
+KINDS = ("csv", "json", "json_lines", "npz", "parquet", "rosbag1", "rosbag2", "mcap", "zip")
+TARGETS: dict[str, Callable[[bytes], object]] = {
+    **{kind: _recording(kind) for kind in KINDS},
+    "urdf": _urdf,
+    "archive": _archive,
+    "manifest": read_manifest_bytes,
+    "tensors": _tensors,
+}
+"""Readers by name."""
+
+
+def run(target: str, data: bytes) -> bool:
+    """Give bytes to a reader; return whether it has taken them. Raise whatever is no error of ours."""
+    try:
+        TARGETS[target](data)
+    except (ServiceError, ModelFormatError):
+        return False
+    return True
