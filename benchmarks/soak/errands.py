@@ -200,8 +200,13 @@ def train(desk: Desk, turn: int) -> None:
     """Train, from recordings and then from what was observed; cancel a job and repeat it; delete old versions."""
     if not desk.datasets:
         record(desk, turn)
-    request = {"model": ARM, "datasets": desk.datasets[-2:], "estimator": "rigid-body", "robot": PROFILE}
-    request |= {"options": FIT}
+    request = {
+        "model": ARM,
+        "datasets": desk.datasets[-2:],
+        "estimator": "rigid-body",
+        "robot": PROFILE,
+        "options": FIT,
+    }
     desk.ask("POST", "/v1/jobs/check", 204, json=request)
     _done(desk, desk.ask("POST", "/v1/jobs", 202, json=request)["id"])
     job = desk.ask("POST", "/v1/jobs", 202, json=request)["id"]
