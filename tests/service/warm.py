@@ -102,11 +102,11 @@ def _start(control: socket.socket) -> ForkServerProcess:
 
 
 def _serve_calls(control: socket.socket) -> None:
-    from service.compute import cage
+    from service.compute import cage, reader_process
 
     os.environ.clear()
     os.environ.update(cage.ENVIRONMENT)
-    cage.serve(control.detach())
+    reader_process.serve(control.detach())
 
 
 def _shim() -> SimpleNamespace:

@@ -11,6 +11,7 @@ from lipcore.extras import MissingExtraError
 from service.compute import cage
 from service.compute.cage import start
 from service.compute.confinement import FORBIDDEN, OF_ITSELF, calls, protections
+from service.compute.reader_process import OUTPUT_BYTES, Failure
 from service.foundation.errors import InvalidDataError, NotReadyError, TooLargeError
 from service.foundation.settings import Settings
 from tests.service.data import eventually
@@ -79,7 +80,7 @@ def test_what_libraries_write_is_kept_short_and_printable(settings, caplog, capf
     assert record.levelno == logging.WARNING
     assert record.fields["reader"] == f"{HERE}:noise"
     assert record.fields["output"].startswith("out\\n\\x1b[2Jxxx")
-    assert len(record.fields["output"]) <= cage.OUTPUT_BYTES
+    assert len(record.fields["output"]) <= OUTPUT_BYTES
     assert capfd.readouterr() == ("", "")
 
 
@@ -211,7 +212,7 @@ def _readers(pid):
 
 
 def test_a_missing_extra_is_told(settings):
-    failure = cage.Failure("extra", "", [("ingest", "pyarrow", "")])
+    failure = Failure("extra", "", [("ingest", "pyarrow", "")])
     error = cage._error(failure, "reader", "file", settings)
     assert isinstance(error, MissingExtraError)
     assert "lipserve[ingest]" in str(error)
