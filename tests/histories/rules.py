@@ -23,6 +23,11 @@ def alias(version: int | None, operation: Operation) -> Iterable[int | None]:
     return [version] if operation.result == version else []
 
 
+def reads(operation: Operation) -> bool:
+    """Whether an operation on an alias only looks."""
+    return operation.call[0] == "read"
+
+
 Batches = tuple[int, ...]
 """Of each stream, the last sequence that is logged; then the revision, which every batch counts up by one."""
 

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.histories.checker import UNKNOWN, Operation, State, Step, contradictions, explained
-from tests.histories.rules import ABSENT, Answer, alias, faults, job, journal
+from tests.histories.checker import UNKNOWN, Looks, Operation, State, Step, contradictions, explained, never
+from tests.histories.rules import ABSENT, Answer, alias, faults, job, journal, reads
 
 
 def at(began: float, ended: float, *call: object, result: object = "moved", client: int = 0) -> Operation:
@@ -58,12 +58,12 @@ BAD = {
 
 @pytest.mark.parametrize("name", GOOD)
 def test_what_can_be_explained_is(name: str) -> None:
-    assert explained(GOOD[name], ABSENT, alias) is not None
+    assert explained(GOOD[name], ABSENT, alias, reads) is not None
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_what_cannot_be_explained_is_found(name: str) -> None:
-    assert contradictions(BAD[name], ABSENT, alias) == ["production"]
+    assert contradictions(BAD[name], ABSENT, alias, reads) == ["production"]
 
 
 def batch(began: float, ended: float, stream: int, sequence: int, result: object) -> Operation:
@@ -118,7 +118,11 @@ def test_answers_are_those_of_the_log_and_do_not_go_back() -> None:
         assert len(faults([*good, bad], expected)) == 1
 
 
-RULES = {"alias": (ABSENT, alias), "journal": ((-1, -1, 0), journal), "job": (ABSENT, job)}
+RULES: dict[str, tuple[State, Step, Looks]] = {
+    "alias": (ABSENT, alias, reads),
+    "journal": ((-1, -1, 0), journal, never),
+    "job": (ABSENT, job, never),
+}
 
 
 def asked(rule: str, rng: np.random.Generator) -> tuple[object, ...]:
@@ -144,7 +148,7 @@ def results(rule: str, call: tuple[object, ...]) -> list[object]:
 def test_what_happened_in_an_order_is_explained(rule: str, seed: int) -> None:
     """Each call takes effect at a moment within it; of those without an answer some do, and some never."""
     rng = np.random.default_rng(seed)
-    state, step = RULES[rule]
+    state, step, looks = RULES[rule]
     history: list[Operation] = []
     for moment in range(60):
         call = asked(rule, rng)
@@ -160,7 +164,7 @@ def test_what_happened_in_an_order_is_explained(rule: str, seed: int) -> None:
             after = state if rng.random() < 0.5 else ([*step(state, chosen)] or [state])[-1]
         history.append(chosen)
         state = after
-    assert explained(history, RULES[rule][0], step) is not None
+    assert explained(history, RULES[rule][0], step, looks) is not None
 
 
 @pytest.mark.parametrize("rule", RULES)
@@ -168,14 +172,14 @@ def test_what_happened_in_an_order_is_explained(rule: str, seed: int) -> None:
 @settings(max_examples=40)
 def test_it_agrees_with_trying_every_order(rule: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    initial, step = RULES[rule]
+    initial, step, looks = RULES[rule]
     history = []
     for client in range(5):
         call = asked(rule, rng)
         began, told = rng.uniform(0, 10), results(rule, call)
         result = UNKNOWN if rng.random() < 0.25 else told[rng.integers(len(told))]
         history.append(Operation(client, rule, call, result, began, began + rng.uniform(0, 6)))
-    assert (explained(history, initial, step) is not None) == slowly(history, initial, step)
+    assert (explained(history, initial, step, looks) is not None) == slowly(history, initial, step)
 
 
 def slowly(history: list[Operation], initial: State, step: Step) -> bool:
@@ -218,6 +222,6 @@ def test_long_histories_are_explained_too() -> None:
         version = call[1] if moves and happens else version
         began, ended = moment - rng.exponential(3.0), moment + rng.exponential(3.0)
         history.append(Operation(0, "production", call, result, began, ended))
-    assert explained(history, ABSENT, alias) is not None
+    assert explained(history, ABSENT, alias, reads) is not None
     wrong = [*history, at(3_100, 3_101, "read", result=7)]
-    assert explained(wrong[-500:], 1, alias) is None
+    assert explained(wrong[-500:], 1, alias, reads) is None

@@ -25,7 +25,7 @@ from tests.histories.actors import ALIASES, WORK, Book, Client
 from tests.histories.checker import contradictions
 from tests.histories.clock import Clock
 from tests.histories.proxy import Proxy
-from tests.histories.rules import ABSENT, alias, faults, job, journal
+from tests.histories.rules import ABSENT, alias, faults, job, journal, reads
 from tests.histories.trouble import Trouble, disturbed
 from tests.service.data import ended, eventually, stream, upload
 from tests.service.learning.lessons import QUERIES, publish
@@ -92,7 +92,7 @@ class Bed:
         counts["without an answer"] = sum(not each.certain for each in (*book.operations, *book.named))
         # of a history that fails, or with -s
         print(f"seed {SEED}, {SECONDS:g} s: {dict(counts)}, {dict(trouble.done)}")  # noqa: T201
-        assert contradictions(book.of("alias"), ABSENT, alias) == []
+        assert contradictions(book.of("alias"), ABSENT, alias, reads) == []
         assert contradictions(book.of("journal"), (*[-1] * CLIENTS, 0), journal) == []
         assert contradictions(book.of("job"), ABSENT, job) == []
         assert faults(book.answers, Expected(self.settings, self.trained)) == []
