@@ -31,11 +31,12 @@ TICK = 1e-6
 
 
 class Taught(NamedTuple):
-    """A frame to learn from. served: what answered it; arrived: time of `time.perf_counter`. request: the whole frame;
-    answer: bytes of mean and standard deviation, (2, n), made before it is learnt; factor: (n,), on the half width of
-    its interval."""
+    """A frame to learn from. served: what answered it; loaded: whether with a load; arrived: time of
+    `time.perf_counter`. request: the whole frame; answer: bytes of mean and standard deviation, (2, n), made before it
+    is learnt; factor: (n,), on the half width of its interval."""
 
     served: Served
+    loaded: bool
     sequence: int
     arrived: float
     request: bytes
@@ -116,10 +117,13 @@ class Learning:
             self._go_on()
 
     def _take(self) -> list[Taught]:
-        """Take the oldest frames, as many as are logged together: at most a block, all answered by one revision."""
-        waiting, served = self._waiting, self._waiting[0].served
+        """Take the oldest frames, as many as are logged together: at most a block, all answered by one revision, and
+        all with a load or all without."""
+        waiting, (served, loaded, *_) = self._waiting, self._waiting[0]
         block: list[Taught] = []
-        while waiting and waiting[0].served is served and len(block) < self._most:
+        while waiting and len(block) < self._most:
+            if waiting[0].served is not served or waiting[0].loaded is not loaded:
+                break
             block.append(waiting.popleft())
         return block
 
@@ -144,12 +148,12 @@ class Learning:
         return {"refused": {"first": first, "through": through, "error": body.model_dump()}}
 
     def _frames(self, block: list[Taught]) -> Frames:
-        served = block[0].served
+        served, loaded, *_ = block[0]
         sequences = np.array([each.sequence for each in block], np.int64)
         q, dq, ddq, tau = _columns([each.request[REQUEST.size :] for each in block], 4)
         mean, std = _columns([each.answer for each in block], 2)
         factor, time = np.array([each.factor for each in block]), self._times(block)
-        return Frames(served.name, self._stream_id, served, sequences, time, q, dq, ddq, tau, mean, std, factor)
+        return Frames(served.name, self._stream_id, served, sequences, time, q, dq, ddq, tau, mean, std, factor, loaded)
 
     def _times(self, block: list[Taught]) -> Array:
         """Times of arrival, Unix time in s, each later than the one before."""

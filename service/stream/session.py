@@ -320,7 +320,9 @@ class Session(Conversation):
         if asked > frames.ASK_STD:
             if asked & frames.ASK_LEARN:
                 assert self._learning is not None  # the frame was admitted
-                self._learning.add(Taught(self._served, sequence, arrived, data, numbers, factor))
+                self._learning.add(
+                    Taught(self._served, self._carried is not None, sequence, arrived, data, numbers, factor)
+                )
             if not (asked & frames.ASK_STD or self._std):  # its standard deviation was for the record, or the test
                 flags, numbers = 0, tau.tobytes()
         if self._scale:

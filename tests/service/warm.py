@@ -96,7 +96,8 @@ def warm_processes() -> Iterator[None]:
 
 def _start(control: socket.socket) -> ForkServerProcess:
     """Start a process that reads uploads, of which each service has one."""
-    process = _context().Process(target=_serve_calls, args=(control,))
+    # who ends does not wait for it, as it waits for calls
+    process = _context().Process(target=_serve_calls, args=(control,), daemon=True)
     process.start()
     return process
 

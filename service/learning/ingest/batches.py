@@ -180,7 +180,8 @@ def state(session: Session, event: EventRow) -> State:
 @dataclass(frozen=True)
 class Frames:
     """N frames of one stream with what `served` answered. sequences: (N,), rising; time: (N,) Unix time, s. q, dq, ddq,
-    tau, mean, std: (N, n). factor: (N, n), on the half widths that they were answered with, where that is known."""
+    tau, mean, std: (N, n). factor: (N, n), on the half widths that they were answered with, where that is known.
+    loaded: whether they were answered with a load."""
 
     model: str
     stream_id: str
@@ -194,6 +195,7 @@ class Frames:
     mean: Array
     std: Array
     factor: Array | None = None
+    loaded: bool = False
 
 
 @dataclass(frozen=True)
@@ -236,7 +238,8 @@ def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
         answered = frames.mean[new], frames.std[new]
         factor = None if frames.factor is None else frames.factor[new]
         carrying = frames.served.loads.of(frames.stream_id)
-        screened = screening.predict(rows, frames.served, slice(0, len(rows)), None, answered, factor, carrying)
+        other = frames.loaded != (carrying is not None)
+        screened = screening.predict(rows, frames.served, slice(0, len(rows)), None, answered, factor, carrying, other)
         sequences = frames.sequences[new]
         ends = int(sequences[0]), int(sequences[-1])
         content = _digest(sequences, numbers)

@@ -138,7 +138,8 @@ class Intake:
             if options.adaptive_intervals and screened.seen is not None:
                 scale = monitor.scale(batch.stream_id, served.version, served.base.scale)
                 adaptive = intervals.follow(scale, screened.seen)
-                if handled:  # these errors were of the arm without what it carries, or with what it no longer does
+                # these errors were of the arm without what it carries, or with what it no longer does
+                if handled or screened.answered is not None:
                     adaptive["scale"] = scale.to_json()
             record = None if verdict.record is None else verdict.record.to_json()
             judged = replace(batch, rows=verdict.rows, record=record)

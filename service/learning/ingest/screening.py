@@ -166,9 +166,10 @@ class Screened:
     """Rows, and the predictions of the model that serves for those that passed so far.
 
     own: which of the rows are of this batch, the others had waited for it. asked: (N,), rows with a finite answer, at
-    rest or not; predicted: (N,); mean, std, bare: (P, n) of
-    these, bare the standard deviation without the floor that past errors put under `std`. noise_std: (n,). trained: see
-    there; None where nothing is compared with it. seen: what intervals are judged by.
+    rest or not; predicted: (N,); mean, std, bare: (P, n) of these, bare the standard deviation without the floor that
+    past errors put under `std`. noise_std: (n,). trained: see there; None where nothing is compared with it. seen: what
+    intervals are judged by. answered: mean and std of the same rows as a stream was answered, where that was with
+    another load than the arm carries by what is known now.
     """
 
     rows: Rows
@@ -182,6 +183,7 @@ class Screened:
     noise_std: Array
     trained: Trained | None = None
     seen: Seen | None = None
+    answered: tuple[Array, Array] | None = None
 
     @property
     def until(self) -> float | None:
@@ -235,23 +237,26 @@ def predict(
     answered: tuple[Array, Array] | None = None,
     factor: Array | None = None,
     carrying: TorqueModel | None = None,
+    with_other_load: bool = False,
 ) -> Screened:
     """Let a version predict the rows that passed, with what it has learnt and as trained; those it has no finite answer
     for are beyond its limits. carrying: the version with what the arm carries, where it does: it is compared with the
     version as trained no more. answered: mean and std, (N, n) each, of all rows, where a stream has answered them
-    already, and factor, (N, n), on their widths."""
+    already, and factor, (N, n), on their widths; with_other_load: whether it had noticed no load, or one that is gone:
+    rows are then judged by what is known now."""
     model = served.model if carrying is None else carrying
     codes, predicted = rows.code.copy(), rows.code == LEARNT
     asked = predicted | ((codes == STATIONARY) & np.isfinite(rows.ddq).all(axis=1))
     good, floor = rows.take(asked), model.posterior.floor
-    if answered is None:
+    if answered is None or with_other_load:
         mean, bare = _answers(good, model)
         std = np.sqrt(np.maximum(bare**2, floor))
     else:
         mean, std = (values[asked] for values in answered)
         bare = _answers(good, model)[1] if floor.any() else std
+    as_answered = (mean, std) if answered is None else (answered[0][asked], answered[1][asked])
     known = np.asarray(np.isfinite(mean).all(axis=1) & np.isfinite(std).all(axis=1))
-    score = scores(good.tau[known] - mean[known], std[known], model.noise_std)
+    score = scores(good.tau[known] - as_answered[0][known], as_answered[1][known], model.noise_std)
     seen = Seen(good.time[known], score, None if factor is None else factor[asked][known])
     answerable = asked.copy()
     answerable[asked] = known
@@ -260,8 +265,9 @@ def predict(
     predicted[predicted] = known
     checked = replace(rows, code=codes)
     believed = mean[judged], std[judged], bare[judged]
+    other = (as_answered[0][judged], as_answered[1][judged]) if with_other_load else None
     if carrying is not None:
-        return Screened(checked, own, derived, answerable, predicted, *believed, model.noise_std, None, seen)
+        return Screened(checked, own, derived, answerable, predicted, *believed, model.noise_std, None, seen, other)
     compared = evenly(good.weight[judged])
     share = judged.sum() / max(1, len(compared))
     if model is served.base:
@@ -269,7 +275,7 @@ def predict(
     else:
         as_trained = _answers(good.take(judged).take(compared), served.base)
     trained = Trained(served.version, compared, share, *as_trained)
-    return Screened(checked, own, derived, answerable, predicted, *believed, model.noise_std, trained, seen)
+    return Screened(checked, own, derived, answerable, predicted, *believed, model.noise_std, trained, seen, other)
 
 
 def evenly(weight: Array) -> NDArray[np.int64]:

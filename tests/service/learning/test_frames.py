@@ -59,6 +59,19 @@ def test_the_record_is_that_of_the_answers_that_were_given(school, pupil, observ
     np.testing.assert_allclose(record.variance, (off["std"] ** 2).mean(axis=0), rtol=1e-12)
 
 
+def test_frames_that_were_answered_with_another_load_are_judged_by_what_is_known_now(school, pupil, observe):
+    """A payload is noticed while frames wait that were answered without it, or answered with one that is gone."""
+    given = frames(school, pupil, range(20))
+    off = given.mean + 1000 * given.std
+    assert observe(range(10), mean=off[:10]).rejected == {"contact": 10}
+    assert observe(range(10, 20), mean=off[10:], loaded=True).accepted == 10
+    with school.service.database.session() as session:
+        event = log.find_batch(session, pupil.model, "socket", 10)
+    record = Record.from_json(event.record)  # of the answers that were given
+    np.testing.assert_allclose(record.squared, ((given.tau - off)[10:] ** 2).mean(axis=0), rtol=1e-12)
+    assert max(event.report["surprise"]) < 20
+
+
 def test_sequences_may_leave_gaps(school, pupil, observe):
     assert observe([0, 1, 5, 9]) == FramesResult(9, 4, 0, {}, 1)
     assert observe([9, 12]) == FramesResult(12, 1, 1, {}, 2)
