@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 FILE = "lipserve.sqlite3"
+LOG_BYTES = 4 * 1024 * 1024
+"""Of SQLite's log, which by itself it brings into the database every 1000 pages."""
 MOST_CONNECTIONS = 64
 """More than there are threads: who only reads shall not wait for those that wait to write."""
 
@@ -113,6 +115,8 @@ def _configure(connection: Any, _: object) -> None:
     cursor.execute("PRAGMA journal_mode=WAL")
     cursor.execute("PRAGMA synchronous=FULL")
     cursor.execute("PRAGMA foreign_keys=ON")
+    # a log that has grown while somebody read for long, as a backup does, is cut to this when it begins anew
+    cursor.execute(f"PRAGMA journal_size_limit={LOG_BYTES}")
     cursor.close()
 
 

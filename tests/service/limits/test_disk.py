@@ -1,8 +1,9 @@
 """The quota of the home and the space that stays free on its disk."""
 
 import os
+import sqlite3
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +13,8 @@ from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings, shipped_models
 from service.models import registry
 from service.storage import disk as measuring
+from service.storage.database import Database, RobotRow
+from service.storage.database.engine import FILE, LOG_BYTES
 from service.storage.disk import Disk, measure
 from service.storage.files import new_id
 from service.web.limits.upload import WRITE_BYTES
@@ -153,3 +156,24 @@ def test_a_state_without_room_is_not_stored_and_learning_goes_on(monkeypatch, ca
     assert "has learnt is not stored" in caplog.text
     assert follower._stored == 0
     assert time.monotonic() < follower.snapshot_due <= time.monotonic() + 60
+
+
+def test_the_log_of_a_database_that_was_read_for_long_is_cut(tmp_path):
+    """SQLite keeps all that is written while somebody reads; without a limit its file stays as large for good."""
+    log, long = tmp_path / "lipserve.sqlite3-wal", "x" * 100_000
+
+    def write(number: int) -> None:
+        with database.transaction() as session:
+            row = {"id": f"rb_{number}", "name": "arm", "created_at": "", "sha256": "", "joints": [], "urdf": long}
+            session.add(RobotRow(**row))
+
+    with closing(Database(tmp_path)) as database:
+        with closing(sqlite3.connect(tmp_path / FILE)) as reader:
+            reader.execute("BEGIN")
+            reader.execute("SELECT count(*) FROM robots").fetchone()
+            for number in range(100):
+                write(number)
+            assert log.stat().st_size > 2 * LOG_BYTES
+        for number in range(100, 103):
+            write(number)
+        assert log.stat().st_size <= LOG_BYTES
