@@ -202,7 +202,7 @@ def train(desk: Desk, turn: int) -> None:
         record(desk, turn)
     request = {
         "model": ARM,
-        "datasets": desk.datasets[-2:],
+        "datasets": desk.datasets[-3::2],  # of each recording one of the two files
         "estimator": "rigid-body",
         "robot": PROFILE,
         "options": FIT,
