@@ -179,9 +179,8 @@ class Client:
 
     def _answer(self) -> None:
         """Ask what is served, now and then what contains all that this client has taught."""
-        place = int(self.rng.integers(len(self.servers)))
-        server, least = self.servers[place], self.acknowledged if self.rng.random() < 0.5 else 0
-        life = f"{place}:{server.process.pid}"
+        server = self.servers[self.rng.integers(len(self.servers))]
+        least = self.acknowledged if self.rng.random() < 0.5 else 0
         try:
             path = f"/v1/models/{self.model}/predict"
             answer = self._ask_of(server, "POST", path, json={**QUERIES, "min_revision": least})
@@ -189,6 +188,8 @@ class Client:
             return
         assert answer.status_code == 200, answer.text
         said = answer.json()
+        # of the process that answered: another one may have taken the port since it was chosen
+        life = answer.headers["x-request-id"].partition("-")[0]
         tau = tuple(float(each) for row in said["tau"] for each in row)
         self.book.answered(Answer(self.number, life, said["version"], said["revision"], least, tau))
 

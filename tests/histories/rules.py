@@ -80,7 +80,7 @@ def job(state: str | None, operation: Operation) -> Iterable[str | None]:
 
 @dataclass(frozen=True)
 class Answer:
-    """What a client was answered. life: which start of which service; least: the revision that it asked for at least;
+    """What a client was answered. life: which start of a service; least: the revision that it asked for at least;
     tau: torques at the queries that all ask, N·m."""
 
     client: int
