@@ -2,6 +2,7 @@
 
 import sqlite3
 from contextlib import closing
+from threading import get_ident
 
 import pytest
 
@@ -26,6 +27,17 @@ class Clock:
 
     def __call__(self):
         return self.now
+
+
+class Uses:
+    """What counts uses of versions, and notes by which threads: others learn and answer meanwhile."""
+
+    def __init__(self, numbers):
+        self.numbers, self.threads = numbers, []
+
+    def __next__(self):
+        self.threads.append(get_ident())
+        return next(self.numbers)
 
 
 @pytest.fixture
@@ -77,13 +89,16 @@ def test_a_home_that_cannot_be_written_is_found_and_not_named(api, look, monkeyp
     assert "gone" not in message  # whoever asks needs no key
 
 
-def test_a_look_leaves_nothing_behind_and_does_not_count_as_using_a_version(api, trained, look):
+def test_a_look_leaves_nothing_behind_and_does_not_count_as_using_a_version(api, trained, look, monkeypatch):
     service = service_of(api)
-    key = service.loaded.get(trained.name, 1).name, 1  # nobody teaches it, as other tests' models are still taught
-    files, used = list(service.files.uploads.iterdir()), service.loaded._used[key]
+    service.loaded.get(trained.name, 1)
+    files, uses = list(service.files.uploads.iterdir()), Uses(service.loaded._clock)
+    monkeypatch.setattr(service.loaded, "_clock", uses)
     look(service)
     assert list(service.files.uploads.iterdir()) == files
-    assert service.loaded._used[key] == used
+    assert get_ident() not in uses.threads
+    service.loaded.get(trained.name, 1)
+    assert get_ident() in uses.threads  # as whoever asks does use it
 
 
 def test_versions_that_cannot_be_read_are_a_warning_while_others_can(api, trained, look, monkeypatch):
