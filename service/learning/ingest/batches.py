@@ -24,10 +24,11 @@ from service.foundation.settings import Settings
 from service.inference.predicting import QUANTITIES, check_shapes
 from service.journal import log
 from service.journal.log import NewBatch, StreamKind, check_kind
-from service.learning.ingest import screening
+from service.learning.ingest import dating, deriving, screening
+from service.learning.ingest.dating import Measured, StreamTime
 from service.learning.ingest.intake import Intake, enabled
 from service.learning.ingest.monitor import Monitor
-from service.learning.ingest.screening import Measured, StreamTime
+from service.learning.ingest.screening import Answered
 from service.learning.schema import Derivation, ExpiredError, ObservationRequest, ObservationResponse, State
 from service.models.loaded import Served
 from service.storage.database import EventRow
@@ -72,10 +73,10 @@ def _take(
         before, after = log.neighbours(session, *key)
         clock = StreamTime.of(source, sequence, before, after, received)
         previous = before.last if before is not None and clock.adjacent else None
-        dated = screening.dated(batch, clock, bounds, previous)
+        dated = dating.dated(batch, clock, bounds, previous)
         rows, own, derived = dated.rows, slice(0, len(batch)), None
         if batch.ddq is None and batch.t is not None:
-            rows, own, derived = screening.derive(session, *key, rows, batch.t, bounds)
+            rows, own, derived = deriving.derive(session, *key, rows, batch.t, bounds)
     screened = screening.predict(rows, served, own, derived, carrying=served.loads.of(stream_id))
     new = _new(served, stream_id, "batches", (sequence, sequence), content, rows, dated.offset, received)
     details = {"derived": None if derived is None else Derivation(ddq=derived).model_dump(), "span": dated.span}
@@ -235,11 +236,10 @@ def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
         # frames are dated by the service as they arrive, so that their times need no check
         weights = independence.stream_weights(frames.time[new], None if before is None else before.last)
         rows = Rows(frames.time[new], q, dq, ddq, tau, check_rows(None, q, dq, ddq, tau, bounds), weights)
-        answered = frames.mean[new], frames.std[new]
-        factor = None if frames.factor is None else frames.factor[new]
         carrying = frames.served.loads.of(frames.stream_id)
-        other = frames.loaded != (carrying is not None)
-        screened = screening.predict(rows, frames.served, slice(0, len(rows)), None, answered, factor, carrying, other)
+        other_load = frames.loaded != (carrying is not None)
+        answered = Answered(frames.mean, frames.std, frames.factor, other_load).take(new)
+        screened = screening.predict(rows, frames.served, slice(0, len(rows)), None, answered, carrying)
         sequences = frames.sequences[new]
         ends = int(sequences[0]), int(sequences[-1])
         content = _digest(sequences, numbers)

@@ -154,8 +154,8 @@ class Intake:
                 _take_back(session, event)
             if verdict.change is not None:
                 _alarm(session, served, "waits" if held else options.on_change, verdict, event)
-            if watch is not None and handled and batch.received - monitor.told_payload >= PAYLOAD_ALARM_S:
-                monitor.told_payload = batch.received
+            if watch is not None and handled and batch.received - monitor.payload_alarm_at >= PAYLOAD_ALARM_S:
+                monitor.payload_alarm_at = batch.received
                 _tell(session, served, watch, event)
             report = details | {
                 "model": model,

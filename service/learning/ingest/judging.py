@@ -172,8 +172,8 @@ def judge(
         opened, opening = (opening if opening.misfit else None), (None if opening.over else opening)
     if counted.any():
         error, bare = (rows.tau - batch.mean)[counted], batch.bare[counted]
-        mean, std = (batch.mean, batch.std) if batch.answered is None else batch.answered
-        record = Record.of(rows.tau[counted], mean[counted], std[counted], batch.noise_std)
+        answered = batch.answered or batch
+        record = Record.of(rows.tau[counted], answered.mean[counted], answered.std[counted], batch.noise_std)
         surprise = (error**2 / (bare**2 + batch.noise_std**2)).mean(axis=0)
         detector, change = detector.step(replace(record, standardised=surprise), float(rows.time.max()))
         if not held and not watch.gate.open and batch.trained is not None:

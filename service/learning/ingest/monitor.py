@@ -90,7 +90,7 @@ class Window:
 class Monitor:
     """One model's windows of quality, its gates and its detector of changes.
 
-    joint_names: in whose order records are. payloads: what its streams carry; told_payload: when an alarm was last
+    joint_names: in whose order records are. payloads: what its streams carry; payload_alarm_at: when an alarm was last
     raised of one, Unix time, s. lock: held while a batch is judged and logged, one at a time; whoever only reads
     windows and counts needs none. counts: rows by code and "learnt", "batches" and "duplicates", since the start and
     that this service has taken. held: whether learning waited for a decision at the last batch. number: of the last
@@ -116,7 +116,7 @@ class Monitor:
         self._detector, self._innovations = ChangeDetector(), Innovations.empty(n)
         self._departure: Departure | None = None
         self.payloads = Payloads()
-        self.told_payload = -np.inf
+        self.payload_alarm_at = -np.inf
 
     @classmethod
     def rebuilt(

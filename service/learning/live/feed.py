@@ -25,8 +25,8 @@ from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import NotFoundError
 from service.foundation.settings import Settings
 from service.learning.control.schema import DECIMALS, LiveLost, LiveNovelty, LivePart, LiveRows, LiveStatus
+from service.learning.ingest.deriving import EDGE
 from service.learning.ingest.intake import Judged
-from service.learning.ingest.screening import EDGE
 from service.models.loaded import Served
 from service.web.limits.requests import Counted
 

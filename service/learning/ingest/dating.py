@@ -1,0 +1,138 @@
+"""When the rows of a batch were measured. They are dated in event time: Unix time, counted by the stream's own clock.
+
+A stream's offset is fixed once, so that the last row of its first batch lies at that batch's arrival. It is 0 where no
+batch of the stream has had times yet.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.data import independence
+from lipcore.data.samples import Array
+from lipcore.online.batch import Rows
+from lipcore.online.gates import RowLimits, check_rows, time_span
+from lipcore.vocabulary import CODES
+from service.storage.database import EventRow, StreamRow
+
+NON_FINITE, LIMIT, TIME_JUMP = (CODES.index(code) for code in ("non_finite", "limit", "time_jump"))
+
+FAR_AHEAD = 86400.0
+"""How far ahead of its arrival a row may be dated, s: as long a recording may be sent in one go."""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """N rows as measured, in the model's joint order. t: (N,) by the stream's clock, s; the others (N, n), SI."""
+
+    t: Array | None
+    q: Array
+    dq: Array
+    ddq: Array | None
+    tau: Array
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+
+@dataclass(frozen=True)
+class StreamTime:
+    """What is known of a stream's time when a batch arrives.
+
+    offset: s, None while it is unknown. after, before: times, by the stream's clock, that the rows must lie between.
+    adjacent: whether `after` is the time of the row right before the batch. arrived: Unix time, s.
+    """
+
+    offset: float | None
+    after: float | None
+    before: float | None
+    adjacent: bool
+    arrived: float
+
+    @staticmethod
+    def of(
+        source: StreamRow | None, sequence: int, before: EventRow | None, after: EventRow | None, arrived: float
+    ) -> StreamTime:
+        """The clock of a stream, with the batches that are kept next below and above a sequence."""
+        offset = None if source is None or source.offset == 0 else source.offset
+        first, last = _span(after), _span(before)
+        latest = None if offset is None else arrived + FAR_AHEAD - offset
+        bounds = [bound for bound in (latest, None if first is None else first[0]) if bound is not None]
+        adjacent = before is not None and before.last_sequence == sequence - 1
+        return StreamTime(offset, None if last is None else last[1], min(bounds, default=None), adjacent, arrived)
+
+    def settled(self, t: Array | None, usable: NDArray[np.bool_], gap: float) -> float:
+        """The offset, s, fixed now if these rows (times (N,), those to be believed) are the first that have times."""
+        if self.offset is not None:
+            return self.offset
+        if t is None or not usable.any():
+            return 0.0
+        times = t[usable]
+        runs = np.split(times, np.flatnonzero(np.diff(times) > gap) + 1)
+        # one wrong time at the end, far from all others, must not date them all
+        last = next((run for run in reversed(runs) if len(run) > 1), runs[-1])
+        return self.arrived - float(last[-1])
+
+    def leaps(self, t: Array, usable: NDArray[np.bool_], offset: float, gap: float) -> NDArray[np.bool_]:
+        """Rows (N,) dated later than now, right after a gap, and before another one or at the end: most likely wrong.
+        Taken for true, such a time would be the present for all rows to come."""
+        leaping = np.zeros(len(t), dtype=np.bool_)
+        times = t[usable]
+        start = self.after if self.adjacent and self.after is not None else times[:1]
+        after_gap = np.diff(times, prepend=start) > gap
+        alone = after_gap & np.append(after_gap[1:], True)
+        leaping[usable] = alone[: len(times)] & (times + offset > self.arrived + gap)
+        return leaping
+
+    def event_time(self, t: Array | None, offset: float, rows: int) -> Array:
+        """Event times (N,), s, finite: a row without a time has that of the row before it."""
+        if t is None:
+            return np.full(rows, self.arrived)
+        known = np.isfinite(t)
+        place = np.maximum.accumulate(np.where(known, np.arange(rows), 0))
+        times = t[place] + offset
+        return np.where(np.isfinite(times), times, self.arrived)
+
+
+def span(t: Array | None, codes: NDArray[np.uint8]) -> list[float] | None:
+    """First and last time of a batch, by its stream's clock, that its neighbours lie before and after."""
+    times = None if t is None else time_span(t, codes)
+    return None if times is None else list(times)
+
+
+def _span(event: EventRow | None) -> list[float] | None:
+    times: list[float] | None = None if event is None or event.report is None else event.report["span"]
+    return times
+
+
+@dataclass(frozen=True)
+class Dated:
+    """Rows with event times and the codes of `check_rows`. offset: of the stream, s; span: see `span`."""
+
+    rows: Rows
+    offset: float
+    span: list[float] | None
+
+
+def dated(measured: Measured, clock: StreamTime, bounds: RowLimits, previous: float | None) -> Dated:
+    """Check, date and weigh rows. previous: event time of the row right before them, s, where it is known. Weights come
+    from the batch itself where it has a spacing, so that they do not depend on the order of arrival."""
+    t = measured.t
+    numbers = measured.q, measured.dq, measured.ddq, measured.tau
+    codes = check_rows(t, *numbers, bounds, clock.after, clock.before)
+    usable = ~np.isin(codes, (NON_FINITE, TIME_JUMP))
+    gap = np.inf if bounds.max_gap_s is None else bounds.max_gap_s
+    offset = clock.settled(t, usable, gap)
+    if t is not None:
+        codes[clock.leaps(t, usable, offset, gap) & (codes != LIMIT)] = TIME_JUMP
+    ddq = np.full_like(measured.q, np.nan) if measured.ddq is None else measured.ddq
+    time = clock.event_time(t, offset, len(measured))
+    if t is None or len(measured) == 1:
+        weights = independence.stream_weights(time, previous)
+    else:
+        weights = independence.even_weights(t)
+    rows = Rows(time, measured.q, measured.dq, ddq, measured.tau, codes, weights)
+    return Dated(rows, offset, span(t, codes))
