@@ -1,9 +1,9 @@
 """Functions that read strangers' files, called in a process that can do nothing else: see `confinement`.
 
-A process that has imported the readers waits for calls and is forked for each, which takes milliseconds: see
-`reader_process`. What goes there are names, paths and plain values; what comes back is data of a type that the caller
-names, checked against it. Nothing is unpickled. A process that crashes, hangs or takes too much costs its own call an
-answer of 422 or 413, and nobody else anything.
+A process that has imported the readers waits for calls, and is forked ahead of each: see `reader_process`. What goes
+there are names, paths and plain values; what comes back is data of a type that the caller names, checked against it.
+Nothing is unpickled. A process that crashes, hangs or takes too much costs its own call an answer of 422 or 413, and
+nobody else anything.
 """
 
 from __future__ import annotations
@@ -77,7 +77,8 @@ def run(
     limits = settings.parser_memory_bytes, settings.parser_cpu_s, settings.parser_s, settings.max_unpacked_bytes
     paths = [os.fspath(each) for each in arguments if isinstance(each, Path)]
     write = [] if folder is None else [os.fspath(folder)]
-    outcome = _ask(Call(function, msgspec.to_builtins(arguments, enc_hook=plain), paths, write, *limits))
+    encoded = msgspec.Raw(msgspec.msgpack.encode(arguments, enc_hook=plain))
+    outcome = _ask(Call(function, encoded, paths, write, *limits))
     if outcome.output:
         shown = readable(outcome.output.decode(errors="backslashreplace"))[:OUTPUT_BYTES]
         logger.warning("a reader of an upload wrote", extra={"fields": {"reader": function, "output": shown}})
@@ -102,6 +103,7 @@ def _ask(call: Call) -> Outcome:
         try:
             with _spawner.connect() as connection:
                 connection.settimeout(call.wall_s + IMPORT_S)
+                send(connection, call.function.encode())
                 send(connection, data)
                 return msgspec.msgpack.decode(receive(connection), type=Outcome)
         except TimeoutError:

@@ -49,24 +49,28 @@ def protections() -> dict[str, bool]:
     }
 
 
-def confine(bounds: Bounds, read: Iterable[Path], write: Iterable[Path]) -> None:
-    """Give up for good whatever else this process, which has one thread, could do.
-
-    read, write: files and folders that it keeps; it can read its own modules, too. Raise OSError where anything that
-    `protections` names cannot be had.
-    """
-    has = protections()
-    _limit(bounds, has["memory"])
+def renounce() -> None:
+    """Give up for good what no call needs: rights, the network, other processes. This one has one thread, and ends with
+    the one that has forked it. Raise OSError where anything that `protections` names cannot be had."""
     if LINUX:
         _call("prctl", _SET_PDEATHSIG, 9, 0, 0, 0)
         with suppress(OSError):  # a sandbox of its own may have closed it
             Path("/proc/self/oom_score_adj").write_text("1000")
         _drop_capabilities()
         _call("prctl", _SET_NO_NEW_PRIVS, 1, 0, 0, 0)
-    if has["landlock"]:
-        _keep_files([*read, *_own_files()], write)
-    if has["seccomp"]:
+    if protections()["seccomp"]:
         _filter_calls()
+
+
+def confine(bounds: Bounds, read: Iterable[Path], write: Iterable[Path]) -> None:
+    """Give up what a call does not need, either: all resources and files but some.
+
+    read, write: files and folders that it keeps; it can read its own modules, too. Raise OSError as `renounce` does.
+    """
+    has = protections()
+    _limit(bounds, has["memory"])
+    if has["landlock"]:
+        _keep_files([*read, *own_files()], write)
 
 
 def _limit(bounds: Bounds, memory: bool) -> None:
@@ -147,7 +151,8 @@ def _keep_files(read: Iterable[Path], write: Iterable[Path]) -> None:
     os.close(rules)
 
 
-def _own_files() -> list[Path]:
+@cache
+def own_files() -> list[Path]:
     """Modules, and the libraries and tables that they open. Not what else lies beside a package, as a home may."""
     modules = [Path(str(import_module(name).__file__)).parent for name in PACKAGES]
     python = [Path(each) for name, each in sysconfig.get_paths().items() if name in ("stdlib", "platstdlib")]

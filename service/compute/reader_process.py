@@ -1,10 +1,9 @@
-"""The process that `cage` calls: it waits for calls, and is forked for each, first into one that watches, then into the
-one that is confined and calls the function."""
+"""The process that `cage` calls: it waits for calls, and is forked ahead of each, first into one that will watch, then
+into the one that is confined and will call the function."""
 
 from __future__ import annotations
 
 import faulthandler
-import importlib
 import os
 import resource
 import select
@@ -16,6 +15,8 @@ import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from errno import EFBIG, EMFILE
+from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NoReturn, get_origin, get_type_hints
 
@@ -23,7 +24,7 @@ import msgspec
 import numpy as np
 
 from lipcore.extras import MissingExtraError
-from service.compute.confinement import Bounds, confine, protections
+from service.compute.confinement import Bounds, confine, own_files, protections, renounce
 from service.compute.remote import imported
 from service.foundation.errors import (
     InvalidDataError,
@@ -49,10 +50,11 @@ ERRORS = {each.code: each for each in (InvalidDataError, InvalidRequestError, St
 
 
 class Call(msgspec.Struct):
-    """A call. function: `module:function`; arguments: its own; read, write: files and folders that it is given."""
+    """A call. function: `module:function`; arguments: an array of its own; read, write: files and folders that it is
+    given."""
 
     function: str
-    arguments: list[Any]
+    arguments: msgspec.Raw
     read: list[str]
     write: list[str]
     memory: int
@@ -80,7 +82,7 @@ class Answer(msgspec.Struct):
 
 class Outcome(msgspec.Struct):
     """What became of a confined process. status: exit code, negative where a signal ended it; late: whether it was
-    ended for its time; output: what it wrote; answer: an `Answer`, empty where there is none."""
+    ended for its time; output: what it wrote; answer: an `Answer`, empty where there is none that is complete."""
 
     status: int
     late: bool
@@ -89,22 +91,46 @@ class Outcome(msgspec.Struct):
 
 
 def serve(descriptor: int) -> None:
-    """Fork a process for each call that comes, until the other end is closed or nothing comes for long."""
+    """Hand each call that comes to a process that was forked for it, until the other end is closed or nothing comes for
+    long."""
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for those that watch
-    protections()
+    protections(), own_files()  # to know them takes a while
     known = set[str]()
     with socket.socket(fileno=descriptor) as control, suppress(TimeoutError):
         control.settimeout(IDLE_S)
+        ready = _ahead(control)
         while descriptors := socket.recv_fds(control, 1, 1)[1]:
             with socket.socket(fileno=descriptors[0]) as connection, suppress(EOFError, ConnectionError):
-                call = msgspec.msgpack.decode(receive(connection), type=Call)
-                if (module := call.function.partition(":")[0]) not in known:
-                    known.add(module)
+                if (function := receive(connection).decode()) not in known:
+                    known.add(function)
                     with suppress(Exception):  # the one that calls it says what cannot be imported
-                        getattr(imported(module), "warm", bool)()
-                if os.fork() == 0:
-                    control.close()
-                    _alone(_watch, call, connection)
+                        getattr(imported(function.partition(":")[0]), "warm", bool)()
+                        _resolved(function)
+                    ready.close()
+                    ready = _ahead(control)
+                socket.send_fds(ready, [b"c"], [connection.fileno()])
+            ready.close()
+            ready = _ahead(control)
+
+
+def _ahead(control: socket.socket) -> socket.socket:
+    """Fork the process that will watch over the next call; return where it waits for the connection of that."""
+    ours, theirs = socket.socketpair()
+    with theirs:
+        if os.fork() == 0:
+            control.close()
+            ours.close()
+            _alone(_watch, theirs)
+    return ours
+
+
+@cache
+def _resolved(function: str) -> tuple[Callable[..., Any], msgspec.msgpack.Decoder[Any]]:
+    """`module:function`, and what decodes its arguments."""
+    module, _, name = function.partition(":")
+    resolved = getattr(imported(module), name)
+    kinds = [kind for what, kind in get_type_hints(resolved).items() if what != "return"]
+    return resolved, msgspec.msgpack.Decoder(tuple[*kinds], dec_hook=typed)  # type: ignore[valid-type]
 
 
 def _alone(function: Callable[..., None], *arguments: Any) -> NoReturn:
@@ -119,78 +145,100 @@ def _alone(function: Callable[..., None], *arguments: Any) -> NoReturn:
         os._exit(code)
 
 
-def _watch(call: Call, connection: socket.socket) -> None:
-    """Start the process that is to be confined, and see to its end; send what became of it."""
+def _watch(calls: socket.socket) -> None:
+    """Fork the process that will be confined, and see to its end; send what became of it."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-    (answer, answer_end), (output, output_end) = os.pipe(), os.pipe()
+    (given, given_end), (answer, answer_end), (output, output_end) = os.pipe(), os.pipe(), os.pipe()
     pid = os.fork()
     if pid == 0:
-        _alone(_confined, call, answer_end, output_end, os.getppid())
-    os.close(answer_end)
-    os.close(output_end)
-    until = time.monotonic() + call.wall_s
-    kept = _collected({answer: ANSWER_BYTES, output: OUTPUT_BYTES}, connection, until)
+        _alone(_confined, given, answer_end, output_end, os.getppid())
+    for each in (given, answer_end, output_end):
+        os.close(each)
+    descriptors = socket.recv_fds(calls, 1, 1)[1]
+    if not descriptors:  # there will be no call
+        return
+    connection = socket.socket(fileno=descriptors[0])
+    data = receive(connection)
+    with suppress(BrokenPipeError), os.fdopen(given_end, "wb") as file:
+        file.write(data)
+    until = time.monotonic() + msgspec.msgpack.decode(data, type=Call).wall_s
+    answered, written, in_time = _collected(answer, output, connection, until)
+    if (content := _complete(answered)) is not None:
+        os.kill(pid, signal.SIGKILL)  # it has nothing left to do, and would take milliseconds to end
+        send(connection, msgspec.msgpack.encode(Outcome(0, False, written, content)))
+        os.waitpid(pid, 0)
+        return
     ended = 0
-    while kept is not None and not ended and time.monotonic() < until:  # it may close both and go on
+    while in_time and not ended and time.monotonic() < until:  # it may close both and go on
         ended, status = os.waitpid(pid, os.WNOHANG)
         time.sleep(0 if ended else 0.0005)
     if not ended:
         os.kill(pid, signal.SIGKILL)
         _, status = os.waitpid(pid, 0)
-    collected = kept or {answer: b"", output: b""}
-    outcome = Outcome(os.waitstatus_to_exitcode(status), not ended, collected[output], collected[answer])
-    send(connection, msgspec.msgpack.encode(outcome))
+    send(connection, msgspec.msgpack.encode(Outcome(os.waitstatus_to_exitcode(status), not ended, written, b"")))
 
 
-def _collected(most: dict[int, int], connection: socket.socket, until: float) -> dict[int, bytes] | None:
-    """What comes of some descriptors until the ends of all, up to so many bytes of each; None where that takes too
-    long, or nobody waits for it any more."""
+def _collected(answer: int, output: int, connection: socket.socket, until: float) -> tuple[bytes, bytes, bool]:
+    """What comes of two descriptors until the answer is complete or both end, up to so many bytes of each; and whether
+    that did not take too long, and somebody still waits for it."""
+    most = {answer: ANSWER_BYTES, output: OUTPUT_BYTES}
     kept = {each: bytearray() for each in most}
     poll = select.poll()
     poll.register(connection, 0)  # only whether the other end is closed
     for each in most:
         poll.register(each, select.POLLIN)
-    opened = set(most)
-    while opened:
+    opened, in_time = set(most), True
+    while opened and in_time and _complete(kept[answer]) is None:
         ready = [each for each, _ in poll.poll(max(0.0, until - time.monotonic()) * 1000)]
-        if not ready or connection.fileno() in ready:
-            return None
-        for each in ready:
+        for each in opened.intersection(ready):
             piece = os.read(each, 1 << 16)
             kept[each] += piece[: most[each] - len(kept[each])]
             if not piece:
                 poll.unregister(each)
                 opened.discard(each)
-    return {each: bytes(content) for each, content in kept.items()}
+        in_time = time.monotonic() < until and connection.fileno() not in ready
+    os.set_blocking(output, False)
+    with suppress(BlockingIOError):  # what was written before the answer
+        kept[output] += os.read(output, OUTPUT_BYTES - len(kept[output]))
+    return bytes(kept[answer]), bytes(kept[output]), in_time
 
 
-def _confined(call: Call, answer: int, output: int, parent: int) -> None:
-    """Call the function with what is left to it, and send what comes of it."""
+def _complete(data: bytes | bytearray) -> bytes | None:
+    """What was sent with its length, once all of it has come."""
+    size = _LENGTH.size
+    if len(data) < size or _LENGTH.unpack_from(data)[0] != len(data) - size:
+        return None
+    return bytes(data[size:])
+
+
+def _confined(given: int, answer: int, output: int, parent: int) -> None:
+    """Wait for a call, call its function with what is left to it, and send what comes of it."""
     os.setsid()
     os.dup2(output, 1)
     os.dup2(output, 2)
-    os.closerange(3, answer)
-    os.closerange(answer + 1, resource.getrlimit(resource.RLIMIT_NOFILE)[0])
+    for low, high in pairwise([2, *sorted((given, answer)), resource.getrlimit(resource.RLIMIT_NOFILE)[0]]):
+        os.closerange(low + 1, high)
     faulthandler.enable()
     os.nice(NICENESS)
-    for name in ("TMPDIR", "SQLITE_TMPDIR"):
-        os.environ[name] = next(iter(call.write), "/nonexistent")
-    confine(Bounds(call.memory, call.cpu_s, call.file), map(Path, call.read), map(Path, call.write))
+    renounce()
     if os.getppid() != parent:  # it has ended before this one could ask to end with it
         return
+    with os.fdopen(given, "rb") as file:
+        data = file.read()
+    if not data:  # there will be no call
+        return
+    call = msgspec.msgpack.decode(data, type=Call)
+    for variable in ("TMPDIR", "SQLITE_TMPDIR"):
+        os.environ[variable] = next(iter(call.write), "/nonexistent")
+    confine(Bounds(call.memory, call.cpu_s, call.file), map(Path, call.read), map(Path, call.write))
     try:
-        module, _, name = call.function.partition(":")
-        function = getattr(importlib.import_module(module), name)
-        kinds = [kind for what, kind in get_type_hints(function).items() if what != "return"]
-        arguments = [
-            msgspec.convert(each, kind, dec_hook=typed) for each, kind in zip(call.arguments, kinds, strict=True)
-        ]
-        value = msgspec.msgpack.encode(function(*arguments), enc_hook=plain)
+        function, decoder = _resolved(call.function)
+        value = msgspec.msgpack.encode(function(*decoder.decode(call.arguments)), enc_hook=plain)
         sent = Answer(value=msgspec.Raw(value))
     except Exception as error:
         sent = Answer(failure=_failure(error))
     with os.fdopen(answer, "wb") as file:
-        file.write(msgspec.msgpack.encode(sent))
+        file.write(_with_length(msgspec.msgpack.encode(sent)))
 
 
 def _failure(error: Exception) -> Failure:
@@ -238,9 +286,13 @@ _LIMITS = {EFBIG: "size", EMFILE: "files"}
 _LENGTH = struct.Struct("<Q")
 
 
+def _with_length(data: bytes) -> bytes:
+    return _LENGTH.pack(len(data)) + data
+
+
 def send(connection: socket.socket, data: bytes) -> None:
     """Send data with their length."""
-    connection.sendall(_LENGTH.pack(len(data)) + data)
+    connection.sendall(_with_length(data))
 
 
 def receive(connection: socket.socket) -> bytes:

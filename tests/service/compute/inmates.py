@@ -25,6 +25,10 @@ def text() -> str:
     return "no number"
 
 
+def long_text(size: int) -> str:
+    return "x" * size
+
+
 def crash() -> None:
     ctypes.string_at(0)
 

@@ -4,6 +4,7 @@ import logging
 import os
 import socket
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
@@ -11,7 +12,7 @@ from lipcore.extras import MissingExtraError
 from service.compute import cage
 from service.compute.cage import start
 from service.compute.confinement import FORBIDDEN, OF_ITSELF, calls, protections
-from service.compute.reader_process import OUTPUT_BYTES, Failure
+from service.compute.reader_process import ANSWER_BYTES, OUTPUT_BYTES, Failure
 from service.foundation.errors import InvalidDataError, NotReadyError, TooLargeError
 from service.foundation.settings import Settings
 from tests.service.data import eventually
@@ -56,6 +57,11 @@ def test_a_value_comes_back_and_is_of_the_type_that_was_asked_for(settings, tmp_
     assert call("add", dict[str, float | str], *given, settings=settings) == {"sum": 2.5, "path": str(tmp_path)}
     with pytest.raises(InvalidDataError, match="cannot be read"):
         cage.run(f"{HERE}:text", int, settings=settings)
+
+
+def test_an_answer_that_is_too_large_is_none(settings):
+    assert len(call("long_text", str, ANSWER_BYTES - 100, settings=settings)) == ANSWER_BYTES - 100
+    assert "exit code 0" in refused("long_text", ANSWER_BYTES, settings=settings)
 
 
 def test_errors_that_a_reader_may_raise_come_back_as_they_are(settings):
@@ -172,8 +178,19 @@ def test_a_process_that_waits_for_calls_is_replaced_once_it_has_ended(settings):
 def test_it_ends_with_the_one_that_has_started_it(settings):
     assert call("noise", int, 0, settings=settings) == 7
     process = cage._spawner._process
+    eventually(lambda: _confined(process.pid))
+    others = [*children(process.pid), *_confined(process.pid)]
     cage._spawner._control.close()
     assert process.wait(60) == 0
+    eventually(lambda: not any(map(_runs, others)))
+
+
+def _runs(pid):
+    """Whether a process is there and has not ended, whether or not anybody has asked how."""
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return False
 
 
 def test_nobody_waits_for_ever_where_no_process_can_be_started(settings, monkeypatch):
@@ -200,14 +217,14 @@ def test_a_caller_that_goes_away_ends_its_process(settings, monkeypatch):
     with ThreadPoolExecutor() as pool:
         waiting = pool.submit(refused, "sleep", settings=settings, error=NotReadyError)
         for _ in range(2):  # it is tried again
-            eventually(lambda: connections and _readers(own._process.pid))
+            eventually(lambda: connections and len(_confined(own._process.pid)) == 2)
             connections.pop().shutdown(socket.SHUT_RDWR)
         assert "uploads cannot be read now" in waiting.result()
-    eventually(lambda: not _readers(own._process.pid))
+    eventually(lambda: len(_confined(own._process.pid)) == 1)
 
 
-def _readers(pid):
-    """Processes that are confined, below the one that waits for calls."""
+def _confined(pid):
+    """Processes that read a file, and the one that will read the next."""
     return [each for child in children(pid) for each in children(child)]
 
 
