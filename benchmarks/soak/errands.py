@@ -156,8 +156,13 @@ def judge(desk: Desk, turn: int) -> None:
     desk.ask("POST", f"/v1/models/{ARM}/trace", json={"dataset": dataset, "points": 200, "components": ["gravity"]})
     if len(versions) > 1:
         chosen = [versions[0], versions[-1]]
-        # 404: one was deleted meanwhile by who trains
-        desk.ask("POST", f"/v1/models/{ARM}/compare", 200, 404, json={"dataset": dataset, "versions": chosen})
+        desk.ask("POST", f"/v1/models/{ARM}/compare", json={"dataset": dataset, "versions": chosen})
+
+
+def tidy(desk: Desk, turn: int) -> None:
+    """Delete old versions."""
+    for each in _versions(desk)[:-KEPT_VERSIONS]:  # the oldest come first
+        desk.ask("DELETE", f"/v1/models/{ARM}/versions/{each['version']}", 204, 409)
 
 
 def record(desk: Desk, turn: int) -> None:
@@ -198,7 +203,7 @@ def set_learning(desk: Desk, turn: int) -> None:
 
 
 def train(desk: Desk, turn: int) -> None:
-    """Train, from recordings and then from what was observed; cancel a job and repeat it; delete old versions."""
+    """Train, from recordings and then from what was observed; cancel a job and repeat it."""
     if not desk.datasets:
         record(desk, turn)
     request = {
@@ -215,8 +220,6 @@ def train(desk: Desk, turn: int) -> None:
     _ended(desk, job)
     _done(desk, desk.ask("POST", f"/v1/jobs/{job}/retry", 202)["id"])
     _done(desk, desk.ask("POST", f"/v1/models/{ARM}/refresh", 202, json={})["id"])
-    for each in _versions(desk)[:-KEPT_VERSIONS]:  # the oldest come first
-        desk.ask("DELETE", f"/v1/models/{ARM}/versions/{each['version']}", 204, 409)
 
 
 def keep(desk: Desk, turn: int) -> None:
@@ -235,7 +238,7 @@ ERRANDS: dict[int, tuple[Errand, ...]] = {
     10: (look_on,),
     15: (watch_over,),
     60: (look_around,),
-    300: (follow, correct, move, judge),
+    300: (follow, correct, move, judge, tidy),
     900: (record, archive, set_learning),
     3600: (keep,),
 }
