@@ -24,7 +24,7 @@ import msgspec
 
 from lipcore.extras import MissingExtraError
 from service.compute.confinement import OPEN_FILES
-from service.compute.reader_process import (
+from service.compute.reader_messages import (
     ERRORS,
     OUTPUT_BYTES,
     Answer,

@@ -9,7 +9,6 @@ import resource
 import select
 import signal
 import socket
-import struct
 import time
 import traceback
 from collections.abc import Callable
@@ -18,76 +17,35 @@ from errno import EFBIG, EMFILE
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NoReturn, get_origin, get_type_hints
+from typing import Any, NoReturn, get_type_hints
 
 import msgspec
-import numpy as np
 
 from lipcore.extras import MissingExtraError
 from service.compute.confinement import Bounds, confine, own_files, protections, renounce
-from service.compute.remote import imported
-from service.foundation.errors import (
-    InvalidDataError,
-    InvalidRequestError,
-    ServiceError,
-    StorageFullError,
-    TooLargeError,
+from service.compute.reader_messages import (
+    ANSWER_BYTES,
+    ERRORS,
+    OUTPUT_BYTES,
+    Answer,
+    Call,
+    Failure,
+    Outcome,
+    complete,
+    plain,
+    receive,
+    send,
+    typed,
+    with_length,
 )
-from service.foundation.settings import Settings
+from service.compute.remote import imported
+from service.foundation.errors import ServiceError
 
 NICENESS = 5
 """Of a confined process: a control loop goes before an upload."""
 IDLE_S = 600.0
 """Seconds without a call after which the process that waits for calls ends; the next call starts another one."""
-ANSWER_BYTES = 32 * 1024 * 1024
-"""Largest answer: names and facts, as numbers come in files."""
-OUTPUT_BYTES = 4096
-"""Most that is kept of what a confined process, or a library in it, writes to stdout and stderr."""
-OF_READERS = ("max_", "min_", "require_signed", "trusted_signers")
-"""How the settings begin that readers need. No secret does."""
-ERRORS = {each.code: each for each in (InvalidDataError, InvalidRequestError, StorageFullError, TooLargeError)}
-"""What a function may raise, by code; and MissingExtraError, OSError."""
-
-
-class Call(msgspec.Struct):
-    """A call. function: `module:function`; arguments: an array of its own; read, write: files and folders that it is
-    given."""
-
-    function: str
-    arguments: msgspec.Raw
-    read: list[str]
-    write: list[str]
-    memory: int
-    cpu_s: int
-    wall_s: float
-    file: int
-
-
-class Failure(msgspec.Struct):
-    """What a function raised. code: of `ERRORS`, or `limit`, `extra`, `system`, `unexpected`; detail: (field, value,
-    expected) each, or the limit's name; number: of an error of the system."""
-
-    code: str
-    message: str
-    detail: list[tuple[str, str | None, str]] = []
-    number: int = 0
-
-
-class Answer(msgspec.Struct):
-    """What a confined process sends: the value that its function returned, or why there is none."""
-
-    value: msgspec.Raw = msgspec.Raw(b"\xc0")
-    failure: Failure | None = None
-
-
-class Outcome(msgspec.Struct):
-    """What became of a confined process. status: exit code, negative where a signal ended it; late: whether it was
-    ended for its time; output: what it wrote; answer: an `Answer`, empty where there is none that is complete."""
-
-    status: int
-    late: bool
-    output: bytes
-    answer: bytes
+_LIMITS = {EFBIG: "size", EMFILE: "files"}
 
 
 def serve(descriptor: int) -> None:
@@ -146,7 +104,7 @@ def _alone(function: Callable[..., None], *arguments: Any) -> NoReturn:
 
 
 def _watch(calls: socket.socket) -> None:
-    """Fork the process that will be confined, and see to its end; send what became of it."""
+    """Fork the process that will be confined; give it the call that comes, and see to its end."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     (given, given_end), (answer, answer_end), (output, output_end) = os.pipe(), os.pipe(), os.pipe()
     pid = os.fork()
@@ -154,16 +112,19 @@ def _watch(calls: socket.socket) -> None:
         _alone(_confined, given, answer_end, output_end, os.getppid())
     for each in (given, answer_end, output_end):
         os.close(each)
-    descriptors = socket.recv_fds(calls, 1, 1)[1]
-    if not descriptors:  # there will be no call
-        return
-    connection = socket.socket(fileno=descriptors[0])
-    data = receive(connection)
-    with suppress(BrokenPipeError), os.fdopen(given_end, "wb") as file:
-        file.write(data)
-    until = time.monotonic() + msgspec.msgpack.decode(data, type=Call).wall_s
+    for descriptor in socket.recv_fds(calls, 1, 1)[1]:  # none where there will be no call
+        with socket.socket(fileno=descriptor) as connection, suppress(EOFError, ConnectionError):
+            data = receive(connection)
+            with suppress(BrokenPipeError), os.fdopen(given_end, "wb") as file:
+                file.write(data)
+            _see_to(pid, answer, output, connection, msgspec.msgpack.decode(data, type=Call).wall_s)
+
+
+def _see_to(pid: int, answer: int, output: int, connection: socket.socket, wall_s: float) -> None:
+    """Send what becomes of a process once it has answered, or has ended, or has to."""
+    until = time.monotonic() + wall_s
     answered, written, in_time = _collected(answer, output, connection, until)
-    if (content := _complete(answered)) is not None:
+    if (content := complete(answered)) is not None:
         os.kill(pid, signal.SIGKILL)  # it has nothing left to do, and would take milliseconds to end
         send(connection, msgspec.msgpack.encode(Outcome(0, False, written, content)))
         os.waitpid(pid, 0)
@@ -188,7 +149,7 @@ def _collected(answer: int, output: int, connection: socket.socket, until: float
     for each in most:
         poll.register(each, select.POLLIN)
     opened, in_time = set(most), True
-    while opened and in_time and _complete(kept[answer]) is None:
+    while opened and in_time and complete(kept[answer]) is None:
         ready = [each for each, _ in poll.poll(max(0.0, until - time.monotonic()) * 1000)]
         for each in opened.intersection(ready):
             piece = os.read(each, 1 << 16)
@@ -201,14 +162,6 @@ def _collected(answer: int, output: int, connection: socket.socket, until: float
     with suppress(BlockingIOError):  # what was written before the answer
         kept[output] += os.read(output, OUTPUT_BYTES - len(kept[output]))
     return bytes(kept[answer]), bytes(kept[output]), in_time
-
-
-def _complete(data: bytes | bytearray) -> bytes | None:
-    """What was sent with its length, once all of it has come."""
-    size = _LENGTH.size
-    if len(data) < size or _LENGTH.unpack_from(data)[0] != len(data) - size:
-        return None
-    return bytes(data[size:])
 
 
 def _confined(given: int, answer: int, output: int, parent: int) -> None:
@@ -238,7 +191,7 @@ def _confined(given: int, answer: int, output: int, parent: int) -> None:
     except Exception as error:
         sent = Answer(failure=_failure(error))
     with os.fdopen(answer, "wb") as file:
-        file.write(_with_length(msgspec.msgpack.encode(sent)))
+        file.write(with_length(msgspec.msgpack.encode(sent)))
 
 
 def _failure(error: Exception) -> Failure:
@@ -258,54 +211,3 @@ def _failure(error: Exception) -> Failure:
         return Failure("system", str(error), number=error.errno)
     traceback.print_exception(error)
     return Failure("unexpected", f"{type(error).__name__}: {error}"[:1000])
-
-
-def plain(value: Any) -> Any:
-    """A path, settings or an array as what goes to another process; for msgspec."""
-    if isinstance(value, Path):
-        return os.fspath(value)
-    if isinstance(value, Settings):
-        return {name: getattr(value, name) for name in Settings.model_fields if name.startswith(OF_READERS)}
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    raise NotImplementedError(f"a {type(value).__name__}")
-
-
-def typed(kind: Any, value: Any) -> Any:
-    """The way back from `plain`."""
-    if kind is Path:
-        return Path(value)
-    if kind is Settings:
-        return Settings.model_construct(**value)  # they have been checked, and the environment is none of theirs
-    if get_origin(kind) is np.ndarray:
-        return np.array(value, dtype=np.float64)
-    raise NotImplementedError(f"a {kind}")
-
-
-_LIMITS = {EFBIG: "size", EMFILE: "files"}
-_LENGTH = struct.Struct("<Q")
-
-
-def _with_length(data: bytes) -> bytes:
-    return _LENGTH.pack(len(data)) + data
-
-
-def send(connection: socket.socket, data: bytes) -> None:
-    """Send data with their length."""
-    connection.sendall(_with_length(data))
-
-
-def receive(connection: socket.socket) -> bytes:
-    """What the other end sent; raise EOFError where it is closed before."""
-    (length,) = _LENGTH.unpack(_exactly(connection, _LENGTH.size))
-    return _exactly(connection, length)
-
-
-def _exactly(connection: socket.socket, count: int) -> bytes:
-    data = bytearray()
-    while len(data) < count:
-        piece = connection.recv(min(count - len(data), 1 << 20))
-        if not piece:
-            raise EOFError
-        data += piece
-    return bytes(data)

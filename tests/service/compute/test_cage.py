@@ -12,7 +12,7 @@ from lipcore.extras import MissingExtraError
 from service.compute import cage
 from service.compute.cage import start
 from service.compute.confinement import FORBIDDEN, OF_ITSELF, calls, protections
-from service.compute.reader_process import ANSWER_BYTES, OUTPUT_BYTES, Failure
+from service.compute.reader_messages import ANSWER_BYTES, OUTPUT_BYTES, Failure
 from service.foundation.errors import InvalidDataError, NotReadyError, TooLargeError
 from service.foundation.settings import Settings
 from tests.service.data import eventually
