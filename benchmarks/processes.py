@@ -49,18 +49,23 @@ def proportional(pid: int) -> float | None:
 
 
 class Watch:
-    """Calls `look` in a thread of its own, once a period of so many seconds, while it is entered."""
+    """Calls `look` in a thread of its own, once a period of so many seconds, while it is entered; then raises the error
+    that `look` may have ended with."""
 
     def __init__(self, period: float, look: Callable[[], None]) -> None:
         self.period, self.look = period, look
         self._end = threading.Event()
+        self._error: Exception | None = None
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
     def _watch(self) -> None:
         due = time.monotonic()
-        while not self._end.wait(max(0.0, due - time.monotonic())):
-            self.look()
-            due += self.period
+        try:
+            while not self._end.wait(max(0.0, due - time.monotonic())):
+                self.look()
+                due += self.period
+        except Exception as error:
+            self._error = error
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -71,6 +76,8 @@ class Watch:
     ) -> None:
         self._end.set()
         self._thread.join()
+        if self._error is not None and error is None:
+            raise self._error
 
 
 def _figure(pid: int, file: str, name: str) -> float | None:
