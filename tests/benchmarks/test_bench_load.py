@@ -10,6 +10,7 @@ import pytest
 from rich.console import Console
 
 from benchmarks.online.sending import Ack
+from benchmarks.processes import Watch
 from benchmarks.scale import passes
 from benchmarks.scale import running as scaling
 from benchmarks.soak import accounting, hours, running, table
@@ -171,6 +172,18 @@ def test_a_soak_is_drawn_and_written(tmp_path):
     hours.draw(found, tmp_path / "soak.png")
     assert (tmp_path / "soak.png").read_bytes().startswith(b"\x89PNG")
     assert [grid.title for grid in hours.grids(found)][1].startswith("8 hours")
+
+
+def test_a_watch_that_fails_says_so():
+    """Nothing that is seen after it may pass for a soak."""
+    looked = threading.Event()
+
+    def look():
+        looked.set()
+        raise FileNotFoundError("a folder")
+
+    with pytest.raises(FileNotFoundError, match="a folder"), Watch(0.0, look):
+        assert looked.wait(60)
 
 
 def test_the_arm_waits_for_those_who_follow_it():
