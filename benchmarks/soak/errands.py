@@ -23,8 +23,8 @@ from benchmarks.soak.day import ARM, BATCH_S, CONTACT_S, LOOP, Day
 from lipcore.data.samples import Samples
 from lipcore.robots.library import profile_urdf
 
-KEPT, KEPT_VERSIONS = 12, 4
-"""Data sets, and versions of the arm, that are kept; older ones are deleted."""
+KEPT, KEPT_VERSIONS = 12, 3
+"""Data sets, and versions of a model, that are kept; older ones are deleted."""
 PROFILE = "panda"
 FIT = {"search_seconds": 5.0}
 """Of training jobs: the geometry is calibrated from the robot's URDF."""
@@ -161,8 +161,9 @@ def judge(desk: Desk, turn: int) -> None:
 
 def tidy(desk: Desk, turn: int) -> None:
     """Delete old versions."""
-    for each in _versions(desk)[:-KEPT_VERSIONS]:  # the oldest come first
-        desk.ask("DELETE", f"/v1/models/{ARM}/versions/{each['version']}", 204, 409)
+    for model in (ARM, LOOP):
+        for each in _versions(desk, model)[:-KEPT_VERSIONS]:  # the oldest come first
+            desk.ask("DELETE", f"/v1/models/{model}/versions/{each['version']}", 204, 404, 409)
 
 
 def record(desk: Desk, turn: int) -> None:
@@ -222,6 +223,12 @@ def train(desk: Desk, turn: int) -> None:
     _done(desk, desk.ask("POST", f"/v1/models/{ARM}/refresh", 202, json={})["id"])
 
 
+def renew(desk: Desk, turn: int) -> None:
+    """Refresh the model of the loop, where that is possible and not under way: from the first hour on, not only once
+    it refreshes itself."""
+    desk.ask("POST", f"/v1/models/{LOOP}/refresh", 202, 409, json={})
+
+
 def keep(desk: Desk, turn: int) -> None:
     """Back the home up; make a key with a rate, ask by it beyond that, and revoke it."""
     file = desk.folder / f"backup-{turn}"
@@ -239,7 +246,7 @@ ERRANDS: dict[int, tuple[Errand, ...]] = {
     15: (watch_over,),
     60: (look_around,),
     300: (follow, correct, move, judge, tidy),
-    900: (record, archive, set_learning),
+    900: (record, archive, set_learning, renew),
     3600: (keep,),
 }
 """By the arm seconds between two of a kind."""
@@ -283,9 +290,9 @@ def _labels(line: str) -> list[tuple[str, str]]:
     return [(name, value.strip('"')) for name, _, value in (part.partition("=") for part in inner.split('",'))]
 
 
-def _versions(desk: Desk) -> list[Any]:
-    found: list[Any] = desk.ask("GET", f"/v1/models/{ARM}")["versions"]
-    return found
+def _versions(desk: Desk, model: str = ARM) -> list[Any]:
+    listed: list[Any] = desk.ask("GET", f"/v1/models/{model}")["versions"]
+    return listed
 
 
 def _ended(desk: Desk, job: str) -> Any:

@@ -42,6 +42,7 @@ SETTINGS = {
     "snapshot_every_s": 30.0 / SHORTER,
     "quality_windows_s": json.dumps([60.0 / SHORTER, 600.0 / SHORTER, 3600.0 / SHORTER]),
     "refresh_pause_s": 600.0 / SHORTER,
+    "max_refreshed_versions": 3,
     "promotion_patience_s": 3600.0 / SHORTER,
     "keys": "on",
     "max_loaded_models": 8,

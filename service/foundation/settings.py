@@ -221,6 +221,9 @@ class Settings(BaseSettings):
         description="Error of a learnt arm's linearisation at which it is refreshed; 1: as large as stated.",
     )
     refresh_pause_s: float = Field(600.0, ge=0, description="Shortest time between two automatic refreshes, s.")
+    max_refreshed_versions: Count = Field(
+        10, description="Versions of a model kept of those that automatic refreshes made and nothing needs."
+    )
     max_refresh_samples: Count = Field(200_000, description="Most logged samples that a refresh learns from.")
     promotion: Literal["ask", "always"] = Field(
         "ask",

@@ -24,7 +24,7 @@ from service.learning import owner
 from service.learning.learner.publication import Contested, Published
 from service.learning.learners import Learners
 from service.learning.owner import AlarmKind
-from service.models import registry
+from service.models import deletion, registry
 from service.models.loaded import LoadedModels
 from service.storage.database import AlarmRow, Database, LearnerRow, ServingRow
 from service.training import jobs
@@ -164,7 +164,8 @@ def decide(database: Database, loaded: LoadedModels, wake: Callable[[str], None]
 
     The pointer to the version that serves, the roles of both and the alarm change in one transaction; queries follow by
     one assignment, once the candidate is in memory with what it has learnt so far. A verdict is void where another
-    version serves by now, or where the candidate is one no more. wake: tells the learner of a model that roles changed.
+    version serves by now, or where the candidate is one no more. Else old versions of refreshes are deleted after it.
+    wake: tells the learner of a model that roles changed.
     """
     model, candidate = contested.model, contested.candidate
     with database.transaction() as session:
@@ -177,6 +178,7 @@ def decide(database: Database, loaded: LoadedModels, wake: Callable[[str], None]
     if promoted:
         loaded.adopt(model)
     wake(model)
+    deletion.delete_refreshed(loaded, model)
     return promoted
 
 

@@ -106,7 +106,7 @@ def _history(session: Session, model: str, alias: str, count: int) -> list[Alias
     return list(session.scalars(query.order_by(AliasMoveRow.seq.desc()).limit(count)))
 
 
-def _standing(session: Session, model: str, alias: str) -> AliasMoveRow | None:
+def standing(session: Session, model: str, alias: str) -> AliasMoveRow | None:
     """The move that a rollback takes back: the newest that neither took one back nor was taken back itself."""
     of_alias = (AliasMoveRow.model == model, AliasMoveRow.alias == alias)
     undone = select(AliasMoveRow.takes_back).where(*of_alias, AliasMoveRow.takes_back.is_not(None))
@@ -116,7 +116,7 @@ def _standing(session: Session, model: str, alias: str) -> AliasMoveRow | None:
 
 def _last(session: Session, model: str, alias: str) -> AliasMoveRow:
     _check_model(session, model)
-    move = _standing(session, model, alias)
+    move = standing(session, model, alias)
     if move is None and (alias == SERVING or _history(session, model, alias, 1)):
         raise ConflictError(f"the alias {alias!r} of model {model!r} has no move left that could be taken back")
     if move is None:
@@ -158,7 +158,7 @@ def _show(loaded: LoadedModels, session: Session, model: str, alias: str) -> Ali
     else:
         row = session.get_one(AliasRow, (model, alias))
         version, changed_at = row.version, row.changed_at
-    move = _standing(session, model, alias)
+    move = standing(session, model, alias)
     return Alias(
         alias=alias,
         version=version,

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection
+from contextlib import suppress
 
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
 from lipserve.states import ACTIVE
-from service.foundation.errors import ConflictError, not_found
-from service.models import registry
+from service.foundation.errors import ConflictError, NotFoundError, not_found
+from service.models import aliases, registry
 from service.models.loaded import LoadedModels
 from service.storage.database import (
     AlarmRow,
@@ -59,6 +60,25 @@ def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
     _remove_files(loaded.files, [row.folder], snapshots)
     loaded.wake(model)
     logger.info("deleted version %d of model %s", version, model)
+
+
+def delete_refreshed(loaded: LoadedModels, model: str) -> list[int]:
+    """Delete the versions that automatic refreshes have made, but the newest `max_refreshed_versions`, those that
+    something needs and the one that a rollback of `serving` returns to; return them. Not for the event loop."""
+    with loaded.database.session() as session:
+        trigger = JobRow.request["refresh"]["trigger"].as_string()
+        by_itself = (VersionRow.model == model, trigger.is_not(None), trigger != "asked")
+        made = select(VersionRow.version).join(JobRow, JobRow.id == VersionRow.job).where(*by_itself)
+        most = loaded.storage.settings.max_refreshed_versions
+        older = list(session.scalars(made.order_by(VersionRow.version.desc()).offset(most)))
+        move = aliases.standing(session, model, registry.SERVING)
+    deleted = []
+    for version in older:
+        if move is None or version != move.before:
+            with suppress(ConflictError, NotFoundError):
+                delete_version(loaded, model, version)
+                deleted.append(version)
+    return deleted
 
 
 def delete_model(loaded: LoadedModels, model: str) -> None:

@@ -1,5 +1,7 @@
 """Which version answers where none is named: the newest, a promoted one, an older one; and what a verdict leads to."""
 
+from dataclasses import replace
+
 import pytest
 from sqlalchemy import delete, select
 
@@ -10,7 +12,7 @@ from service.learning.learner.publication import Contested
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.models.registry import Serving
-from service.storage.database import LearnerRow, ServingRow
+from service.storage.database import JobRow, LearnerRow, ServingRow, VersionRow, now
 from tests.service.learning.lessons import answered
 from tests.service.learning.pendulums import ARM
 
@@ -178,6 +180,43 @@ def test_one_that_is_not_better_is_dismissed_for_good(school, pupil):
     assert line["after"] == {"verdict": "dismiss", "serving": 1}
     assert decide(school, pupil) == (False, [])
     assert answering(pupil) == (1, 1)
+
+
+def test_of_versions_that_refreshed_themselves_the_newest_are_kept_and_those_that_are_needed(
+    school, pupil, monkeypatch
+):
+    loaded = school.service.loaded
+    few = loaded.storage.settings.model_copy(update={"max_refreshed_versions": 1})
+    monkeypatch.setattr(loaded, "storage", replace(loaded.storage, settings=few))
+
+    def end(version, trigger, verdict):
+        """A contest of a version that a refresh has made."""
+        school.publish(pupil.model, candidate=True)
+        job = f"job_{pupil.model[-20:]}_{version}"
+        with school.service.database.transaction() as session:
+            request = {"refresh": {"version": 1, "trigger": trigger}}
+            session.add(
+                JobRow(id=job, model=pupil.model, state="succeeded", request=request, progress={}, created_at=now())
+            )
+            session.get_one(VersionRow, (pupil.model, version)).job = job
+        assert decide(school, pupil, version, verdict, answering(pupil)[0])[0] == (verdict == "promote")
+
+    end(2, "novelty", "promote")
+    end(3, "asked", "promote")  # a rollback returns to 2
+    end(4, "linearisation", "dismiss")
+    answered(pupil.client.put(f"/v1/models/{pupil.model}/aliases/liked", json={"version": 4}))
+    end(5, "novelty", "dismiss")
+    assert versions_of(pupil) == [1, 2, 3, 4, 5]
+    end(6, "novelty", "dismiss")
+    assert versions_of(pupil) == [1, 2, 3, 4, 6]
+    lines = answered(pupil.client.get("/v1/audit", params={"model": pupil.model}))["items"]
+    assert [line["version"] for line in lines if line["change"] == "version deleted"] == [5]
+    assert answering(pupil) == (3, 3)
+
+
+def versions_of(pupil):
+    """The versions that there are."""
+    return [each["version"] for each in answered(pupil.client.get(f"/v1/models/{pupil.model}"))["versions"]]
 
 
 def test_the_owner_may_decide_alone(school, pupil):
