@@ -87,8 +87,8 @@ class Load:
         """Ask for every batch that was acknowledged, count those logged, and compare the answers of both services."""
         with HttpClient(("127.0.0.1", self.services[0].port)) as http:
             known = sum(send(http, self._request(sequence)).duplicate for sequence in range(self.sent))
-        query = "SELECT count(*) FROM events WHERE model = %s AND kind = 'batch' AND NOT void"
-        logged = int(self.engines.postgres.ask(query, self.engines.database, MODEL)[0][0])
+        query = "SELECT count(*) FROM events WHERE model = %s AND stream_id = %s AND kind = 'batch' AND NOT void"
+        logged = int(self.engines.postgres.ask(query, self.engines.database, MODEL, STREAM)[0][0])
         tally.lost += self.sent - known
         tally.twice += max(0, logged - self.sent)
 
