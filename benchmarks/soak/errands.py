@@ -156,7 +156,8 @@ def judge(desk: Desk, turn: int) -> None:
     desk.ask("POST", f"/v1/models/{ARM}/trace", json={"dataset": dataset, "points": 200, "components": ["gravity"]})
     if len(versions) > 1:
         chosen = [versions[0], versions[-1]]
-        desk.ask("POST", f"/v1/models/{ARM}/compare", json={"dataset": dataset, "versions": chosen})
+        # 404: one was deleted meanwhile, as refreshes do
+        desk.ask("POST", f"/v1/models/{ARM}/compare", 200, 404, json={"dataset": dataset, "versions": chosen})
 
 
 def tidy(desk: Desk, turn: int) -> None:

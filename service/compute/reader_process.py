@@ -123,8 +123,8 @@ def _watch(calls: socket.socket) -> None:
 def _see_to(pid: int, answer: int, output: int, connection: socket.socket, wall_s: float) -> None:
     """Send what becomes of a process once it has answered, or has ended, or has to."""
     until = time.monotonic() + wall_s
-    answered, written, in_time = _collected(answer, output, connection, until)
-    if (content := complete(answered)) is not None:
+    content, written, in_time = _collected(answer, output, connection, until)
+    if content is not None:
         os.kill(pid, signal.SIGKILL)  # it has nothing left to do, and would take milliseconds to end
         send(connection, msgspec.msgpack.encode(Outcome(0, False, written, content)))
         os.waitpid(pid, 0)
@@ -139,17 +139,17 @@ def _see_to(pid: int, answer: int, output: int, connection: socket.socket, wall_
     send(connection, msgspec.msgpack.encode(Outcome(os.waitstatus_to_exitcode(status), not ended, written, b"")))
 
 
-def _collected(answer: int, output: int, connection: socket.socket, until: float) -> tuple[bytes, bytes, bool]:
-    """What comes of two descriptors until the answer is complete or both end, up to so many bytes of each; and whether
-    that did not take too long, and somebody still waits for it."""
+def _collected(answer: int, output: int, connection: socket.socket, until: float) -> tuple[bytes | None, bytes, bool]:
+    """The answer that comes of a descriptor, None where it ends before, and what comes of another one until then, up to
+    so many bytes of each; and whether that did not take too long, and somebody still waits for it."""
     most = {answer: ANSWER_BYTES, output: OUTPUT_BYTES}
     kept = {each: bytearray() for each in most}
     poll = select.poll()
     poll.register(connection, 0)  # only whether the other end is closed
     for each in most:
         poll.register(each, select.POLLIN)
-    opened, in_time = set(most), True
-    while opened and in_time and complete(kept[answer]) is None:
+    opened, in_time, content = set(most), True, None
+    while opened and in_time and content is None:
         ready = [each for each, _ in poll.poll(max(0.0, until - time.monotonic()) * 1000)]
         for each in opened.intersection(ready):
             piece = os.read(each, 1 << 16)
@@ -158,10 +158,11 @@ def _collected(answer: int, output: int, connection: socket.socket, until: float
                 poll.unregister(each)
                 opened.discard(each)
         in_time = time.monotonic() < until and connection.fileno() not in ready
+        content = complete(kept[answer])
     os.set_blocking(output, False)
     with suppress(BlockingIOError):  # what was written before the answer
         kept[output] += os.read(output, OUTPUT_BYTES - len(kept[output]))
-    return bytes(kept[answer]), bytes(kept[output]), in_time
+    return content, bytes(kept[output]), in_time
 
 
 def _confined(given: int, answer: int, output: int, parent: int) -> None:

@@ -62,23 +62,20 @@ def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
     logger.info("deleted version %d of model %s", version, model)
 
 
-def delete_refreshed(loaded: LoadedModels, model: str) -> list[int]:
+def delete_refreshed(loaded: LoadedModels, model: str) -> None:
     """Delete the versions that automatic refreshes have made, but the newest `max_refreshed_versions`, those that
-    something needs and the one that a rollback of `serving` returns to; return them. Not for the event loop."""
+    something needs and the one that a rollback of `serving` returns to. Not for the event loop."""
     with loaded.database.session() as session:
         trigger = JobRow.request["refresh"]["trigger"].as_string()
-        by_itself = (VersionRow.model == model, trigger.is_not(None), trigger != "asked")
+        by_itself = (VersionRow.model == model, trigger != "asked")  # of what is no refresh it is NULL
         made = select(VersionRow.version).join(JobRow, JobRow.id == VersionRow.job).where(*by_itself)
         most = loaded.storage.settings.max_refreshed_versions
         older = list(session.scalars(made.order_by(VersionRow.version.desc()).offset(most)))
         move = aliases.standing(session, model, registry.SERVING)
-    deleted = []
     for version in older:
         if move is None or version != move.before:
             with suppress(ConflictError, NotFoundError):
                 delete_version(loaded, model, version)
-                deleted.append(version)
-    return deleted
 
 
 def delete_model(loaded: LoadedModels, model: str) -> None:

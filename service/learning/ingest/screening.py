@@ -143,22 +143,25 @@ def predict(
     known = np.asarray(np.isfinite(mean).all(axis=1) & np.isfinite(std).all(axis=1))
     reached = given.take(known)
     score = scores(good.tau[known] - reached.mean, reached.std, model.noise_std)
+    seen = Seen(good.time[known], score, reached.factor)
     answerable = asked.copy()
     answerable[asked] = known
     judged, known = known & predicted[asked], known[predicted[asked]]
     codes[predicted] = np.where(known, LEARNT, LIMIT)
     predicted[predicted] = known
-    believed = mean[judged], std[judged], bare[judged]
+    mean, std, bare = mean[judged], std[judged], bare[judged]
     return Screened(
         replace(rows, code=codes),
         own,
         derived,
         answerable,
         predicted,
-        *believed,
+        mean,
+        std,
+        bare,
         model.noise_std,
-        None if carrying is not None else _as_trained(good.take(judged), served, mean[judged], bare[judged]),
-        Seen(good.time[answerable[asked]], score, reached.factor),
+        None if carrying is not None else _as_trained(good.take(judged), served, mean, bare),
+        seen,
         given.take(judged) if given.other_load else None,
     )
 
