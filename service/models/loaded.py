@@ -366,7 +366,8 @@ class LoadedModels:
         with self._lock:
             if key in self._deleted:  # while it was loaded: who asked before is answered, nobody after
                 return served
-            self._used.setdefault(key, next(self._clock))
+            if key not in self._used:  # a revision of one that is known is no use of it
+                self._used[key] = next(self._clock)
             entries, pointers = dict(self._snapshot.served), dict(self._snapshot.serving)
             current = entries.get(key)
             if current is None or current.revision < served.revision:
