@@ -48,6 +48,9 @@ class _Answer(msgspec.Struct):
     rejected: dict[str, int]
 
 
+_decoder = msgspec.json.Decoder(_Answer)
+
+
 def batch_request(
     model: str,
     stream_id: str,
@@ -80,7 +83,7 @@ def send(client: HttpClient, request: bytes) -> Ack:
     sent = time.monotonic_ns()
     answer = client.ask(request)
     acked = time.monotonic_ns()
-    said = msgspec.json.decode(answer, type=_Answer)
+    said = _decoder.decode(answer)
     return Ack(said.sequence, sent, acked, said.rows, said.accepted, said.revision, said.duplicate, said.rejected)
 
 

@@ -52,6 +52,7 @@ ENVIRONMENT = {
     "ARROW_DEFAULT_MEMORY_POOL": "system",
 }
 KEPT_VARIABLES = ("LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "TZ")
+_making = threading.Lock()
 
 
 class UnexpectedReaderError(RuntimeError):
@@ -87,14 +88,20 @@ def run(
     if outcome.status == -signal.SIGXCPU:
         raise _beyond("processor", field, settings)
     try:
-        answer = msgspec.msgpack.decode(outcome.answer, type=Answer)
+        answer = _decoder(Answer).decode(outcome.answer)
         if answer.failure is not None:
             raise _error(answer.failure, function, field, settings)
         if outcome.status == 0:
-            return msgspec.msgpack.decode(answer.value, type=returns, dec_hook=typed)
+            return _decoder(returns).decode(answer.value)
     except msgspec.MsgspecError as error:
         logger.warning("a reader of an upload sent what is no answer: %s", error)
     raise invalid_data(field, f"one that cannot be read: its reader {_ending(outcome.status)}", "an undamaged one")
+
+
+def _decoder(kind: type[T]) -> msgspec.msgpack.Decoder[T]:
+    """Made by one thread at a time: two that are the first to use a type of msgspec at once can end the process."""
+    with _making:
+        return msgspec.msgpack.Decoder(kind, dec_hook=typed)
 
 
 def _ask(call: Call) -> Outcome:
@@ -105,7 +112,7 @@ def _ask(call: Call) -> Outcome:
                 connection.settimeout(call.wall_s + IMPORT_S)
                 send(connection, call.function.encode())
                 send(connection, data)
-                return msgspec.msgpack.decode(receive(connection), type=Outcome)
+                return _decoder(Outcome).decode(receive(connection))
         except TimeoutError:
             return Outcome(0, True, b"", b"")
         except (EOFError, OSError) as error:  # the process that waits for calls had just ended, or none can be started

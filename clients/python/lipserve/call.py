@@ -10,9 +10,10 @@ import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache, wraps
+from functools import wraps
 from pathlib import Path
 from secrets import token_hex
+from threading import Lock
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 from urllib.parse import quote
 
@@ -122,28 +123,35 @@ def route(
     return decorate
 
 
+_making = Lock()
+
+
 class _Listed(msgspec.Struct, Generic[T]):
     items: list[T]
     next_cursor: str | None = None
 
 
-@cache
-def _decoder(kind: type[T]) -> msgspec.json.Decoder[T]:
-    return msgspec.json.Decoder(kind)
+def decoder(kind: type[T], hook: Callable[[Any, Any], Any] | None = None) -> msgspec.json.Decoder[T]:
+    """What decodes JSON as a type. hook: as `dec_hook` of msgspec, for what msgspec does not know.
+
+    Made by one thread at a time: two that are the first to use a type of msgspec at once can end the process (SIGSEGV).
+    """
+    with _making:
+        return msgspec.json.Decoder(kind, dec_hook=hook)
 
 
 def record(kind: type[R]) -> Callable[[Answer], R]:
     """Read a record of the API."""
-    decoder = _decoder(kind)
-    return lambda answer: decoder.decode(answer.body)
+    decode = decoder(kind).decode
+    return lambda answer: decode(answer.body)
 
 
 def page(kind: type[R]) -> Callable[[Answer], Page[R]]:
     """Read one page of a list of records."""
-    decoder = _decoder(_Listed[kind])  # type: ignore[valid-type]
+    decode = decoder(_Listed[kind]).decode  # type: ignore[valid-type]
 
     def read(answer: Answer) -> Page[R]:
-        listed: _Listed[R] = decoder.decode(answer.body)
+        listed: _Listed[R] = decode(answer.body)
         return Page(listed.items, listed.next_cursor)
 
     return read

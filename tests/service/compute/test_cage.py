@@ -3,6 +3,8 @@
 import logging
 import os
 import socket
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -264,3 +266,48 @@ def test_a_filter_answers_each_call_as_its_tables_say(machine, place):
     assert answer(0) == answer((9, 222)[place]) == "allow"
     assert answer(0x40000000 + 41) == "error 1"
     assert answer(0, seen=0x40000003) == "kill"
+
+
+FIRST_AT_ONCE = """
+import sys, threading
+from importlib import import_module
+
+sys.setswitchinterval(1e-6)  # s, between two threads
+module, _, name = sys.argv[1].partition(":")
+make, encode = getattr(import_module(module), name), import_module(sys.argv[2]).encode
+for _ in range(1000):
+    exec(sys.argv[3])
+    barrier = threading.Barrier(4)
+
+    def decode():
+        barrier.wait()
+        assert make(Outer).decode(encode(Outer(1, Inner("x")))).inner.text == "x"
+
+    threads = [threading.Thread(target=decode) for _ in range(4)]
+    [thread.start() for thread in threads]
+    [thread.join() for thread in threads]
+print("done")
+"""
+TYPES = """
+from __future__ import annotations
+import msgspec
+
+class Inner(msgspec.Struct):
+    text: str
+    names: list[tuple[str, str | None, str]] = []
+
+class Outer(msgspec.Struct):
+    number: int
+    inner: Inner | None = None
+"""
+
+
+@pytest.mark.parametrize(
+    ("maker", "encoder"),
+    [("service.compute.cage:_decoder", "msgspec.msgpack"), ("lipserve.call:decoder", "msgspec.json")],
+)
+def test_threads_that_are_the_first_to_read_a_type_at_once_all_read_it(maker, encoder):
+    """msgspec makes what it knows of a type in steps, without a lock: a second thread ends the process (SIGSEGV)."""
+    command = [sys.executable, "-c", FIRST_AT_ONCE, maker, encoder, TYPES]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr

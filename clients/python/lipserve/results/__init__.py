@@ -7,11 +7,10 @@ from dataclasses import fields, is_dataclass
 from html import escape
 from typing import Any, TypeVar, get_args
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from lipserve.call import Answer
+from lipserve.call import Answer, decoder
 
 Array = NDArray[np.float64]
 Result = TypeVar("Result")
@@ -25,8 +24,8 @@ def array(values: Any) -> Array:
 def reading(kind: type[Result]) -> Callable[[Answer], Result]:
     """A function that reads an answer as a dataclass of results: lists as arrays, null in them as NaN. What the
     dataclass does not name is left out."""
-    decoder = msgspec.json.Decoder(kind, dec_hook=_numbers)
-    return lambda answer: decoder.decode(answer.body)
+    decode = decoder(kind, _numbers).decode
+    return lambda answer: decode(answer.body)
 
 
 def _numbers(kind: Any, values: Any) -> Any:
