@@ -43,9 +43,14 @@ def resident(pid: int, name: str = "VmRSS") -> float | None:
     return _figure(pid, "status", name)
 
 
-def proportional(pid: int) -> float | None:
-    """Memory of a process, MiB, where what n processes share counts an n-th (PSS); None where it has ended."""
-    return _figure(pid, "smaps_rollup", "Pss")
+def written(pid: int) -> float | None:
+    """Memory that a process has written, MiB, where what n processes share counts an n-th; None where it has ended.
+
+    Without what is mapped of files: its share changes with every other process on the machine that maps the same
+    libraries, and the system drops it when it needs the room.
+    """
+    figures = [_figure(pid, "smaps_rollup", name) for name in ("Pss_Anon", "Pss_Shmem")]
+    return None if None in figures else sum(each for each in figures if each is not None)
 
 
 class Watch:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.processes import PROC, Watch, levels, proportional, resident
+from benchmarks.processes import PROC, Watch, levels, resident, written
 
 WARMING = 0.1
 """Share of a run in which caches fill and processes start: what grows there is no leak."""
@@ -23,9 +23,8 @@ BLOCKS = 18
 class Look:
     """What there was at a moment. at: by the clock of the watch, s.
 
-    service, learner: memory in MiB, in which what n processes share counts an n-th; jobs: that of all other processes
-    below the service; descriptors, threads: of service and learner; processes: below the service; disk: MiB of its
-    home.
+    service, learner: memory that they have written, MiB, see `written`; jobs: that of all other processes below the
+    service; descriptors, threads: of service and learner; processes: below the service; disk: MiB of its home.
     """
 
     at: float
@@ -54,7 +53,7 @@ class ResourceWatch(Watch):
 
     def note(self) -> None:
         """Take down what there is now, while the service lives."""
-        own = proportional(self.pid)
+        own = written(self.pid)
         if own is None:
             return
         below = [pid for level in levels(self.pid)[1:] for pid in level]
@@ -64,8 +63,8 @@ class ResourceWatch(Watch):
             Look(
                 at=self.clock(),
                 service=own,
-                learner=0.0 if learner is None else proportional(learner) or 0.0,
-                jobs=sum(proportional(pid) or 0.0 for pid in below if pid != learner),
+                learner=0.0 if learner is None else written(learner) or 0.0,
+                jobs=sum(written(pid) or 0.0 for pid in below if pid != learner),
                 descriptors=sum(_descriptors(pid) for pid in main),
                 threads=sum(_threads(pid) for pid in main),
                 processes=len(below),

@@ -80,7 +80,7 @@ def _memory(results: Results) -> Grid:
             parts = [float(np.median(part)) for part in np.array_split(looks, 4) if len(part)]
             rows.append((name, *(f"{value:,.0f}" for value in parts), f"{max(looks):,.0f}"))
     columns = ("MiB, median of", "first quarter", "second", "third", "last", "largest")
-    return Grid("memory while loaded (PSS)", columns, [row for row in rows if len(row) == len(columns)])
+    return Grid("memory written while loaded", columns, [row for row in rows if len(row) == len(columns)])
 
 
 def _account(results: Results) -> Grid:

@@ -1,6 +1,8 @@
 """`python -m benchmarks load`, `soak` and `scale`: what they count and conclude, where things go wrong on purpose."""
 
 import json
+import mmap
+import os
 import threading
 from collections import Counter
 from dataclasses import replace
@@ -10,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from benchmarks.online.sending import Ack
-from benchmarks.processes import Watch
+from benchmarks.processes import PROC, Watch, written
 from benchmarks.scale import passes
 from benchmarks.scale import running as scaling
 from benchmarks.soak import accounting, hours, running, table
@@ -184,6 +186,20 @@ def test_a_watch_that_fails_says_so():
 
     with pytest.raises(FileNotFoundError, match="a folder"), Watch(0.0, look):
         assert looked.wait(60)
+
+
+@pytest.mark.skipif(not (PROC / "self" / "smaps_rollup").exists(), reason="Linux says what memory a process has")
+def test_memory_is_what_was_written_not_what_is_mapped_of_files(tmp_path):
+    file = tmp_path / "library"
+    file.write_bytes(bytes(64 << 20))
+    before = written(os.getpid())
+    with file.open("rb") as opened, mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
+        assert sum(mapped[at] for at in range(0, len(mapped), mmap.PAGESIZE)) == 0
+        assert written(os.getpid()) - before < 16
+        kept = np.ones(64 << 17)
+        assert 48 < written(os.getpid()) - before < 80
+        del kept
+    assert written(1 << 30) is None
 
 
 def test_the_arm_waits_for_those_who_follow_it():
