@@ -24,6 +24,7 @@ import msgspec
 
 from lipcore.extras import MissingExtraError
 from service.compute.confinement import OPEN_FILES
+from service.compute.progress import LOOK_S, Progress
 from service.compute.reader_messages import (
     ERRORS,
     OUTPUT_BYTES,
@@ -43,7 +44,7 @@ logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 IMPORT_S = 120.0
-"""Longest wait in s for a process that is yet to be started, or to import a reader, on a busy machine."""
+"""Longest wait in s for a process that is yet to be started, to import a reader or to answer, on a busy machine."""
 ENVIRONMENT = {
     "LANG": "C.UTF-8",
     "OPENBLAS_NUM_THREADS": "1",  # a thread that runs when a process is forked is not in the fork
@@ -108,16 +109,34 @@ def _ask(call: Call) -> Outcome:
     data = msgspec.msgpack.encode(call)
     for _ in range(2):
         try:
-            with _spawner.connect() as connection:
+            connection, process = _spawner.connect()
+            with connection:
+                _hand_over(call, connection, process)
                 connection.settimeout(call.wall_s + IMPORT_S)
-                send(connection, call.function.encode())
                 send(connection, data)
                 return _decoder(Outcome).decode(receive(connection))
-        except TimeoutError:
-            return Outcome(0, True, b"", b"")
-        except (EOFError, OSError) as error:  # the process that waits for calls had just ended, or none can be started
+        # the process that waits for calls had just ended, or hangs, or none can be started
+        except (EOFError, OSError) as error:
             failed = error
     raise NotReadyError(f"uploads cannot be read now: no process can be started for it ({failed!r})")
+
+
+def _hand_over(call: Call, connection: socket.socket, process: Any) -> None:
+    """Name the function of a call and wait until a process has it; raise TimeoutError where the one that waits for
+    calls hangs, once that has been ended."""
+    progress = Progress(lambda: [process.pid], call.wall_s, IMPORT_S)
+    connection.settimeout(LOOK_S)
+    send(connection, call.function.encode())
+    while True:
+        try:
+            if connection.recv(1):
+                return
+            raise EOFError
+        except TimeoutError:
+            if (reason := progress.look()) is not None:
+                logger.error("the process that waits for uploads hangs and is killed: %s", reason)
+                _spawner.end(process)
+                raise
 
 
 def _beyond(limit: str, field: str, settings: Settings) -> ServiceError:
@@ -166,8 +185,8 @@ class _Spawner:
         self._process: Any = None
         self._owner = 0
 
-    def connect(self) -> socket.socket:
-        """A connection for one call; raise OSError where no process can be started."""
+    def connect(self) -> tuple[socket.socket, Any]:
+        """A connection for one call, and the process that it goes to; raise OSError where none can be started."""
         ours, theirs = socket.socketpair()
         with theirs, self._lock:
             control = self._control if self._owner == os.getpid() else None  # a forked process starts its own
@@ -177,7 +196,15 @@ class _Spawner:
                 socket.send_fds(control, [b"c"], [theirs.fileno()])
             except ConnectionError:  # it has ended, as it does when nobody calls
                 socket.send_fds(self._start(), [b"c"], [theirs.fileno()])
-        return ours
+            return ours, self._process
+
+    def end(self, process: Any) -> None:
+        """End a process, and start another one for the next call."""
+        with self._lock:
+            if process is self._process and self._control is not None:
+                process.kill()
+                self._control.close()
+                self._control = None
 
     def _start(self) -> socket.socket:
         self._owner = os.getpid()

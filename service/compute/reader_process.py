@@ -114,6 +114,7 @@ def _watch(calls: socket.socket) -> None:
         os.close(each)
     for descriptor in socket.recv_fds(calls, 1, 1)[1]:  # none where there will be no call
         with socket.socket(fileno=descriptor) as connection, suppress(EOFError, ConnectionError):
+            connection.sendall(b"c")  # it has the call
             data = receive(connection)
             with suppress(BrokenPipeError), os.fdopen(given_end, "wb") as file:
                 file.write(data)

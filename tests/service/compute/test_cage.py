@@ -2,6 +2,7 @@
 
 import logging
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -177,6 +178,18 @@ def test_a_process_that_waits_for_calls_is_replaced_once_it_has_ended(settings):
     assert cage._spawner._process.pid != process.pid
 
 
+def test_a_process_that_waits_for_calls_and_hangs_is_replaced(settings, caplog):
+    assert call("noise", int, 0, settings=settings) == 7
+    process = cage._spawner._process
+    process.send_signal(signal.SIGSTOP)
+    hasty = settings.model_copy(update={"parser_s": 4.0})
+    with ThreadPoolExecutor() as pool:
+        waiting = [pool.submit(call, "noise", int, 0, settings=hasty) for _ in range(3)]
+        assert [each.result() for each in waiting] == [7, 7, 7]
+    assert process.wait(60) == -signal.SIGKILL
+    assert "hangs and is killed: it has not got on for 4 s" in caplog.text
+
+
 def test_it_ends_with_the_one_that_has_started_it(settings):
     assert call("noise", int, 0, settings=settings) == 7
     process = cage._spawner._process
@@ -211,8 +224,9 @@ def test_a_caller_that_goes_away_ends_its_process(settings, monkeypatch):
 
     class Watched(cage._Spawner):
         def connect(self):
-            connections.append(super().connect())
-            return connections[-1]
+            connection, process = super().connect()
+            connections.append(connection)
+            return connection, process
 
     own = Watched()
     monkeypatch.setattr(cage, "_spawner", own)
