@@ -2,28 +2,35 @@
 
 glibc gives each thread that allocates a heap of its own, up to eight for each CPU, and raises the size from which on it
 asks the system for a block by itself with every block that is freed. A service has dozens of threads: what one of them
-frees, no other one uses, and what lies below a block still in use goes back to nobody. Memory grows over thousands of
-requests and versions, though nothing is held (`benchmarks/studies/memory.py`).
+frees, no other one uses, and what lies below a block still in use goes back to nobody until it is asked for. Memory
+grows over thousands of requests and versions, though nothing is held (`benchmarks/studies/memory.py`).
 """
 
 from __future__ import annotations
 
 import ctypes
 import os
+import threading
+import time
 from collections.abc import Mapping
 
 HEAPS = 2
 """One for the event loop, as a rule, and one for all threads beside it."""
 BLOCK = 1024 * 1024
 """Bytes from which on a block is the system's own, and goes back to it at once; and of free memory that is kept."""
+PERIOD_S = 60.0
+"""Seconds after which free memory below blocks in use goes back, too. That takes a heap's lock for a millisecond."""
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 """Parameters of `mallopt`, see malloc.h of glibc."""
 _VARIABLES = ("MALLOC_", "GLIBC_TUNABLES")
 
 
 def keep_little(environment: Mapping[str, str] = os.environ) -> bool:
-    """Have this process keep few heaps and little free memory; return whether it does. To be called before it starts
-    threads. Nothing is done where the environment has settings of its own, or the C library is another one."""
+    """Have this process keep few heaps and little free memory, as long as it lives; return whether it does.
+
+    To be called before it starts threads. Nothing is done where the environment has settings of its own, or the C
+    library is another one.
+    """
     if any(name.startswith(_VARIABLES) for name in environment):
         return False
     library = ctypes.CDLL(None)
@@ -31,4 +38,18 @@ def keep_little(environment: Mapping[str, str] = os.environ) -> bool:
         return False
     settings = ((_ARENA_MAX, HEAPS), (_MMAP_THRESHOLD, BLOCK), (_TRIM_THRESHOLD, BLOCK))
     taken = [library.mallopt(parameter, value) for parameter, value in settings]
+    threading.Thread(target=_give_back_often, name="give-back", daemon=True).start()
     return all(taken)
+
+
+def give_back() -> None:
+    """Give the system all memory that this process has free, wherever it lies; nothing with a library but glibc."""
+    library = ctypes.CDLL(None)
+    if hasattr(library, "malloc_trim"):
+        library.malloc_trim(0)
+
+
+def _give_back_often() -> None:
+    while True:
+        time.sleep(PERIOD_S)
+        give_back()

@@ -18,6 +18,7 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.training.conditioning import should_condition
 from lipcore.training.train import fit_model
 from lipserve.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState, PromotionOption
+from service.compute.allocator import give_back
 from service.compute.executors import ClusterUnavailableError
 from service.foundation.errors import NotInstalledError, ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
@@ -60,6 +61,7 @@ def run(settings: Settings, job: str) -> None:
     finally:
         database.close()
         job_id.reset(token)
+        give_back()  # the process waits for the next job
 
 
 @dataclass(frozen=True)

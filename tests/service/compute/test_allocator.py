@@ -55,3 +55,31 @@ def test_what_the_environment_says_stays():
     kept, count = heaps(MALLOC_ARENA_MAX="5")
     assert not kept
     assert HEAPS < count <= 5
+
+
+BLOCKS = 2000
+PINNED = f"""
+import ctypes, os
+from pathlib import Path
+from service.compute.allocator import give_back
+library = ctypes.CDLL(None)
+library.malloc.restype = ctypes.c_void_p
+library.malloc.argtypes = [ctypes.c_size_t]
+library.free.argtypes = [ctypes.c_void_p]
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+blocks = [library.malloc(50_000) for _ in range({BLOCKS})]
+for block in blocks:
+    ctypes.memset(block, 1, 50_000)
+for block in blocks[:-1]:
+    library.free(block)
+before = resident()
+give_back()
+print((before - resident()) / {BLOCKS * 50_000})
+"""
+
+
+@glibc
+def test_what_is_free_below_a_block_in_use_is_given_back():
+    done = subprocess.run([sys.executable, "-c", PINNED], capture_output=True, text=True, check=True)
+    assert float(done.stdout) > 0.9
