@@ -29,6 +29,7 @@ from benchmarks.soak import errands
 from benchmarks.soak.day import ARM, LOOP, Clock, Day, Tally
 from benchmarks.soak.errands import ERRANDS, SLOW, Desk
 from benchmarks.soak.resources import WARMING, Growth, Look, ResourceWatch, growth, series
+from lipcore.warm_up import warm_up
 from service.learning.schema import LearningOptions
 from service.models import signing
 from service.storage.database import Database
@@ -103,6 +104,7 @@ def run(options: Options, console: Console) -> Results:
         folder = Path(name)
         home = folder / "home"
         console.print("training a model of panda", highlight=False)
+        warm_up("rigid-body")  # a process that compiles keeps 30 MiB of the compiler
         base, _ = train(scene.history(50.0, 10.0), scene.arm.joint_types, FIT, "rigid-body")
         lipcore.save(base, folder / "model")
         install(home, folder / "model", {ARM: LEARNING, LOOP: LEARNING}, base.n_joints)
