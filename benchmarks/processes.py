@@ -49,8 +49,7 @@ def written(pid: int) -> float | None:
     Without what is mapped of files: its share changes with every other process on the machine that maps the same
     libraries, and the system drops it when it needs the room.
     """
-    figures = [_figure(pid, "smaps_rollup", name) for name in ("Pss_Anon", "Pss_Shmem")]
-    return None if None in figures else sum(each for each in figures if each is not None)
+    return _figure(pid, "smaps_rollup", "Pss_Anon", "Pss_Shmem")
 
 
 class Watch:
@@ -85,10 +84,11 @@ class Watch:
             raise self._error
 
 
-def _figure(pid: int, file: str, name: str) -> float | None:
+def _figure(pid: int, file: str, *names: str) -> float | None:
+    """Sum of what a file below /proc/PID says under these names, MiB; None where it does not say all of them."""
     try:
         text = (PROC / str(pid) / file).read_text()
     except OSError:
         return None
-    found = re.search(rf"^{name}:\s+(\d+) kB", text, re.MULTILINE)
-    return None if found is None else int(found.group(1)) / 1024
+    found = re.findall(rf"^(?:{'|'.join(names)}):\s+(\d+) kB", text, re.MULTILINE)
+    return sum(map(int, found)) / 1024 if len(found) == len(names) else None
