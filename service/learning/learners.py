@@ -212,7 +212,7 @@ class Learners:
         self._revisions = {}
         with self.database.session() as session:
             for model in self.monitors():
-                served = self.loaded.hot(model, None)
+                served = self.loaded.peek(model)
                 if served is None:
                     continue
                 key = model, served.version

@@ -72,7 +72,7 @@ class Learning(Collector):
             _add_quality(gauges, model, monitor)
             for outcome in CODES:
                 rows.add_metric([model, outcome], monitor.counts[outcome])
-            if (served := self._learners.loaded.hot(model, None)) is None:
+            if (served := self._learners.loaded.peek(model)) is None:
                 continue
             for joint, factor in zip(served.model.joint_names, served.scales.asked, strict=True):
                 scale.add_metric([model, joint], factor)

@@ -10,6 +10,7 @@ from service import __version__
 from service.journal import log
 from service.learning.learner.process import LearnerProcess
 from service.learning.learners import RESTART_S
+from service.learning.metrics import Learning
 from service.storage import storage
 from service.training.metrics import START_S
 from service.web.observability.readiness import KEPT_S, Readiness
@@ -89,13 +90,18 @@ def test_a_home_that_cannot_be_written_is_found_and_not_named(api, look, monkeyp
     assert "gone" not in message  # whoever asks needs no key
 
 
-def test_a_look_leaves_nothing_behind_and_does_not_count_as_using_a_version(api, trained, look, monkeypatch):
+def test_a_look_leaves_nothing_behind_and_like_a_scrape_does_not_count_as_using_a_version(
+    api, trained, look, monkeypatch
+):
     service = service_of(api)
-    service.loaded.get(trained.name, 1)
+    monkeypatch.setattr(LearnerProcess, "needed", True)
+    monkeypatch.setattr(LearnerProcess, "pid", 1)
+    service.learners.monitor(trained.name)  # what has one is looked at
     files, uses = list(service.files.uploads.iterdir()), Uses(service.loaded._clock)
     monkeypatch.setattr(service.loaded, "_clock", uses)
-    look(service)
+    assert look(service)["learner"] == ("ok", "runs")
     assert list(service.files.uploads.iterdir()) == files
+    assert list(Learning(service.learners).collect())
     assert get_ident() not in uses.threads
     service.loaded.get(trained.name, 1)
     assert get_ident() in uses.threads  # as whoever asks does use it
