@@ -6,6 +6,7 @@ import logging
 import resource
 import sys
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 from sqlalchemy import update
@@ -53,7 +54,7 @@ def run(settings: Settings, job: str) -> None:
     """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit. Raise
     StorageError where the outcome could not be written, or what is needed not be read."""
     token = job_id.set(job)
-    database, files = Database.of(settings), Files.of(settings, PATIENCE_S)
+    database, files = _database(settings), Files.of(settings, PATIENCE_S)
     try:
         claim = _claim(settings, database, job)
         if claim is not None:
@@ -62,6 +63,12 @@ def run(settings: Settings, job: str) -> None:
         database.close()
         job_id.reset(token)
         give_back()  # the process waits for the next job
+
+
+@lru_cache(1)
+def _database(settings: Settings) -> Database:
+    """One for all jobs of a process: what SQLAlchemy compiles for each it keeps with the tables, 0.1 MiB a job."""
+    return Database.of(settings)
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,11 @@
 """Jobs whose processes are superseded, killed or interrupted: each is done once, and the service goes on."""
 
+import gc
 import os
 import signal
 
 import pytest
+from sqlalchemy import Dialect
 
 from service.training import worker
 from tests.service.data import ENDLESS, ended, error, job, queue, running, service_of, stream, upload
@@ -39,6 +41,20 @@ def test_a_job_is_run_once_even_if_it_is_handed_out_twice(api, pendulum, monkeyp
         worker.run(service.settings, name)
     assert job(api, name)["attempts"] == 1
     assert api.get("/v1/models/once").json()["latest_version"] == 1
+
+
+def test_a_process_keeps_nothing_of_the_jobs_that_it_has_done(api, pendulum, monkeypatch):
+    """What SQLAlchemy compiles it keeps with the tables, for each dialect that has asked: one for each job, it was."""
+    service = service_of(api)
+    monkeypatch.setattr(service.jobs, "submit", lambda job: None)
+    dialects = []
+    for _ in range(3):
+        name = queue(api, "one-of-many", pendulum["id"])["id"]
+        worker.run(service.settings, name)
+        assert job(api, name)["state"] == "succeeded"
+        gc.collect()
+        dialects.append(sum(isinstance(each, Dialect) for each in gc.get_objects()))
+    assert dialects == dialects[:1] * 3
 
 
 @pytest.mark.parametrize(
