@@ -105,14 +105,14 @@ def look_around(desk: Desk, turn: int) -> None:
     paths = ["models", "audit?limit=20", "jobs", "datasets", "robots", "robots/profiles", f"robots/profiles/{PROFILE}"]
     for path in [*paths, f"models/{ARM}/aliases"]:
         desk.ask("GET", f"/v1/{path}")
-    version = desk.ask("GET", f"/v1/models/{ARM}")["versions"][-1]["version"]
-    desk.ask("GET", f"/v1/models/{ARM}/versions/{version}")
-    newest = desk.ask("GET", f"/v1/models/{ARM}/observations?limit=1")["items"][0]
-    desk.ask("GET", f"/v1/models/{ARM}/observations/{ARM}/{newest['sequence']}?rows=true")
+    newest = {model: _versions(desk, model)[-1]["version"] for model in (ARM, LOOP)}
+    desk.ask("GET", f"/v1/models/{ARM}/versions/{newest[ARM]}")
+    batch = desk.ask("GET", f"/v1/models/{ARM}/observations?limit=1")["items"][0]
+    desk.ask("GET", f"/v1/models/{ARM}/observations/{ARM}/{batch['sequence']}?rows=true")
     desk.ask("POST", f"/v1/models/{ARM}/predict", json={**desk.at(), "components": ["gravity", "friction"]})
     desk.ask("POST", "/v1/echo", json={**desk.at()})
     desk.ask("GET", "/v2")
-    for path in (f"/v2/models/{LOOP}", f"/v2/models/{LOOP}/versions/1"):
+    for path in (f"/v2/models/{LOOP}", f"/v2/models/{LOOP}/versions/{newest[LOOP]}"):
         desk.ask("GET", path)
         desk.ask("GET", f"{path}/ready")
         inputs = [{"name": name, "shape": [1, 7], "datatype": "FP64", "data": data} for name, data in desk.at().items()]
