@@ -12,17 +12,16 @@ left out: rows that follow each other err alike.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
+from lipcore.kernels.compiled.arm import arm_torques
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.robots.urdf import RigidBody
 from service.datasets.report.fit import EIGHTHS
@@ -96,10 +95,10 @@ class Bodies:
 
     def torque(self, q: Array, dq: Array, ddq: Array, down: Sequence[float] | Array) -> Array:
         """Torque (R, n), N·m, of motion (R, n) each, with gravity `down` (3,) m/s² in the base's frame."""
-        kernel = ArmKernel(replace(self._arm, geometry=replace(self._arm.geometry, gravity=np.array(down, np.float64))))
-        weights = kernel.prior_weights()
-        assert weights is not None
-        return kernel.torque(weights, Motion.from_arrays(q, dq, ddq))
+        arm, out = self._arm, np.zeros(q.shape)
+        motions = np.stack([q, dq, ddq], axis=1)
+        arm_torques(arm.geometry.constants, np.array(down, np.float64), arm.parameters, arm.order, motions, out)
+        return out
 
     def parts(self, signals: Signals) -> tuple[Array, Array]:
         """Torques of gravity and of the rest, (R, n) each."""
