@@ -3,7 +3,7 @@
 glibc gives each thread that allocates a heap of its own, up to eight for each CPU, and raises the size from which on it
 asks the system for a block by itself with every block that is freed. A service has dozens of threads: what one of them
 frees, no other one uses, and what lies below a block still in use goes back to nobody until it is asked for. Memory
-grows over thousands of requests and versions, though nothing is held (`benchmarks/studies/memory.py`).
+grows over thousands of requests and versions, though nothing is held (`python -m benchmarks soak` plots it).
 """
 
 from __future__ import annotations
