@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lipcore.data.samples import Array
+from lipcore.posterior.linalg import eigen
 
 SHARE, SEED = 1.5, 0
 """Torques of the virtual motions, as a share of the arm's weights; and what they are drawn by."""
@@ -56,7 +57,7 @@ class Memory:
         """What a posterior N(mean, covariance), (M,) and (M, M), remembers. arm: places of its weights; variance: of a
         sample at the motions, (V, n) (N·m)²."""
         flat = features[arm].reshape(-1, variance.size).T
-        values, vectors = np.linalg.eigh(covariance)
+        values, vectors = eigen(covariance)
         precision = 1 / values - 1
         taught = precision > TAUGHT
         root, along = np.sqrt(precision[taught]), vectors[:, taught]

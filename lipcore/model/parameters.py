@@ -18,6 +18,7 @@ from lipcore.model.plausible import is_plausible, nearest_plausible
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.compression import checks
 from lipcore.posterior.exact import Posterior
+from lipcore.posterior.linalg import eigen
 from lipcore.robots.urdf import PARAMETERS
 
 STEPS = ("turn 1", "turn 2", "shift 1", "shift 2")
@@ -154,7 +155,7 @@ def precision(posterior: CompactPosterior, term: LinearKernel) -> Array:
         return posterior.statistics.a[rows, rows] + np.eye(rows.stop - rows.start)
     weights = weight_posterior(posterior, term)
     scaled = weights.covariance / np.outer(weights.scale, weights.scale)
-    values, vectors = np.linalg.eigh(0.5 * (scaled + scaled.T))
+    values, vectors = eigen(0.5 * (scaled + scaled.T))
     return np.asarray((vectors / np.maximum(values, LEAST_VARIANCE)) @ vectors.T)
 
 

@@ -31,7 +31,7 @@ from lipcore.model.memory import SEED, SHARE, Memory
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
-from lipcore.posterior.linalg import block_diagonal
+from lipcore.posterior.linalg import block_diagonal, eigen
 from lipcore.posterior.statistics import known
 from lipcore.robots.urdf import PARAMETERS
 
@@ -112,7 +112,7 @@ class Carrier:
     def covariance(self) -> Array:
         """Covariance Σ of the whitened variables, (M, M)."""
         covariance = self.model.posterior.covariance
-        values, vectors = np.linalg.eigh(covariance)
+        values, vectors = eigen(covariance)
         if values[0] >= LEAST:
             return np.asarray(covariance)
         # what samples tell to rounding has a variance of either sign

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
-from scipy.linalg import blas, lapack
+from scipy.linalg import blas, eigh, lapack
 
 from lipcore.data.motion import Array
 
@@ -115,6 +115,21 @@ def inverse_factored(lower: Array) -> Array:
     inverse = np.asarray(upper.T)
     mirror(inverse)
     return inverse
+
+
+def eigen(matrix: Array) -> tuple[Array, Array]:
+    """Eigenvalues of a symmetric matrix, (m,), rising, and its eigenvectors, the columns of (m, m).
+
+    By divide and conquer, which does not converge for every matrix; for such by QR iterations, which take longer. The
+    matrix is read from its lower triangle. Raise NotPositiveDefiniteError for a number that is not finite.
+    """
+    if not np.isfinite(matrix).all():
+        raise NotPositiveDefiniteError("a symmetric matrix holds a number that is not finite")
+    try:
+        values, vectors = np.linalg.eigh(matrix)
+    except np.linalg.LinAlgError:
+        values, vectors = eigh(matrix, driver="ev")
+    return values, vectors
 
 
 def add_diagonal(matrix: Array, values: Array | float) -> None:

@@ -16,6 +16,7 @@ from lipcore.posterior.linalg import (
     NotPositiveDefiniteError,
     add_diagonal,
     add_square,
+    eigen,
     inverse_factored,
     lower_root,
     mirror,
@@ -201,7 +202,7 @@ def _lower_root(matrix: Array) -> Array:
     root = lower_root(matrix[::-1, ::-1])
     if root is not None:
         return np.ascontiguousarray(root.T[::-1, ::-1])
-    values, vectors = np.linalg.eigh(matrix)
+    values, vectors = eigen(matrix)
     if not float(values[0]) >= -BELOW:
         raise NotPositiveDefiniteError(f"a covariance is {-float(values[0]):.3g} above the prior's or below zero")
     root = np.sqrt(values.clip(0.0))[:, None] * vectors.T
@@ -215,7 +216,7 @@ def _by_cholesky(a: Array) -> Array | None:
 
 def _by_eigenvalues(a: Array) -> Array:
     """The same from any statistics, at three times the cost; raise NotPositiveDefiniteError for impossible ones."""
-    values, vectors = np.linalg.eigh(a)
+    values, vectors = eigen(a)
     if not float(values[0]) >= -ROUNDING * max(float(values[-1]), 1.0):
         raise NotPositiveDefiniteError(
             f"statistics of size {len(values)} have the eigenvalue {float(values[0]):.3g}, expected none below zero"

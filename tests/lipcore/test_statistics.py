@@ -14,7 +14,7 @@ from lipcore.fitting.options import FitOptions
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.posterior.basis import Basis
-from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.posterior.linalg import NotPositiveDefiniteError, eigen
 from lipcore.posterior.statistics import (
     Statistics,
     collect,
@@ -158,6 +158,32 @@ def test_eigenvalues_say_the_same_where_rounding_has_gone_too_far(first: int, mo
     assert np.allclose(found.mean, expected.mean, rtol=0, atol=1e-9)
     assert not np.array_equal(found.root, expected.root)
     assert np.count_nonzero(np.triu(found.root, 1)) == 0
+
+
+def test_eigenvalues_are_those_of_qr_iterations_where_divide_and_conquer_does_not_converge(monkeypatch) -> None:
+    columns = np.random.default_rng(0).standard_normal((40, 5))
+    matrix = columns @ columns.T
+    values, _ = eigen(matrix)
+    calls = []
+
+    def fail(a: Array) -> tuple[Array, Array]:
+        calls.append(a)
+        raise np.linalg.LinAlgError("Eigenvalues did not converge")
+
+    monkeypatch.setattr(np.linalg, "eigh", fail)
+    found, vectors = eigen(matrix)
+    assert len(calls) == 1
+    assert np.allclose(found, values, rtol=0, atol=1e-12 * values[-1])
+    assert np.allclose((vectors * found) @ vectors.T, matrix, rtol=0, atol=1e-12 * values[-1])
+
+
+@pytest.mark.parametrize("size", [10, 40])
+def test_what_is_not_finite_has_no_eigenvalues(size: int) -> None:
+    """LAPACK says of a large one that the smallest is a number, and other ones are not."""
+    matrix = np.eye(size)
+    matrix[size // 2, 1] = np.nan
+    with pytest.raises(NotPositiveDefiniteError, match="not finite"):
+        eigen(matrix)
 
 
 @pytest.mark.parametrize("factor", [-0.1, 1.1, float("nan")])
