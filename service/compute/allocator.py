@@ -15,8 +15,8 @@ import time
 from collections.abc import Mapping
 
 HEAPS = 1
-"""What one thread frees serves all others. With one more, a day leaves 6 MiB more free in between, and no query is
-answered sooner: Python's threads take turns anyway."""
+"""What one thread frees serves all others. With one more, more is left free in between, and no query is answered sooner:
+Python's threads take turns anyway."""
 BLOCK = 1024 * 1024
 """Bytes from which on a block is the system's own, and goes back to it at once; and of free memory that is kept."""
 PERIOD_S = 60.0
