@@ -15,7 +15,7 @@ import time
 from collections.abc import Mapping
 
 HEAPS = 1
-"""What one thread frees serves all others. With one more, more is left free in between, and no query is answered sooner:
+"""What one thread frees serves all others. With two, more is left free in between, and no query is answered sooner:
 Python's threads take turns anyway."""
 BLOCK = 1024 * 1024
 """Bytes from which on a block is the system's own, and goes back to it at once; and of free memory that is kept."""
