@@ -41,6 +41,7 @@ from benchmarks.soak import table as soak_table
 from benchmarks.workload import BenchError, Source, model_folder
 from lipcore.robots.library import ROBOTS
 from lipserve import ApiError, StreamError
+from lipserve.wording import counted
 from service.cli.demo import DemoError
 from service.foundation.errors import ServiceError
 
@@ -338,7 +339,7 @@ def real(
     found = real_report.targets(outcome.results)
     _tell(real_report.grids(outcome), real_report.notes(outcome), found, console, None, strict)
     if outcome.failed:
-        raise BenchError(f"{len(outcome.failed)} cells failed. The same command computes them again.")
+        raise BenchError(f"{counted(len(outcome.failed), 'cell')} failed. The same command computes what is missing.")
 
 
 def _begin() -> Console:

@@ -35,11 +35,11 @@ def is_installed() -> bool:
 def predict_mujoco(body: RigidBody, train: Samples, test: Samples) -> Forecast:
     """Predict torque with the parameters that `mujoco.sysid` finds."""
     import mujoco  # noqa: PLC0415 - not a dependency
-    from mujoco import sysid  # noqa: PLC0415
+    from mujoco import sysid  # noqa: PLC0415 - as above
 
     rows = train.rows(np.linspace(0, len(train) - 1, min(len(train), MAX_ROWS)).round().astype(np.int64))
     chain = np.argsort(body.order)
-    spec = _spec(mujoco, body)
+    spec = arm(body)
     parameters = _parameters(sysid, spec, np.abs(train.tau).max(axis=0), body)
     spread = np.where(train.tau.std(axis=0) > 0, train.tau.std(axis=0), 1.0)
 
@@ -67,10 +67,13 @@ def predict_mujoco(body: RigidBody, train: Samples, test: Samples) -> Forecast:
     return Forecast(mean, np.broadcast_to(std, mean.shape))
 
 
-def _spec(mujoco: Any, body: RigidBody) -> Any:
-    """Return the URDF's arm as a MuJoCo model, bodies `body1` to `bodyN` from base to tip."""
+def arm(body: RigidBody) -> Any:
+    """Return the URDF's arm as an `MjSpec`, its bodies called body1 to bodyN from base to tip."""
+    import mujoco  # noqa: PLC0415 - not a dependency
+
     spec, model = mujoco.MjSpec(), body.model
     spec.option.gravity = list(model.gravity.linear)
+    spec.compiler.balanceinertia = True  # some URDFs have inertias that no body has
     axes, last = model.createData().joints, spec.worldbody
     for index in range(1, model.njoints):
         place, inertia = model.jointPlacements[index], model.inertias[index]

@@ -77,7 +77,25 @@ def test_the_mean_is_of_the_training_samples():
     assert forecast.mean.shape == forecast.std.shape == test.tau.shape
 
 
-@pytest.mark.skipif(not mujoco_sysid.is_installed(), reason="mujoco.sysid is not installed")
+needs_mujoco = pytest.mark.skipif(not mujoco_sysid.is_installed(), reason="mujoco.sysid is not installed")
+
+
+@needs_mujoco
+@pytest.mark.parametrize("name", ["panda", "ur10", "tiago", "double-pendulum"])
+def test_the_mujoco_model_has_the_torque_of_the_urdf(name):
+    import mujoco
+
+    robot, samples = load_robot(name), simulated(name, samples=20)
+    model = mujoco_sysid.arm(RigidBody.from_profile(name, robot.joint_names, robot.joint_types)).compile()
+    data, found = mujoco.MjData(model), []
+    for data.qpos, data.qvel, data.qacc in zip(samples.q, samples.dq, samples.ddq, strict=True):
+        mujoco.mj_inverse(model, data)
+        found.append(data.qfrc_inverse.copy())
+    true = inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)
+    np.testing.assert_allclose(found, true, atol=1e-3 * np.abs(true).max())
+
+
+@needs_mujoco
 def test_mujoco_finds_the_torque_of_a_simulated_robot():
     train, test = simulated(noise=0.001, samples=100), simulated(seed=2)
     assert nmse(mujoco_sysid.predict_mujoco(PENDULUM.body(train), train, test), test).max() < 1e-2
