@@ -30,6 +30,9 @@ from benchmarks.online.arms import KINDS
 from benchmarks.online.promises import targets as online_targets
 from benchmarks.online.running import PARTS
 from benchmarks.online.scene import Scene
+from benchmarks.real import report as real_report
+from benchmarks.real import running as real_running
+from benchmarks.real.cells import product_revision
 from benchmarks.scale import running as scale_running
 from benchmarks.scale.running import PARTS as SCALE_PARTS
 from benchmarks.soak import hours as soak_hours
@@ -38,6 +41,7 @@ from benchmarks.soak import table as soak_table
 from benchmarks.workload import BenchError, Source, model_folder
 from lipcore.robots.library import ROBOTS
 from lipserve import ApiError, StreamError
+from lipserve.wording import counted
 from service.cli.demo import DemoError
 from service.foundation.errors import ServiceError
 
@@ -308,6 +312,34 @@ def exported(
     if json_file is not None:
         results.write(json_file, _judged(found))
     _tell(exported_running.grids(results), [], found, console, markdown, strict)
+
+
+@app.command()
+def real(
+    folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Of the recordings.")],
+    out: Annotated[
+        Path, typer.Option(file_okay=False, help="Folder of the results. What is there is not computed again.")
+    ] = Path("build/real"),
+    only: Annotated[str, typer.Option(help="Pattern that recording/split/told/method must contain.")] = "",
+    jobs: Annotated[int, typer.Option(min=1, help="Cells computed at a time. Compare seconds with 1.")] = 1,
+    tables: Annotated[bool, typer.Option("--table", help="Compute nothing: print the results that there are.")] = False,
+    revision: Annotated[
+        str | None, typer.Option(help="Of the product, by which its results are kept. By default from git.")
+    ] = None,
+    page: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the documentation's page here.")] = None,
+    strict: Strict = False,
+) -> None:
+    """Train on recordings of real arms with default options, beside what others try first: hours, resumable."""
+    console = _begin()
+    known = revision or product_revision()
+    options = real_running.Options(folder, out, known, only, jobs, compute=not tables)
+    outcome = real_running.run(options, console)
+    if page is not None:
+        page.write_text(real_report.page(outcome, known))
+    found = real_report.targets(outcome.results)
+    _tell(real_report.grids(outcome), real_report.notes(outcome), found, console, None, strict)
+    if outcome.failed:
+        raise BenchError(f"{counted(len(outcome.failed), 'cell')} failed. The same command computes what is missing.")
 
 
 def _begin() -> Console:

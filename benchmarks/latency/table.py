@@ -127,15 +127,15 @@ def motions(results: Results) -> Grid:
     return Grid("how the motion decides: p50 in process, idle", columns, rows)
 
 
-def promises(found: Sequence[Target]) -> Grid:
-    """What was promised and what was measured."""
+def promises(found: Sequence[Target], heading: str = "medians over runs") -> Grid:
+    """What was promised and what was measured; heading: of the column of names."""
     verdicts = {True: "met", False: "NOT met", None: ""}
     rows = []
     for each in found:
         measured = "not measured" if each.value is None else f"{_figure(each.value)} {each.unit}"
         limit = "" if each.limit is None else f"{each.sense} {each.limit:g} {each.unit}"
         rows.append((each.name, limit, measured, verdicts[each.met]))
-    return Grid("promised and measured", ("medians over runs", "promised", "measured", ""), rows)
+    return Grid("promised and measured", (heading, "promised", "measured", ""), rows)
 
 
 def show(results: Results, console: Console) -> None:

@@ -1,0 +1,95 @@
+"""The service under test: it prepares recordings, trains with default options and predicts, all through its API."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from benchmarks.real.rivals import Forecast
+from benchmarks.workload import BenchError
+from lipcore.data.metrics import LEVEL, quantile
+from lipcore.data.samples import Samples
+from lipserve import Client
+from lipserve.asking import Reading
+from lipserve.states import SUCCEEDED
+from service.cli.demo import ServiceProcess
+from service.cli.simulate import write_recording
+from service.datasets import store
+from service.foundation.settings import Settings
+from service.storage.storage import Storage
+
+BATCH_ROWS = 500
+"""Queries of one request to predict."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A trained version. estimator: the one that serves; seconds: from the job's start to its end."""
+
+    model: str
+    version: int
+    estimator: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Bed:
+    """A running service of its own, and the folder of its files."""
+
+    client: Client
+    home: Path
+
+    def prepare(self, path: Path, reading: Reading) -> Samples:
+        """Upload a recording and return its samples as the service has prepared and stored them."""
+        dataset = self.client.upload(path, **reading)
+        storage = Storage.open(Settings(home=self.home))
+        try:
+            return store.samples(storage.files, store.find(storage.database, dataset.id))
+        finally:
+            storage.database.close()
+
+    def train(self, model: str, samples: Samples, joint_types: Sequence[str], robot: str | None) -> Trained:
+        """Upload samples and train on them with default options; raise BenchError if the job fails."""
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / f"{model}.npz"
+            write_recording(path, samples)
+            dataset = self.client.upload(path)
+        queued = self.client.train(model, [dataset.id], joint_types=joint_types, robot=robot)
+        job = self.client.wait(queued.id)
+        if job.state != SUCCEEDED or job.version is None or job.started_at is None or job.finished_at is None:
+            raise BenchError(
+                f"The training job has {job.state}: {job.error.message if job.error else 'no reason given'}"
+            )
+        spent = datetime.fromisoformat(job.finished_at) - datetime.fromisoformat(job.started_at)
+        version = self.client.version(model, job.version)
+        return Trained(model, job.version, version.estimator, spent.total_seconds())
+
+    def predict(self, trained: Trained, samples: Samples) -> Forecast:
+        """Predict the torque of each row, and the standard deviation that the 95 % interval stands for."""
+        means, halves = [], []
+        for start in range(0, len(samples), BATCH_ROWS):
+            rows = samples.rows(slice(start, start + BATCH_ROWS))
+            answer = self.client.predict(trained.model, rows.q, rows.dq, rows.ddq, version=trained.version)
+            low, high = answer.interval(LEVEL)
+            means.append(answer.tau)
+            halves.append((high - low) / 2)
+        return Forecast(np.concatenate(means), np.concatenate(halves) / quantile(LEVEL))
+
+
+@contextmanager
+def open_bed(jobs: int) -> Iterator[Bed]:
+    """Start a service that trains at most `jobs` models at a time; stop it in the end."""
+    with TemporaryDirectory(prefix="lipserve-bench-") as home:
+        service = ServiceProcess(0, {"LIPSERVE_HOME": home, "LIPSERVE_TRAINING_WORKERS": str(jobs)})
+        try:
+            with Client(service.url) as client:
+                service.wait_ready(client)
+                yield Bed(client, Path(home))
+        finally:
+            service.stop()

@@ -1,0 +1,190 @@
+"""Tables of the results, the promises, and the page of the documentation."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from benchmarks.latency import table
+from benchmarks.latency.table import NOTHING, Grid
+from benchmarks.latency.targets import Target
+from benchmarks.real.cells import PRODUCT, Result, Told
+from benchmarks.real.running import ALONE, WITH_BODY, Outcome
+from benchmarks.real.splits import EARLY, GUARD_S, MAX_TEST_ROWS
+
+TEN_S = 9.4
+"""What counts as ten seconds: preparation cuts half a second off a recording of ten."""
+LIMITS: Mapping[tuple[str, str], tuple[str, Mapping[Told, float]]] = {
+    ("panda-9s", EARLY): ("R1, panda-9s, its last 30 %", {"nothing": 2e-2, "URDF": 1.3e-2}),
+    ("panda-9s", "other"): ("R2, panda-9s, other motion", {"nothing": 1.6e-2, "URDF": 1.3e-2}),
+    ("kuka", "other"): ("kuka, other motion", {"nothing": 1.4e-1}),
+}
+"""Mean nMSE that is promised on some splits."""
+COVERED = 0.85
+"""Least coverage of a joint's 95 % interval."""
+MAX_OF_MEAN = 1.05
+"""Largest error, in errors of the recording's mean."""
+
+EITHER: tuple[Told, ...] = ("nothing", "URDF")
+UNTOLD: tuple[Told, ...] = ("nothing",)
+Split = tuple[str, str]
+"""Recording and split by name."""
+Column = tuple[str, Told]
+COLUMNS: Sequence[Column] = (
+    *((PRODUCT, "nothing"), (PRODUCT, "URDF")),
+    *((method, "nothing") for method in ALONE),
+    *((method, "URDF") for method in WITH_BODY),
+)
+"""Methods and what they are told."""
+
+
+class Summary:
+    """Results by recording and split."""
+
+    def __init__(self, results: Iterable[Result]) -> None:
+        self.results = list(results)
+        self.rows: dict[Split, dict[Column, Result]] = {}
+        for result in self.results:
+            row = self.rows.setdefault((result.cell.recording, result.cell.split), {})
+            row[result.cell.method, result.cell.told] = result
+
+    def product(self) -> list[Result]:
+        """Return the product's results."""
+        return [each for each in self.results if each.cell.method == PRODUCT]
+
+    def ratio(self, result: Result, told: tuple[Told, ...] = EITHER) -> float | None:
+        """Return the error over that of the best rival of those that were told so; None without any."""
+        row = self.rows[result.cell.recording, result.cell.split]
+        rivals = [each.error for (method, known), each in row.items() if method != PRODUCT and known in told]
+        return result.error / min(rivals) if rivals else None
+
+
+def targets(results: Iterable[Result]) -> list[Target]:
+    """Return every promise and what was measured."""
+    summary = Summary(results)
+    everything = summary.product()
+    ratios: defaultdict[tuple[Told, bool], list[float]] = defaultdict(list)
+    for each in everything:
+        if (ratio := summary.ratio(each)) is not None:
+            ratios[each.cell.told, each.train_s >= TEN_S].append(ratio)
+    long, of_mean = ratios["URDF", True], "error / error of the recording's mean"
+    found = [
+        Target("nothing told, 10 s and more: largest error / best rival", _max(ratios["nothing", True]), "×", "≤", 2.0),
+        Target("URDF told, 10 s and more: largest error / best rival", _max(long), "×", "≤", 1.15),
+        Target("URDF told, 10 s and more: median error / best rival", _median(long), "×", "≤", 1.0),
+        Target("nothing told, less than 10 s: largest error / best rival", _max(ratios["nothing", False]), "×", "≤", 5),
+        Target(f"largest {of_mean}", _max([each.of_mean for each in everything]), "×", "≤", MAX_OF_MEAN),
+        Target(f"worst joint: {of_mean}", _max([each.worst for each in everything]), "×", "≤", MAX_OF_MEAN),
+    ]
+    for split, (name, limits) in LIMITS.items():
+        for told, limit in limits.items():
+            result = summary.rows.get(split, {}).get((PRODUCT, told))
+            found.append(Target(f"{name}, told {told}", None if result is None else result.error, "nMSE", "≤", limit))
+    covered = [100.0 * (each >= COVERED) for result in everything for each in result.coverage]
+    widths = [each for result in everything for each in result.width]
+    return [
+        *found,
+        Target("joints whose coverage is 85 to 100 %", float(np.mean(covered)) if covered else None, "%", "≥", 90),
+        Target("median width / need", _median(widths), "×", "≤", 2.0),
+    ]
+
+
+def _max(values: Sequence[float]) -> float | None:
+    return max(values) if values else None
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if values else None
+
+
+def grids(outcome: Outcome) -> list[Grid]:
+    """Return every table, the promises last."""
+    summary = Summary(outcome.results)
+    found = [errors(summary), details(summary), methods(summary), table.promises(targets(outcome.results), "")]
+    return [grid for grid in found if grid.rows]
+
+
+def errors(summary: Summary) -> Grid:
+    """Return the mean nMSE of each method on each split."""
+    rows = []
+    for (recording, split), row in summary.rows.items():
+        learnt = next(iter(row.values())).train_s
+        cells = (row.get(column) for column in COLUMNS)
+        figures = (NOTHING if each is None else _power(each.error) for each in cells)
+        rows.append((f"{recording}, {split}", f"{learnt:.1f}", *figures))
+    heads = (f"{method}, told {told}" if method == PRODUCT else method for method, told in COLUMNS)
+    title = "nMSE, mean over the joints; from least squares on, methods know the URDF"
+    return Grid(title, ("recording, test", "s learnt", *heads), rows)
+
+
+def details(summary: Summary) -> Grid:
+    """Return the product's figures on each split."""
+    rows = []
+    for each in summary.product():
+        rows.append(
+            (
+                f"{each.cell.recording}, {each.cell.split}, {each.cell.told}",
+                " ".join(map(_power, each.nmse)),
+                " ".join(f"{100 * value:.0f}" for value in each.coverage),
+                f"{np.median(each.width):.1f}",
+                f"{each.worst:.2g}",
+                _times(summary.ratio(each)),
+                _times(summary.ratio(each, UNTOLD)),
+                f"{each.seconds:.0f}",
+                each.estimator,
+            )
+        )
+    heads = (
+        *("recording, test, told", "nMSE, joint by joint", "coverage of 95 %, %", "width / need"),
+        *("worst joint / mean", "× best rival", "× best told nothing", "s", "estimator"),
+    )
+    return Grid(f"{PRODUCT}, default options", heads, rows, texts=True)
+
+
+def methods(summary: Summary) -> Grid:
+    """Return the intervals and times of each method, and how often it has the smallest error."""
+    best = [min(row, key=lambda column: row[column].error) for row in summary.rows.values()]
+    rows = []
+    for column in COLUMNS:
+        results = [row[column] for row in summary.rows.values() if column in row]
+        if not results:
+            continue
+        covered = np.mean([value >= COVERED for each in results for value in each.coverage])
+        width = np.median([value for each in results for value in each.width])
+        times = [each.seconds for each in results]
+        figures = (f"{100 * covered:.0f}", f"{width:.1f}", f"{np.median(times):.1f}", f"{max(times):.1f}")
+        rows.append((f"{column[0]}, told {column[1]}", *figures, f"{best.count(column)} of {len(results)}"))
+    heads = ("method", "% of joints covered 85 to 100 %", "median width / need", "median s", "max s", "smallest error")
+    return Grid("intervals, times, and on how many splits the error is the smallest", heads, rows)
+
+
+def notes(outcome: Outcome) -> list[str]:
+    """Return what a reader needs beside the tables."""
+    lines = [
+        f"Tests begin {GUARD_S:g} s after what is learnt and have at most {MAX_TEST_ROWS} rows. {EARLY}: the first "
+        "60 % is learnt, the last 30 % tested. other: another motion.",
+        "Width / need: the mean half width of the 95 % interval over 1.96 RMSE. Worst joint / mean: its error over "
+        "that of the training samples' mean.",
+        "Rivals choose their constants on the last quarter of the training samples.",
+    ]
+    if outcome.absent:
+        lines.append(f"Not installed: {', '.join(outcome.absent)}.")
+    if outcome.skipped:
+        lines.append("Too short: " + ", ".join(f"{name} ({why})" for name, why in outcome.skipped.items()) + ".")
+    return lines
+
+
+def page(outcome: Outcome, revision: str) -> str:
+    """Return the page of the documentation."""
+    head = f"# Real recordings\n\nWritten by `python -m benchmarks real FOLDER --page FILE`, {PRODUCT} {revision}.\n\n"
+    return head + table.grids_markdown(grids(outcome), notes(outcome))
+
+
+def _power(value: float) -> str:
+    return f"{value:.2g}" if value >= 0.995 else f"{value:.1e}".replace("e-0", "e-")
+
+
+def _times(value: float | None) -> str:
+    return NOTHING if value is None else f"{value:.2f}"

@@ -1,0 +1,165 @@
+"""Which cells there are, and computing those that have no result yet."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from benchmarks.real import mujoco_sysid, rivals
+from benchmarks.real.cells import PRODUCT, Cache, Cell, Result, judge
+from benchmarks.real.product import Bed, open_bed
+from benchmarks.real.recordings import RECORDINGS, Recording, prepare
+from benchmarks.real.rivals import Forecast, Predict
+from benchmarks.real.splits import Split, splits
+from lipcore.data.samples import Samples
+from lipcore.robots.urdf import RigidBody
+
+ALONE: Mapping[str, Predict] = {"mean": rivals.predict_mean, "RBF ridge": rivals.predict_rbf}
+"""Rivals that know nothing of the robot."""
+WITH_BODY: Mapping[str, Callable[[RigidBody, Samples, Samples], Forecast]] = {
+    "least squares": rivals.predict_least_squares,
+    "Bayesian least squares": rivals.predict_bayesian,
+    "mujoco.sysid": mujoco_sysid.predict_mujoco,
+}
+"""Rivals that know the URDF."""
+OPTIONAL = {"mujoco.sysid": mujoco_sysid.is_installed}
+"""Rivals that may be missing here, and whether they are there."""
+
+Service = Callable[[], Bed]
+"""Returns the service, which starts when it is first needed."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a run.
+
+    folder: of the recordings; out: of the results; revision: of the product; only: pattern that the name of a cell
+    must contain; jobs: cells that are computed at a time; compute: False returns only the results that there are.
+    """
+
+    folder: Path
+    out: Path
+    revision: str
+    only: str = ""
+    jobs: int = 1
+    compute: bool = True
+    recordings: Sequence[Recording] = RECORDINGS
+
+
+@dataclass(frozen=True)
+class Plan:
+    """work: what each cell learns from and is tested on; skipped: splits that a recording is too short for, and why."""
+
+    work: Mapping[Cell, tuple[Recording, Split]]
+    skipped: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All results of a plan. failed: why a cell has none, by its name; absent: rivals that are not installed."""
+
+    results: Sequence[Result]
+    skipped: Mapping[str, str]
+    failed: Mapping[str, str]
+    absent: Sequence[str]
+
+
+def run(options: Options, console: Console) -> Outcome:
+    """Compute the cells that have no result; return all results.
+
+    Raise BenchError if a recording is neither in the folder nor prepared in the results.
+    """
+    cache = Cache(options.out / "cells", options.revision)
+    with _service(options.jobs) as service:
+        plan = make_plan(options, service)
+        absent = [method for method, is_installed in OPTIONAL.items() if not is_installed()]
+        wanted = [cell for cell in plan.work if options.compute and cell.method not in absent]
+        missing = [cell for cell in wanted if cache.find(cell) is None]
+        console.print(f"{len(plan.work)} cells of {options.revision}, {len(missing)} to compute", highlight=False)
+        failed = _compute_all(missing, plan, cache, options.jobs, service, console)
+    results = [result for cell in plan.work if (result := cache.find(cell)) is not None]
+    return Outcome(results, plan.skipped, failed, absent)
+
+
+def make_plan(options: Options, service: Service) -> Plan:
+    """Prepare the recordings; return the cells whose names `only` matches."""
+    work, all_skipped = {}, {}
+    for recording in options.recordings:
+        found, skipped = splits(prepare(recording, options.folder, options.out / "prepared", service))
+        all_skipped.update({f"{recording.name}/{split}": why for split, why in skipped.items()})
+        for name, split in found.items():
+            for cell in _cells(recording, name):
+                if re.search(options.only, str(cell)):
+                    work[cell] = recording, split
+    return Plan(work, all_skipped)
+
+
+def _cells(recording: Recording, split: str) -> Iterator[Cell]:
+    for method in (PRODUCT, *ALONE):
+        yield Cell(recording=recording.name, split=split, told="nothing", method=method)
+    if recording.robot is not None:
+        for method in (PRODUCT, *WITH_BODY):
+            yield Cell(recording=recording.name, split=split, told="URDF", method=method)
+
+
+def compute_cell(cell: Cell, recording: Recording, split: Split, service: Service) -> Result:
+    """Train on the split's training samples and predict its test, whose torque no method sees."""
+    states = replace(split.test, tau=np.full_like(split.test.tau, np.nan))
+    if cell.method == PRODUCT:
+        bed, types = service(), recording.joint_types(split.train.n_joints)
+        robot = recording.robot if cell.told == "URDF" else None
+        trained = bed.train(f"{cell.recording}-{cell.split}-{cell.told}".lower(), split.train, types, robot)
+        return judge(cell, split, bed.predict(trained, states), trained.seconds, trained.estimator)
+    known = cell.told == "URDF"
+    predict = partial(WITH_BODY[cell.method], recording.body(split.train)) if known else ALONE[cell.method]
+    began = time.monotonic()
+    forecast = predict(split.train, states)
+    return judge(cell, split, forecast, time.monotonic() - began)
+
+
+def _compute_all(
+    cells: Sequence[Cell], plan: Plan, cache: Cache, jobs: int, service: Service, console: Console
+) -> dict[str, str]:
+    """Compute cells, `jobs` at a time, and store each result; return why others failed."""
+    failed = {}
+    with ThreadPoolExecutor(jobs) as pool:
+        running = {pool.submit(compute_cell, cell, *plan.work[cell], service): cell for cell in cells}
+        try:
+            for done, future in enumerate(as_completed(running), start=1):
+                cell, error = running[future], future.exception()
+                if error is None:
+                    result = future.result()
+                    cache.add(result)
+                    said = f"nMSE {result.error:.1e}, {result.seconds:.1f} s {result.estimator}"
+                else:
+                    failed[str(cell)] = said = f"{type(error).__name__}: {error}"
+                console.print(f"  {done}/{len(cells)}  {cell}: {said}", highlight=False, markup=False)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return failed
+
+
+@contextmanager
+def _service(jobs: int) -> Iterator[Service]:
+    beds: list[Bed] = []
+    lock = threading.Lock()
+    with ExitStack() as stack:
+
+        def service() -> Bed:
+            with lock:
+                if not beds:
+                    beds.append(stack.enter_context(open_bed(jobs)))
+                return beds[0]
+
+        yield service

@@ -1,0 +1,265 @@
+"""Rivals, splits, cached cells and promises of `python -m benchmarks real`, on simulated arms."""
+
+import io
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from benchmarks.real import mujoco_sysid, report, rivals, running
+from benchmarks.real.cells import PRODUCT, Cache, Cell, Result, judge
+from benchmarks.real.product import open_bed
+from benchmarks.real.recordings import Recording
+from benchmarks.real.rivals import Forecast
+from benchmarks.real.splits import GUARD_S, MAX_TEST_ROWS, Split, elapsed, splits
+from lipcore.data.samples import Samples
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.urdf import RigidBody
+from lipserve.asking import Reading
+from service.cli.simulate import write_recording
+
+PENDULUM = Recording("pendulum", robot="double-pendulum")
+
+
+def simulated(robot="double-pendulum", seed=1, samples=300, **stream):
+    return simulate(load_robot(robot), Stream(samples, 20.0, 10, speed=5.0, **stream), seed)
+
+
+def still(seconds, rate=100.0, episode=0):
+    """Samples of one joint whose position counts the rows."""
+    rows = round(seconds * rate)
+    column = np.arange(rows, dtype=float)[:, None]
+    return Samples(("a",), column[:, 0] / rate, np.full(rows, episode), column, column, column, column)
+
+
+def nmse(forecast, samples):
+    """Error against the torque without noise."""
+    robot = load_robot("double-pendulum")
+    true = inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)
+    return np.mean((forecast.mean - true) ** 2, axis=0) / true.var(axis=0)
+
+
+@pytest.mark.parametrize("predict", [rivals.predict_least_squares, rivals.predict_bayesian])
+def test_least_squares_finds_the_torque_of_a_simulated_robot(predict):
+    train, test = simulated(noise=0.001), simulated(seed=2)
+    forecast = predict(PENDULUM.body(train), train, test)
+    assert nmse(forecast, test).max() < 1e-3
+    assert np.all(forecast.std > 0)
+
+
+def test_the_regressor_follows_the_order_of_the_datas_joints():
+    samples, robot = simulated("ur5", noise=0.0), load_robot("ur5")
+    turned = [3, 0, 5, 1, 4, 2]
+    names = tuple(robot.joint_names[joint] for joint in turned)
+    columns = {name: getattr(samples, name)[:, turned] for name in ("q", "dq", "ddq", "tau")}
+    shuffled = replace(samples, joint_names=names, **columns)
+    body = RigidBody.from_profile("ur5", names, ("revolute",) * 6)
+    parameters = np.concatenate([np.ravel(each.toDynamicParameters()) for each in robot.model.inertias[1:]])
+    rigid = rivals.regressor(body, shuffled)[:, :, : parameters.size]
+    true = inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)[:, turned]
+    np.testing.assert_allclose(rigid @ parameters, true, atol=1e-9)
+
+
+def test_ridge_regression_is_far_better_than_the_mean_where_test_and_training_are_alike():
+    samples = simulated(samples=600, noise=0.001)
+    train, test = samples.rows(slice(0, 600, 2)), samples.rows(slice(1, 600, 2))
+    mean, ridge = (nmse(predict(train, test), test) for predict in (rivals.predict_mean, rivals.predict_rbf))
+    assert np.all(ridge < 0.01 * mean)
+
+
+def test_the_mean_is_of_the_training_samples():
+    train, test = simulated(), simulated(seed=2)
+    forecast = rivals.predict_mean(train, test)
+    np.testing.assert_allclose(forecast.mean[7], train.tau.mean(axis=0))
+    assert forecast.mean.shape == forecast.std.shape == test.tau.shape
+
+
+needs_mujoco = pytest.mark.skipif(not mujoco_sysid.is_installed(), reason="mujoco.sysid is not installed")
+
+
+@needs_mujoco
+@pytest.mark.parametrize("name", ["panda", "ur10", "tiago", "double-pendulum"])
+def test_the_mujoco_model_has_the_torque_of_the_urdf(name):
+    import mujoco
+
+    robot, samples = load_robot(name), simulated(name, samples=20)
+    model = mujoco_sysid.arm(RigidBody.from_profile(name, robot.joint_names, robot.joint_types)).compile()
+    data, found = mujoco.MjData(model), []
+    for data.qpos, data.qvel, data.qacc in zip(samples.q, samples.dq, samples.ddq, strict=True):
+        mujoco.mj_inverse(model, data)
+        found.append(data.qfrc_inverse.copy())
+    true = inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)
+    np.testing.assert_allclose(found, true, atol=1e-3 * np.abs(true).max())
+
+
+@needs_mujoco
+def test_mujoco_finds_the_torque_of_a_simulated_robot():
+    train, test = simulated(noise=0.001, samples=100), simulated(seed=2)
+    assert nmse(mujoco_sysid.predict_mujoco(PENDULUM.body(train), train, test), test).max() < 1e-2
+
+
+def test_splits_keep_a_guard_between_training_and_test():
+    found, skipped = splits({"train": still(24.0), "other": still(3.0)})
+    assert list(found) == ["first-5s", "first-10s", "last-30pct", "other"]
+    assert list(skipped) == ["first-30s"]
+    rows = {name: (len(each.train), each.test.q[0, 0]) for name, each in found.items()}
+    guard = 100 * GUARD_S
+    assert rows == {
+        "first-5s": (500, 500 + guard),
+        "first-10s": (1000, 1000 + guard),
+        "last-30pct": (1680, 1680 + guard),
+        "other": (2400, 0),
+    }
+    assert all(len(each.test) <= MAX_TEST_ROWS for each in found.values())
+
+
+def test_a_short_recording_is_also_split_at_60_and_70_percent():
+    found, _ = splits({"train": still(9.0)})
+    early = found["first-60pct"]
+    assert (len(early.train), early.test.q[0, 0], early.test.q[-1, 0]) == (540, 630, 899)
+
+
+def test_the_time_between_episodes_does_not_count():
+    samples = Samples.concatenate([still(6.0), still(6.0)])
+    apart = replace(samples, t=samples.t + 1000.0 * samples.episode)
+    np.testing.assert_allclose(elapsed(apart), np.arange(1200) / 100)
+
+
+def toy(recording="toy", split="other", told="nothing", method="mean", error=0.5, **figures):
+    """A result that was never computed."""
+    usual = {
+        **{"train_s": 20.0, "train_rows": 10, "test_rows": 10, "seconds": 1.0},
+        **{"nmse": [error, error], "nmse_mean": [1.0, 1.0], "coverage": [0.95, 0.95], "width": [1.0, 1.0]},
+    }
+    return Result(cell=Cell(recording=recording, split=split, told=told, method=method), **{**usual, **figures})
+
+
+def test_figures_compare_errors_and_widths_with_what_was_measured():
+    test = replace(still(1.0), tau=np.tile([1.0, -1.0], 50)[:, None])
+    split = Split(replace(still(2.0), tau=np.full((200, 1), 3.0)), test)
+    found = judge(toy().cell, split, Forecast(test.tau + 0.5, np.full((100, 1), 1.0)), 2.0)
+    assert found.nmse == pytest.approx([0.25])
+    assert found.nmse_mean == pytest.approx([10.0])
+    assert found.worst == pytest.approx(0.025)
+    assert found.width == pytest.approx([2.0])
+    assert found.coverage == [1.0]
+    assert found.train_s == pytest.approx(2.0)
+
+
+def test_results_of_the_product_belong_to_a_revision_and_those_of_rivals_to_none(tmp_path):
+    first, second = Cache(tmp_path, "aaaa"), Cache(tmp_path, "bbbb")
+    product, rival = toy(method=PRODUCT), toy(method="RBF ridge")
+    first.add(product)
+    first.add(rival)
+    assert first.find(product.cell).revision == "aaaa"
+    assert second.find(product.cell) is None
+    assert second.find(rival.cell) == rival
+
+
+@pytest.fixture
+def options(tmp_path):
+    """Options of a run on a recording that is prepared already, without the product."""
+    (tmp_path / "prepared").mkdir()
+    write_recording(tmp_path / "prepared" / "pendulum-train.npz", simulated(samples=400, noise=0.01))
+    return running.Options(tmp_path, tmp_path, "aaaa", only="mean|least", recordings=(PENDULUM,))
+
+
+def run(options):
+    return running.run(options, Console(file=io.StringIO()))
+
+
+def test_a_second_run_computes_nothing(options, monkeypatch):
+    first = run(options)
+    assert {result.cell.method for result in first.results} == {"mean", "least squares", "Bayesian least squares"}
+    assert {result.cell.split for result in first.results} == {"first-5s", "first-10s", "last-30pct"}
+    monkeypatch.setattr(running, "compute_cell", lambda *_: pytest.fail("computed again"))
+    assert run(options) == first
+
+
+def test_a_run_continues_after_cells_that_failed(options, monkeypatch):
+    def fail(train, test):
+        raise ValueError("no luck")
+
+    with monkeypatch.context() as patch:
+        patch.setitem(running.ALONE, "mean", fail)
+        broken = run(options)
+    assert set(broken.failed.values()) == {"ValueError: no luck"}
+    assert len(broken.failed) == 3
+    assert len(broken.results) == 6
+    assert len(run(options).results) == 9
+
+
+def test_a_table_is_made_without_computing(options):
+    assert run(replace(options, compute=False)).results == []
+
+
+def test_methods_do_not_see_the_torque_of_the_test(options, monkeypatch):
+    seen = []
+
+    def watch(train, test):
+        seen.append(test.tau)
+        return rivals.predict_mean(train, test)
+
+    monkeypatch.setitem(running.ALONE, "mean", watch)
+    run(replace(options, only="first-5s/nothing/mean"))
+    assert np.isnan(seen[0]).all()
+
+
+def promises(results):
+    return {each.name: (each.value, each.met) for each in report.targets(results)}
+
+
+def test_promises_compare_the_product_with_the_best_rival_of_each_split():
+    found = promises(
+        [
+            toy("a", method=PRODUCT, error=0.3),
+            toy("a", told="URDF", method=PRODUCT, error=0.12),
+            toy("a", method="RBF ridge", error=0.2),
+            toy("a", told="URDF", method="least squares", error=0.1),
+            toy("b", method=PRODUCT, nmse=[0.7, 0.1], nmse_mean=[0.5, 1.5], train_s=5.0, coverage=[0.5, 1.0]),
+            toy("b", method="mean", error=0.1, train_s=5.0),
+        ]
+    )
+    assert found["nothing told, 10 s and more: largest error / best rival"] == (pytest.approx(3.0), False)
+    assert found["URDF told, 10 s and more: largest error / best rival"] == (pytest.approx(1.2), False)
+    assert found["nothing told, less than 10 s: largest error / best rival"] == (pytest.approx(4.0), True)
+    assert found["largest error / error of the recording's mean"] == (pytest.approx(0.4), True)
+    assert found["worst joint: error / error of the recording's mean"] == (pytest.approx(1.4), False)
+    assert found["joints whose coverage is 85 to 100 %"] == (pytest.approx(100 * 5 / 6), False)
+    assert found["median width / need"] == (1.0, True)
+
+
+def test_promises_name_the_splits_that_they_are_about():
+    found = promises([toy("panda-9s", "other", "URDF", PRODUCT, error=0.012)])
+    assert found["R2, panda-9s, other motion, told URDF"] == (pytest.approx(0.012), True)
+    assert found["R2, panda-9s, other motion, told nothing"] == (None, None)
+    assert found["kuka, other motion, told nothing"] == (None, None)
+
+
+def test_the_page_holds_every_table():
+    results = [toy("a", method=PRODUCT, error=0.3, estimator="rigid-body"), toy("a", error=1.5)]
+    page = report.page(running.Outcome(results, {"a/first-30s": "9.0 s recorded"}, {}, ["mujoco.sysid"]), "aaaa")
+    assert "| a, other | 20.0 | 3.0e-1 | – | 1.5 |" in page
+    assert "| a, other, nothing | 3.0e-1 3.0e-1 | 95 95 | 1.0 | 0.3 | 0.20 | 0.20 | 1 | rigid-body |" in page
+    assert "| LIPServe, told nothing | 100 | 1.0 | 1.0 | 1.0 | 1 of 1 |" in page
+    assert "NOT met" not in page
+    assert "a/first-30s (9.0 s recorded)" in page
+    assert "Not installed: mujoco.sysid." in page
+
+
+@pytest.mark.slow
+def test_the_product_prepares_trains_and_predicts_through_its_api(tmp_path):
+    raw = simulated(samples=600, noise=0.001)
+    np.savez(tmp_path / "raw.npz", t=raw.t, q=raw.q, tau=raw.tau, joint_names=np.array(raw.joint_names))
+    with open_bed(1) as bed:
+        prepared = bed.prepare(tmp_path / "raw.npz", Reading())
+        assert prepared.ddq.shape == prepared.q.shape
+        split = Split(raw.rows(slice(0, 300)), raw.rows(slice(320, 600)))
+        cell = toy(method=PRODUCT).cell
+        found = running.compute_cell(cell, PENDULUM, split, partial(lambda bed: bed, bed))
+    assert max(found.nmse) < 0.1
+    assert found.estimator
+    assert found.seconds > 0
