@@ -199,7 +199,7 @@ def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch
     for number in range(rounds):
         scaled = rescale(problem, point)
         problem = scaled.problem
-        point = problem.descend(point.geometry, scaled.sigma, ROUND_STEPS, watch.stop, noise=False)
+        point = problem.descend(point.geometry, scaled.point.sigma, ROUND_STEPS, watch.stop, noise=False)
         watch.step("hyperparameters", point.value, fraction + 0.01 * number)
     return point, problem
 
