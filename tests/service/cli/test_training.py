@@ -217,7 +217,7 @@ def test_without_options_the_service_holds_out_what_it_does_by_default_and_zero_
     body = {"model": "by-default", "datasets": job["datasets"], "estimator": "lip-chain"}
     plain = server.client.post("/v1/jobs", json=body).json()
     server.client.post(f"/v1/jobs/{plain['id']}/cancel")
-    assert job["holdout"] == {**plain["holdout"], "stretches": None}
+    assert job["holdout"] == {**plain["holdout"], "stretches": None, "only": False}
     assert (job["holdout"]["kind"], job["holdout"]["share"]) == ("auto", 0.3)
     assert job["quality"]["samples"] > 0
     job = asked("train", path, "--model", "by-default", *QUICKLY, "--hold-out", 0, "--json")
