@@ -16,7 +16,7 @@ from service.training.material import Material
 from service.training.table import TablePart
 
 
-def judge(settings: Settings, model: TorqueModel, material: Material) -> dict[str, Any]:
+def judged_figures(settings: Settings, model: TorqueModel, material: Material) -> dict[str, Any]:
     """Return the figures of a fit on what was held out, as a lineage keeps them.
 
     If a last fit follows, these are also what can be computed no more after it: fields of a `HoldoutLineage`.

@@ -133,7 +133,7 @@ def _version(
     lineage = {"job": claim.job, **material.lineage}
     if material.held_out is not None:
         pulse.stage("evaluating")
-        lineage["holdout"] = {**lineage["holdout"], **judging.judge(settings, trained, material)}
+        lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(settings, trained, material)}
     judged, learnt = _judged(settings, database, files, claim, material, trained, lineage), material
     if last is not None:
         trained = last.last(settings, trained, pulse)

@@ -340,6 +340,15 @@ def test_a_refresh_leaves_the_same_samples_out(api):
     assert answer["in_training"] is False
 
 
+def test_a_refresh_keeps_out_what_its_version_never_learns(api):
+    dataset = upload(api, recording(seed=13))["id"]
+    train(api, "refreshed-kept", dataset, holdout={"share": 0.3, "only": True})
+    seen = ended(api, api.post("/v1/models/refreshed-kept/refresh", json={}).json()["id"])
+    assert seen["state"] == "succeeded", seen
+    after = version(api, "refreshed-kept", 2)
+    assert (after["fit"]["samples_given"], after["lineage"]["holdout"]["learnt"]) == (TRAIN.stop, False)
+
+
 def test_an_exported_version_takes_its_split_with_it(api, held, dataset):
     answer = send(api, exported(api, held[0]), name="came")
     assert answer.status_code == 201, answer.text

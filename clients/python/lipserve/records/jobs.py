@@ -52,7 +52,8 @@ class Refresh(Record, frozen=True, kw_only=True):
 class JobProgress(Record, frozen=True, kw_only=True):
     """How far a job is.
 
-    stage: waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, saving or done
+    stage: waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, all_rows, saving or done.
+        `all_rows` is the last fit, on the rows held out, too
     estimator: The one at work, where `auto` trains several
     objective: Penalised negative log evidence, nats: falls during the fit
     remaining_s: Roughly the seconds that are left; null until that can be told. Taken to need all iterations, though a
