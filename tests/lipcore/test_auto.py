@@ -123,7 +123,7 @@ def test_of_an_arm_with_springs_the_chain_is_chosen():
 
 
 def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
-    def fails(self, samples, place, before=None, search=True):
+    def fails(self, samples, place, before=None):
         raise NotPositiveDefiniteError("nothing can be\nlearnt")
 
     monkeypatch.setattr(auto.Fits, "learn", fails)
