@@ -21,7 +21,7 @@ from lipcore.data.splits import SplitError, taken
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress, Progress
 from lipcore.fitting.task import Task
 from lipcore.model.selection import Candidate, plain, selection, unjudged
-from lipcore.model.torque_model import TorqueModel, training_range
+from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.selection import spread_out
 from lipcore.training.fit import compact, fit_estimator
 from lipcore.training.held_out import hold_out
@@ -82,6 +82,7 @@ def _of_all(work: Fits, contest: Contest, chosen: str) -> TorqueModel:
         model,
         posterior=compression.posterior,
         training_range=training_range(used.motion()),
+        training_torque=training_torque(task.samples.tau),
         compact=compression.report(),
         fit={**model.fit, **counts},
         conformal=conformal,
@@ -244,7 +245,7 @@ class Contest:
         try:
             model = self.work.fit(self.training, name, place, learnt)
             torque = model.predict(self.held.q, self.held.dq, self.held.ddq)
-            answer = torque.interval
+            answer = torque.interval._replace(mean=torque.mean)  # a density is that of the posterior
             density = -float(evaluate(self.held.tau, *answer).nlpd.sum())
             if not np.isfinite(density):
                 raise ValueError("what it predicts is not finite")
