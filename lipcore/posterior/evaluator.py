@@ -113,8 +113,9 @@ class Evaluator:
         """What of this evaluator depends on weights and root, laid out for compiled code: to make another `revised`."""
         return self._fixed
 
-    def revised(self, packed: Array, floor: Array) -> Evaluator:
-        """Return an evaluator with other weights, root and floor, from `packed` of one of the same anchors.
+    def revised(self, packed: Array, floor: Array, falls_back: bool = True) -> Evaluator:
+        """Return an evaluator with other weights, root and floor, from `packed` of one of the same anchors. falls_back:
+        whether its answers may, if those of this one may.
 
         What is compiled and the memory of threads are shared with this one: an answer uses either of them at a time.
         """
@@ -122,6 +123,8 @@ class Evaluator:
             raise ValueError(f"packed has shape {packed.shape}, expected {self._fixed.shape}")
         other = copy(self)
         other._fixed, other._floor = packed, floor
+        if not falls_back:
+            other._falls_back, other._usual = False, np.full_like(self._usual, np.inf)
         return other
 
     def one(

@@ -14,6 +14,9 @@ from lipcore.kernels.payload import PayloadKernel
 from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import training_torque
 from lipcore.model.warnings import warnings
+from lipcore.online.batch import Rows
+from lipcore.online.learner import OnlineModel
+from lipcore.online.transfer import Revision, consolidate
 from lipcore.posterior.evaluator import QUERIES
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, simulate
@@ -209,3 +212,21 @@ def test_a_joint_whose_torque_never_varied_answers_its_mean(model: TorqueModel, 
     answer = replace(model, training_torque=torque).predict(learnt.q, learnt.dq, learnt.ddq)
     np.testing.assert_array_equal(answer.tau[:, 1], torque["mean"][1])
     assert np.isfinite(answer.tau).all()
+
+
+@pytest.mark.parametrize("estimator", ["rigid-body"], indirect=True)
+def test_learning_ends_it_and_a_change_or_forgetting_does_not_begin_it(model: TorqueModel, fast: Samples) -> None:
+    batch = Rows(fast.t, fast.q, fast.dq, fast.ddq, fast.tau, np.zeros(len(fast), np.uint8), np.ones(len(fast)))
+    online = OnlineModel.start(model).learn(batch)
+    before, after = (each.predict(fast.q, fast.dq, fast.ddq) for each in (model, online.model()))
+    assert before.fallback is not None
+    share = 0.0 if after.fallback is None else after.fallback.share.mean()
+    assert share < 0.1 * before.fallback.share.mean()
+    for opened in (online.change(1e3), OnlineModel.start(model, forgetting_s=1.0).learn(batch)):
+        learnt = opened.model()
+        for each in (learnt, consolidate(opened), Revision.of(learnt).apply(model)):
+            answer = each.predict(fast.q, fast.dq, fast.ddq)
+            assert answer.fallback is None
+            np.testing.assert_allclose(answer.tau, learnt.predict(fast.q, fast.dq, fast.ddq).tau, rtol=1e-6, atol=1e-6)
+    again = Revision.of(online.model()).apply(model).predict(fast.q, fast.dq, fast.ddq)
+    assert np.array_equal(again.tau, after.tau)
