@@ -58,7 +58,7 @@ class TorquePrediction:
 
         tau ± 1.96 · scale · √(tau_std² + noise_std²)
 
-    covariance: (N, n, n) of the function between joints, where asked for. fallback: None where every torque is the
+    covariance: (N, n, n) of the function between joints, where asked for. fallback: None if every torque is the
     posterior mean; standard deviations and covariances are always those of the posterior.
     """
 
@@ -93,7 +93,7 @@ def training_range(motion: Motion) -> TrainingRange:
 
 
 TrainingTorque = dict[str, list[float]]
-"""Mean (`mean`) and standard deviation (`std`) of the torque of the samples behind a posterior, N·m, per joint."""
+"""Mean (`mean`) and standard deviation (`std`) of the recorded torque, N·m, per joint."""
 
 
 def training_torque(tau: Array) -> TrainingTorque:
@@ -110,11 +110,11 @@ class TorqueModel:
     manifest; training_range: of the samples behind the posterior; robot: the rigid bodies of an estimator that has
     them; calibration: how the posterior's deviations are corrected; selection: how `auto` has chosen the estimator,
     None where it was named; conformal: what left-out blocks of the training say of the intervals; training_torque: of
-    the samples behind the posterior. Both are None where an earlier release has trained it.
+    the recording. Both are None if an earlier release has trained it.
 
-    Where the posterior variance of a torque (without misfit and floor) is above its variance in training, answers go
-    back to gravity, offset and friction, and where these are not determined either, to the training's mean (eq. 26 of
-    docs/method.md). Without `training_torque` they never do.
+    If the posterior variance of a torque (without misfit and floor) exceeds its variance in training, the answer falls
+    back to gravity, offset and friction, or to the training's mean if these are not determined either (eq. 26 of
+    docs/method.md). Without `training_torque` no answer does.
     """
 
     estimator: Estimator
@@ -181,7 +181,7 @@ class TorqueModel:
         return tau if share is None else self._harmless(motion, tau, share), deviation
 
     def answer_fully(self, motion: Array, std: bool = True, covariance: bool = False) -> TorqueAnswer:
-        """Return what `answer` does, the share of the fallback and, where asked for with std, the covariance."""
+        """Return what `answer` does, with the fallback and, if asked for together with std, the covariance."""
         between = np.empty((1, self.n_joints, self.n_joints)) if covariance else None
         mean, deviation, share = self.evaluator.one(motion, std, between)
         tau, fallback = mean, None

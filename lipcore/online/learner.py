@@ -156,8 +156,8 @@ class OnlineModel:
 
     @property
     def training_torque(self) -> TrainingTorque | None:
-        """What lets answers fall back. None after a change and with forgetting: variance then says what may be another
-        by now, and the mean is still the best that is known."""
+        """The version's, by which answers fall back. None after a change and with forgetting, which widen the variance
+        of torques whose mean is still the best that is known."""
         return self.base.training_torque if self.before is None and self.forgetting_s is None else None
 
     def model(self, floor: Array | None = None) -> TorqueModel:

@@ -51,8 +51,8 @@ class Evaluator:
     (N·m)²; misfit: (5, n), see `Misfit.packed`; none where None. usual: mean and variance of the torque in training,
     (n,) each, of a model whose answers may fall back.
 
-    `one` and `many` return the mean of the posterior, which all that learns or compares is about. They also return the
-    share of the fallback in the torque to send, which `fall_back` computes.
+    `one` and `many` return the mean of the posterior: learning and external torque need it. They also return the share
+    of the fallback in the torque to send, which `fall_back` computes.
 
     Safe from several threads, each of which has memory of its own. `many` computes without the GIL, at the same time as
     others; `one` keeps it, but for a nonlinear term. Raises ValueError naming the argument that does not fit.
@@ -131,7 +131,7 @@ class Evaluator:
         self, motion: Array, std: bool = True, covariance: Array | None = None
     ) -> tuple[Array, Array | None, Array | None]:
         """Torque (n,) and, if asked for, its standard deviation (n,) at one query, (3, n): q, dq and ddq. Third, the
-        share of the fallback, (n,), None where it is zero for all joints.
+        share of the fallback, (n,), None if it is zero for all joints.
 
         covariance: (1, n, n), takes that between the joints where given, with std. Neither shape nor finiteness is
         checked. The same numbers as of `many`, to the last bit.
@@ -171,7 +171,7 @@ class Evaluator:
         self, q: Array, dq: Array, ddq: Array, covariance: bool = False
     ) -> tuple[Array, Array, Array | None, Array | None]:
         """Torques (N, n), their standard deviations (N, n) and, if asked for, covariances (N, n, n) of N queries.
-        Fourth, the shares of the fallback, (N, n), None where all are zero.
+        Fourth, the shares of the fallback, (N, n), None if all are zero.
 
         q, dq, ddq: (N, n); neither shapes nor finiteness are checked.
         """
@@ -190,7 +190,7 @@ class Evaluator:
         return tau, std, covariances, share if doubtful else None
 
     def fall_back(self, motions: Array, tau: Array, share: Array) -> Array:
-        """Return the torques to send, (N, n) N·m, at N queries where `many` has answered tau and share, (N, n) each.
+        """Return the torques to send at N queries that `many` answers with tau and share, (N, n) each (eq. 26).
 
         They are (1 − share) tau + share h, with the fallback h = (1 − share_s) s + share_s (t + p). s is the posterior
         mean at rest in the same posture, but with friction and payload as they move, and share_s its own share. t is

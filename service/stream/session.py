@@ -258,7 +258,7 @@ class Session(Conversation):
             if std is not None:
                 check_answer("tau_std", std)
             factor, more = self._served.scales.of(self._stream_id), b""
-            mean = tau if fallback is None else fallback.mean  # what is learnt from and compared with
+            mean = tau if fallback is None else fallback.mean  # for learning and external torque
             if compares:
                 more = self._external(data, mean, std, covariance, factor)
         except ServiceError as error:
@@ -325,9 +325,9 @@ class Session(Conversation):
             if asked & frames.ASK_LEARN:
                 assert self._learning is not None  # the frame was admitted
                 assert std is not None  # every flag asks for it
-                believed = mean.tobytes() + std.tobytes()
+                posterior = mean.tobytes() + std.tobytes()
                 self._learning.add(
-                    Taught(self._served, self._carried is not None, sequence, arrived, data, believed, factor)
+                    Taught(self._served, self._carried is not None, sequence, arrived, data, posterior, factor)
                 )
             if not (asked & frames.ASK_STD or self._std):  # its standard deviation was for the record, or the test
                 flags, numbers = 0, tau.tobytes()

@@ -101,7 +101,7 @@ def answer(
     variance, at least 0;
     misfit: (5, n), variance at rest, the speed where it has faded to exp(−1), variance that grows with speed and
     acceleration beyond the usual ones, and those, see `posterior.misfit`; usual: (n,), variance of the torque in
-    training, infinite where it is not known; motions: (N, 3, n), of which dq and ddq are read;
+    training, infinite if unknown; motions: (N, 3, n), of which dq and ddq are read;
     tau, std: (N, n); covariance: (N, n, n), work unless asked for; share: (N, n), of the fallback, see
     `fallback_share`, not written for MEAN.
     """
