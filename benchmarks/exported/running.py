@@ -89,11 +89,11 @@ def run(options: Options, console: Console) -> Results:
             times = measure(rnea(robot, motion[:1000]), options.calls // 10)
             results.timings["Pinocchio's rnea, called from Python"] = Timing.of(times)
     q, dq, ddq = (np.ascontiguousarray(part) for part in motion.transpose(1, 0, 2))
-    expected = model.predict(q, dq, ddq)
+    tau, tau_std, *_ = model.evaluator.many(q, dq, ddq)  # C has no fallback
     results.deviations = {
         # where a torque passes through zero nothing is left of its digits
-        "tau, of the service's or of tau_std": _relative(answers[:, 0], expected.tau, expected.tau_std),
-        "tau_std, of the service's": _relative(answers[:, 1], expected.tau_std, 0.0),
+        "tau, of the service's or of tau_std": _relative(answers[:, 0], tau, tau_std),
+        "tau_std, of the service's": _relative(answers[:, 1], tau_std, 0.0),
     }
     return results
 

@@ -229,12 +229,12 @@ def _vectors(model: TorqueModel, learnt: Learnt) -> Array:
     for rows, carried in ((slice(0, VECTORS // 2), False), (slice(VECTORS // 2, VECTORS), True)):
         motion = [each[rows] for each in motions]
         q, dq, ddq = motion
-        answer = (_carrying(model, learnt) if carried else model).predict(q, dq, ddq)
-        more = np.zeros_like(answer.tau)
+        mean, std, *_ = (_carrying(model, learnt) if carried else model).evaluator.many(q, dq, ddq)
+        more = np.zeros_like(mean)
         if carried:
             features = PayloadKernel(learnt.arm.arm, np.ones(PARAMETERS)).rows(np.stack(motion, axis=1))
             more = np.einsum("nkj,k->nj", features, PAYLOAD.parameters)
-        out.append(np.stack([*motion, answer.tau + more, answer.tau_std], axis=1))
+        out.append(np.stack([*motion, mean + more, std], axis=1))
     return np.concatenate(out)
 
 

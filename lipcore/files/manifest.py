@@ -177,6 +177,12 @@ def _check_range(name: str, value: Any, n: int) -> None:
                 raise wrong(f"{where}.min[{joint}]", low, f"at most the max, {high:g}")
 
 
+def _check_training_torque(name: str, value: Any, n: int) -> None:
+    check_keys(name, value, ("mean", "std"))
+    check_numbers(f"{name}.mean", value["mean"], (n,), -LARGEST, LARGEST)
+    check_numbers(f"{name}.std", value["std"], (n,), 0, LARGEST)
+
+
 def _check_parameters(name: str, value: Any, n: int) -> None:
     check_keys(name, value, ("friction",), ("inertia", "rotor", "geometry"))
     check_keys(f"{name}.friction", value["friction"], FRICTION_TERMS, (STRIBECK,))
@@ -293,4 +299,5 @@ OPTIONAL: dict[str, Check] = {
     "robot": _check_robot,
     "selection": _check_selection,
     "conformal": _check_conformal,
+    "training_torque": _check_training_torque,
 }

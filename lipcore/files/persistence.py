@@ -101,6 +101,8 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
     }
     if model.selection is not None:
         manifest["selection"] = model.selection
+    if model.training_torque is not None:
+        manifest["training_torque"] = model.training_torque
     if model.conformal is not None:
         manifest["conformal"] = {
             name: each if name == "blocks" else list(each) for name, each in vars(model.conformal).items()
@@ -306,6 +308,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: Rigi
         calibration=calibration,
         selection=manifest.get("selection"),
         conformal=Conformal(**manifest["conformal"]) if "conformal" in manifest else None,
+        training_torque=manifest.get("training_torque"),
     )
     stated = manifest.get("hyperparameters")
     if stated is not None and stated != {name: value.tolist() for name, value in params.items()}:

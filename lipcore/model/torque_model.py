@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,6 +25,31 @@ from lipcore.vocabulary import JointType, TorqueConvention
 
 
 @dataclass(frozen=True)
+class Fallback:
+    """How torques differ from the posterior mean because the training does not determine them.
+
+    share: of the fallback in each torque, 0 to 1; mean: of the posterior, N·m. Both have the shape of the torques.
+    """
+
+    share: Array
+    mean: Array
+
+
+class TorqueAnswer(NamedTuple):
+    """Answer for one query of n joints, N·m: see `TorquePrediction`. tau, tau_std: (n,); covariance: (n, n)."""
+
+    tau: Array
+    tau_std: Array | None
+    covariance: Array | None
+    fallback: Fallback | None
+
+    @property
+    def mean(self) -> Array:
+        """Mean of the posterior, (n,): `tau` unless it falls back."""
+        return self.tau if self.fallback is None else self.fallback.mean
+
+
+@dataclass(frozen=True)
 class TorquePrediction:
     """Answer for N queries of n joints, N·m.
 
@@ -32,7 +58,8 @@ class TorquePrediction:
 
         tau ± 1.96 · scale · √(tau_std² + noise_std²)
 
-    covariance: (N, n, n) of the function between joints, where asked for.
+    covariance: (N, n, n) of the function between joints, where asked for. fallback: None if every torque is the
+    posterior mean; standard deviations and covariances are always those of the posterior.
     """
 
     tau: Array
@@ -40,6 +67,12 @@ class TorquePrediction:
     noise_std: Array
     scale: Array
     covariance: Array | None = None
+    fallback: Fallback | None = None
+
+    @property
+    def mean(self) -> Array:
+        """Mean of the posterior, (N, n): `tau` unless it falls back."""
+        return self.tau if self.fallback is None else self.fallback.mean
 
     @property
     def interval(self) -> Answer:
@@ -59,6 +92,15 @@ def training_range(motion: Motion) -> TrainingRange:
     }
 
 
+TrainingTorque = dict[str, list[float]]
+"""Mean (`mean`) and standard deviation (`std`) of the recorded torque, N·m, per joint."""
+
+
+def training_torque(tau: Array) -> TrainingTorque:
+    """Mean and standard deviation of N torques, (N, n) N·m."""
+    return {"mean": tau.mean(0).tolist(), "std": tau.std(0).tolist()}
+
+
 @dataclass(frozen=True)
 class TorqueModel:
     """Fitted inverse dynamics of one robot: immutable, safe to share between threads.
@@ -67,8 +109,12 @@ class TorqueModel:
     of the fit; fit: what the fit reported, compact: how near the compact posterior comes to the exact one, both for the
     manifest; training_range: of the samples behind the posterior; robot: the rigid bodies of an estimator that has
     them; calibration: how the posterior's deviations are corrected; selection: how `auto` has chosen the estimator,
-    None where it was named; conformal: what left-out blocks of the training say of the intervals, None where an earlier
-    release has trained it.
+    None where it was named; conformal: what left-out blocks of the training say of the intervals; training_torque: of
+    the recording. Both are None if an earlier release has trained it.
+
+    If the posterior variance of a torque (without misfit and floor) exceeds its variance in training, the answer falls
+    back to gravity, offset and friction, or to the training's mean if these are not determined either (eq. 26 of
+    docs/method.md). Without `training_torque` no answer does.
     """
 
     estimator: Estimator
@@ -84,6 +130,7 @@ class TorqueModel:
     calibration: Calibration = NO_CALIBRATION
     selection: Selection | None = None
     conformal: Conformal | None = None
+    training_torque: TrainingTorque | None = None
 
     @property
     def n_joints(self) -> int:
@@ -116,8 +163,13 @@ class TorqueModel:
         joints = query[0].shape[1]
         if joints != self.n_joints:
             raise ValueError(f"q has {joints} joints, expected {self.n_joints}: {', '.join(self.joint_names)}")
-        tau, std, between = self.evaluator.many(*query, covariance)
-        return TorquePrediction(tau, std, self.noise_std, self.scale, between)
+        mean, std, between, share = self.evaluator.many(*query, covariance)
+        tau, fallback = mean, None
+        if share is not None:
+            rows = share.any(axis=1)
+            tau, fallback = mean.copy(), Fallback(share, mean)
+            tau[rows] = self.evaluator.fall_back(np.stack(query, axis=1)[rows], mean[rows], share[rows])
+        return TorquePrediction(tau, std, self.noise_std, self.scale, between, fallback)
 
     def answer(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
         """Torque at one instant, and its standard deviation where asked for: both (n,) N·m. For control loops.
@@ -125,14 +177,20 @@ class TorqueModel:
         motion: q, dq and ddq as a float64 array (3, n). Neither shape nor finiteness is checked; what is not finite
         ends in what is not finite.
         """
-        return self.evaluator.one(motion, std)
+        tau, deviation, share = self.evaluator.one(motion, std)
+        return tau if share is None else self._harmless(motion, tau, share), deviation
 
-    def answer_with_covariance(self, motion: Array) -> tuple[Array, Array, Array]:
-        """What `answer` says of one instant, and the covariance of the function between the joints, (n, n) (N·m)²."""
-        covariance = np.empty((1, self.n_joints, self.n_joints))
-        tau, std = self.evaluator.one(motion, covariance=covariance)
-        assert std is not None  # it is asked for
-        return tau, std, covariance[0]
+    def answer_fully(self, motion: Array, std: bool = True, covariance: bool = False) -> TorqueAnswer:
+        """Return what `answer` does, with the fallback and, if asked for together with std, the covariance."""
+        between = np.empty((1, self.n_joints, self.n_joints)) if covariance else None
+        mean, deviation, share = self.evaluator.one(motion, std, between)
+        tau, fallback = mean, None
+        if share is not None:
+            tau, fallback = self._harmless(motion, mean, share), Fallback(share, mean)
+        return TorqueAnswer(tau, deviation, None if between is None else between[0], fallback)
+
+    def _harmless(self, motion: Array, tau: Array, share: Array) -> Array:
+        return np.asarray(self.evaluator.fall_back(motion[None], tau[None], share[None])[0])
 
     def warm_up(self) -> None:
         """Do all that the first answer would otherwise wait for."""
@@ -142,7 +200,7 @@ class TorqueModel:
     @cached_property
     def evaluator(self) -> Evaluator:
         """The compiled form of the posterior, which answers queries."""
-        posterior, basis = self.posterior, self.posterior.basis
+        posterior, basis, torque = self.posterior, self.posterior.basis, self.training_torque
         return Evaluator(
             basis.term,
             posterior.params,
@@ -154,4 +212,5 @@ class TorqueModel:
             posterior.std_factor,
             posterior.floor,
             posterior.misfit.packed(),
+            None if torque is None else (np.array(torque["mean"]), np.square(torque["std"])),
         )

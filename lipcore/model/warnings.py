@@ -1,4 +1,4 @@
-"""What to be careful with of a model: how its fit ended, and of a learnt arm what is open and how linear it is."""
+"""What to be careful with of a model: where it falls back, what its recording leaves open, how its fits ended."""
 
 from __future__ import annotations
 
@@ -23,7 +23,10 @@ ALWAYS_OPEN = 2
 TOGETHER = 0.7
 """Independent motions, as a share of the joints, below which joints count as moving together."""
 FARTHER = 2.0
-"""How much farther, or faster, a joint moves than it did where alternative arms are compared."""
+"""How much farther, or faster, than recorded a joint moves where alternative arms, or shares of the fallback, are
+compared."""
+MOST = 0.5
+"""Share of these motions above which a joint counts as one that falls back."""
 LISTED = 8
 """Joints that are named in a sentence, at most."""
 REFIT_ERROR = "refit_error"
@@ -59,7 +62,8 @@ def linearisation_error(model: TorqueModel) -> Array | None:
 
 
 def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
-    """Sentences about a model's arm, the gravest first; of a model without one, about the motion of its recording.
+    """Sentences about a model: which joints fall back, then about its arm, the gravest first; of a model without one,
+    about the motion of its recording.
 
     parameters: the report of `lipcore.model.parameters.report`.
     """
@@ -73,6 +77,7 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
         f"Its joints moved together, like {moved:.1f} independent ones of {model.n_joints}: torque of other motion may "
         "be off by more than tau_std says. A recording in which each moves by itself tells more."
     )
+    out = _fallback(model)
     if arm is None:
         return [*out, together] if moved < TOGETHER * model.n_joints else out
     if len(arm.alternatives) > 1:
@@ -96,6 +101,26 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
     if (count > ALWAYS_OPEN or arm.alternatives) and moved < TOGETHER * model.n_joints:
         out.append(together)
     return out
+
+
+def _fallback(model: TorqueModel) -> list[str]:
+    """Name the joints that fall back at most motions FARTHER and faster than those recombined from the basis' own."""
+    motion = checks(model.posterior.basis.inducing, 0, QUERIES)[-QUERIES // 2 :]
+    low, high = (np.array(model.training_range["q"][end]) for end in ("min", "max"))
+    middle = 0.5 * (low + high)
+    q = middle + FARTHER * (motion.q - middle)
+    share = model.evaluator.many(q, FARTHER * motion.dq, FARTHER**2 * motion.ddq)[3]
+    if share is None:
+        return []
+    names = [name for name, often in zip(model.joint_names, (share > 0).mean(axis=0), strict=True) if often > MOST]
+    if not names:
+        return []
+    listed = ", ".join([*names[:LISTED], "…"] if len(names) > LISTED else names)
+    listed = " and ".join(listed.rsplit(", ", 1))
+    return [
+        f"Twice as far and as fast as recorded, the torque of {listed} is only gravity and friction, as far as the "
+        "recording identifies them. A recording of such motion identifies more."
+    ]
 
 
 def _alternatives(model: TorqueModel) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
-from lipcore.model.torque_model import TorqueModel
+from lipcore.model.torque_model import TorqueModel, TrainingTorque
 from lipcore.online.batch import Rows
 from lipcore.online.regime import COLD, Regime, Walk
 from lipcore.posterior.compact import CompactPosterior
@@ -154,6 +154,12 @@ class OnlineModel:
             walk = Walk.of(self.base, friction_walk_s, None if self.since is None else self.reference)
         return replace(self, now=now, before=before, walk=walk)
 
+    @property
+    def training_torque(self) -> TrainingTorque | None:
+        """The version's, by which answers fall back. None after a change and with forgetting, which widen the variance
+        of torques whose mean is still the best that is known."""
+        return self.base.training_torque if self.before is None and self.forgetting_s is None else None
+
     def model(self, floor: Array | None = None) -> TorqueModel:
         """Solve for the model that answers. floor: (n,) (N·m)², which its variances are never below."""
         posterior = self.base.posterior
@@ -166,7 +172,7 @@ class OnlineModel:
             None if floor is None else np.array(floor, np.float64),
             posterior.misfit,
         )
-        return replace(self.base, posterior=updated)
+        return replace(self.base, posterior=updated, training_torque=self.training_torque)
 
     def symmetrised(self) -> OnlineModel:
         """Return the same model with both triangles of its sums, once it has learnt with `own`."""

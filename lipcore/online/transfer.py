@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
@@ -44,27 +45,31 @@ def consolidate(online: OnlineModel, floor: Array | None = None) -> TorqueModel:
     )
     if floor is not None:
         posterior = replace(posterior, floor=floor.copy())
-    return replace(online.base, posterior=posterior)
+    return replace(online.base, posterior=posterior, training_torque=online.training_torque)
 
 
 @dataclass(frozen=True)
 class Revision:
     """Answers of one basis after some learning.
 
-    weights: (M,); root: (M, M), see `CompactPosterior`; packed: both as the evaluator lays them out; floor: (n,).
+    weights: (M,); root: (M, M), see `CompactPosterior`; packed: both as the evaluator lays them out; floor: (n,);
+    falls_back: (1,), whether answers may.
     """
 
     weights: Array
     root: Array
     packed: Array
     floor: Array
+    falls_back: NDArray[np.bool_]
 
     @classmethod
     def of(cls, model: TorqueModel) -> Revision:
         """The arrays of a model that has learnt."""
         posterior = model.posterior
         arrays = posterior.weights, posterior.root, model.evaluator.packed, posterior.floor
-        return cls(*(np.ascontiguousarray(each) for each in arrays))
+        falls_back = np.array([model.training_torque is not None])
+        weights, root, packed, floor = (np.ascontiguousarray(each) for each in arrays)
+        return cls(weights, root, packed, floor, falls_back)
 
     def apply(self, base: TorqueModel) -> TorqueModel:
         """Return the model of the same basis that answers so; raise ValueError where shapes do not fit.
@@ -76,9 +81,10 @@ class Revision:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {tuple(like.shape)}")
         weights, root, floor = (each for each in (self.weights, self.root, self.floor))
         posterior = replace(base.posterior, weights=weights, root=root, floor=floor, statistics=None)
-        model = replace(base, posterior=posterior)
+        falls_back = bool(self.falls_back.all())
+        model = replace(base, posterior=posterior, training_torque=base.training_torque if falls_back else None)
         # the cached property, filled without laying anything out again
-        model.__dict__["evaluator"] = base.evaluator.revised(self.packed, self.floor)
+        model.__dict__["evaluator"] = base.evaluator.revised(self.packed, self.floor, falls_back)
         return model
 
 

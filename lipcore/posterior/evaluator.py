@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, PairKernel, Params
 from lipcore.kernels.compiled.answer import COVARIANCE, MEAN, ROWS, STD, WIDTH, answer, answer_one, pack
+from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.payload import PayloadKernel
 from lipcore.posterior.misfit import Misfit
 
 Array = NDArray[np.float64]
@@ -32,7 +34,8 @@ class _Scratch(threading.local):
         self.memory = np.zeros(groups * WIDTH * (queries * anchors + ROWS))
         self.std = np.zeros((queries, n))
         self.covariance = np.zeros((queries, n, n))
-        self.of_one = self.motions, self.blocks, self.features, self.covariance, self.memory, self.std
+        self.share = np.zeros((queries, n))
+        self.of_one = self.motions, self.blocks, self.features, self.covariance, self.memory, self.std, self.share
 
 
 class Evaluator:
@@ -45,7 +48,11 @@ class Evaluator:
     term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
     None without `term`. outputs: (m,), which of their torques, as sample · n + joint. linear: the linear terms in the
     order of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,)
-    (N·m)²; misfit: (5, n), see `Misfit.packed`; none where None.
+    (N·m)²; misfit: (5, n), see `Misfit.packed`; none where None. usual: mean and variance of the torque in training,
+    (n,) each, of a model whose answers may fall back.
+
+    `one` and `many` return the mean of the posterior: learning and external torque need it. They also return the share
+    of the fallback in the torque to send, which `fall_back` computes.
 
     Safe from several threads, each of which has memory of its own. `many` computes without the GIL, at the same time as
     others; `one` keeps it, but for a nonlinear term. Raises ValueError naming the argument that does not fit.
@@ -63,6 +70,7 @@ class Evaluator:
         std_factor: float = 1.0,
         floor: Array | None = None,
         misfit: Array | None = None,
+        usual: tuple[Array, Array] | None = None,
     ) -> None:
         if (term is None) != (inducing is None):
             raise ValueError("term and inducing: expected both of them or neither")
@@ -76,12 +84,16 @@ class Evaluator:
         _check(self._outputs, samples * n, weights, root, len(means))
         self._fixed = _lay_out(weights, root, means, variances)
         self._fills, self._fills_many = [], []
+        self._payload = slice(0, 0)
         first = 0
         for kernel in linear:
             regressor = kernel.regressor()
-            self._fills.append((first, first + regressor.size, regressor.fill))
-            self._fills_many.append((first, regressor.fill_many))
-            first += regressor.size
+            last = first + regressor.size
+            self._fills.append((first, last, regressor.fill))
+            self._fills_many.append((first, regressor.fill_many, isinstance(kernel, FrictionKernel | PayloadKernel)))
+            if isinstance(kernel, PayloadKernel):
+                self._payload = slice(first, last)
+            first = last
         self._std_factor = float(std_factor)
         self._floor = np.zeros(n) if floor is None else np.array(floor, np.float64)
         if self._floor.shape != (n,):
@@ -90,6 +102,9 @@ class Evaluator:
         self._misfit = nothing if misfit is None else np.array(misfit, np.float64)
         if self._misfit.shape != nothing.shape:
             raise ValueError(f"misfit has shape {self._misfit.shape}, expected {nothing.shape}")
+        self._falls_back = usual is not None
+        self._usual_mean: Array = np.zeros(n) if usual is None else usual[0]
+        self._usual: Array = np.full(n, np.inf) if usual is None else usual[1]
         sizes = samples, len(self._outputs) + len(means), len(means), n
         self._one, self._many = _Scratch(1, *sizes), _Scratch(QUERIES, *sizes)
 
@@ -98,8 +113,9 @@ class Evaluator:
         """What of this evaluator depends on weights and root, laid out for compiled code: to make another `revised`."""
         return self._fixed
 
-    def revised(self, packed: Array, floor: Array) -> Evaluator:
-        """Return an evaluator with other weights, root and floor, from `packed` of one of the same anchors.
+    def revised(self, packed: Array, floor: Array, falls_back: bool = True) -> Evaluator:
+        """Return an evaluator with other weights, root and floor, from `packed` of one of the same anchors. falls_back:
+        whether its answers may, if those of this one may.
 
         What is compiled and the memory of threads are shared with this one: an answer uses either of them at a time.
         """
@@ -107,16 +123,22 @@ class Evaluator:
             raise ValueError(f"packed has shape {packed.shape}, expected {self._fixed.shape}")
         other = copy(self)
         other._fixed, other._floor = packed, floor
+        if not falls_back:
+            other._falls_back, other._usual = False, np.full_like(self._usual, np.inf)
         return other
 
-    def one(self, motion: Array, std: bool = True, covariance: Array | None = None) -> tuple[Array, Array | None]:
-        """Torque (n,) and, if asked for, its standard deviation (n,) at one query, (3, n): q, dq and ddq.
+    def one(
+        self, motion: Array, std: bool = True, covariance: Array | None = None
+    ) -> tuple[Array, Array | None, Array | None]:
+        """Torque (n,) and, if asked for, its standard deviation (n,) at one query, (3, n): q, dq and ddq. Third, the
+        share of the fallback, (n,), None if it is zero for all joints.
 
         covariance: (1, n, n), takes that between the joints where given, with std. Neither shape nor finiteness is
         checked. The same numbers as of `many`, to the last bit.
         """
-        scratch, what = self._one, STD if std else MEAN
-        query, blocks, features, work, memory, own = scratch.of_one  # slicing takes as long as the arithmetic
+        scratch, what = self._one, STD if std or self._falls_back else MEAN
+        # slicing takes as long as the arithmetic
+        query, blocks, features, work, memory, own, share = scratch.of_one
         if covariance is not None:
             work, what = covariance, COVARIANCE
         query[0] = motion
@@ -126,7 +148,7 @@ class Evaluator:
             fill(query[0], features[0, first:last])
         tau = np.empty((1, self.n_joints))
         deviation = np.empty((1, self.n_joints)) if std else own
-        answer_one(
+        doubtful = answer_one(
             self._fixed,
             self._outputs,
             blocks,
@@ -134,31 +156,58 @@ class Evaluator:
             self._std_factor,
             self._floor,
             self._misfit,
+            self._usual,
             query,
             what,
             memory,
             tau,
             deviation,
             work,
+            share,
         )
-        return tau[0], deviation[0] if std else None
+        return tau[0], deviation[0] if std else None, share[0].copy() if doubtful else None
 
-    def many(self, q: Array, dq: Array, ddq: Array, covariance: bool = False) -> tuple[Array, Array, Array | None]:
+    def many(
+        self, q: Array, dq: Array, ddq: Array, covariance: bool = False
+    ) -> tuple[Array, Array, Array | None, Array | None]:
         """Torques (N, n), their standard deviations (N, n) and, if asked for, covariances (N, n, n) of N queries.
+        Fourth, the shares of the fallback, (N, n), None if all are zero.
 
         q, dq, ddq: (N, n); neither shapes nor finiteness are checked.
         """
         scratch, (size, n) = self._many, q.shape
-        tau, std = np.empty((size, n)), np.empty((size, n))
+        tau, std, share = np.empty((size, n)), np.empty((size, n)), np.empty((size, n))
         covariances = np.empty((size, n, n)) if covariance else None
+        doubtful = False
         for start in range(0, size, QUERIES):
             rows = slice(start, min(start + QUERIES, size))
             count = rows.stop - start
             for part, values in enumerate((q, dq, ddq)):
                 scratch.motions[:count, part] = values[rows]
             work = scratch.covariance[:count] if covariances is None else covariances[rows]
-            self._answer(scratch, count, STD if covariances is None else COVARIANCE, tau[rows], std[rows], work)
-        return tau, std, covariances
+            what = STD if covariances is None else COVARIANCE
+            doubtful |= self._answer(scratch, scratch.motions[:count], what, tau[rows], std[rows], work, share[rows])
+        return tau, std, covariances, share if doubtful else None
+
+    def fall_back(self, motions: Array, tau: Array, share: Array) -> Array:
+        """Return the torques to send at N queries that `many` answers with tau and share, (N, n) each (eq. 26).
+
+        They are (1 − share) tau + share h, with the fallback h = (1 − share_s) s + share_s (t + p). s is the posterior
+        mean at rest in the same posture, but with friction and payload as they move, and share_s its own share. t is
+        the training's mean, p the mean torque of the payload. motions: (N, 3, n).
+        """
+        scratch, harmless = self._many, np.empty_like(tau)
+        slopes = self._slopes[self._payload]
+        for start in range(0, len(tau), QUERIES):
+            moving = np.ascontiguousarray(motions[start : start + QUERIES])
+            rows, count = slice(start, start + len(moving)), len(moving)
+            scratch.motions[:count] = moving
+            scratch.motions[:count, 1:] = 0.0
+            static, own = harmless[rows], scratch.share[:count]
+            self._answer(scratch, moving, STD, static, scratch.std[:count], scratch.covariance[:count], own)
+            payload = np.einsum("p,kpj->kj", slopes, scratch.features[:count, self._payload])
+            static[:] = (1.0 - own) * static + own * (self._usual_mean + payload)
+        return np.asarray((1.0 - share) * tau + share * harmless)
 
     def warm_up(self) -> None:
         """Compile everything that an answer takes, or load it from Numba's cache."""
@@ -166,13 +215,23 @@ class Evaluator:
         self.many(zeros, zeros, zeros, covariance=True)
         self.one(np.zeros((3, self.n_joints)))
 
-    def _answer(self, scratch: _Scratch, count: int, what: int, tau: Array, std: Array, covariance: Array) -> None:
+    @property
+    def _slopes(self) -> Array:
+        """Factors of the linear terms' features in the mean, (P,)."""
+        size = len(self._outputs) + self._one.features.shape[1]
+        return self._fixed[: ROWS * size : ROWS][len(self._outputs) :]
+
+    def _answer(
+        self, scratch: _Scratch, moving: Array, what: int, tau: Array, std: Array, covariance: Array, share: Array
+    ) -> bool:
+        """Answer the first N queries in `scratch`. moving: (N, 3, n), what friction and payload see of them."""
+        count = len(moving)
         motions, blocks, features = scratch.motions[:count], scratch.blocks[:count], scratch.features[:count]
         if self._cross is not None:
             self._cross.fill_many(motions, blocks)
-        for first, fill_many in self._fills_many:
-            fill_many(motions, features, first)
-        answer(
+        for first, fill_many, moves in self._fills_many:
+            fill_many(moving if moves else motions, features, first)
+        return answer(
             self._fixed,
             self._outputs,
             blocks,
@@ -180,12 +239,14 @@ class Evaluator:
             self._std_factor,
             self._floor,
             self._misfit,
+            self._usual,
             motions,
             what,
             scratch.memory,
             tau,
             std,
             covariance,
+            share,
         )
 
 

@@ -18,7 +18,7 @@ from lipcore.fitting.task import Task
 from lipcore.kernels.base import Params
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.parameters import friction_coefficients
-from lipcore.model.torque_model import TorqueModel, training_range
+from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.compression import Compression, compressed, linear
 from lipcore.posterior.conformal import Conformal, conform
@@ -83,6 +83,7 @@ def fit_estimator(
         fit={**report, "motion_dimensions": motion_dimensions(samples.dq)},
         posterior=compression.posterior,
         training_range=training_range(used.motion()),
+        training_torque=training_torque(samples.tau),
         compact=compression.report(),
         robot=task.robot,
         calibration=calibration,

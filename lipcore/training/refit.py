@@ -9,7 +9,7 @@ from lipcore.arm.learning import learn
 from lipcore.data.independence import motion_dimensions
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
 from lipcore.fitting.task import Task
-from lipcore.model.torque_model import TorqueModel, training_range
+from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.selection import spread_out
 from lipcore.training.fit import compact, fit_estimator
 
@@ -54,6 +54,7 @@ def _with_posterior_of(model: TorqueModel, task: Task) -> TorqueModel:
         model,
         posterior=compression.posterior,
         training_range=training_range(used.motion()),
+        training_torque=training_torque(task.samples.tau),
         compact=compression.report(),
         fit={**model.fit, **counts, **stands_on},
         conformal=conformal,

@@ -186,6 +186,7 @@ class Prediction(Struct, omit_defaults=True):
     guaranteed: list[float] | None = None
     covariance: list[Any] | None = None
     components: dict[ComponentName, dict[str, Any]] | None = None
+    fallback: list[Any] | None = None
 
 
 _decoder = msgspec.json.Decoder(PredictBody, dec_hook=lambda _, value: Payload.model_validate(value))
@@ -223,12 +224,14 @@ def at_once(served: Served, motion: Array, max_position: float, payload: Payload
     model = served.asked if payload is None else served.declared.known(payload.numbers)
     if model is None or motion.shape[1] != model.n_joints or abs(motion[0]).max() > max_position:
         return None
-    mean, deviation = model.answer(motion)
-    assert deviation is not None  # it is, unless declined
-    tau, tau_std = mean.tolist(), deviation.tolist()
+    answer = model.answer_fully(motion)
+    assert answer.tau_std is not None  # it is, unless declined
+    tau, tau_std = answer.tau.tolist(), answer.tau_std.tolist()
     if not isfinite(sum(tau) + sum(tau_std)):
         return None
-    return _prediction_of(served, tau, tau_std)
+    return _prediction_of(
+        served, tau, tau_std, fallback=None if answer.fallback is None else answer.fallback.share.tolist()
+    )
 
 
 def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None = None) -> Prediction:
@@ -251,6 +254,8 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
     arrays = {"tau": answer.tau, "tau_std": answer.tau_std}
     if answer.covariance is not None:
         arrays["covariance"] = answer.covariance
+    if answer.fallback is not None:
+        arrays["fallback"] = answer.fallback.share
     lists: dict[str, list[Any]] = {}
     for name, values in arrays.items():
         shaped = values[0] if single else values
@@ -268,7 +273,11 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
 
 
 def _prediction_of(
-    served: Served, tau: list[Any], tau_std: list[Any], covariance: list[Any] | None = None
+    served: Served,
+    tau: list[Any],
+    tau_std: list[Any],
+    covariance: list[Any] | None = None,
+    fallback: list[Any] | None = None,
 ) -> Prediction:
     model = served.model
     return Prediction(
@@ -283,4 +292,5 @@ def _prediction_of(
         scale=served.scales.asked,
         guaranteed=served.guaranteed,
         covariance=covariance,
+        fallback=fallback,
     )

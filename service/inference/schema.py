@@ -145,10 +145,18 @@ class PredictResponse(BaseModel):
     components: dict[ComponentName, ComponentValues] | None = Field(
         None,
         description="Where asked for. `inertia_matrix` M(q), kg·m²; torques `inertial` M(q) ddq, `coriolis`, `gravity` "
-        "and `friction`, N·m, which sum to `tau`; `kinetic_energy`, J; `potential_energy`, J, relative to the posture "
-        "in the middle of each joint's training range; `forward_dynamics`, rad/s²: the acceleration under the torque "
+        "and `friction`, N·m, which sum to `tau` unless it falls back; `kinetic_energy`, J; `potential_energy`, J, "
+        "relative to the posture in the middle of each joint's training range; `forward_dynamics`, rad/s²: the "
+        "acceleration under the torque "
         "asked for. Friction is in `friction` and `forward_dynamics` alone; a model of gravity-compensated torques "
         "knows no gravity",
+    )
+    fallback: list[float] | list[list[float]] | None = Field(
+        None,
+        description="Share of the fallback in each torque, 0 to 1, shaped as `tau`; absent if all are zero. At 1 the "
+        "training does not determine the torque of this motion: `tau` is gravity, offset and friction only, or the "
+        "mean torque of the training if these are not determined either. `tau_std` is that of the full model",
+        examples=[[0.0, 0.0, 0.0, 0.0, 0.35, 1.0, 0.0]],
     )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lipcore.model.dynamics import available
 from lipcore.model.external import external
-from lipcore.model.torque_model import TorqueModel
+from lipcore.model.torque_model import TorqueAnswer, TorqueModel, TorquePrediction
 from lipcore.vocabulary import COMPONENTS, ComponentName
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
@@ -31,7 +31,11 @@ OF_ARM = {"tau_external_statistic": "statistic", "tau_external_p": "p"}
 """Outputs of external torque that are one number a query, which take a covariance."""
 EXTERNAL = {"tau_external": "tau", "tau_external_std": "std", "tau_external_z": "z"} | OF_ARM
 """Outputs of external torque, and what of `External` they are."""
-QUICK = OF_MODEL | EXTERNAL.keys() | {"tau", "tau_std"}
+FALLBACK = "fallback"
+"""Output with the shares of the fallback in `tau`."""
+_MEAN = "mean"
+"""Posterior mean, which is no output: external torque is compared with it."""
+QUICK = OF_MODEL | EXTERNAL.keys() | {"tau", "tau_std", FALLBACK}
 """Outputs of which one query is answered on the event loop."""
 FORWARD: ComponentName = "forward_dynamics"
 _STD = "_std"
@@ -57,7 +61,7 @@ NEED_TORQUE = {name for name, part in PARTS.items() if part.component == FORWARD
 def shapes(model: TorqueModel) -> dict[str, Shape]:
     """Every tensor that a model can answer, and its shape at N queries; -1 stands for N."""
     n, offered = model.n_joints, available(model.estimator)
-    tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "covariance": (-1, n, n)}
+    tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "covariance": (-1, n, n), FALLBACK: (-1, n)}
     tensors |= dict.fromkeys(sorted(OF_MODEL), (n,))
     tensors |= {name: (-1, 1) if name in OF_ARM else (-1, n) for name in EXTERNAL}
     for name, part in PARTS.items():
@@ -203,7 +207,7 @@ def compute(served: Served, query: Query, names: frozenset[str]) -> dict[str, Ar
         tensors |= {"noise_std": model.noise_std, "scale": scale}
     if compared:
         between = tensors["covariance"] if of_arm else None
-        seen = external(query.values[3], tensors["tau"], tensors["tau_std"], model.noise_std, scale, between)
+        seen = external(query.values[3], tensors[_MEAN], tensors["tau_std"], model.noise_std, scale, between)
         tensors |= {name: _rows(getattr(seen, EXTERNAL[name])) for name in compared}
     parts = {name: PARTS[name] for name in names if name in PARTS}
     if parts:
@@ -221,24 +225,22 @@ def _rows(values: Array) -> Array:
 
 def _torques(model: TorqueModel, motion: Array, names: frozenset[str]) -> dict[str, Array]:
     """motion: q, dq and ddq, (3, N, n)."""
-    if "covariance" in names and motion.shape[1] == 1:
-        names_of = "tau", "tau_std", "covariance"
-        return dict(zip(names_of, (each[None] for each in model.answer_with_covariance(motion[:, 0])), strict=True))
-    if "covariance" in names:
-        batch = model.predict(motion[0], motion[1], motion[2], covariance=True)
-        assert batch.covariance is not None  # it is asked for
-        return {"tau": batch.tau, "tau_std": batch.tau_std, "covariance": batch.covariance}
-    if "tau_std" in names and motion.shape[1] > 1:
-        batch = model.predict(motion[0], motion[1], motion[2])
-        return {"tau": batch.tau, "tau_std": batch.tau_std}
-    if "tau_std" in names:
-        tau, std = model.answer(motion[:, 0])
-        assert std is not None  # it is asked for
-        return {"tau": tau[None], "tau_std": std[None]}
-    if "tau" in names:  # the mean of one query costs less than its share of a batch with standard deviations
+    wide, rows = "covariance" in names, motion.shape[1]
+    if not wide and names.isdisjoint({"tau_std", FALLBACK}):
+        if "tau" not in names:
+            return {}
+        # the mean of one query costs less than its share of a batch with standard deviations
         each = np.ascontiguousarray(motion.transpose(1, 0, 2))
         return {"tau": np.stack([model.answer(one, std=False)[0] for one in each])}
-    return {}
+    answer: TorqueAnswer | TorquePrediction
+    if rows == 1:
+        answer = model.answer_fully(motion[:, 0], covariance=wide)
+    else:
+        answer = model.predict(motion[0], motion[1], motion[2], wide)
+    share = np.zeros_like(answer.tau) if answer.fallback is None else answer.fallback.share
+    tensors = {"tau": answer.tau, "tau_std": answer.tau_std, "covariance": answer.covariance}
+    tensors |= {FALLBACK: share, _MEAN: answer.mean}
+    return {name: each[None] if rows == 1 else each for name, each in tensors.items() if each is not None}
 
 
 def infer(served: Served, decode: Callable[[], Message], settings: Settings) -> Reply:

@@ -32,8 +32,8 @@ TICK = 1e-6
 
 class Taught(NamedTuple):
     """A frame to learn from. served: what answered it; loaded: whether with a load; arrived: time of
-    `time.perf_counter`. request: the whole frame; answer: bytes of mean and standard deviation, (2, n), made before it
-    is learnt; factor: (n,), on the half width of its interval."""
+    `time.perf_counter`. request: the whole frame; answer: bytes of the posterior's mean and standard deviation, (2, n),
+    made before it is learnt; factor: (n,), on the half width of its interval."""
 
     served: Served
     loaded: bool

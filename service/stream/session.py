@@ -252,23 +252,25 @@ class Session(Conversation):
             motion = self._reader.read(data, asked, n, budget)
             if asked & frames.ASK_LEARN:
                 await self._admit(sequence, asked)
-            if asked < frames.ASK_EXTERNAL:
-                tau, std = self._answer(motion, self._std or asked != 0)
-            else:
-                tau, std, covariance = self._answer_with_covariance(motion)
+            compares = asked >= frames.ASK_EXTERNAL
+            tau, std, covariance, fallback = self._answer(motion, self._std or asked != 0, compares)
             check_answer("tau", tau)
             if std is not None:
                 check_answer("tau_std", std)
             factor, more = self._served.scales.of(self._stream_id), b""
-            if asked >= frames.ASK_EXTERNAL:
-                more = self._external(data, tau, std, covariance, factor)
+            mean = tau if fallback is None else fallback.mean  # for learning and external torque
+            if compares:
+                more = self._external(data, mean, std, covariance, factor)
         except ServiceError as error:
             return self._refuse(sequence, flags, arrived, error)
         except Exception as error:  # the next frame may be answered
             logger.error("unexpected error in a stream of model %s", self._name, exc_info=error)
             unexpected = ServiceError("an unexpected error; the service's log says more")
             return self._refuse(sequence, flags, arrived, unexpected)
-        served, (flags, numbers) = self._served, self._numbers(sequence, asked, arrived, data, tau, std, factor, more)
+        served = self._served
+        flags, numbers = self._numbers(sequence, asked, arrived, data, tau, std, factor, more, mean)
+        if fallback is not None:
+            flags |= frames.FALLBACK
         seconds = perf_counter() - arrived
         self._meter.durations.add(seconds)
         if seconds > (budget or self._deadline):
@@ -294,11 +296,12 @@ class Session(Conversation):
             raise invalid_request("stream_id", "missing", expected)
         await self._learning.admit(sequence)
 
-    def _external(self, data: bytes, tau: Array, std: Array | None, covariance: Array, factor: Array) -> bytes:
+    def _external(self, data: bytes, mean: Array, std: Array | None, covariance: Array | None, factor: Array) -> bytes:
         """Numbers of the external torque of a frame; raise InvalidRequestError."""
-        assert std is not None  # it comes with the covariance
+        assert std is not None  # both are asked for
+        assert covariance is not None
         measured, noise_std = self._reader.torque(data), self._noise_std
-        seen = external(measured[None], tau[None], std[None], noise_std, factor, covariance[None])
+        seen = external(measured[None], mean[None], std[None], noise_std, factor, covariance[None])
         check_answer("tau_external_statistic", seen.statistic)  # no z² is larger
         return seen.rows.tobytes()
 
@@ -312,16 +315,19 @@ class Session(Conversation):
         std: Array | None,
         factor: Array,
         external: bytes,
+        mean: Array,
     ) -> tuple[int, bytes]:
-        """Flags and numbers of an answer. A frame to learn from is gathered with the torque that it was answered."""
+        """Flags and numbers of an answer. A frame to learn from is gathered with the posterior mean at that time."""
         flags, numbers = 0, tau.tobytes()
         if std is not None:
             flags, numbers = frames.HAS_STD, numbers + std.tobytes()
         if asked > frames.ASK_STD:
             if asked & frames.ASK_LEARN:
                 assert self._learning is not None  # the frame was admitted
+                assert std is not None  # every flag asks for it
+                posterior = mean.tobytes() + std.tobytes()
                 self._learning.add(
-                    Taught(self._served, self._carried is not None, sequence, arrived, data, numbers, factor)
+                    Taught(self._served, self._carried is not None, sequence, arrived, data, posterior, factor)
                 )
             if not (asked & frames.ASK_STD or self._std):  # its standard deviation was for the record, or the test
                 flags, numbers = 0, tau.tobytes()
@@ -366,4 +372,4 @@ class Session(Conversation):
         """Answer with what the arm carries, as far as that is known by now."""
         self._carried = self._loads.of(self._stream_id)
         model = self._carried or self._served.model
-        self._answer, self._answer_with_covariance = model.answer, model.answer_with_covariance
+        self._answer = model.answer_fully

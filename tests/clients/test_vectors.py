@@ -46,7 +46,7 @@ def numbers(text: str) -> np.ndarray:
 
 def test_there_are_vectors_of_every_kind():
     assert {kind: len(group) for kind, group in KINDS.items()} == {
-        "request": 4, "answer": 5, "error": 3, "text": 2, "websocket": 3, "handshake": 1,
+        "request": 4, "answer": 6, "error": 3, "text": 2, "websocket": 3, "handshake": 1,
     }  # fmt: skip
 
 
@@ -73,6 +73,7 @@ def test_the_python_client_reads_answers(vector):
         assert getattr(answer, name) == int(vector[name])
     assert answer.seconds == float(vector["seconds"])
     assert answer.late == bool(int(vector["flags"]) & 2)
+    assert answer.fallback == bool(int(vector["flags"]) & 128)
     for name in ("tau", "tau_std", "scale"):
         assert (getattr(answer, name) is not None) == (name in vector)
         if name in vector:

@@ -167,7 +167,7 @@ def test_many_equals_the_dense_formulas(any_case: Case) -> None:
     mean, covariance = any_case.dense()
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     assert (variance > 0).all()
-    tau, std, found = any_case.evaluator().many(*asked(any_case.query), covariance=True)
+    tau, std, found, _ = any_case.evaluator().many(*asked(any_case.query), covariance=True)
     agree(tau, mean)
     agree(std, np.sqrt(variance))
     agree(found, covariance)
@@ -176,19 +176,19 @@ def test_many_equals_the_dense_formulas(any_case: Case) -> None:
 
 def test_one_query_gives_the_same_bits_as_many(any_case: Case) -> None:
     evaluator, query = any_case.evaluator(), np.stack(asked(any_case.query))
-    tau, std, nothing = evaluator.many(*query)
+    tau, std, nothing, _ = evaluator.many(*query)
     assert nothing is None
     between, own = evaluator.many(*query, covariance=True)[2], np.empty((1, *query.shape[2:] * 2))
     assert between is not None
     for k in range(query.shape[1]):
-        one, deviation = evaluator.one(np.ascontiguousarray(query[:, k]))
+        one, deviation, _ = evaluator.one(np.ascontiguousarray(query[:, k]))
         assert np.array_equal(one, tau[k])
         assert deviation is not None
         assert np.array_equal(deviation, std[k])
-        mean_only, nothing = evaluator.one(np.ascontiguousarray(query[:, k]), std=False)
+        mean_only, nothing, _ = evaluator.one(np.ascontiguousarray(query[:, k]), std=False)
         assert nothing is None
         assert np.array_equal(mean_only, tau[k])
-        one, deviation = evaluator.one(np.ascontiguousarray(query[:, k]), covariance=own)
+        one, deviation, _ = evaluator.one(np.ascontiguousarray(query[:, k]), covariance=own)
         assert np.array_equal(one, tau[k])
         agree(deviation, std[k])
         agree(own[0], between[k])
@@ -200,7 +200,7 @@ def test_batches_of_any_size(queries: int) -> None:
     mean, covariance = chain.dense()
     evaluator = chain.evaluator()
     evaluator.warm_up()  # changes nothing
-    tau, _, found = evaluator.many(*asked(chain.query), covariance=True)
+    tau, _, found, _ = evaluator.many(*asked(chain.query), covariance=True)
     agree(tau, mean)
     agree(found, covariance)
 
@@ -208,7 +208,7 @@ def test_batches_of_any_size(queries: int) -> None:
 def test_a_variance_that_rounding_makes_negative_is_a_std_of_zero() -> None:
     chain = case(MIXED)
     chain.root *= 100
-    _, std, covariance = chain.evaluator().many(*asked(chain.query), covariance=True)
+    _, std, covariance, _ = chain.evaluator().many(*asked(chain.query), covariance=True)
     assert covariance is not None
     assert (np.diagonal(covariance, axis1=1, axis2=2) == 0).all()
     assert (std == 0).all()
@@ -218,7 +218,7 @@ def test_threads_get_the_same_bits_and_nobody_elses_answer() -> None:
     threads, rounds = 4, 30
     both = case(PANDA, "chain", (rigid_body("panda"), FrictionKernel(7)), queries=threads)
     evaluator, query = both.evaluator(), np.stack(asked(both.query))
-    tau, std, covariance = evaluator.many(*query, covariance=True)
+    tau, std, covariance, _ = evaluator.many(*query, covariance=True)
     assert covariance is not None
     start = Barrier(threads)
 
@@ -226,7 +226,7 @@ def test_threads_get_the_same_bits_and_nobody_elses_answer() -> None:
         start.wait(timeout=60)
         mine, same = np.ascontiguousarray(query[:, k]), True
         for _ in range(rounds):
-            one, deviation = evaluator.one(mine)
+            one, deviation, _ = evaluator.one(mine)
             same &= np.array_equal(one, tau[k]) and deviation is not None and np.array_equal(deviation, std[k])
             many = evaluator.many(*mine[:, None], covariance=True)[2]
             same &= many is not None and np.array_equal(many[0], covariance[k])

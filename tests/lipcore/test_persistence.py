@@ -160,6 +160,13 @@ def test_file_that_cannot_be_read_is_named(folder: Path) -> None:
         ({"options": []}, "options is a list of 0 entries, expected an object"),
         ({"compact": {}}, "compact.data_samples is None, expected a number"),
         ({"training_range": []}, "training_range is a list of 0 entries, expected an object"),
+        ({"training_torque": {"mean": [0, 0]}}, "training_torque lacks std"),
+        ({"training_torque": {"mean": [0], "std": [1, 1]}}, "training_torque.mean is a list of 1 entries"),
+        (
+            {"training_torque": {"mean": [0, 0], "std": [1, -1]}},
+            r"training_torque.std\[1\] is -1, expected a number from 0",
+        ),
+        ({"training_torque": {"mean": [0, None], "std": [1, 1]}}, r"training_torque.mean\[1\] is None"),
         ({"calibration": None}, "calibration is None, expected an object"),
         ({"calibration": {"function_std_factor": 0.9}}, "function_std_factor is 0.9, expected a number from 1 to 100"),
         ({"calibration": {"factor": 2.0}}, "calibration lacks function_std_factor"),

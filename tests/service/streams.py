@@ -22,7 +22,7 @@ from service.storage.files import Files
 from tests.service.data import DEADLINE
 from tests.service.server import Server
 
-STD, LATE, ERROR, UNREAD, SCALE, EXTERNAL, PAYLOAD = 1, 2, 4, 8, 16, 32, 64
+STD, LATE, ERROR, UNREAD, SCALE, EXTERNAL, PAYLOAD, FALLBACK = 1, 2, 4, 8, 16, 32, 64, 128
 LEARN, ASK_EXTERNAL = 2, 4
 STREAM = "/v1/models/pendulum/stream"
 MOTION = np.array([[0.3, -0.2], [0.1, 0.4], [1.0, -0.5]])
@@ -80,7 +80,7 @@ def read(data: bytes) -> Answer:
     """Read an answer frame, and check that its length is what its header says."""
     assert isinstance(data, bytes)
     sequence, flags, n, version, late, revision, seconds = struct.unpack_from("<IHHIIQd", data)
-    assert flags & ~(STD | LATE | ERROR | UNREAD | SCALE | EXTERNAL | PAYLOAD) == 0
+    assert flags & ~(STD | LATE | ERROR | UNREAD | SCALE | EXTERNAL | PAYLOAD | FALLBACK) == 0
     assert seconds >= 0
     reply = Answer(sequence, flags, version, late, revision, seconds)
     if flags & ERROR:

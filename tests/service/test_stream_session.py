@@ -6,13 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from lipcore.model.torque_model import Fallback, TorqueAnswer
 from service.foundation.settings import Settings
 from service.models.loads import Carried, Loads
 from service.models.scales import Factor, Scales
 from service.stream.session import Echo, Session
 from service.web.observability.meters import Meters
 from tests.service.data import DEADLINE
-from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, SCALE, frame, read
+from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, FALLBACK, SCALE, STD, frame, read
 
 
 class Model:
@@ -26,8 +27,9 @@ class Model:
     def answer(self, motion, std=True):
         return self.factor * motion[0], np.full_like(motion[0], self.factor) if std else None
 
-    def answer_with_covariance(self, motion):
-        return *self.answer(motion), self.factor**2 * (0.5 + 0.5 * np.eye(motion.shape[1]))
+    def answer_fully(self, motion, std=True, covariance=False):
+        covariance_or_none = self.factor**2 * (0.5 + 0.5 * np.eye(motion.shape[1])) if covariance else None
+        return TorqueAnswer(*self.answer(motion, std), covariance_or_none, None)
 
 
 class Loaded:
@@ -175,16 +177,31 @@ def test_an_unexpected_error_is_answered_logged_and_survived(caplog):
         "detail": [],
     }
     assert "ZeroDivisionError" in caplog.text
-    talk._answer = Model().answer
+    talk._answer = Model().answer_fully
     assert reply(talk).tau.tolist() == [1.0, 2.0]
 
 
 def test_the_buffer_of_one_frame_does_not_reach_the_answer_of_another():
     talk, _ = session(Loaded(v1=Model()), 1)
-    talk._answer = lambda motion, std: (motion[0], None)  # a view of the buffer
+    talk._answer = lambda motion, *_: (motion[0], None, None, None)  # a view of the buffer
     first = asyncio.run(talk.reply({"bytes": frame([[1.0, 1.0], [0, 0], [0, 0]])}, 0.0))
     reply(talk)
     assert read(first).tau.tolist() == [1.0, 1.0]
+
+
+def test_a_frame_that_falls_back_is_flagged_and_learnt_with_the_mean_of_the_posterior():
+    talk, _ = session(Loaded(v1=Model()), 1)
+    mean, gathered = np.array([7.0, -3.0]), []
+    answer = TorqueAnswer(np.ones(2), np.full(2, 0.5), None, Fallback(np.array([0.0, 1.0]), mean))
+    talk._answer = lambda *_: answer
+
+    async def admit(_):
+        pass
+
+    talk._learning = SimpleNamespace(admit=admit, add=gathered.append)
+    found = reply(talk, frame(flags=STD, tau=[1.0, 1.0]))
+    assert (found.flags, found.tau.tolist(), found.std.tolist()) == (STD | FALLBACK, [1.0, 1.0], [0.5, 0.5])
+    assert np.frombuffer(gathered[0].answer).tolist() == [7.0, -3.0, 0.5, 0.5]
 
 
 def test_a_stream_without_frames_is_closed():

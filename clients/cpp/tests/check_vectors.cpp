@@ -102,6 +102,7 @@ void check_answer(const Fields& fields, const Bytes& bytes) {
     CHECK(same(&seen.external_statistic, fields.at("external_statistic")));
     CHECK(same(&seen.external_p, fields.at("external_p")));
   }
+  CHECK(seen.fallback == ((whole(fields, "flags") & 128U) != 0));
   CHECK(seen.has_payload == (fields.count("payload") == 1));
   const std::vector<double> payload = numbers_of(seen.has_payload ? fields.at("payload") : "0.0 0.0");
   CHECK(seen.payload_mass == payload[0] || (seen.payload_mass != seen.payload_mass && payload[0] != payload[0]));

@@ -19,6 +19,7 @@ from lipserve.frames import (
     ASK_LEARN,
     ASK_STD,
     ERROR,
+    FALLBACK,
     HAS_EXTERNAL,
     HAS_PAYLOAD,
     HAS_SCALE,
@@ -89,7 +90,8 @@ class StreamAnswer:
     more than the deadline; late_answers: how many of this connection have been late, this one included; seconds: from
     the arrival of the frame in the service to the departure of the answer; scale: (n,) factor on the half width of
     intervals that hold measurements, external: torque that is not explained, payload: what the arm carries, where
-    asked for.
+    asked for; fallback: whether some joint's torque went back to gravity, offset and friction, or to the training's
+    mean, because the training does not determine it at this motion.
     """
 
     sequence: int
@@ -103,6 +105,7 @@ class StreamAnswer:
     scale: NDArray[np.float64] | None = None
     external: StreamExternal | None = None
     payload: StreamPayload | None = None
+    fallback: bool = False
 
 
 @dataclass(frozen=True)
@@ -169,7 +172,10 @@ def read_answer(data: bytes) -> StreamAnswer | StreamError:
         external = StreamExternal(*last[:-2].reshape(3, n), *last[-2:].tolist())
     scale = numbers[-n:] if flags & HAS_SCALE else None
     tau, missed = numbers[:n], bool(flags & LATE)
-    return StreamAnswer(sequence, tau, std, version, revision, missed, late, seconds, scale, external, carried)
+    fallback = bool(flags & FALLBACK)
+    return StreamAnswer(
+        sequence, tau, std, version, revision, missed, late, seconds, scale, external, carried, fallback
+    )
 
 
 SEQUENCES = 1 << 32

@@ -21,7 +21,8 @@ Answer, 32 + 8 n bytes, 8 n more with tau_std, 8 n with scale, 24 n + 16 with ex
     offset  type     field
     0       u32      sequence of the request
     4       u16      flags: 1 = tau_std follows tau; 2 = late; 4 = error; 8 = no sequence;
-                     16 = scale follows; 32 = external torque follows; 64 = payload follows, last
+                     16 = scale follows; 32 = external torque follows; 64 = payload follows, last;
+                     128 = fallback: some torque is not, or not fully, determined by the training
     6       u16      n; 0 in an error
     8       u32      version that answers
     12      u32      answers of this connection that missed their deadlines so far
@@ -30,7 +31,8 @@ Answer, 32 + 8 n bytes, 8 n more with tau_std, 8 n with scale, 24 n + 16 with ex
     32      f64 n    tau, N·m (prismatic: N): mean torque
     …       f64 n    tau_std, N·m: standard deviation of the function, where asked for
     …       f64 n    scale, where asked for: factor on the half width of intervals that hold measurements
-    …       f64 n    tau_external, where asked for, as all that follows, N·m: the request's tau less the mean
+    …       f64 n    tau_external, where asked for, as all that follows, N·m: the request's tau less the
+                     mean, that of the full model with flag 128
     …       f64 n    tau_external_std, N·m: scale · √(tau_std² + noise_std²)
     …       f64 n    tau_external_z: tau_external / tau_external_std
     …       f64      tau_external_statistic: of the arm as one, T = eᵀ C⁻¹ e, e = tau_external; C has the squares of
@@ -52,6 +54,10 @@ is the time between both. An answer is late where seconds is more than the deadl
 late_answers counts the answers of the connection with flag 2. That is the service's clock. On the client's clock an
 answer is late where more than the deadline passes between sending the request and having the answer. The network and
 the sockets' buffers are in that, and what is late for the service is late for its client, too.
+
+Flag 128 says that the training does not determine some joint's torque at this motion. That torque then goes back to
+gravity, offset and friction, or to the training's mean; the `fallback` of `POST /v1/models/{model}/predict` says which
+joints, and how far. tau_std, external torque and learning are those of the full model.
 
 External torque is no safety function. It is what the model does not explain: a touch, a payload, a fault of the sensor
 or of the model. tau must be finite then; nothing is learnt of it without flag 2.
@@ -114,6 +120,7 @@ UNREAD = 8
 HAS_SCALE = 16
 HAS_EXTERNAL = 32
 HAS_PAYLOAD = 64
+FALLBACK = 128
 
 NUMBER = "<f8"
 

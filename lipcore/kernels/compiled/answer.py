@@ -56,11 +56,23 @@ def multiply(panels: Array, panel: int, columns: Array, first: int, count: int, 
 
 
 MEAN, STD, COVARIANCE = range(3)  # how much to answer: each takes what is before it, too
+FALLBACK_START, FALLBACK_END = 1.0, 3.0
+"""Posterior variance of a torque, as a multiple of its variance in training, where the fallback begins and where it is
+complete. Chosen on ten short recordings of seven real arms: a start at 0.25 to 0.75 made more good joints worse, and no
+more bad joints harmless."""
 ACCELERATED = 0.1
 """How much a mean square of accelerations counts beside one of speeds, where motion is beyond the training's: errors of
 inertias grow with the former, of friction with the latter. Chosen on simulated arms with `Dirt` (seeds 50 and 51 of
 `benchmarks/studies/dirty_arms.py`) among 0, 0.02, 0.05, 0.1 and 0.2: of motion three times as fast, 1 to 3 % of the
 arms' joints have a coverage below 85 % with it, 6 to 9 % without."""
+
+
+@inlined
+def fallback_share(variance: float, usual: float) -> float:
+    """Return the share of the fallback in an answer, 0 to 1, of its posterior variance and the training's, (N·m)²."""
+    if not variance > FALLBACK_START * usual:  # a joint whose torque has never varied has a `usual` of zero
+        return 0.0
+    return min((variance - FALLBACK_START * usual) / ((FALLBACK_END - FALLBACK_START) * usual), 1.0)
 
 
 @compiled
@@ -72,22 +84,26 @@ def answer(
     std_factor: float,
     floor: Array,
     misfit: Array,
+    usual: Array,
     motions: Array,
     what: int,
     memory: Array,
     tau: Array,
     std: Array,
     covariance: Array,
-) -> None:
-    """Write the torques of N queries, and as much of their uncertainty as `what` says.
+    share: Array,
+) -> bool:
+    """Write the torques of N queries, and as much of their uncertainty as `what` says. Return whether any of `share` is
+    above zero.
 
     fixed: the panel of the mean, those of the root's rows that are subtracted, one an output, then those that are
     added, one a linear weight; blocks: (N, S + 1, n, n) from `Cross`; features: (N, P, n), Φᵀ; floor: (n,), smallest
     variance, at least 0;
     misfit: (5, n), variance at rest, the speed where it has faded to exp(−1), variance that grows with speed and
-    acceleration beyond the usual ones, and those, see `posterior.misfit`; motions: (N, 3, n), of which dq and ddq are
-    read;
-    tau, std: (N, n); covariance: (N, n, n), work unless asked for.
+    acceleration beyond the usual ones, and those, see `posterior.misfit`; usual: (n,), variance of the torque in
+    training, infinite if unknown; motions: (N, 3, n), of which dq and ddq are read;
+    tau, std: (N, n); covariance: (N, n, n), work unless asked for; share: (N, n), of the fallback, see
+    `fallback_share`, not written for MEAN.
     """
     queries, n = tau.shape
     chosen, linear = outputs.shape[0], features.shape[1]
@@ -101,8 +117,9 @@ def answer(
             for j in range(min(WIDTH, n - group * WIDTH)):
                 tau[query, group * WIDTH + j] = memory[products + j]
     if what == MEAN:
-        return
+        return False
 
+    any_share = False
     full = what == COVARIANCE
     for query in range(queries):
         _begin(blocks[query, -1], full, covariance[query])
@@ -118,9 +135,12 @@ def answer(
             acceleration += (motions[query, 2, j] / misfit[4, j]) ** 2
         faster = max(speed / n - 1.0, 0.0) + ACCELERATED * max(acceleration / n - 1.0, 0.0)
         for j in range(n):
+            share[query, j] = fallback_share(covariance[query, j, j], usual[j])
+            any_share |= share[query, j] > 0.0
             more = misfit[0, j] * np.exp(-((motions[query, 1, j] / misfit[1, j]) ** 2)) + misfit[2, j] * faster
             covariance[query, j, j] = max(covariance[query, j, j] + more, floor[j])
             std[query, j] = np.sqrt(covariance[query, j, j])
+    return any_share
 
 
 @brief
@@ -132,15 +152,17 @@ def answer_one(
     std_factor: float,
     floor: Array,
     misfit: Array,
+    usual: Array,
     motions: Array,
     what: int,
     memory: Array,
     tau: Array,
     std: Array,
     covariance: Array,
-) -> None:
+    share: Array,
+) -> bool:
     """`answer` of one query."""
-    answer(
+    return answer(
         fixed,
         outputs,
         blocks,
@@ -148,12 +170,14 @@ def answer_one(
         std_factor,
         floor,
         misfit,
+        usual,
         motions,
         what,
         memory,
         tau,
         std,
         covariance,
+        share,
     )
 
 

@@ -181,7 +181,11 @@ def evenly(weight: Array) -> NDArray[np.int64]:
 
 
 def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:
-    """Mean and standard deviation, without floor, of rows that are finite: (N, n) each."""
+    """Mean and standard deviation, without floor, of rows that are finite: (N, n) each.
+
+    These are the posterior's. Learning never sees the fallback of an answer, because sums over samples stay sums only
+    if innovations are linear in the torque.
+    """
     evaluator = model.evaluator.revised(model.evaluator.packed, np.zeros(model.n_joints))
-    mean, std, _ = evaluator.many(rows.q, rows.dq, rows.ddq)
+    mean, std, *_ = evaluator.many(rows.q, rows.dq, rows.ddq)
     return mean, std

@@ -110,6 +110,9 @@ struct Answer {
   const double* tau_external_z = nullptr;
   double external_statistic = 0.0;           // χ² of all joints together
   double external_p = 0.0;                   // probability of a larger one where nothing touches the arm
+  /// Some joint's torque went back to gravity, offset and friction, or to the training's mean: the training does not
+  /// determine it at this motion.
+  bool fallback = false;
   bool has_payload = false;
   double payload_mass = 0.0;                 // kg; both NaN where nothing is carried as far as is known
   double payload_std = 0.0;
@@ -192,6 +195,7 @@ constexpr int layout = 1;
 constexpr std::size_t request_head = 16, answer_head = 32;
 constexpr unsigned ask_std = 1, ask_learn = 2, ask_external = 4;
 constexpr unsigned has_std = 1, late = 2, error = 4, unread = 8, has_scale = 16, has_external = 32, has_payload = 64;
+constexpr unsigned fallback = 128;
 
 /// Write the low bytes of a number; return where the next one goes.
 inline std::uint8_t* put(std::uint8_t* out, std::uint64_t value, unsigned bytes) {
@@ -264,6 +268,7 @@ inline bool read(const std::uint8_t* data, std::size_t size, std::size_t joints,
     answer.external_statistic = *take(1);
     answer.external_p = *take(1);
   }
+  answer.fallback = (flags & fallback) != 0;
   answer.has_payload = (flags & has_payload) != 0;
   if (answer.has_payload) {
     answer.payload_mass = *take(1);

@@ -46,7 +46,9 @@ class Prediction(Plain):
     where the model knows little; noise_std: (n) of a measurement around the function; scale: (n) factor on the half
     width of intervals that streams need at the moment, None of an earlier service; guaranteed: (n) share of
     measurements that left-out blocks of the training guarantee for intervals of 95 %, None of an earlier release;
-    covariance: (…, n, n) (N·m)² of the function between joints, where asked for; components: by name, where asked for.
+    covariance: (…, n, n) (N·m)² of the function between joints, where asked for; components: by name, where asked for;
+    fallback: share of the fallback in each torque, shaped as `tau`, None if all are zero. Where it is 1, `tau` is
+    gravity, offset and friction only, or the training's mean: the training does not determine the torque there.
     """
 
     model: str
@@ -61,6 +63,7 @@ class Prediction(Plain):
     guaranteed: Array | None = None
     covariance: Array | None = None
     components: Mapping[str, Component] | None = None
+    fallback: Array | None = None
 
     def interval(self, level: float = 0.95) -> tuple[Array, Array]:
         """Lower and upper end, shaped as `tau`, of the central interval that a *measurement* lies in with probability
