@@ -219,10 +219,8 @@ class Contest:
             row = unjudged(name, entry.seconds, entry.error)
             if entry.answer is not None and best.answer is not None:
                 row["log_density"], row["difference"] = entry.density, entry.density - best.density
-                row["nmse"], row["edge_nmse"] = (
-                    plain(self.held.nmse(entry.answer)),
-                    plain(self.held.edge_nmse(entry.answer)),
-                )
+                row["nmse"] = plain(self.held.nmse(entry.answer))
+                row["edge_nmse"] = plain(self.held.edge_nmse(entry.answer))
                 row["coverage"] = plain(entry.answer.holds(self.held.samples.tau).mean(axis=0))
                 if entry is not best:
                     total = compare(self.held.samples, best.answer, entry.answer).total

@@ -2,6 +2,7 @@
 
 from copy import deepcopy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from lipcore.training.held_out import LEAST_ROWS, hold_out
 from lipcore.training.train import train
 from tests.choosing import slow
 
+REAL_ARMS = Path(__file__).parents[3] / "shared/data/real_arms.npz"
 ARM = "finger-edu"
 TYPES = ("revolute",) * 3
 OPTIONS = FitOptions(
@@ -172,6 +174,22 @@ def test_of_an_arm_with_springs_a_chain_is_chosen():
     rows = {row["estimator"]: row for row in model.selection["table"]}
     assert rows["rigid-body"]["difference"] < -2 * rows["rigid-body"]["standard_error"] < 0
     assert model.fit["samples_posterior"] == len(samples)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL_ARMS.exists(), reason=f"no recordings at {REAL_ARMS}")
+def test_of_a_real_kuka_the_arm_is_chosen_and_predicts_a_motion_twice_as_fast():
+    with np.load(REAL_ARMS) as arms:
+        parts = [
+            {name: arms[f"kuka|{part}|{name}"].astype(float) for name in ("t", "episode", "q", "dq", "ddq", "tau")}
+            for part in ("train", "other")
+        ]
+    names = tuple(f"joint{number}" for number in range(1, 8))
+    training, other = (Samples(names, **{**each, "episode": each["episode"].astype(np.int64)}) for each in parts)
+    model = train(training, ("revolute",) * 7)
+    assert model.estimator.name == "rigid-body", model.selection
+    error = model.predict(other.q, other.dq, other.ddq).tau - other.tau
+    assert np.mean(np.mean(error**2, axis=0) / other.tau.var(axis=0)) < 0.5
 
 
 def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
