@@ -72,7 +72,8 @@ def _train(engines: Engines, rows: int, fit: Mapping[str, Any], seed: int, conso
             path.unlink()
         console.print("training", highlight=False)
         began = time.monotonic()
-        queued = client.train("bench", datasets, "lip-chain", list(streams.robot().joint_types), fit)
+        types = list(streams.robot().joint_types)
+        queued = client.train("bench", datasets, "lip-chain", types, fit, holdout={"only": True})  # one fit, one pass
         stages: dict[str, float] = {}
         while (job := client.job(queued.id)).state in ACTIVE:
             stages[job.progress.stage] = stages.get(job.progress.stage, 0.0) + _POLL

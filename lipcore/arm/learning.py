@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from lipcore.arm import right_angles
 from lipcore.arm.posing import make_problem, mode_of, surroundings, with_samples, with_stribeck
 from lipcore.arm.problem import UNIT_WIDTH, Point, Problem, root_of
+from lipcore.arm.right_angles import Candidate
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Pool, SearchResult, search
 from lipcore.data.samples import Array, Samples
@@ -101,12 +103,13 @@ def learn(
         counting = _Counting(task.contiguous(CORRELATED), order, shared_rows(samples, len(rows)))
         problem = counting.applied(problem, ends[0], at_rest=False)
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
-        best, others, problem, stribeck_nats = _refined(problem, ends, counting, watch)
+        found, stribeck_nats = _refined(problem, ends, counting, watch, mode == "learn")
+        best, problem = found[0].point, found[0].problem
         misfit, _ = counting.misfit(problem, best, best.sigma**2)
         watch.step("posterior", best.value, 0.95)
         report: dict[str, float | int | bool | str] = {"geometry": mode, "search_objective": ends[0].value}
         if result is not None:
-            report |= _search_report(result, ends, others)
+            report |= _search_report(result, ends, found)
         report |= {
             "objective": best.value,
             "friction_terms": problem.friction_terms,
@@ -120,7 +123,10 @@ def learn(
             "seconds": time.monotonic() - watch.began,
             "device": "cpu",
         }
-        arm, params = _arm(problem, best, others, order, mode)
+        if mode == "learn":
+            sure = right_angles.certainty(found)[np.argsort(order)]
+            report["right_angles"] = " ".join(f"{each:.3f}" for each in sure)
+        arm, params = _arm(found, order, mode)
         place, n = np.argsort(order), problem.n_joints
         friction = problem.weights(best)[(PARAMETERS + 1) * n :].reshape(n, -1)
         misfit = misfit.with_friction(friction[:, FRICTION_TERMS.index("coulomb")]).of_joints(place)
@@ -168,12 +174,21 @@ def _search(
 
 
 def _refined(
-    problem: Problem, ends: Sequence[Point], counting: _Counting, watch: _Watch
-) -> tuple[Point, list[Point], Problem, float]:
-    """Scales, noise and geometry of the best end, with friction's fourth term where the evidence wants it, and what
-    torques count at rest; then what becomes of the other ends with the same scales; last how many nats that term gains.
+    problem: Problem, ends: Sequence[Point], counting: _Counting, watch: _Watch, learnt: bool
+) -> tuple[list[Candidate], float]:
+    """The best end and the others that are nearly as likely, with the scales and noise of the best, and how many nats
+    friction's fourth term gains, which is there where the evidence wants it.
+
+    learnt: whether the geometry is learnt from nothing, so that layouts at right angles are ends, too.
     """
     best, problem = _in_turn(problem, ends[0], ROUNDS, 0.85, watch)
+    free = (None,) * problem.n_joints
+    starts = [(free, problem.expected, best), *((free, problem.expected, end) for end in ends[1:])]
+    if learnt:
+        chosen = right_angles.likely(problem, [best, *ends[1:]], watch.stop)
+        starts = [(each.layout, each.problem.expected, each.point) for each in chosen] + starts
+        _, expected, best = starts[0]
+        best, problem = _in_turn(replace(problem, expected=expected), best, STRIBECK_ROUNDS, 0.87, watch)
     wider = with_stribeck(problem)
     start = wider.at(best.geometry, best.sigma)
     gain = rescale(problem, best).value - rescale(wider, start).value
@@ -184,14 +199,13 @@ def _refined(
         best, problem = _in_turn(
             problem, problem.at(best.geometry, best.sigma), STRIBECK_ROUNDS, 0.9 + 0.02 * number, watch
         )
-    others = []
-    for end in ends[1:]:
-        if end.value < ends[0].value + 2 * NEAR:
-            other = problem.descend(end.geometry, best.sigma, ROUND_STEPS, watch.stop, noise=False)
-            if other.value < best.value:
-                best, other = other, best
-            others.append(other)
-    return best, [each for each in others if each.value < best.value + NEAR], problem, gain
+    found = [right_angles.weigh(problem, best, starts[0][0])]
+    for layout, expected, start in starts[1:]:
+        posed = replace(problem, expected=expected)
+        end = posed.descend(start.geometry, best.sigma, ROUND_STEPS, watch.stop, noise=False)
+        found.append(right_angles.weigh(posed, end, layout))
+    found.sort(key=lambda each: each.evidence)
+    return [each for each in found if each.evidence < found[0].evidence + NEAR], gain
 
 
 def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch: _Watch) -> tuple[Point, Problem]:
@@ -199,14 +213,14 @@ def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch
     for number in range(rounds):
         scaled = rescale(problem, point)
         problem = scaled.problem
-        point = problem.descend(point.geometry, scaled.sigma, ROUND_STEPS, watch.stop, noise=False)
+        point = problem.descend(point.geometry, scaled.point.sigma, ROUND_STEPS, watch.stop, noise=False)
         watch.step("hyperparameters", point.value, fraction + 0.01 * number)
     return point, problem
 
 
-def _arm(
-    problem: Problem, best: Point, others: Sequence[Point], order: NDArray[np.int64], mode: GeometryMode
-) -> tuple[Arm, dict[str, Array]]:
+def _arm(found: Sequence[Candidate], order: NDArray[np.int64], mode: GeometryMode) -> tuple[Arm, dict[str, Array]]:
+    """The arm of the most likely candidate, with the others that answer otherwise."""
+    problem, best = found[0].problem, found[0].point
     n, place = problem.n_joints, np.argsort(order)
     first = (PARAMETERS + 1) * n
     body = problem.scale[: PARAMETERS * n].reshape(n, PARAMETERS)[place].reshape(-1)
@@ -230,15 +244,13 @@ def _arm(
         np.zeros(0) if expected is None else expected.widths,
         problem.friction_terms > len(FRICTION_TERMS),
     )
-    differing = [each for each in others if _differs(problem, best, each)]
+    differing = [each for each in found[1:] if _differs(problem, best, each.point)]
     if not differing:
         return arm, params
-    chosen = [best, *differing[:3]]
-    values = np.array([problem.laplace(each) for each in chosen])
-    odds = np.exp(np.maximum(values.min() - values, -2 * NEAR))  # (none of zero: their covariance is to be factored)
-    shares = odds / odds.sum()
+    chosen = [found[0], *differing[:3]]
+    shares = right_angles.shares(chosen)
     alternatives = tuple(
-        _alternative(problem, each, place, float(share)) for each, share in zip(chosen, shares, strict=True)
+        _alternative(each.problem, each.point, place, float(share)) for each, share in zip(chosen, shares, strict=True)
     )
     return replace(arm, alternatives=alternatives), params
 
@@ -264,7 +276,7 @@ def _differs(problem: Problem, best: Point, other: Point) -> bool:
 
 
 def _search_report(
-    result: SearchResult, ends: Sequence[Point], others: Sequence[Point]
+    result: SearchResult, ends: Sequence[Point], found: Sequence[Candidate]
 ) -> dict[str, float | int | bool | str]:
     report: dict[str, float | int | bool | str] = {
         "search_starts": result.starts,
@@ -274,7 +286,7 @@ def _search_report(
         "search_explained": result.explained,
         "search_ended": result.ended,
         "search_seconds": result.seconds,
-        "search_alternatives": len(others),
+        "search_alternatives": len(found) - 1,
     }
     if len(ends) > 1:
         report["search_next_nats"] = ends[1].value - ends[0].value

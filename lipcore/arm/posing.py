@@ -75,13 +75,15 @@ def make_problem(
         body = np.concatenate([masses[order].reshape(-1), rotors[order]])
         centre = np.concatenate([around.centre.reshape(-1), around.rotor[order]])
     types = tuple(joint_types[joint] for joint in order)
+    unit = np.concatenate([body, friction])
     return Problem(
         motions,
         tau,
         np.ones(tau.shape),
         joint_friction(motions[:, 1]),
         np.concatenate([centre, np.zeros(len(friction))]),
-        np.concatenate([body, friction]),
+        unit,
+        unit,
         start,
         floor,
         _expected(types, gravity, around),
@@ -116,16 +118,22 @@ def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -
 
 
 def with_stribeck(problem: Problem) -> Problem:
-    """The same with friction's fourth term, whose weights may be as large as a joint's torque, like the Coulomb ones
-    before their scale was fitted."""
-    n = problem.n_joints
-    first, usual = (PARAMETERS + 1) * n, np.sqrt(np.mean(problem.tau**2, axis=0)) + problem.floor
-    scale = np.concatenate([problem.scale[first:].reshape(n, -1), usual[:, None]], axis=1)
+    """The same with friction's fourth term, whose weights may be as large as a joint's torque, like the Coulomb ones."""
+    n, first = problem.n_joints, problem.bodies
+    coulomb = FRICTION_TERMS.index("coulomb")
+
+    def wider(friction: Array) -> Array:
+        each = friction.reshape(n, -1)
+        return np.concatenate([each, each[:, coulomb, None]], axis=1).reshape(-1)
+
+    unit = wider(problem.unit[first:])
+    scale = np.concatenate([problem.scale[first:].reshape(n, -1), unit.reshape(n, -1)[:, -1:]], axis=1).reshape(-1)
     return replace(
         problem,
         friction=joint_friction(problem.motions[:, 1], stribeck=True),
-        centre=np.concatenate([problem.centre[:first], np.zeros(scale.size)]),
-        scale=np.concatenate([problem.scale[:first], scale.reshape(-1)]),
+        centre=np.concatenate([problem.centre[:first], np.zeros(len(unit))]),
+        scale=np.concatenate([problem.scale[:first], scale]),
+        unit=np.concatenate([problem.unit[:first], unit]),
     )
 
 

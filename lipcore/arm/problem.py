@@ -78,9 +78,10 @@ class Problem:
     """Samples that a geometry is to explain.
 
     motions: (N, 3, n), q, dq and ddq from base to tip; tau: (N, n); counts: (N, n), independent measurements that a
-    torque stands for; friction: (N, n, f n), its features; centre, scale: (k,), μ and s of w; noise: (n,), where its
-    prior lies; floor: (n,), the smallest admitted; expected: prior of the geometry, None where it is fixed;
-    scale_width: prior width of what the logarithms of s are made of, but for friction's.
+    torque stands for; friction: (N, n, f n), its features; centre, scale: (k,), μ and s of w; unit: (k,), s before any
+    samples, of friction the joint's torque; noise: (n,), where its prior lies; floor: (n,), the smallest admitted;
+    expected: prior of the geometry, None where it is fixed; scale_width: prior width of what the logarithms of s are
+    made of, but for friction's.
     """
 
     motions: Array
@@ -89,6 +90,7 @@ class Problem:
     friction: Array
     centre: Array
     scale: Array
+    unit: Array
     noise: Array
     floor: Array
     expected: Expected | None
@@ -98,6 +100,11 @@ class Problem:
     def n_joints(self) -> int:
         """Number of joints n."""
         return int(self.tau.shape[1])
+
+    @property
+    def bodies(self) -> int:
+        """Weights of masses and rotors, those before friction's."""
+        return (PARAMETERS + 1) * self.n_joints
 
     @property
     def friction_terms(self) -> int:
@@ -188,14 +195,16 @@ class Problem:
         return self.tau - point.features @ (self.weights(point) / self.scale)
 
     def with_noise(self, point: Point) -> Point:
-        """The point with the noise that its residuals say: squares over the samples left to tell it."""
+        """The point with the noise that its residuals say: their variance over the degrees of freedom that are left.
+
+        Every row tells of the noise, however few of them are independent: errors that last are as large as others.
+        """
         size, n = self.tau.shape
         scaled, _ = self._scaled(point.features, point.sigma)
         white = solve_triangular(point.factor, scaled.T, lower=True, check_finite=False)
         leverage = np.square(white).sum(0).reshape(size, n).sum(0)
-        total = self.counts.sum(0)
-        left = np.maximum(total - np.minimum(leverage, MOST_LEVERAGE * total), 1.0)
-        squares = (self.counts * self.residual(point) ** 2).sum(0)
+        left = size - np.minimum(leverage, MOST_LEVERAGE * size)
+        squares = (self.counts / self.counts.mean(0) * self.residual(point) ** 2).sum(0)
         sigma = np.maximum(np.sqrt(squares / left), self.floor)
         return self.at(point.geometry, sigma, point.features)
 

@@ -1,13 +1,14 @@
-"""How large masses, rotor inertias and friction are expected to be, and the noise: what the evidence says.
+"""How large masses, rotor inertias and friction are expected to be: what the evidence says.
 
-Around an optimum the torque is linear in all unknowns u = (w, θ), so the evidence of noise σ and prior deviations s,
+Around an optimum the torque is linear in all unknowns u = (w, θ), so the evidence of prior deviations s,
 
-    −log p(τ | σ, s) = Σ_j N log σ_j + ½ log |I + S A S| + ½ (y − Φ û)ᵀ R⁻¹ (y − Φ û) + ½ |d|²,    û = μ + S d,
+    −log p(τ | s) = Σ_j N_j log σ_j + ½ log |I + S A S| + ½ (y − Φ û)ᵀ R⁻¹ (y − Φ û) + ½ |d|²,    û = μ + S d,
 
-costs no more than a factorisation of A = Φᵀ R⁻¹ Φ. The logarithm of a deviation is a sum: of one number for the kind of
-parameter (mass, first moment, inertia, rotor, each term of friction), and for a body's parameters of one for the body,
-since a wrist is lighter than a shoulder. Where a recording tells nothing of some masses, they stay as small as their
-likes; taken for as large as a shoulder's, they would let motion that was not seen go wrong.
+costs no more than a factorisation of A = Φᵀ R⁻¹ Φ. The noise σ is held at what residuals say. The logarithm of a body's
+deviation is a sum of one number for the kind of parameter (mass, first moment, inertia) and one for the body, since a
+wrist is lighter than a shoulder; rotors share one number. Each term of each joint's friction has its own, near the mean
+of all joints. Every deviation keeps within limits: where few samples tell nothing, the largest evidence lies at zero or
+at infinity.
 """
 
 from __future__ import annotations
@@ -17,115 +18,120 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import solve_triangular
 
-from lipcore.arm.problem import NOISE_WIDTH, SCALE_WIDTH, Point, Problem, root_of
+from lipcore.arm.problem import Point, Problem, root_of
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS
 from lipcore.kernels.compiled.arm import PARAMETERS
 
-FARTHEST = 8.0
+MAX_LOG_SHARE = 2.5
+"""Largest logarithm, either way, of the numbers that the deviations of masses and rotors are made of: a factor of 12."""
+MIN_FRICTION_SHARE = 0.1
+"""Smallest deviation of a friction torque, as a share of its joint's root mean square torque, which is the largest."""
+POOLING_WIDTH = 0.7
+"""Prior width of the logarithm of a joint's friction deviation around the mean of all joints."""
+COUNTS_POWER = 0.5
+"""Power of the counts with which torques enter the evidence of deviations: between all rows (0), with which masses
+follow errors that last, and independent samples (1), with which friction and masses seem to be nothing where these are
+few."""
 ITERATIONS = 60
 BODY_KINDS = 3
 
 
 @dataclass(frozen=True)
 class Scaled:
-    """problem: with the deviations of largest evidence; sigma: (n,) noise std, N·m; value: −log evidence, nats."""
+    """problem: with the deviations of largest evidence; point: the same geometry with them and with the noise of its
+    residuals; value: −log evidence of the deviations, nats."""
 
     problem: Problem
-    sigma: Array
+    point: Point
     value: float
 
 
 def rescale(problem: Problem, point: Point) -> Scaled:
-    """Maximise the evidence over noise and prior deviations around a point (eq. 20 of docs/method.md).
+    """Maximise the evidence over prior deviations around a point (eq. 20 of docs/method.md).
 
     Raise LinAlgError where there is no evidence.
     """
     from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
 
     n, k = problem.n_joints, len(problem.scale)
+    point = problem.with_noise(problem.at(point.geometry, point.sigma))
     evidence = _Evidence.around(problem, point)
-    parts = _parts(n, k)
-    noise, floor = np.log(problem.noise), np.log(problem.floor)
-    width = np.full(parts.shape[1], SCALE_WIDTH)
-    width[: BODY_KINDS + n + 1] = problem.scale_width
+    parts, masses = _parts(n, k), BODY_KINDS + n + 1
+    bounds = [(-MAX_LOG_SHARE, MAX_LOG_SHARE)] * masses + [(np.log(MIN_FRICTION_SHARE), 0.0)] * (k - problem.bodies)
 
-    def negative(flat: Array) -> tuple[float, Array]:
-        log_noise, shares = flat[:n], flat[n:]
-        value, by_noise, by_scale = evidence(log_noise, parts @ shares)
-        off = (log_noise - noise) / NOISE_WIDTH
-        value += 0.5 * float(off @ off + np.sum((shares / width) ** 2))
-        return value, np.concatenate([by_noise + off / NOISE_WIDTH, parts.T @ by_scale + shares / width**2])
+    def negative(shares: Array) -> tuple[float, Array]:
+        value, slopes = evidence(parts @ shares)
+        friction = shares[masses:].reshape(n, -1)
+        off = np.concatenate([shares[:masses] / problem.scale_width, ((friction - friction.mean(0)) / POOLING_WIDTH).reshape(-1)])
+        width = np.concatenate([np.full(masses, problem.scale_width), np.full(k - problem.bodies, POOLING_WIDTH)])
+        return value + 0.5 * float(off @ off), parts.T @ slopes + off / width
 
-    start = np.concatenate([np.log(point.sigma), np.zeros(parts.shape[1])])
-    bounds = [(low, None) for low in floor.tolist()] + [(-FARTHEST, FARTHEST)] * parts.shape[1]
+    start = np.linalg.lstsq(parts, np.log(problem.scale / problem.unit))[0]
+    start = np.clip(start, *np.transpose(bounds))
     best = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS})
-    scale = problem.scale * np.exp(parts @ best.x[n:])
-    return Scaled(replace(problem, scale=scale), np.exp(best.x[:n]), float(best.fun))
+    problem = replace(problem, scale=problem.unit * np.exp(parts @ best.x))
+    return Scaled(problem, problem.with_noise(problem.at(point.geometry, point.sigma)), float(best.fun))
 
 
 @dataclass(frozen=True)
 class _Evidence:
-    """Sums over samples: of each joint the Gram matrix (k + g, k + g) and right-hand side of all features, Σ τ²; the
-    prior's mean and deviations; how many of them are scaled; counts: (n,)."""
+    """Sums over samples, in units of the noise: the Gram matrix (k + g, k + g) and right-hand side of all features, Σ τ²;
+    log_noise: Σ N_j log σ_j; the prior's mean and deviations (k + g,), the first `scaled` of which for unit weights."""
 
-    grams: Array
-    rights: Array
-    squares: Array
-    counts: Array
+    gram: Array
+    right: Array
+    squares: float
+    log_noise: float
     mean: Array
     std: Array
     scaled: int
 
     @classmethod
     def around(cls, problem: Problem, point: Point) -> _Evidence:
-        plain = point.features / problem.scale
-        both = np.concatenate([plain, problem.shapes(point)], axis=2)
+        both = np.concatenate([point.features / problem.scale, problem.shapes(point)], axis=2)
         steps = np.zeros(0) if problem.expected is None else problem.expected.step(point.geometry)
         widths = np.zeros(0) if problem.expected is None else problem.expected.widths
-        weighed = both * problem.counts[:, :, None]
+        counts = problem.counts**COUNTS_POWER
+        weight = np.sqrt(counts) / point.sigma
+        flat, target = (both * weight[:, :, None]).reshape(-1, both.shape[2]), (problem.tau * weight).reshape(-1)
         return cls(
-            np.stack([weighed[:, j].T @ both[:, j] for j in range(problem.n_joints)]),
-            np.stack([weighed[:, j].T @ problem.tau[:, j] for j in range(problem.n_joints)]),
-            (problem.counts * problem.tau**2).sum(0),
-            problem.counts.sum(0),
+            flat.T @ flat,
+            flat.T @ target,
+            float(target @ target),
+            float(counts.sum(0) @ np.log(point.sigma)),
             np.concatenate([problem.centre, steps]),
-            np.concatenate([problem.scale, widths]),
+            np.concatenate([problem.unit, widths]),
             len(problem.scale),
         )
 
-    def __call__(self, log_noise: Array, log_factor: Array) -> tuple[float, Array, Array]:
-        """−log evidence and its derivatives by log σ (n,) and by the logarithms of the scaled deviations (k,)."""
+    def __call__(self, log_factor: Array) -> tuple[float, Array]:
+        """−log evidence and its derivatives by the logarithms of the scaled deviations, (k,).
+
+        log_factor: (k,), of the deviations over those of unit weights.
+        """
         std = self.std.copy()
         std[: self.scaled] *= np.exp(log_factor)
-        precision = np.exp(-2 * log_noise)
-        gram = np.tensordot(precision, self.grams, 1)
-        right = std * (precision @ self.rights - gram @ self.mean)
-        total = gram * np.outer(std, std)
+        total = self.gram * np.outer(std, std)
         total.flat[:: len(total) + 1] += 1.0
         lower = root_of(total)
         root = solve_triangular(lower, np.eye(len(lower)), lower=True, check_finite=False)
-        covariance = root.T @ root
-        deviation = covariance @ right
+        deviation = root.T @ (root @ (std * (self.right - self.gram @ self.mean)))
         weights = self.mean + std * deviation
-        squares = self.squares - 2 * self.rights @ weights + np.einsum("k,jkl,l->j", weights, self.grams, weights)
-        value = 0.5 * (precision @ squares + deviation @ deviation) + np.log(lower.diagonal()).sum()
-        spread = covariance * np.outer(std, std)
-        used = np.einsum("kl,jkl->j", spread, self.grams)
-        by_noise = self.counts - precision * (squares + used)
-        by_scale = 1.0 - deviation**2 - covariance.diagonal()
-        return float(value + self.counts @ log_noise), by_noise, by_scale[: self.scaled]
+        squares = self.squares - 2 * self.right @ weights + weights @ self.gram @ weights
+        value = 0.5 * (squares + deviation @ deviation) + np.log(lower.diagonal()).sum() + self.log_noise
+        slopes = 1.0 - deviation**2 - np.square(root).sum(0)
+        return float(value), slopes[: self.scaled]
 
 
 def _parts(n: int, k: int) -> Array:
-    """Which numbers each deviation's logarithm is the sum of: (k, 3 + n + 1 + terms of friction)."""
-    terms = (k - (PARAMETERS + 1) * n) // n
-    out = np.zeros((k, BODY_KINDS + n + 1 + terms))
+    """Which numbers each deviation's logarithm is the sum of: (k, 3 + n + 1 + friction's weights)."""
+    first = (PARAMETERS + 1) * n
+    out = np.zeros((k, BODY_KINDS + n + 1 + k - first))
     for body in range(n):
         rows = slice(PARAMETERS * body, PARAMETERS * (body + 1))
         out[rows, :BODY_KINDS] = np.eye(BODY_KINDS)[list(KINDS)]
         out[rows, BODY_KINDS + body] = 1.0
-    first = PARAMETERS * n
-    out[first : first + n, BODY_KINDS + n] = 1.0
-    out[first + n :, BODY_KINDS + n + 1 :] = np.tile(np.eye(terms), (n, 1))
+    out[PARAMETERS * n : first, BODY_KINDS + n] = 1.0
+    out[first:, BODY_KINDS + n + 1 :] = np.eye(k - first)
     return out

@@ -161,6 +161,32 @@ class Comparison:
     blocks: int
 
 
+@dataclass(frozen=True)
+class BlockScores:
+    """Scores of a model in B blocks of samples: enough to compare it later with another one on the same samples.
+
+    rows: (B,) of each block; sums: (B, 2) over these rows, of the negative log predictive density summed over the
+    joints, nats, and of squared error / variance of the torque averaged over the joints that vary, NaN where none does.
+    """
+
+    rows: NDArray[np.int64]
+    sums: Array
+
+    @classmethod
+    def of(cls, samples: Samples, answer: Answer) -> BlockScores:
+        """Score what a model predicts of samples (N, n)."""
+        starts, tau = blocks(samples), samples.tau
+        varies = np.ptp(tau, axis=0) > 0
+        squared = (tau - answer.mean)[:, varies] ** 2 / tau[:, varies].var(axis=0)
+        nmse = squared.mean(axis=1) if varies.any() else np.full(len(tau), np.nan)
+        values = np.stack([surprise(tau, answer).sum(axis=1), nmse], axis=1)
+        return cls(np.diff(starts, append=len(tau)), np.add.reduceat(values, starts, axis=0))
+
+    def less(self, first: BlockScores) -> Difference:
+        """Return the mean difference of these scores from the first's on the same blocks, a row, (2,)."""
+        return of_blocks(self.rows, self.sums - first.sums)
+
+
 def compare(samples: Samples, first: Answer, second: Answer) -> Comparison:
     """Compare two models on samples (N, n), each by what it predicts of them: the second's figures less the first's."""
     starts, tau = blocks(samples), samples.tau
@@ -169,15 +195,13 @@ def compare(samples: Samples, first: Answer, second: Answer) -> Comparison:
     variance = np.where(np.ptp(tau, axis=0) > 0, tau.var(axis=0), np.nan)
     normalised = (others - squared) / variance
     rms = np.sqrt(squared.mean(axis=0)) + np.sqrt(others.mean(axis=0))
-    varies = np.isfinite(variance)
-    nmse = normalised[:, varies].mean(axis=1) if varies.any() else np.full(len(tau), np.nan)
     return Comparison(
         nmse=difference(normalised, starts),
         # a² - b² = (a - b)(a + b)
         rmse=difference(np.divide(others - squared, rms, out=np.zeros_like(squared), where=rms > 0), starts),
         coverage=difference(insides - inside, starts),
         nlpd=difference(densities - density, starts),
-        total=difference(np.stack([(densities - density).sum(axis=1), nmse], axis=1), starts),
+        total=BlockScores.of(samples, second).less(BlockScores.of(samples, first)),
         blocks=len(starts),
     )
 

@@ -1,4 +1,4 @@
-"""What to be careful with of a learnt arm: what its recording leaves open, how its fit ended, how linear it is."""
+"""What to be careful with of a model: how its fit ended, and of a learnt arm what is open and how linear it is."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ FARTHER = 2.0
 """How much farther, or faster, a joint moves than it did where alternative arms are compared."""
 LISTED = 8
 """Joints that are named in a sentence, at most."""
+REFIT_ERROR = "refit_error"
+"""Entry of a fit's report: why the last fit, on all rows, has failed."""
 COUNTS = {2: "Two", 3: "Three", 4: "Four"}
 
 
@@ -61,15 +63,18 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
 
     parameters: the report of `lipcore.model.parameters.report`.
     """
-    arm, fit = model.arm, model.fit
+    arm, fit, out = model.arm, model.fit, []
+    if REFIT_ERROR in fit:
+        out.append(
+            f"The last fit, on all rows, failed ({fit[REFIT_ERROR]}). The model has not learnt the rows held out."
+        )
     moved = float(fit.get("motion_dimensions", model.n_joints))
     together = (
         f"Its joints moved together, like {moved:.1f} independent ones of {model.n_joints}: torque of other motion may "
         "be off by more than tau_std says. A recording in which each moves by itself tells more."
     )
     if arm is None:
-        return [together] if moved < TOGETHER * model.n_joints else []
-    out = []
+        return [*out, together] if moved < TOGETHER * model.n_joints else out
     if len(arm.alternatives) > 1:
         out.append(_alternatives(model))
     if fit.get("search_ended") == "time":

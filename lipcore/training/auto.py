@@ -20,11 +20,11 @@ from lipcore.data.splits import SplitError, taken
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress, Progress
 from lipcore.fitting.task import Task
 from lipcore.model.selection import Candidate, HeldOut, plain, selection, unjudged
-from lipcore.model.torque_model import TorqueModel, training_range
-from lipcore.posterior.selection import spread_out
+from lipcore.model.torque_model import TorqueModel
 from lipcore.training.choice import HeldOutSamples, choose_estimator
-from lipcore.training.fit import compact, fit_estimator
+from lipcore.training.fit import fit_estimator
 from lipcore.training.held_out import HoldOut, hold_out
+from lipcore.training.refit import refit
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 RIGID, CHAIN, BOTH = "rigid-body", "lip-chain", "rigid-body+lip-chain"
@@ -67,30 +67,10 @@ def choose(task: Task) -> TorqueModel:
 
 
 def _of_all(work: Fits, contest: Contest, chosen: str) -> TorqueModel:
-    """The chosen model as it is when it has learnt all samples.
-
-    An arm is followed from where it was learnt. Of the others hyperparameters stay; basis and posterior are made anew.
-    """
-    model, task = contest.entries[chosen].model, work.task
+    """The chosen model as it is when it has learnt all samples."""
+    model = contest.entries[chosen].model
     assert model is not None  # what is chosen was trained
-    if chosen == RIGID:
-        learnt = work.learn(task.samples, ALL, contest.learnt, search=False)
-        searched = {name: value for name, value in model.fit.items() if name.startswith("search_")}
-        return work.fit(task.samples, chosen, ALL, replace(learnt, report={**learnt.report, **searched}))
-    objective = float(model.fit["objective"])
-    work.overall.of(chosen, ALL)(FitProgress("posterior", 0, 0, objective, 0.0, 0.0))
-    used = task.samples.rows(spread_out(task.samples.motion(), task.options.posterior_samples))
-    rigid = None if contest.learnt is None else contest.learnt.misfit
-    compression, stands_on, conformal = compact(task, model.estimator, model.posterior.params, used, rigid)
-    counts = {"samples_given": len(task.samples), "samples_posterior": len(used), **stands_on}
-    return replace(
-        model,
-        posterior=compression.posterior,
-        training_range=training_range(used.motion()),
-        compact=compression.report(),
-        fit={**model.fit, **counts},
-        conformal=conformal,
-    )
+    return refit(model, replace(work.task, on_progress=work.overall.of(chosen, ALL)))
 
 
 def _unjudged(work: Fits, reason: str) -> TorqueModel:
@@ -140,15 +120,13 @@ class Fits:
     task: Task
     overall: Overall
 
-    def learn(self, samples: Samples, place: str, before: Learnt | None = None, search: bool = True) -> Learnt:
-        """The arm of some samples. place: one of PLACES; before: what other samples have led to, where a search begins,
-        too, or, without `search`, what replaces one."""
+    def learn(self, samples: Samples, place: str, before: Learnt | None = None) -> Learnt:
+        """The arm of some samples. place: one of PLACES; before: an earlier search, where this one begins, too."""
         task = replace(self.task.on(samples), on_progress=self.overall.of(RIGID, place))
         shapes = () if before is None else before.arm.geometries
         if before is None and task.robot is None and task.sibling is None:
             shapes = known_geometries(task.joint_types, task.gravity)
-        known, begin, seed = (shapes, (), int(before is not None)) if search else ((), shapes, 0)
-        return learn(task, known, begin, seed)
+        return learn(task, shapes, (), int(before is not None))
 
     def fit(self, samples: Samples, name: str, place: str, learnt: Learnt | None = None) -> TorqueModel:
         """A model of one estimator, which makes of an arm that is learnt already what `fit_estimator` says.

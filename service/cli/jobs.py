@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.markup import escape
@@ -161,6 +161,13 @@ def train(
             autocompletion=lambda: HELD_OUT_BY,
         ),
     ] = None,
+    hold_out_only: Annotated[
+        bool,
+        typer.Option(
+            "--hold-out-only",
+            help="Never learn what is held out. By default the version is judged without it, then trained on all rows.",
+        ),
+    ] = False,
     promotion: Annotated[
         str | None,
         typer.Option(
@@ -180,7 +187,6 @@ def train(
     options: dict[str, Any] = {name: value(text) for name, text in pairs("--option", option).items()}
     if prior is not None:
         options["prior"] = prior
-    asked = {name: value for name, value in (("share", hold_out), ("kind", hold_out_by)) if value is not None}
     urdf = None if robot is None or not robot.endswith(".urdf") else Path(robot)
     if urdf is not None and not urdf.is_file():
         raise CommandError(f"--robot is {robot!r}, expected a profile such as panda, the id of a URDF, or a .urdf file")
@@ -189,7 +195,7 @@ def train(
         "joint_types": names(joint_types),
         "options": options or None,
         "robot": robot if urdf is None else None,
-        "holdout": False if hold_out == 0 else asked or None,
+        "holdout": _holdout(hold_out, hold_out_by, hold_out_only),
         "base": base,
         "promotion": promotion,
     }
@@ -237,3 +243,13 @@ def train(
     print_promotion(made)
     if waits:
         note(f"`lipserve models promote {model} {job.version}` lets it answer all the same")
+
+
+def _holdout(share: float | None, kind: str | None, only: bool) -> dict[str, Any] | Literal[False] | None:
+    """The `holdout` of a request to train: False for nothing, None for the service's default; raise CommandError."""
+    if share == 0:
+        if only:
+            raise CommandError("--hold-out-only needs rows that are held out: set --hold-out above 0, or leave it out")
+        return False
+    given = (("share", share), ("kind", kind), ("only", only or None))
+    return {name: value for name, value in given if value is not None} or None

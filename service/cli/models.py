@@ -288,6 +288,8 @@ def print_held_out(version: VersionRecord) -> None:
 
     held = version.lineage["holdout"]
     out.print(figures_table(f"on {counted(held['samples'], 'sample')} held out", version.joint_names, held))
+    if held.get("learnt"):
+        echo("  Judged on held-out rows; the version was then trained on all rows.")
     print_warnings(held.get("warnings", ()))
 
 

@@ -15,7 +15,7 @@ FLAGS = {
     **{name: f"--{name}" for name in ("trim", "joints", "form", "model", "estimator", "base", "promotion")},
     **{"drop_joints": "--drop", "columns": "--column", "units": "--unit", "options": "--option"},
     **{"column_names": "--columns", "dt": "--dt"},
-    **{"holdout.share": "--hold-out", "holdout.kind": "--hold-out-by"},
+    **{"holdout.share": "--hold-out", "holdout.kind": "--hold-out-by", "holdout.only": "--hold-out-only"},
 }
 """Options of the command line by the fields of the API."""
 QUANTITIES_BY_NAME = ("columns", "units", "options")

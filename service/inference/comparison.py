@@ -12,7 +12,8 @@ from lipserve.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
 from service.inference import schema
-from service.inference.evaluating import figures, measured
+from service.inference.evaluating import measured
+from service.models.evaluation import joint_figures
 from service.models.loaded import LoadedModels, Served
 
 
@@ -36,7 +37,7 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
             schema.VersionFigures(
                 version=each.version,
                 revision=each.revision,
-                **figures(evaluate(recorded.used.tau, *answer)),
+                **joint_figures(evaluate(recorded.used.tau, *answer)),
                 in_training=trained,
             )
             for each, answer, trained in zip(versions, answers, in_training, strict=True)

@@ -5,59 +5,27 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.coverage import coverage_interval
-from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Metrics
-from lipcore.data.metrics import evaluate as compare
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
 from lipcore.model import dynamics
 from lipcore.profiles import profile, recognise
 from service.datasets import store
 from service.foundation.errors import DamagedDataError, invalid_request
-from service.foundation.fields import finite
 from service.inference import schema
 from service.inference.predicting import check_offered
-from service.models import lineage, registry
+from service.models import registry
+from service.models.evaluation import evaluation
 from service.models.loaded import LoadedModels, Served
+from service.models.schema import Evaluation, HoldoutLineage
 from service.storage import sample_file
 from service.storage.database import DatasetRow
 from service.training import holding_out, repeating
 from service.training.holding_out import CannotHoldOutError, SetSplit
-
-FEWEST_EPISODES, MOST_EPISODES = 5, 200
-"""Episodes stand for stretches where there are so many; fewer make no box plot, more are mostly a few samples long."""
-EQUAL = 10
-
-
-def stretches(samples: Samples, mean: Array) -> schema.Stretches:
-    """Mean squared error of each stretch / variance of the measured torque over all samples; mean: (N, n) N·m.
-
-    The variance is that of all samples: a joint that rests for a while has a variance near zero then, and any error
-    would look enormous.
-    """
-    episodes = samples.episodes()
-    by_episode = FEWEST_EPISODES <= len(episodes) <= MOST_EPISODES
-    if not by_episode:
-        edges = np.linspace(0, len(samples), min(EQUAL, len(samples)) + 1).astype(np.int64).tolist()
-        episodes = [slice(first, last) for first, last in pairwise(edges)]
-    squared = (samples.tau - mean) ** 2
-    varies = np.ptp(samples.tau, axis=0) > 0  # rounding gives a constant column a variance above zero
-    variance = samples.tau.var(axis=0)
-    means = np.array([squared[each].mean(axis=0) for each in episodes])
-    return schema.Stretches(
-        kind="episodes" if by_episode else "equal",
-        samples=[each.stop - each.start for each in episodes],
-        nmse=[
-            (column / variance[joint]).tolist() if varies[joint] else [None] * len(episodes)
-            for joint, column in enumerate(means.T)
-        ],
-    )
 
 
 @dataclass(frozen=True)
@@ -134,37 +102,60 @@ def evaluate(
     loaded: LoadedModels, model: str, request: schema.EvaluateRequest, served: Served | None = None
 ) -> schema.EvaluateResponse:
     """Compare a model with a data set or what it has held out of it; raise InvalidRequestError or NotFoundError.
-    served: what answers, where that is found already."""
+
+    Of rows held out that a version has learnt since, the figures of its judged fit are returned. served: what answers,
+    where that is found already.
+    """
     served = served or loaded.get(model, request.version, request.alias)
-    known = served.model
-    all_of_it = request.part == "all"
-    recorded = (measured if all_of_it else held_out)(loaded, request.dataset, served)
-    used = recorded.used
-    answer = known.predict(used.q, used.dq, used.ddq)
-    metrics = compare(used.tau, *answer.interval)
-    interval = coverage_interval(used, answer.interval)
-    in_training = all_of_it and served.has_learnt_from(recorded.id, recorded.sha256)
+    row = fitting(loaded, request.dataset, served)
+    judged = _judged(loaded, row, served) if request.part == "held_out" else None
+    in_training, revision = False, 0
+    if judged is None:
+        in_training, revision = _in_training(loaded, row, request.part, served), served.revision
     return schema.EvaluateResponse(
         model=served.name,
         version=served.version,
-        revision=served.revision,
-        dataset=recorded.id,
+        revision=revision,
+        dataset=row.id,
         part=request.part,
-        joint_names=list(known.joint_names),
-        samples=recorded.samples,
-        samples_used=len(used),
-        level=metrics.level,
-        **figures(metrics),
-        **lineage.known(interval),
-        coverages=[
-            schema.Interval(level=each, coverage=coverage.tolist(), interval_width=width.tolist())
-            for each, coverage, width in zip(LEVELS, metrics.coverages, metrics.widths, strict=True)
-        ],
-        reliability=schema.Reliability(nominal=list(RELIABILITY_LEVELS), observed=metrics.reliability.T.tolist()),
-        stretches=stretches(used, answer.tau),
+        joint_names=list(served.model.joint_names),
         in_training=in_training,
-        **_repeats(loaded, served, used, in_training),
+        judged=judged is not None,
+        **(_compared(loaded, request, served, in_training) if judged is None else judged.model_dump()),
     )
+
+
+def _compared(
+    loaded: LoadedModels, request: schema.EvaluateRequest, served: Served, in_training: bool
+) -> dict[str, Any]:
+    """Fields of an `Evaluation` of a version."""
+    recorded = (measured if request.part == "all" else held_out)(loaded, request.dataset, served)
+    used = recorded.used
+    answer = served.model.predict(used.q, used.dq, used.ddq)
+    repeats = _repeats(loaded, served, used, in_training)
+    return {"samples": recorded.samples, **evaluation(used, answer.interval), **repeats}
+
+
+def _judged(loaded: LoadedModels, row: DatasetRow, served: Served) -> Evaluation | None:
+    """How the judged fit of a version predicts what was held out of a data set; None unless its lineage says so."""
+    if not (record := _holdout_of(loaded, served)).get("learnt"):
+        return None
+    holdout = HoldoutLineage.model_validate(record)
+    names = [each.id for each in holdout.datasets if row.id == each.id or row.sha256 == each.sha256]
+    return next((holdout.evaluations[name] for name in names if name in holdout.evaluations), None)
+
+
+def _in_training(loaded: LoadedModels, row: DatasetRow, part: schema.Part, served: Served) -> bool:
+    """Whether a version has learnt a data set or part of it, or what was held out of it."""
+    if part == "held_out" and not _holdout_of(loaded, served).get("learnt"):
+        return False
+    return served.has_learnt_from(row.id, row.sha256)
+
+
+def _holdout_of(loaded: LoadedModels, served: Served) -> dict[str, Any]:
+    """What the lineage of a version says of what was held out; empty if that is nothing."""
+    version = registry.find(loaded.database, served.name, served.version)
+    return version.manifest["lineage"].get("holdout") or {}
 
 
 def _repeats(loaded: LoadedModels, served: Served, used: Samples, in_training: bool) -> dict[str, Any]:
@@ -177,12 +168,6 @@ def _repeats(loaded: LoadedModels, served: Served, used: Samples, in_training: b
         return repeating.look(training, used, served.model.joint_types)
     except (CannotHoldOutError, DamagedDataError) as error:  # the samples judged can be read, and figures be had
         return {**repeating.look([], used, ()), "warnings": [f"whether they repeat the training is not known: {error}"]}
-
-
-def figures(metrics: Metrics) -> dict[str, Any]:
-    """Figures of each joint, nmse null where its torque does not vary."""
-    per_joint = {name: getattr(metrics, name).tolist() for name in ("rmse", "coverage", "nlpd")}
-    return {"nmse": finite(metrics.nmse), **per_joint, "interval_width": metrics.width.tolist()}
 
 
 Rows = NDArray[np.int64]
@@ -229,7 +214,7 @@ def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> sch
         scale=predicted.scale.tolist(),
         offered=[name for name in get_args(schema.TraceComponent) if name in offered],
         components=_components(served, samples, request.components, loaded.storage.settings.max_component_batch),
-        in_training=request.part == "all" and served.has_learnt_from(dataset.id, dataset.sha256),
+        in_training=_in_training(loaded, dataset, request.part, served),
     )
 
 

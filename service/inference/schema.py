@@ -21,7 +21,7 @@ from lipserve.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import LONGEST, each_once, rows_of_numbers
 from service.inference.payload import Payload
-from service.models.schema import AliasName, VersionNumber
+from service.models.schema import AliasName, Evaluation, VersionNumber
 
 _NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
 _ROWS: dict[str, Any] = {"type": "array", "items": _NUMBERS}
@@ -163,77 +163,25 @@ class EvaluateRequest(VersionChoice):
     part: Part = Field(
         "all",
         description="`held_out`: only what the training of the version has held out of the data set, see `holdout` of "
-        "a job",
+        "a job. If the version has learnt that since, `evaluate` returns the figures of the judged fit",
     )
     min_revision: MinRevision = None
 
 
-class Interval(BaseModel):
-    """What the central intervals of one probability hold, per joint."""
-
-    level: float = Field(description="Probability that the interval promises")
-    coverage: list[float] = Field(description="Share of measurements inside the interval, noise included")
-    interval_width: list[float] = Field(description="Mean width of the interval, N·m")
-
-
-class Reliability(BaseModel):
-    """Reliability curve: observed equals nominal where uncertainty is true, and lies below where it is too small."""
-
-    nominal: list[float] = Field(description="Probabilities that intervals promise")
-    observed: list[list[float]] = Field(
-        description="Share of measurements inside: for each joint one list, like nominal"
-    )
-
-
-class Stretches(BaseModel):
-    """How the error is spread over the recording: nMSE stretch by stretch, for a box plot."""
-
-    kind: Literal["episodes", "equal"] = Field(
-        description="`episodes` where the samples have 5 to 200 of them, else `equal`: ten stretches of as many samples"
-    )
-    samples: list[int] = Field(description="Samples compared of each stretch, in order of rows")
-    nmse: list[list[float | None]] = Field(
-        description="For each joint one list, like samples: mean squared error within the stretch / variance of the "
-        "measured torque over *all* samples compared, so that a stretch in which a joint hardly moves does not stand "
-        "out; weighted by `samples` they average to the joint's `nmse`. null where the torque does not vary"
-    )
-
-
-class EvaluateResponse(BaseModel):
+class EvaluateResponse(Evaluation):
     """Figures per joint. nmse is null for a joint whose measured torque does not vary."""
 
     model: str
     version: int
-    revision: int
+    revision: int = Field(description="Online updates applied to the version; 0 for figures of a judged fit")
     dataset: str
     part: Part
     joint_names: list[str]
-    samples: int = Field(description="Samples of the data set, or of the part")
-    samples_used: int = Field(description="Samples compared: evenly thinned where there are more than the limit")
-    level: float = Field(description="Probability that the interval promises")
-    nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
-    rmse: list[float] = Field(description="N·m")
-    coverage: list[float] = Field(description="Share of measurements inside the interval, noise included")
-    nlpd: list[float] = Field(description="Mean negative log predictive density, nats")
-    interval_width: list[float] = Field(description="Mean width of the interval, N·m")
-    coverages: list[Interval] = Field(description="Coverage and width of the 50, 80, 95 and 99 % intervals")
-    reliability: Reliability
-    stretches: Stretches
-    independent: list[float] = Field(
-        description="Independent errors that the coverage stands on: neighbouring ones tell the same"
+    in_training: bool = Field(description="Whether the version has learnt these samples: then the figures flatter")
+    judged: bool = Field(
+        description="Whether the figures are of the judged fit, which was trained without these samples; the version "
+        "was then trained on all"
     )
-    coverage_low: list[float] = Field(description="Lower end of the coverage's 95 % confidence interval, from these")
-    coverage_high: list[float] = Field(description="Its upper end: where it is below 0.9, intervals are too narrow")
-    in_training: bool = Field(
-        description="Whether the model was trained on these samples: then the figures flatter. Not on what it held out"
-    )
-    repeats_training: float | None = Field(
-        description="Share of the samples whose motion (position, velocity and acceleration) repeats what the version "
-        "was trained on, so that figures flatter; null where it was trained on these samples, and where its data sets "
-        "are gone"
-    )
-    period_s: float | None = Field(description="Time after which that motion repeats itself, s; null where it does not")
-    warnings: list[str] = Field(description="What else makes the figures flatter")
 
 
 TraceComponent = Literal["inertial", "coriolis", "gravity", "friction"]
@@ -298,8 +246,8 @@ class TraceResponse(BaseModel):
     offered: list[TraceComponent] = Field(description="Components that may be asked for")
     components: dict[TraceComponent, TraceComponentValues]
     in_training: bool = Field(
-        description="Whether the model was trained on these samples: then it looks better than it is. Not on what it "
-        "held out"
+        description="Whether the version has learnt these samples, even if they were held out: then it looks better "
+        "than it is"
     )
 
 

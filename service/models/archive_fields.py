@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.files.checks import LARGEST, LARGEST_SQUARE
+from lipcore.files.checks import LARGEST, LARGEST_SQUARE, MAX_NAME
 from service.models.schema import HoldoutLineage
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
@@ -46,6 +46,7 @@ class FitFields(Strict):
     corrupt: str | None = Field(
         None, max_length=300, pattern=r"^\d+ by [a-z]+(, \d+ by [a-z]+)*; the first are rows [\d, ]+, counted from 0$"
     )
+    refit_error: str | None = Field(None, max_length=MAX_NAME)
     independent_samples: Size | None = None
     row_correlation: Size | None = None
     motion_dimensions: Size | None = None

@@ -13,13 +13,14 @@ import numpy as np
 import scipy
 
 from lipcore.data import metrics
-from lipcore.data.coverage import CoverageInterval, coverage_interval
+from lipcore.data.coverage import coverage_interval
 from lipcore.data.metrics import Answer
 from lipcore.data.samples import Samples
 from lipcore.files.manifest import FORMAT_VERSION
 from lipcore.model.torque_model import TorqueModel
 from service import __version__
 from service.foundation.fields import finite
+from service.models.evaluation import known
 from service.storage.database import DatasetRow
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -63,7 +64,8 @@ def named(rows: Sequence[DatasetRow]) -> list[dict[str, Any]]:
 
 def learnt_from(lineage: dict[str, Any]) -> frozenset[str]:
     """Ids and hashes of the data sets that a version has learnt from, be it from part of them."""
-    left_out = {each["id"] for each in (lineage.get("holdout") or {}).get("datasets", []) if each["whole"]}
+    holdout = lineage.get("holdout") or {}
+    left_out = set() if holdout.get("learnt") else {each["id"] for each in holdout.get("datasets", []) if each["whole"]}
     learnt = [each for each in lineage.get("datasets", []) if each["id"] not in left_out]
     return frozenset(each[field] for each in learnt for field in ("id", "sha256") if field in each)
 
@@ -86,15 +88,6 @@ def answer_of(model: TorqueModel, samples: Samples) -> Answer:
     that."""
     answer = model.posterior.predict(samples.motion())
     return Answer(answer.mean, answer.std, model.noise_std, model.scale)
-
-
-def known(interval: CoverageInterval) -> dict[str, list[float]]:
-    """How far coverages are known, as the API and lineages name it."""
-    return {
-        "independent": interval.independent.tolist(),
-        "coverage_low": interval.low.tolist(),
-        "coverage_high": interval.high.tolist(),
-    }
 
 
 @cache

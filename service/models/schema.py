@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StringConstraints, model_validator
 
 from lipcore.data.splits import Kind, Split
 from lipcore.vocabulary import JointType, TorqueConvention
@@ -72,7 +72,7 @@ class Promotion(BaseModel):
 
 
 class HeldOutQuality(BaseModel):
-    """How well a version predicts what its training held out, per joint; null where a joint's torque does not vary."""
+    """How well the judged fit of a version predicts what was held out, per joint; null where torque does not vary."""
 
     samples: int = Field(description="Samples that the figures are of")
     nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
@@ -221,7 +221,7 @@ Stretch = Annotated[list[Row], Field(min_length=2, max_length=2)]
 
 
 class Holdout(BaseModel):
-    """Part of the data that is not learnt from, so that the version can be evaluated on it: never rows at random."""
+    """Part of the data that the version is judged on before it learns it: never rows at random."""
 
     model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"share": 0.3}]})
 
@@ -251,6 +251,12 @@ class Holdout(BaseModel):
         "(exclusive) in order of episode and time. Data sets that are not named are learnt from",
         exclude_if=lambda value: value is None,  # lineages written before there were any compare as equal
     )
+    only: bool = Field(
+        False,
+        description="Whether the version never learns these samples. By default it is judged without them, and then "
+        "trained on all samples",
+        exclude_if=lambda value: not value,  # as above
+    )
 
 
 class HeldOutSet(BaseModel):
@@ -260,7 +266,7 @@ class HeldOutSet(BaseModel):
 
     id: str = Field(max_length=40)
     sha256: str = Field(max_length=64)
-    whole: bool = Field(description="Whether nothing of it was learnt")
+    whole: bool = Field(description="Whether all of it was held out")
     guard: float = Field(ge=0, description="See `guard_unit`")
     guard_unit: Literal["s", "rows"]
     rows: int = Field(ge=1, lt=2**63, description="Samples held out")
@@ -273,8 +279,87 @@ class HeldOutSet(BaseModel):
     )
 
 
+class Interval(BaseModel):
+    """What the central intervals of one probability hold, per joint."""
+
+    level: float = Field(description="Probability that the interval promises")
+    coverage: list[float] = Field(description="Share of measurements inside the interval, noise included")
+    interval_width: list[float] = Field(description="Mean width of the interval, N·m")
+
+
+class Reliability(BaseModel):
+    """Reliability curve: observed equals nominal where uncertainty is true, and lies below where it is too small."""
+
+    nominal: list[float] = Field(description="Probabilities that intervals promise")
+    observed: list[list[float]] = Field(
+        description="Share of measurements inside: for each joint one list, like nominal"
+    )
+
+
+class Stretches(BaseModel):
+    """How the error is spread over the recording: nMSE stretch by stretch, for a box plot."""
+
+    kind: Literal["episodes", "equal"] = Field(
+        description="`episodes` where the samples have 5 to 200 of them, else `equal`: ten stretches of as many samples"
+    )
+    samples: list[int] = Field(description="Samples compared of each stretch, in order of rows")
+    nmse: list[list[float | None]] = Field(
+        description="For each joint one list, like samples: mean squared error within the stretch / variance of the "
+        "measured torque over *all* samples compared, so that a stretch in which a joint hardly moves does not stand "
+        "out; weighted by `samples` they average to the joint's `nmse`. null where the torque does not vary"
+    )
+
+
+class Evaluation(BaseModel):
+    """How well torques of a data set, or of part of it, were predicted, per joint."""
+
+    samples: int = Field(description="Samples of the data set, or of the part")
+    samples_used: int = Field(description="Samples compared: evenly thinned where there are more than the limit")
+    level: float = Field(description="Probability that the interval promises")
+    nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
+    rmse: list[float] = Field(description="N·m")
+    coverage: list[float] = Field(description="Share of measurements inside the interval, noise included")
+    nlpd: list[float] = Field(description="Mean negative log predictive density, nats")
+    interval_width: list[float] = Field(description="Mean width of the interval, N·m")
+    coverages: list[Interval] = Field(description="Coverage and width of the 50, 80, 95 and 99 % intervals")
+    reliability: Reliability
+    stretches: Stretches
+    independent: list[float] = Field(
+        description="Independent errors that the coverage stands on: neighbouring ones tell the same"
+    )
+    coverage_low: list[float] = Field(description="Lower end of the coverage's 95 % confidence interval, from these")
+    coverage_high: list[float] = Field(description="Its upper end: where it is below 0.9, intervals are too narrow")
+    repeats_training: float | None = Field(
+        description="Share of the samples whose motion (position, velocity and acceleration) repeats what the version "
+        "was trained on, so that figures flatter; null where it was trained on these samples, and where its data sets "
+        "are gone"
+    )
+    period_s: float | None = Field(description="Time after which that motion repeats itself, s; null where it does not")
+    warnings: list[str] = Field(description="What else makes the figures flatter")
+
+
+class HeldOutBlocks(BaseModel):
+    """Scores of the judged fit in blocks of the samples held out: a later version is compared with them, see
+    `lipcore.data.metrics.BlockScores`."""
+
+    model_config = ConfigDict(strict=True)
+
+    rows: list[Annotated[int, Field(ge=1, lt=2**63)]] = Field(min_length=1, description="Of each block")
+    nlpd: list[FiniteFloat] = Field(description="Sum over these rows of the negative log density of all joints, nats")
+    nmse: list[FiniteFloat | None] = Field(description="Sum over these rows of squared error / variance of the torque")
+
+    @model_validator(mode="after")
+    def _check_lengths(self) -> Self:
+        if not len(self.rows) == len(self.nlpd) == len(self.nmse):
+            raise ValueError("rows, nlpd and nmse differ in length")
+        return self
+
+
 class HoldoutLineage(BaseModel):
-    """What a version's lineage says of it; the figures that go with it are shown and not read."""
+    """What a version's lineage says of it; the figures that go with it are shown and not read.
+
+    The figures are those of the judged fit, which was trained without the samples held out.
+    """
 
     model_config = ConfigDict(strict=True)
 
@@ -282,3 +367,9 @@ class HoldoutLineage(BaseModel):
     datasets: list[HeldOutSet] = Field(min_length=1, max_length=10_000)
     rows: int = Field(ge=1, lt=2**63)
     guarded: int = Field(ge=0, lt=2**63)
+    learnt: bool = Field(False, description="Whether the version was trained on these samples after it was judged")
+    judged_rows: int | None = Field(None, ge=0, lt=2**63, description="Samples that the judged fit was trained on")
+    evaluations: dict[str, Evaluation] = Field(
+        {}, max_length=10_000, description="By data set, if `learnt`: how the judged fit predicts what was held out"
+    )
+    blocks: HeldOutBlocks | None = Field(None, description="If `learnt`: what a later version is compared with")

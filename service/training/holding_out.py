@@ -1,7 +1,8 @@
-"""Holding part of the data sets out of training, and finding the same samples again from a version's lineage.
+"""Holding part of the data sets out of the fit that is judged, and finding the same samples again by a lineage.
 
-A refresh leaves out what its version left out, where it still learns from that data set: the figures of both then speak
-of the same samples, which neither has seen.
+A refresh holds out what its version held out, where it still learns from that data set. The figures of both are then
+those of their judged fits on the same samples, which neither fit has learnt. The versions themselves have learnt them:
+which of both serves is decided by a contest on rows that arrive later (`service.learning.learner.contest`).
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
@@ -60,9 +60,9 @@ class Material:
     samples: what a fit chooses from; stretches: contiguous samples, where these are thinned, else None; table: the data
     sets' rows to learn from; logged: what the model has observed, with weights (N,), None where that is nothing; rows:
     how many both are; lineage: where they come from; seen: number of the newest
-    event of the model's log when it was read; held_out: samples that the version is evaluated on and does not learn
-    from, and how many they stand for; None where that is nothing; geometries: of an arm, as an earlier version has
-    learnt them; sibling: the arm of another unit, which is expected of this one.
+    event of the model's log when it was read; held_out: the data sets' rows that the version is judged on before it
+    learns them; every: all their rows, for its last fit, None if there is none; geometries: of an arm, as an earlier
+    version has learnt them; sibling: the arm of another unit, which is expected of this one.
     """
 
     samples: Samples
@@ -73,7 +73,8 @@ class Material:
     lineage: dict[str, Any]
     logged: tuple[Samples, Array] | None = None
     seen: int = 0
-    held_out: tuple[Samples, int] | None = None
+    held_out: Table | None = None
+    every: Table | None = None
     geometries: tuple[Geometry, ...] = ()
     sibling: Arm | None = None
 
@@ -81,6 +82,12 @@ class Material:
     def rows(self) -> int:
         """Samples that there are to learn from."""
         return len(self.table) + (0 if self.logged is None else len(self.logged[0]))
+
+    def for_last_fit(self) -> Material:
+        """The same with all rows to learn from, those held out included."""
+        assert self.every is not None  # there is a last fit
+        samples, stretches = _candidates(self.every, None if self.logged is None else self.logged[0])
+        return replace(self, samples=samples, stretches=stretches, table=self.every, every=None)
 
 
 def recorded(settings: Settings, database: Database, files: Files, request: dict[str, Any]) -> Material:
@@ -96,7 +103,7 @@ def recorded(settings: Settings, database: Database, files: Files, request: dict
         clocks = [part.clock() for part in parts]
         divided = holding_out.hold_out(rows, clocks, how, lambda place: unrepeated(parts[place], types, how))
     corrupt = [sound(part) for part in parts]
-    table = _learnt(parts, divided, corrupt)
+    table, held_out, every = _tables(parts, divided, corrupt)
     names, robot = rows[0].joint_names, None
     if (asked_robot := request.get("robot")) is not None:
         robot = robots.resolve(database, asked_robot, names, request["joint_types"])
@@ -113,7 +120,8 @@ def recorded(settings: Settings, database: Database, files: Files, request: dict
         rows[0].torque_convention,  # type: ignore[arg-type]  # checked when it was stored
         robot,
         {"datasets": named(rows), **base_lineage, **_holdout(divided.lineage), **_corrupt(rows, corrupt)},
-        held_out=_held_out(settings, parts, divided, corrupt),
+        held_out=held_out,
+        every=every,
         sibling=sibling,
     )
 
@@ -138,7 +146,8 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
     parts = opened(files, rows)
     divided = holding_out.hold_out_again(rows, [part.clock() for part in parts], version.manifest["lineage"])
     corrupt = [sound(part) for part in parts]
-    table = _learnt([replace(part, factor=_aged(part.row, within)) for part in parts], divided, corrupt)
+    parts = [replace(part, factor=_aged(part.row, within)) for part in parts]
+    table, held_out, every = _tables(parts, divided, corrupt)
     if not table.parts and logged.rows < settings.min_samples:
         raise NothingToLearnError(f"the log has {logged.rows} rows to train on, expected {settings.min_samples}")
     log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.rows}
@@ -164,26 +173,30 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
         },
         weighted,
         seen,
-        _held_out(settings, parts, divided, corrupt),
+        held_out,
+        every,
         () if base.arm is None else base.arm.geometries,
         arm_as_expected(base.arm) if base.arm is not None and "base" in lineage else None,
     )
 
 
-def _learnt(parts: list[TablePart], divided: Divided, corrupt: list[Corrupt]) -> Table:
-    """What is learnt from of data sets, those left out that nothing is learnt from."""
-    each = zip(parts, divided.train, corrupt, strict=True)
-    chosen = [replace(part, chosen=_without(mask, corrupt)) for part, mask, corrupt in each]
-    return Table([part for part in chosen if len(part)])
+def _tables(
+    parts: list[TablePart], divided: Divided, corrupt: list[Corrupt]
+) -> tuple[Table, Table | None, Table | None]:
+    """The rows to learn from, those held out, and those of the last fit; None where that is nothing.
+
+    Data sets of which nothing is left are not in a table.
+    """
+    held = _table(each for each in zip(parts, divided.held_out, corrupt, strict=True) if each[1] is not None)
+    every = None
+    if divided.lineage is not None and not divided.lineage.split.only:
+        every = _table((part, None, found) for part, found in zip(parts, corrupt, strict=True))
+    return _table(zip(parts, divided.train, corrupt, strict=True)), held if len(held) else None, every
 
 
-def _held_out(
-    settings: Settings, parts: list[TablePart], divided: Divided, found: list[Corrupt]
-) -> tuple[Samples, int] | None:
-    """What is evaluated on, thinned to as much as an evaluation takes, and how much there is of it."""
-    each = zip(parts, divided.held_out, found, strict=True)
-    table = Table([replace(part, chosen=_without(mask, corrupt)) for part, mask, corrupt in each if mask is not None])
-    return (table.thinned(settings.max_evaluation_samples), len(table)) if len(table) else None
+def _table(chosen: Iterable[tuple[TablePart, Mask | None, Corrupt]]) -> Table:
+    parts = [replace(part, chosen=_without(mask, corrupt)) for part, mask, corrupt in chosen]
+    return Table([part for part in parts if len(part)])
 
 
 def _without(mask: Mask | None, corrupt: Corrupt) -> Mask | None:
@@ -221,4 +234,5 @@ def _aged(row: DatasetRow, within: refresh_data.Scope) -> float:
 
 
 def _holdout(lineage: HoldoutLineage | None) -> dict[str, Any]:
-    return {} if lineage is None else {"holdout": lineage.model_dump(mode="json")}
+    """The split as a lineage keeps it; what is known only after the fit is left out."""
+    return {} if lineage is None else {"holdout": lineage.model_dump(mode="json", exclude={"evaluations", "blocks"})}

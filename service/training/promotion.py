@@ -1,25 +1,27 @@
-"""Whether a version that was trained answers by itself: judged by what its training held out.
+"""Whether a version that was trained answers by itself: judged by what its training held out, before its last fit.
 
 It waits where the 95 % intervals of a joint hold less than LEAST_COVERAGE of that, by the upper end of the confidence
 interval, as 85 % of ten errors tell nothing; and where it is worse than the version that serves, by paired differences.
-Both are compared as they were trained. Of versions that are as good 1 to 7 % wait (simulated: 5 to 60 s held out,
-errors that stay alike for 0.1 to 3 s).
+Both are compared as they were trained; a version that has learnt the rows held out is compared by its judged fit, whose
+scores its lineage keeps. Of versions that are as good 1 to 7 % wait (simulated: 5 to 60 s held out, errors that stay
+alike for 0.1 to 3 s).
 """
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from sqlalchemy.orm import Session
 
-from lipcore.data.metrics import Comparison, compare
+from lipcore.data.metrics import BlockScores, Difference
 from lipcore.data.samples import Samples
 from lipcore.files.manifest import ModelFormatError
 from lipcore.model.torque_model import TorqueModel
 from lipserve.states import PromotionOption
 from service.models import aliases, registry
 from service.models.lineage import answer_of, learnt_from
-from service.models.schema import Promotion
+from service.models.schema import HoldoutLineage, Promotion
 from service.storage.database import Database, LearnerRow, VersionRow
 from service.storage.files import Files
 
@@ -59,6 +61,21 @@ def judge(
     return Promotion(answers=False, passed=False, serving=before, reason=reason)
 
 
+def compare_refreshed(
+    database: Database, files: Files, model: str, version: int, trained: TorqueModel, held_out: Samples, lineage: Any
+) -> str | None:
+    """How the judged fit of a refresh compares with the version that it refreshes; None if that has been deleted.
+
+    This decides nothing, as the robot may have changed since the samples held out were recorded.
+    """
+    with database.session() as session:
+        refreshed = session.get(VersionRow, (model, version))
+    if refreshed is None:
+        return None
+    problems, passes = _against(files, refreshed, trained, held_out, lineage)
+    return "; ".join(problems + passes)
+
+
 def settle(session: Session, model: str, judged: Promotion, option: PromotionOption) -> Promotion:
     """The same as of the moment when the version is added: it waits where another one answers by now."""
     serving = registry.answering(session, model) or None
@@ -95,25 +112,43 @@ def _against(
     files: Files, serving: VersionRow, trained: TorqueModel, held_out: Samples, lineage: dict[str, Any]
 ) -> tuple[list[str], list[str]]:
     """How the version is worse than the one that serves, or why that is not said."""
-    name = f"version {serving.version}"
-    if not _is_new_to(serving.manifest["lineage"], lineage["holdout"]):
-        return [], [f"not compared with {name}, which was trained on what was held out"]
+    name, manifest = f"version {serving.version}", serving.manifest
+    kind = tuple(manifest["joint_names"]), manifest["torque_convention"]
+    if kind != (trained.joint_names, trained.torque_convention):
+        return [f"{name} has other joints or another torque convention"], []
+    scores = BlockScores.of(held_out, answer_of(trained, held_out))
     try:
-        other = files.load_version(serving.folder, serving.checksums)
+        before = _scores(files, serving, held_out, lineage["holdout"])
     except ModelFormatError:
         return [], [f"not compared with {name}, which cannot be read"]
-    if (other.joint_names, other.torque_convention) != (trained.joint_names, trained.torque_convention):
-        return [f"{name} has other joints or another torque convention"], []
-    compared = compare(held_out, *(answer_of(each, held_out) for each in (other, trained)))
-    if compared.blocks < 2:
+    if before is None or not np.array_equal(before.rows, scores.rows):
+        return [], [f"not compared with {name}, which was trained on what was held out"]
+    if len(scores.rows) < 2:
         return [], [f"what was held out is too short to compare it with {name}"]
-    return _verdict(compared, name)
+    return _verdict(scores.less(before), name)
 
 
-def _verdict(compared: Comparison, name: str) -> tuple[list[str], list[str]]:
+def _scores(files: Files, serving: VersionRow, held_out: Samples, holdout: dict[str, Any]) -> BlockScores | None:
+    """Scores of a version on what is held out now, which it has not learnt, or else of its judged fit, if that held out
+    the same; None if neither is known. Raise ModelFormatError for a version that cannot be read."""
+    earlier = serving.manifest["lineage"]
+    if _is_new_to(earlier, holdout):
+        other = files.load_version(serving.folder, serving.checksums)
+        return BlockScores.of(held_out, answer_of(other, held_out))
+    before = earlier.get("holdout")
+    if before is None or _rows_of(before) != _rows_of(holdout):
+        return None
+    blocks = HoldoutLineage.model_validate(before).blocks
+    if blocks is None:
+        return None
+    nmse = [np.nan if each is None else each for each in blocks.nmse]
+    return BlockScores(np.array(blocks.rows, np.int64), np.array([blocks.nlpd, nmse]).T)
+
+
+def _verdict(total: Difference, name: str) -> tuple[list[str], list[str]]:
     """Worse by the log predictive density, or by the errors where it is not better by the former."""
-    (density, nmse), (clear, larger) = compared.total.mean.tolist(), compared.total.significant.tolist()
-    half, half_nmse = compared.total.half_width.tolist()
+    (density, nmse), (clear, larger) = total.mean.tolist(), total.significant.tolist()
+    half, half_nmse = total.half_width.tolist()
     amount = f"{density:+.3g} ± {half:.2g} nats a sample"
     if clear and density > 0:
         return [f"it predicts what was held out worse than {name}: negative log density {amount}"], []
@@ -124,15 +159,15 @@ def _verdict(compared: Comparison, name: str) -> tuple[list[str], list[str]]:
 
 
 def _is_new_to(earlier: dict[str, Any], holdout: dict[str, Any]) -> bool:
-    """Whether a version with an earlier lineage has seen nothing of what is held out now."""
-    learnt, before = learnt_from(earlier), (earlier.get("holdout") or {})
-    alike = {each["sha256"]: each for each in before.get("datasets", [])}
-    for each in holdout["datasets"]:
-        if learnt.isdisjoint((each["id"], each["sha256"])):
-            continue
-        same = alike.get(each["sha256"])
-        if same is None or before["split"] != holdout["split"]:
-            return False
-        if any(same.get(field) != each[field] for field in ("rows", "guarded", "whole", "stretches")):
-            return False
-    return True
+    """Whether a version with an earlier lineage has learnt nothing of what is held out now."""
+    learnt, before = learnt_from(earlier), earlier.get("holdout")
+    kept = [] if before is None or before.get("learnt") else _rows_of(before)
+    sets = zip(holdout["datasets"], _rows_of(holdout), strict=True)
+    return all(learnt.isdisjoint((each["id"], each["sha256"])) or rows in kept for each, rows in sets)
+
+
+def _rows_of(holdout: dict[str, Any]) -> list[dict[str, Any]]:
+    """What tells which rows of each data set were held out, in order."""
+    split = {name: value for name, value in holdout["split"].items() if name != "only"}
+    fields = ("sha256", "rows", "guarded", "whole", "stretches")
+    return [{"split": split, **{field: each.get(field) for field in fields}} for each in holdout["datasets"]]

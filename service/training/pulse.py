@@ -68,8 +68,10 @@ BEAT_S = 0.5
 """Seconds between two signs of life."""
 STATISTICS = "statistics"
 """Stage of the pass over all rows."""
-FIT_ROWS = 200_000
-"""Rows whose pass takes about as long as a fit, for the fraction that is shown."""
+LAST_FIT = "all_rows"
+"""Stage of the fit that learns what was held out, too."""
+FIT_ROWS, LAST_FIT_ROWS = 200_000, 20_000
+"""Rows whose pass takes about as long as a fit, and as the last fit, which does not search; for the fraction shown."""
 
 
 class SupersededError(RuntimeError):
@@ -89,7 +91,8 @@ class Pulse:
         self.database, self.own, self.model = database, own, model
         self.remaining: Remaining | None = None
         self._began = time.monotonic()
-        self._fit_share, self._pass_began = 1.0, (0.0, 0.0)
+        self._fit_begins, self._fit_ends, self._pass_ends = 0.0, 1.0, 1.0  # fractions
+        self._passes_later, self._pass_began = 0.0, (0.0, 0.0)
         self._ends: float | None = None
         self._latest: dict[str, Any] = {"stage": "loading"}
         self._stop, self._superseded = False, False
@@ -125,14 +128,27 @@ class Pulse:
             "iteration": at.iteration,
             "max_iterations": at.max_iterations,
             "objective": at.objective,
-            "fraction": self._fit_share * at.fraction,
+            "fraction": self._during_fit(at),
         }
         if changed:
             self._wake.set()
 
-    def plan(self, rows: int) -> None:
-        """Say that a pass over so many rows follows the fit, which is then part of the work only."""
-        self._fit_share = FIT_ROWS / (FIT_ROWS + rows)
+    def last_fit(self, at: FitProgress) -> None:
+        """Take how far the last fit is; iterations and objective stay those of the search before it."""
+        self._progress.step()
+        self._latest = {**self._latest, "fraction": self._during_fit(at)}
+
+    def plan(self, fit: int, rows: int, later: int = 0) -> None:
+        """Divide the fraction that is left among a fit that begins, a pass over `rows` rows, and what follows.
+
+        fit, later: in rows whose pass takes as long; later: all that follows the pass.
+        """
+        begins, total = self._latest.get("fraction", 0.0), fit + rows + later
+        self._fit_begins = begins
+        self._fit_ends = begins + (1.0 - begins) * fit / total
+        self._pass_ends = begins + (1.0 - begins) * (fit + rows) / total
+        self._passes_later = later / rows if rows else 0.0
+        self.remaining = self._ends = None
 
     def share(self, done: float) -> None:
         """Take what share of the pass is done; how long the rest takes shows from then on."""
@@ -142,8 +158,8 @@ class Pulse:
             self._pass_began = clock, done
         began, before = self._pass_began
         if done > before:
-            self._ends = clock + (clock - began) * (1.0 - done) / (done - before)
-        fraction = self._fit_share + (0.98 - self._fit_share) * done
+            self._ends = clock + (clock - began) * (1.0 - done + self._passes_later) / (done - before)
+        fraction = self._fit_ends + (min(self._pass_ends, 0.98) - self._fit_ends) * done
         self._latest = {
             **self._latest,
             "stage": STATISTICS,
@@ -163,6 +179,9 @@ class Pulse:
         if self._superseded:
             raise SupersededError
         return self._stop
+
+    def _during_fit(self, at: FitProgress) -> float:
+        return self._fit_begins + (self._fit_ends - self._fit_begins) * at.fraction
 
     def as_json(self) -> dict[str, Any]:
         """The progress as it is written now."""

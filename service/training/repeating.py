@@ -52,7 +52,9 @@ def trained_on(database: Database, files: Files, lineage: dict[str, Any]) -> lis
     """
     with database.session() as session:
         known = refresh_data.datasets(session, [each["id"] for each in lineage.get("datasets", [])])
-    parts = [_learnt(part, lineage) for part in opened(files, list(known.values()))]
+    parts = opened(files, list(known.values()))
+    if not (lineage.get("holdout") or {}).get("learnt"):
+        parts = [_learnt(part, lineage) for part in parts]
     return [part for part in parts if len(part)]
 
 

@@ -100,8 +100,9 @@ class JobRequest(BaseModel):
     options: Options = Field(default_factory=Options)
     holdout: Holdout | None = Field(
         default_factory=Holdout,
-        description="What to hold out of the data sets, to evaluate the version on: its lineage keeps the figures. By "
-        f"default {100 * _HOLDOUT.share:.0f} %, as `{_HOLDOUT.kind}` chooses; null: nothing",
+        description="What to hold out of the data sets, to judge the version on: its lineage keeps the figures. The "
+        f"version is then trained on all samples, unless `only` is true. By default {100 * _HOLDOUT.share:.0f} %, as "
+        f"`{_HOLDOUT.kind}` chooses; null: nothing",
     )
     promotion: PromotionOption | None = Field(
         None,
@@ -123,7 +124,8 @@ class JobProgress(BaseModel):
     """How far a job is."""
 
     stage: str = Field(
-        description="waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, saving or done"
+        description="waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, all_rows, saving "
+        "or done. `all_rows` is the last fit, on the rows held out, too"
     )
     estimator: str | None = Field(None, description="The one at work, where `auto` trains several")
     iteration: int = 0

@@ -30,7 +30,6 @@ from service.compute.executors import placed, sent, shard_executor, summed
 from service.foundation.settings import Settings
 from service.storage.files import PATIENCE_S, Files
 from service.storage.sample_file import Reader
-from service.training.material import Material
 from service.training.table import Shard, Table
 
 Made = TypeVar("Made")
@@ -50,18 +49,20 @@ class Context:
 def all_rows(
     settings: Settings,
     model: TorqueModel,
-    material: Material,
     table: Table,
+    logged: tuple[Samples, Array] | None,
     options: FitOptions,
     cancelled: Callable[[], bool],
     progress: Callable[[float], None],
 ) -> TorqueModel:
-    """The model with the posterior of all rows of its material, instead of those that its fit has chosen.
+    """The model with the posterior of all rows of a table and of a log, instead of those that its fit has chosen.
 
-    table: the data sets' rows, each with what it counts; progress: told what share is done.
+    table: the data sets' rows, each with what it counts; logged: the log's, with weights; progress: told what share is
+    done.
     Raise FitCancelledError when `cancelled` says so.
     """
     gpu = options.device == "cuda"
+    rows = len(table) + (0 if logged is None else len(logged[0]))
     total: ShardStatistics | None = None
     shards = table.shards()
     if shards:
@@ -69,13 +70,13 @@ def all_rows(
         context = Context(sent(settings), packed(model), model.joint_names, "cuda" if gpu else "cpu")
         with shard_executor(settings, gpu) as executor:
             work = partial(shard_statistics, context)
-            share = len(table) / material.rows / len(shards)
+            share = len(table) / rows / len(shards)
             total = summed(executor, work, shards, cancelled, done=lambda done: progress(share * done))
-    if material.logged is not None:
-        logged = sum_samples(Summing.of(model.posterior), *material.logged, cancelled)
-        total = logged if total is None else total + logged
+    if logged is not None:
+        of_log = sum_samples(Summing.of(model.posterior), *logged, cancelled)
+        total = of_log if total is None else total + of_log
     assert total is not None  # a job has samples
-    return with_statistics(model, total, material.rows)
+    return with_statistics(model, total, rows)
 
 
 def shard_statistics(context: Context, shard: Shard) -> ShardStatistics:

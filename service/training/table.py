@@ -93,6 +93,12 @@ class TablePart:
         weights = independence.recording_weights(clock.t, clock.episode)
         return self.factor * float(weights.sum() if self.chosen is None else weights[self.chosen].sum())
 
+    def every(self, step: int) -> TablePart:
+        """Every `step`-th of its rows, which counts for as many."""
+        chosen = np.zeros(self.reader.rows, dtype=bool)
+        chosen[(np.arange(self.reader.rows) if self.chosen is None else np.flatnonzero(self.chosen))[::step]] = True
+        return replace(self, chosen=chosen, factor=step * self.factor)
+
     def shards(self) -> Iterator[Shard]:
         """Pieces of one size; those that nothing counts of are left out."""
         for first in range(0, self.reader.rows, SHARD):
@@ -141,6 +147,11 @@ class Table:
         data set count for no more than `most` independent ones."""
         bounded = [replace(part, factor=part.factor * min(1.0, most / len(part))) for part in self.parts]
         return Table([part if part.timed else less for part, less in zip(self.parts, bounded, strict=True)])
+
+    def sparse(self, most: int) -> Table:
+        """The table, or of more than `most` rows about so many, evenly, which count for all."""
+        step = -(-len(self) // most)
+        return self if step <= 1 else Table([part.every(step) for part in self.parts])
 
     def shards(self) -> list[Shard]:
         """What its rows are summed up in."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import resource
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -14,10 +14,8 @@ from sqlalchemy.orm import Session
 
 import lipcore
 from lipcore.extras import MissingExtraError
-from lipcore.fitting.task import Task
 from lipcore.model.torque_model import TorqueModel
-from lipcore.training.conditioning import should_condition
-from lipcore.training.train import fit_model
+from lipcore.model.warnings import REFIT_ERROR
 from lipserve.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState, PromotionOption
 from service.compute.allocator import give_back
 from service.compute.executors import ClusterUnavailableError
@@ -29,11 +27,11 @@ from service.models.schema import Promotion
 from service.storage.database import Database, JobRow, LearnerRow, now
 from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
-from service.training import lifecycle, promotion, refresh_data, repeating
+from service.training import judging, lifecycle, promotion, refresh_data
 from service.training.holding_out import CannotHoldOutError
-from service.training.material import CANDIDATES, Material, observed, recorded
-from service.training.pulse import Pulse, Remaining, SupersededError
-from service.training.summing import all_rows
+from service.training.material import Material, observed, recorded
+from service.training.planned_fit import PlannedFit
+from service.training.pulse import Pulse, SupersededError
 from service.web import storage_errors
 from service.web.observability.logs import job_id
 
@@ -100,22 +98,7 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
                 material = recorded(settings, database, files, claim.request)
             else:
                 material = observed(settings, database, files, claim.model, claim.request)
-            trained = _fit(settings, claim, material, pulse)
-            lineage = {
-                "job": claim.job,
-                **material.lineage,
-                "trained_at": now(),
-                "training_process": {"seconds": round(pulse.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
-                "software": software(),
-                "training_metrics": figures(trained, material.samples, MOST_SAMPLES, material.rows),
-            }
-            if material.held_out is not None:
-                pulse.stage("evaluating")
-                held_out, of = material.held_out
-                held_out_figures = figures(trained, held_out, settings.max_evaluation_samples, of)
-                repeats = repeating.look(material.table.parts, held_out, trained.joint_types)
-                lineage["holdout"] = {**lineage["holdout"], **held_out_figures, **repeats}
-            judged = _judged(settings, database, files, claim, material, trained, lineage)
+            trained, lineage, judged = _version(settings, database, files, claim, material, pulse)
             pulse.stage("saving")
             folder = lifecycle.new_folder(claim.job)
             Disk(settings).require()
@@ -140,35 +123,29 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
         _finish(database, files, claim, FAILED, f"{type(error).__name__}: {error}", _code(error))
 
 
-def _fit(settings: Settings, claim: Claim, material: Material, pulse: Pulse) -> TorqueModel:
-    request, count = claim.request, len(material.samples)
-    options = lipcore.FitOptions(**request["options"])
-    table = material.table.weighed(options.posterior_samples)
-    # the version that serves has learnt all rows of a refresh, not only the few that a fit chooses
-    every = request.get("refresh") is not None or should_condition(options, material.rows, table.independent_rows())
-    if every:
-        pulse.plan(material.rows)
-    if not every or material.rows <= CANDIDATES:  # else it is the pass that takes long
-        pulse.remaining = Remaining(min(options.hyperparameter_samples, count), min(options.posterior_samples, count))
-    pulse.stage("hyperparameters")
-    task = Task(
-        material.samples,
-        request["joint_types"],
-        options,
-        material.torque_convention,
-        material.robot,
-        material.stretches,
-        pulse.progress,
-        pulse.cancelled,
-        material.sibling,
-    )
-    trained = fit_model(task, request["estimator"], material.geometries)
-    corrupt = sum(each["rows"] for each in material.lineage.get("corrupt", ()))
-    counts = {"samples_given": material.rows} | ({"samples_corrupt": corrupt} if corrupt else {})
-    trained = replace(trained, fit={**trained.fit, **counts})
-    if not every:
-        return trained
-    return all_rows(settings, trained, material, table, options, pulse.cancelled, pulse.share)
+def _version(
+    settings: Settings, database: Database, files: Files, claim: Claim, material: Material, pulse: Pulse
+) -> tuple[TorqueModel, dict[str, Any], Promotion | None]:
+    """The model of a version, its lineage, and what came of its judgement: it is judged before its last fit."""
+    fit = PlannedFit.of(claim.request, material)
+    last = None if material.every is None else PlannedFit.of(claim.request, material.for_last_fit())
+    trained = fit.first(settings, claim.request["estimator"], last, pulse)
+    lineage = {"job": claim.job, **material.lineage}
+    if material.held_out is not None:
+        pulse.stage("evaluating")
+        lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(settings, trained, material)}
+    judged, learnt = _judged(settings, database, files, claim, material, trained, lineage), material
+    if last is not None:
+        trained = last.last(settings, trained, pulse)
+        if REFIT_ERROR not in trained.fit:
+            lineage["holdout"]["learnt"], learnt = True, last.material
+    lineage |= {
+        "trained_at": now(),
+        "training_process": {"seconds": round(pulse.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
+        "software": software(),
+        "training_metrics": figures(trained, learnt.samples, MOST_SAMPLES, learnt.rows),
+    }
+    return trained, lineage, judged
 
 
 def _option(settings: Settings, claim: Claim) -> PromotionOption:
@@ -186,11 +163,18 @@ def _judged(
     trained: TorqueModel,
     lineage: dict[str, Any],
 ) -> Promotion | None:
-    """Whether the version answers by itself; None for one of a refresh, which has to prove better first."""
-    if claim.request.get("refresh") is not None:
-        return None
-    held_out = None if material.held_out is None else material.held_out[0]
-    return promotion.judge(database, files, claim.model, trained, held_out, lineage, _option(settings, claim))
+    """Whether the version answers by itself; None for one of a refresh, which has to prove better first. The lineage
+    of that says how it compares with the version that it refreshes."""
+    held_out = None
+    if material.held_out is not None:
+        held_out = material.held_out.thinned(settings.max_evaluation_samples)
+    refresh = claim.request.get("refresh")
+    if refresh is None:
+        return promotion.judge(database, files, claim.model, trained, held_out, lineage, _option(settings, claim))
+    if held_out is not None:
+        given = database, files, claim.model, refresh["version"], trained, held_out, lineage
+        lineage["refresh"] = {**lineage["refresh"], "compared": promotion.compare_refreshed(*given)}
+    return None
 
 
 def _publish(
@@ -202,7 +186,7 @@ def _publish(
     manifest: dict[str, Any],
     judged: Promotion | None,
 ) -> tuple[int, str]:
-    """Add the version that was trained; return its number, and in words what came of it where it was judged."""
+    """Add the version that was trained; return its number, and in words what came of it where it was compared."""
     if judged is not None:
         judged = promotion.settle(session, claim.model, judged, _option(settings, claim))
         waits = not judged.answers
@@ -215,8 +199,9 @@ def _publish(
         raise TakenBackError("part of what was observed has been taken back while it was trained on: refresh again")
     earlier = (LearnerRow.model == claim.model, LearnerRow.role == "candidate")
     session.execute(update(LearnerRow).where(*earlier).values(role="dismissed"))  # the newer one has seen more
-    start = refresh["through"]
-    return registry.publish(session, claim.model, folder, manifest, claim.job, candidate=True, start=start), ""
+    start, compared = refresh["through"], manifest["lineage"]["refresh"].get("compared")
+    version = registry.publish(session, claim.model, folder, manifest, claim.job, candidate=True, start=start)
+    return version, "" if compared is None else f": {compared}"
 
 
 def _code(error: Exception) -> str:

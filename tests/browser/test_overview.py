@@ -53,7 +53,7 @@ def test_a_card_tells_how_well_a_model_predicts_joint_by_joint(visitor: Visitor,
     place = card(visitor.open("#/"), "judged")
     expect(place).to_contain_text("Version 1, lip-chain")
     expect(place).to_contain_text("no stream yet")
-    expect(place).to_contain_text("On what was held out.")
+    expect(place).to_contain_text("Judged on held-out rows.")
     label = place.get_by_role("img", name="nMSE by joint").get_attribute("aria-label")
     assert label is not None
     told = [float(each) for each in re.findall(r"joint\d ([\d.e-]+)", label)]

@@ -18,7 +18,7 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.parameters import friction_coefficients, report
-from lipcore.model.warnings import linearisation_error, warnings
+from lipcore.model.warnings import REFIT_ERROR, linearisation_error, warnings
 from lipcore.online.learner import OnlineModel
 from lipcore.robots.library import Robot, random_arm
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
@@ -85,6 +85,8 @@ def test_how_the_fit_ended(model: TorqueModel) -> None:
     late, coarse = warnings(replace(model, fit={**model.fit, "search_ended": "time", "search_explained": False}), {})
     assert "time limit, 10 s" in late
     assert coarse.endswith("Compare with rigid-body+lip-chain.")
+    failed = warnings(replace(model, fit={**model.fit, REFIT_ERROR: "ValueError: no"}), {})
+    assert failed == ["The last fit, on all rows, failed (ValueError: no). The model has not learnt the rows held out."]
 
 
 def test_numbers_of_the_geometry_that_are_open(model: TorqueModel, parameters: dict[str, Any]) -> None:

@@ -193,7 +193,7 @@ def test_of_a_real_kuka_the_arm_is_chosen_and_predicts_a_motion_twice_as_fast():
 
 
 def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
-    def fails(self, samples, place, before=None, search=True):
+    def fails(self, samples, place, before=None):
         raise NotPositiveDefiniteError("nothing can be\nlearnt")
 
     monkeypatch.setattr(auto.Fits, "learn", fails)

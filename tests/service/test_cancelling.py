@@ -2,8 +2,8 @@
 
 import pytest
 
-from service.training import worker
-from tests.service.data import ENDLESS, ended, error, job, queue, running, service_of, stream, upload
+from service.training import planned_fit, worker
+from tests.service.data import ENDLESS, ended, error, eventually, job, queue, running, service_of, stream, upload
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +55,25 @@ def test_a_cancel_that_comes_while_the_model_is_saved_still_counts(api, pendulum
     worker.run(service.settings, name)
     assert job(api, name)["state"] == "cancelled"
     error(api.get("/v1/models/late"), 404, "not_found")
+
+
+def test_a_cancel_while_all_rows_are_learnt_still_counts(api, pendulum, monkeypatch):
+    service, refit = service_of(api), planned_fit.refit
+    monkeypatch.setattr(service.jobs, "submit", lambda job: None)
+    name = queue(api, "last-fit", pendulum["id"], holdout={"share": 0.3})["id"]
+
+    def cancel_and_refit(model, task):
+        assert job(api, name)["progress"]["fraction"] < 1
+        assert api.post(f"/v1/jobs/{name}/cancel").json()["state"] == "running"
+        eventually(task.cancelled)
+        return refit(model, task)
+
+    monkeypatch.setattr(planned_fit, "refit", cancel_and_refit)
+    worker.run(service.settings, name)
+    seen = job(api, name)
+    assert (seen["state"], seen["version"]) == ("cancelled", None)
+    assert seen["progress"]["stage"] == "all_rows"
+    error(api.get("/v1/models/last-fit"), 404, "not_found")
 
 
 def test_an_ended_job_cannot_be_cancelled(api, pendulum):

@@ -7,8 +7,8 @@ import pytest
 
 import lipcore
 from lipcore.data.metrics import evaluate
-from service.inference.evaluating import stretches
 from service.models import registry
+from service.models.evaluation import stretches
 from tests.service.data import error, service_of, stream, upload
 
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")

@@ -1,5 +1,7 @@
 """Holding data out of training: what is left out, how the version does on it, and that it stays left out."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -7,10 +9,14 @@ from pydantic import ValidationError
 import lipcore
 from lipcore.data.metrics import evaluate
 from lipcore.data.samples import Samples
+from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.robots.library import load_robot
+from lipcore.robots.simulation import inverse_dynamics
 from service.models import registry
 from service.models.archive_fields import Lineage
 from service.models.lineage import learnt_from, named
 from service.storage.database import DatasetRow
+from service.training import planned_fit, worker
 from service.training.holding_out import CannotHoldOutError, remembered
 from service.training.material import recorded
 from tests.service.archives.packing import exported, send
@@ -48,6 +54,15 @@ def version(api, model, number=1):
     return api.get(f"/v1/models/{model}/versions/{number}").json()
 
 
+def numbers(value):
+    """The numbers of a JSON value in order, NaN for null."""
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        return [each for part in value for each in numbers(part)]
+    return [] if isinstance(value, str) else [np.nan if value is None else value]
+
+
 def rows_of(samples, result):
     """Which rows of a recording these are, by their torques, which never repeat."""
     known = {row.tobytes(): index for index, row in enumerate(samples.tau)}
@@ -58,6 +73,11 @@ def material(api, *datasets, **holdout):
     service = service_of(api)
     request = {"datasets": list(datasets), "holdout": holdout, "joint_types": ["revolute"] * 2}
     return recorded(service.settings, service.database, service.files, request)
+
+
+def held_out(result):
+    """The rows that a job judges by."""
+    return result.held_out.thinned(ROWS * 10)
 
 
 @pytest.fixture(scope="module")
@@ -72,12 +92,26 @@ def held(api, dataset):
     return "held-out", train(api, "held-out", dataset, holdout={"share": 0.3})
 
 
-def test_only_the_rest_is_trained_on(api, held, dataset):
+@pytest.fixture(scope="module")
+def kept(api, dataset):
+    """A model whose version never learns what was held out; its name."""
+    job = train(api, "kept-out", dataset, holdout={"share": 0.3, "only": True})
+    assert job["holdout"]["only"] is True
+    return "kept-out"
+
+
+def test_only_the_rest_is_judged_and_then_all_is_learnt(api, held, kept, dataset):
     assert held[1]["holdout"] == {"kind": "auto", "share": 0.3, "blocks": 10, "guard_s": None, "seed": 0}
-    assert version(api, held[0])["fit"]["samples_given"] == TRAIN.stop
+    for model, rows, learnt in ((held[0], ROWS, True), (kept, TRAIN.stop, False)):
+        found = version(api, model)
+        assert found["fit"]["samples_given"] == rows
+        assert (found["lineage"]["holdout"]["learnt"], found["lineage"]["holdout"]["judged_rows"]) == (
+            learnt,
+            TRAIN.stop,
+        )
     result = material(api, dataset, share=0.3)
     assert rows_of(recording(), result.samples) == list(range(ROWS))[TRAIN]
-    assert rows_of(recording(), result.held_out[0]) == list(range(ROWS))[HELD_OUT]
+    assert rows_of(recording(), held_out(result)) == list(range(ROWS))[HELD_OUT]
 
 
 def test_the_lineage_keeps_the_split_and_the_figures(api, held, dataset):
@@ -88,21 +122,85 @@ def test_the_lineage_keeps_the_split_and_the_figures(api, held, dataset):
     assert (entry["id"], entry["whole"], entry["rows"], entry["guarded"]) == (dataset, False, 34, 4)
     assert (entry["guard"], entry["guard_unit"]) == (0.25, "s")
 
+
+def test_the_figures_are_those_of_a_model_that_has_not_learnt_what_was_held_out(api, held, kept):
     service, unseen = service_of(api), recording().rows(HELD_OUT)
-    model = lipcore.load(service.files.version_folder(registry.find(service.database, held[0], 1).folder))
-    answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
-    metrics = evaluate(unseen.tau, *answer.interval)
-    for name in FIGURES:
-        np.testing.assert_allclose(reply[name], getattr(metrics, name), rtol=1e-6)
+    model = lipcore.load(service.files.version_folder(registry.find(service.database, kept, 1).folder))
+    metrics = evaluate(unseen.tau, *model.predict(unseen.q, unseen.dq, unseen.ddq).interval)
+    for each in (held[0], kept):
+        reply = version(api, each)["lineage"]["holdout"]
+        for name in FIGURES:
+            np.testing.assert_allclose(reply[name], getattr(metrics, name), rtol=1e-6)
 
 
-def test_an_evaluation_finds_the_same_samples_again(api, held, dataset):
-    reply, answer = version(api, held[0])["lineage"]["holdout"], ask(api, held[0], dataset, part="held_out").json()
+@pytest.mark.parametrize("model", ["held-out", "kept-out"])
+def test_an_evaluation_finds_the_same_samples_again(api, held, kept, dataset, model):
+    reply, answer = version(api, model)["lineage"]["holdout"], ask(api, model, dataset, part="held_out").json()
     assert [answer[name] for name in ("part", "samples", "samples_used", "in_training")] == ["held_out", 34, 34, False]
+    assert answer["judged"] is (model == "held-out")
     for name in FIGURES:
         np.testing.assert_allclose(answer[name], reply[name], rtol=1e-6)
-    answer = ask(api, held[0], dataset).json()
-    assert (answer["part"], answer["samples"], answer["in_training"]) == ("all", ROWS, True)
+    answer = ask(api, model, dataset).json()
+    assert (answer["part"], answer["samples"], answer["in_training"], answer["judged"]) == ("all", ROWS, True, False)
+
+
+def test_an_evaluation_of_the_judged_fit_is_complete(api, held, kept, dataset):
+    judged, computed = (ask(api, model, dataset, part="held_out").json() for model in ("held-out", "kept-out"))
+    for name in computed.keys() - {"model", "judged"}:
+        if name in ("coverages", "reliability", "stretches"):
+            np.testing.assert_allclose(numbers(judged[name]), numbers(computed[name]), rtol=1e-6)
+        elif isinstance(computed[name], list) and name not in ("joint_names", "warnings"):
+            np.testing.assert_allclose(judged[name], computed[name], rtol=1e-6)
+        else:
+            assert judged[name] == computed[name], name
+
+
+def test_a_trace_of_what_was_held_out_says_whether_it_was_learnt(api, held, kept, dataset):
+    for model, learnt in ((held[0], True), (kept, False)):
+        answer = api.post(f"/v1/models/{model}/trace", json={"dataset": dataset, "part": "held_out"}).json()
+        assert (answer["samples"], answer["in_training"]) == (34, learnt)
+
+
+def resting():
+    """A recording whose second joint rests until the part that is held out."""
+    samples, share = stream(samples=ROWS, rate=10.0, seed=11), np.ones((ROWS, 2))
+    share[: HELD_OUT.start, 1] = 0.0
+    motion = [share * each for each in (samples.q, samples.dq, samples.ddq)]
+    tau = inverse_dynamics(load_robot("double-pendulum"), *motion)
+    return replace(samples, q=motion[0], dq=motion[1], ddq=motion[2], tau=tau)
+
+
+def test_a_version_has_learnt_motion_that_only_the_held_out_part_has(api):
+    dataset, other = (upload(api, each)["id"] for each in (resting(), stream(samples=60, rate=10.0, seed=12)))
+    errors = {}
+    for model, only in (("moves-late", False), ("never-moves", True)):
+        train(api, model, dataset, holdout={"kind": "last", "share": 0.3, "only": only})
+        errors[model] = ask(api, model, other).json()["nmse"]
+    assert max(errors["moves-late"]) < 0.1 * max(errors["never-moves"])
+    reply = [version(api, model)["lineage"]["holdout"]["nmse"] for model in errors]
+    np.testing.assert_allclose(*reply, rtol=1e-6)
+
+
+def test_a_fit_on_all_rows_that_fails_leaves_the_judged_model(api, dataset, monkeypatch):
+    service = service_of(api)
+    monkeypatch.setattr(service.jobs, "submit", lambda job: None)
+
+    def fails(model, task):
+        raise NotPositiveDefiniteError("the matrix is\nsingular")
+
+    monkeypatch.setattr(planned_fit, "refit", fails)
+    name = queue(api, "fails-late", dataset, holdout={"share": 0.3})["id"]
+    worker.run(service.settings, name)
+    assert ended(api, name)["state"] == "succeeded"
+    found = version(api, "fails-late")
+    assert found["fit"]["samples_given"] == TRAIN.stop
+    assert found["lineage"]["holdout"]["learnt"] is False
+    assert found["warnings"][0] == (
+        "The last fit, on all rows, failed (NotPositiveDefiniteError: the matrix is singular). "
+        "The model has not learnt the rows held out."
+    )
+    answer = ask(api, "fails-late", dataset, part="held_out").json()
+    assert (answer["judged"], answer["in_training"]) == (False, False)
 
 
 def test_the_same_samples_uploaded_again_split_alike(api, held, dataset):
@@ -135,12 +233,15 @@ def test_whole_data_sets_stand_for_episodes(api):
     assert all(each["whole"] for each in reply["datasets"])
     assert reply["rows"] == sum(length for name, length in zip(names, lengths, strict=True) if name in held)
     assert reply["guarded"] == 0
-    assert version(api, "whole-sets")["fit"]["samples_given"] == sum(lengths) - reply["rows"]
+    assert reply["judged_rows"] == sum(lengths) - reply["rows"]
+    assert version(api, "whole-sets")["fit"]["samples_given"] == sum(lengths)
     for name, length in zip(names, lengths, strict=True):
         answer = ask(api, "whole-sets", name).json()
-        assert (answer["samples"], answer["in_training"]) == (length, name not in held)
+        assert (answer["samples"], answer["in_training"]) == (length, True)
         part = ask(api, "whole-sets", name, part="held_out")
         assert part.status_code == (200 if name in held else 422)
+        if name in held:
+            assert (part.json()["samples"], part.json()["judged"]) == (length, True)
 
     result = material(api, *reversed(names), kind="episodes", share=0.3)
     assert {each["id"] for each in result.lineage["holdout"]["datasets"]} == set(held)
@@ -154,7 +255,7 @@ def test_a_data_set_without_times_has_a_guard_in_rows(api):
     (entry,) = result.lineage["holdout"]["datasets"]
     assert (entry["guard"], entry["guard_unit"]) == (25.0, "rows")
     assert rows_of(recording(seed=4), result.samples) == list(range(35))
-    assert rows_of(recording(seed=4), result.held_out[0]) == list(range(85, ROWS))
+    assert rows_of(recording(seed=4), held_out(result)) == list(range(85, ROWS))
     body = {"model": "m", "datasets": [untimed], "holdout": {"guard_s": 0.1}}
     reply = error(api.post("/v1/jobs", json=body), 422, "invalid_request")
     assert reply["detail"][0]["field"] == "holdout.guard_s"
@@ -202,7 +303,7 @@ def test_rows_that_are_named_are_held_out_and_found_again(api, dataset):
     other = upload(api, recording(seed=7))["id"]
     holdout = {"kind": "stretches", "stretches": {dataset: [[30, 60], [100, 110]]}}
     result = material(api, dataset, other, **holdout)
-    assert rows_of(recording(), result.held_out[0]) == [*range(32, 58), *range(102, 108)]
+    assert rows_of(recording(), held_out(result)) == [*range(32, 58), *range(102, 108)]
     assert len(result.samples.t) == ROWS - 32 - 4 * 4 + ROWS
     job = train(api, "named-rows", dataset, other, holdout=holdout)
     assert job["holdout"]["stretches"] == holdout["stretches"]
@@ -227,12 +328,25 @@ def test_a_refresh_leaves_the_same_samples_out(api):
     seen = ended(api, answer.json()["id"])
     assert seen["state"] == "succeeded", seen
     after = version(api, "refreshed-held", 2)
-    for name in ("split", "datasets", "rows", "guarded"):
+    for name in ("split", "datasets", "rows", "guarded", "judged_rows"):
         assert after["lineage"]["holdout"][name] == before["lineage"]["holdout"][name]
-    assert after["fit"]["samples_given"] == before["fit"]["samples_given"] < ROWS
+    assert after["fit"]["samples_given"] == before["fit"]["samples_given"] == ROWS
+    compared = after["lineage"]["refresh"]["compared"]
+    assert compared.startswith("it predicts what was held out")
+    assert "than version 1: negative log density" in compared
+    assert seen["history"][-1]["message"] == f"version 2 is trained: {compared}"
     answer = ask(api, "refreshed-held", dataset, part="held_out", version=2).json()
     np.testing.assert_allclose(answer["nmse"], after["lineage"]["holdout"]["nmse"], rtol=1e-6)
     assert answer["in_training"] is False
+
+
+def test_a_refresh_keeps_out_what_its_version_never_learns(api):
+    dataset = upload(api, recording(seed=13))["id"]
+    train(api, "refreshed-kept", dataset, holdout={"share": 0.3, "only": True})
+    seen = ended(api, api.post("/v1/models/refreshed-kept/refresh", json={}).json()["id"])
+    assert seen["state"] == "succeeded", seen
+    after = version(api, "refreshed-kept", 2)
+    assert (after["fit"]["samples_given"], after["lineage"]["holdout"]["learnt"]) == (TRAIN.stop, False)
 
 
 def test_an_exported_version_takes_its_split_with_it(api, held, dataset):
@@ -253,7 +367,7 @@ def test_the_guard_is_a_period_of_the_low_pass_that_was_used(api):
         row.report = {**row.report, "recipe": {"cutoff_hz": 2.0}}
     result = material(api, name, share=0.3)
     assert result.lineage["holdout"]["datasets"][0]["guard"] == 0.5
-    assert result.held_out[0].t[0] - result.samples.t[-1] > 1.0
+    assert held_out(result).t[0] - result.samples.t[-1] > 1.0
 
 
 def periodic(rows=600, seed=1):
@@ -301,7 +415,7 @@ def test_by_itself_a_part_is_held_out_that_repeats_nothing_and_is_found_again(ap
     ((first, last),) = entry["stretches"]
     assert first == 0
     assert last == pytest.approx(200, abs=100)  # a period
-    assert rows_of(samples, result.held_out[0]) == list(range(last - 5))  # a quarter of a second of guard
+    assert rows_of(samples, held_out(result)) == list(range(last - 5))  # a quarter of a second of guard
     split = remembered(DatasetRow(id=dataset, sha256="?"), result.lineage)
     assert np.flatnonzero(split.held_out(samples.episode, samples.t)).tolist() == list(range(last - 5))
     assert material(api, dataset, share=0.3, kind="last").lineage["holdout"]["datasets"][0]["stretches"] is None
@@ -325,6 +439,7 @@ def test_data_sets_that_nothing_was_learnt_of_are_not_in_training():
     assert learnt_from({"datasets": datasets, "holdout": HOLDOUT}) == {"ds_1", "s", "ds_2", "r"}
     entire = {**HOLDOUT, "datasets": [{**ENTRY, "whole": True}]}
     assert learnt_from({"datasets": datasets, "holdout": entire}) == {"ds_2", "r"}
+    assert learnt_from({"datasets": datasets, "holdout": {**entire, "learnt": True}}) == {"ds_1", "s", "ds_2", "r"}
     assert learnt_from({}) == frozenset()
 
 

@@ -7,6 +7,8 @@ import pytest
 
 from lipcore.data.outliers import Corrupt
 from service.datasets import staging
+from service.training import worker
+from service.training.pulse import Pulse
 from tests.service.data import (
     ENDLESS,
     QUICK,
@@ -18,6 +20,7 @@ from tests.service.data import (
     post,
     queue,
     running,
+    service_of,
     stream,
     train,
     upload,
@@ -56,6 +59,37 @@ def test_progress_moves_while_the_objective_falls(api):
     assert later["progress"]["objective"] < first["progress"]["objective"]
     assert later["heartbeat_at"] > first["heartbeat_at"]
     api.post(f"/v1/jobs/{seen['id']}/cancel")
+
+
+@pytest.mark.parametrize("statistics", ["chosen", "all"])
+def test_the_fraction_done_never_falls_while_a_version_is_judged_and_learns_all_rows(api, monkeypatch, statistics):
+    service, seen = service_of(api), []
+    monkeypatch.setattr(service.jobs, "submit", lambda job: None)
+    for name in ("plan", "progress", "last_fit", "share", "stage"):
+        monkeypatch.setattr(Pulse, name, noted(getattr(Pulse, name), seen))
+    dataset = upload(api, stream(samples=150, seed=4))["id"]
+    options = {**QUICK, "statistics": statistics}
+    name = queue(api, f"learns-{statistics}", dataset, options=options, holdout={"share": 0.3})["id"]
+    worker.run(service.settings, name)
+    assert job(api, name)["state"] == "succeeded"
+    fractions = [each["fraction"] for each in seen]
+    assert fractions == sorted(fractions)
+    assert fractions[-1] < 1
+    stages = [*dict.fromkeys(each["stage"] for each in seen)]
+    passes = ["statistics"] if statistics == "all" else []
+    assert stages == ["loading", "hyperparameters", "posterior", *passes, "evaluating", "all_rows", "saving"]
+    fit = api.get(f"/v1/models/learns-{statistics}/versions/1").json()["fit"]
+    assert (fit["samples_given"], fit["samples_posterior"]) == (150, 150 if statistics == "all" else 60)
+
+
+def noted(method, seen):
+    """A method of a pulse that notes its progress afterwards."""
+
+    def call(self, *given):
+        method(self, *given)
+        seen.append({"fraction": 0.0, **self.as_json()})
+
+    return call
 
 
 def test_lineage_names_the_data_with_their_hashes(api, two_versions):

@@ -217,11 +217,24 @@ def test_without_options_the_service_holds_out_what_it_does_by_default_and_zero_
     body = {"model": "by-default", "datasets": job["datasets"], "estimator": "lip-chain"}
     plain = server.client.post("/v1/jobs", json=body).json()
     server.client.post(f"/v1/jobs/{plain['id']}/cancel")
-    assert job["holdout"] == {**plain["holdout"], "stretches": None}
+    assert job["holdout"] == {**plain["holdout"], "stretches": None, "only": False}
     assert (job["holdout"]["kind"], job["holdout"]["share"]) == ("auto", 0.3)
     assert job["quality"]["samples"] > 0
     job = asked("train", path, "--model", "by-default", *QUICKLY, "--hold-out", 0, "--json")
     assert (job["holdout"], job["quality"]) == (None, None)
+
+
+def test_what_is_held_out_only_is_never_learnt(asked, refused, server, recording):
+    path = recording(18, samples=120, rate=10.0)
+    text = asked("train", path, "--model", "cli-only", *QUICKLY)
+    assert "Judged on held-out rows; the version was then trained on all rows." in text
+    assert "Judged on" not in asked("train", path, "--model", "cli-only", *QUICKLY, "--hold-out-only")
+    for number, learnt in ((1, True), (2, False)):
+        lineage = server.client.get(f"/v1/models/cli-only/versions/{number}").json()["lineage"]
+        assert lineage["holdout"]["learnt"] is learnt
+    judged = asked("evaluate", "cli-only", lineage["datasets"][0]["id"], "--held-out", "--version", 1)
+    assert "as judged before it learnt them" in " ".join(judged.split())
+    assert "--hold-out above 0" in refused("train", path, "--model", "m", "--hold-out", 0, "--hold-out-only")
 
 
 def test_the_id_of_a_job_is_told_before_its_end(lipserve, server, recording):

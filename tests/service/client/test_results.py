@@ -22,7 +22,7 @@ EVALUATION = {
     **{"samples": 100, "samples_used": 50, "level": 0.95, "nmse": [0.0123, None], "rmse": [0.5, 0.25]},
     **{"coverage": [0.94, 1.0], "nlpd": [-1.5, 0.125], "interval_width": [2.0, 1.0], "in_training": True},
     **{"independent": [12.4, 8.0], "coverage_low": [0.6, 0.63], "coverage_high": [1.0, 1.0]},
-    **{"repeats_training": 0.97, "period_s": 5.0, "warnings": ["97 % repeat: <flatters>"]},
+    **{"repeats_training": 0.97, "period_s": 5.0, "warnings": ["97 % repeat: <flatters>"], "judged": False},
     "coverages": [{"level": 0.5, "coverage": [0.5, 0.6], "interval_width": [0.7, 0.4]}],
     "reliability": {"nominal": [0.5, 0.9], "observed": [[0.5, 0.9], [0.6, 0.95]]},
     "stretches": {"kind": "equal", "samples": [25, 25], "nmse": [[0.01, 0.02], [None, None]]},

@@ -107,6 +107,15 @@ def test_rows_without_times_count_for_no_more_than_the_chosen_ones(parts):
     assert Table([parts[1]]).weighed(500).independent_rows() == pytest.approx(500)
 
 
+def test_the_rows_of_a_sparse_table_count_for_those_left_out(parts):
+    table = Table([masked(parts[0]), parts[1]]).weighed(500)
+    assert table.sparse(len(table)) is table
+    sparse = table.sparse(len(table) // 3 + 1)
+    assert len(sparse) == pytest.approx(len(table) / 3, abs=2)
+    assert not (sparse.parts[0].chosen & ~table.parts[0].chosen).any()
+    assert sparse.independent_rows() == pytest.approx(table.independent_rows(), rel=0.02)
+
+
 def test_shards_without_rows_are_left_out(parts):
     mask = np.zeros(ROWS, dtype=bool)
     mask[SHARD + 5] = True

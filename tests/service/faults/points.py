@@ -68,7 +68,7 @@ JOBS = [
     Point("job queued: before it is handed on", actions.Train, Fault("service.training.queue:JobQueue.submit"), "all"),
     *_both("job claimed", actions.Train, Fault(COMMIT, "after", "service.training.worker:_claim")),
     *_both("job at work: fit begun", actions.Train, Fault("lipcore.fitting.hyperparameters:fit", "before", WORK)),
-    *_both("job at work: fit ended", actions.Train, Fault("service.training.worker:_fit", "after")),
+    *_both("job at work: fit ended", actions.Train, Fault("service.training.planned_fit:PlannedFit.first", "after")),
     *_both("version: half of its files", actions.Train, Fault(FSYNC, "before", WORK)),
     *_both("version: files complete, no row", actions.Train, Fault(RENAME, "after", WORK)),
     *_both("version: row made", actions.Train, Fault("service.models.registry:publish", "after", WORK)),

@@ -103,6 +103,25 @@ def test_nothing_is_written_after_the_end(beating):
     assert row(database).progress == {"stage": "done"}
 
 
+def test_the_fraction_is_divided_by_how_long_fits_and_passes_take(beating):
+    _, talk = beating
+    talk.plan(200, 100, 100)
+    for method, given, expected in (
+        (talk.progress, FitProgress("posterior", 9, 9, -1.0, 1.0, 3.0), 0.5),
+        (talk.share, 0.5, 0.625),
+        (talk.share, 1.0, 0.75),
+    ):
+        method(given)
+        assert talk.as_json()["fraction"] == pytest.approx(expected)
+    talk.plan(20, 0)
+    talk.stage(pulse.LAST_FIT)
+    assert talk.as_json()["remaining_s"] is None
+    talk.last_fit(FitProgress("hyperparameters", 2, 9, -5.0, 0.8, 3.0))
+    seen = talk.as_json()
+    assert seen["fraction"] == pytest.approx(0.75 + 0.8 * 0.25)
+    assert (seen["stage"], seen["iteration"], seen["objective"]) == ("all_rows", 9, -1.0)
+
+
 def at(iteration, stage="hyperparameters", most=50):
     return FitProgress(stage, iteration, most, 0.0, 0.95 * iteration / most, 0.0)
 

@@ -10,7 +10,7 @@ from service.journal import log
 from service.learning import refresh
 from service.learning.learner.publication import Published
 from service.storage.database import AlarmRow, JobRow, now
-from service.training import worker
+from service.training import planned_fit, worker
 from tests.service.data import QUICK, arrays, ended, running, stream, train, upload
 from tests.service.learning.lessons import LESSON, Pupil, answered
 from tests.service.server import Server
@@ -98,13 +98,13 @@ def test_without_data_there_is_nothing_to_refresh_from(pupil):
 def test_what_is_taken_back_while_it_is_trained_on_fails_the_job(waiting, pupil, monkeypatch):
     pupil.teach(0, 1, 2, 3)
     job, service = answered_202(pupil), waiting.service
-    fit = worker.fit_model
+    fit = planned_fit.fit_model
 
     def slowly(*given, **more):
         pupil.delete("observations/arm/1")
         return fit(*given, **more)
 
-    monkeypatch.setattr(worker, "fit_model", slowly)
+    monkeypatch.setattr(planned_fit, "fit_model", slowly)
     worker.run(service.settings, job["id"])
     seen = answered(pupil.client.get(f"/v1/jobs/{job['id']}"))
     assert (seen["state"], seen["error"]["code"]) == ("failed", "observations_taken_back")

@@ -70,8 +70,8 @@ def evaluate(
 ) -> Call[Evaluation]:
     """Compare a model with a data set: the version that serves, unless one is named by its number or an alias.
 
-    part: `held_out` compares with what the version's training has held out of the data set. min_revision: as of
-    `predict`.
+    part: `held_out` compares with what the version's training has held out of the data set. If the version has learnt
+    that since, the figures are of the judged fit. min_revision: as of `predict`.
     """
     body = {"dataset": dataset, "part": part} | given(version=version, alias=alias, min_revision=min_revision)
     return at(read_evaluation, names={"model": model}, json=body)

@@ -35,10 +35,10 @@ def train(
     """Queue a training job.
 
     robot: for rigid bodies, a profile such as panda or the id of an uploaded URDF; holdout: what to hold out of the
-    data sets and evaluate the version on, {"share": 0.3} by default, False for nothing; promotion: `ask` (default) lets
-    the version answer if it does well there, `always` in any case; base: a version of another unit of the same robot to
-    start from, as `model:3` or `model@alias`; idempotency_key: the same request under the same key queues one job, also
-    from another client.
+    data sets and judge the version on, {"share": 0.3} by default, False for nothing. The version then learns it, too,
+    unless that is {"only": True}. promotion: `ask` (default) lets the version answer if it does well there, `always` in
+    any case; base: a version of another unit of the same robot to start from, as `model:3` or `model@alias`;
+    idempotency_key: the same request under the same key queues one job, also from another client.
     """
     body = _asked(model, datasets, estimator, joint_types, options, robot, holdout, promotion, base)
     return at(record(Job), names={}, json=body, headers={KEY_HEADER: idempotency_key or new_key()})

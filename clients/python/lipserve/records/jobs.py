@@ -9,7 +9,7 @@ from lipserve.records.models import HeldOutQuality
 
 
 class Holdout(Record, frozen=True, kw_only=True):
-    """Part of the data that is not learnt from, so that the version can be evaluated on it: never rows at random.
+    """Part of the data that the version is judged on before it learns it: never rows at random.
 
     kind: Of each data set: whole `episodes`, chosen by the seed; its `last` part; some of many equal `blocks`, chosen
         by the seed; or `auto`, the last part, unless that repeats motion that is learnt from and there are periods,
@@ -22,6 +22,8 @@ class Holdout(Record, frozen=True, kw_only=True):
     seed: Of the choice
     stretches: With `kind` `stretches`: by the ids of data sets, which rows to hold out, first and last (exclusive) in
         order of episode and time. Data sets that are not named are learnt from
+    only: Whether the version never learns these samples. By default it is judged without them, and then trained on all
+        samples
     """
 
     kind: Literal["auto", "stretches", "episodes", "last", "blocks"] = "auto"
@@ -30,6 +32,7 @@ class Holdout(Record, frozen=True, kw_only=True):
     guard_s: float | None = None
     seed: int = 0
     stretches: dict[str, list[list[int]]] | None = None
+    only: bool = False
 
 
 class Refresh(Record, frozen=True, kw_only=True):
@@ -49,7 +52,8 @@ class Refresh(Record, frozen=True, kw_only=True):
 class JobProgress(Record, frozen=True, kw_only=True):
     """How far a job is.
 
-    stage: waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, saving or done
+    stage: waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, all_rows, saving or done.
+        `all_rows` is the last fit, on the rows held out, too
     estimator: The one at work, where `auto` trains several
     objective: Penalised negative log evidence, nats: falls during the fit
     remaining_s: Roughly the seconds that are left; null until that can be told. Taken to need all iterations, though a

@@ -10,7 +10,7 @@ from lipserve.records import Record
 
 
 class HeldOutQuality(Record, frozen=True, kw_only=True):
-    """How well a version predicts what its training held out, per joint; null where a joint's torque does not vary.
+    """How well the judged fit of a version predicts what was held out, per joint; null where torque does not vary.
 
     samples: Samples that the figures are of
     nmse: Mean squared error / variance of the measured torque

@@ -51,9 +51,9 @@ class Evaluation(Plain):
     measured torque, NaN where that does not vary; rmse: N·m; coverage: share of measurements inside the interval of
     probability `level`, noise included; independent: errors that it stands on; coverage_low, coverage_high: its 95 %
     confidence interval; nlpd: mean negative log predictive density, nats; interval_width: N·m; in_training: whether the
-    model was trained on these samples: then the figures flatter; repeats_training: share of them that repeat motion it
+    version has learnt these samples: then the figures flatter; repeats_training: share of them that repeat motion it
     was trained on, and period_s: after which that repeats itself, s, None where not known; warnings: what else
-    flatters.
+    flatters; judged: whether the figures are of the judged fit, which was trained without these samples.
     """
 
     model: str
@@ -80,6 +80,7 @@ class Evaluation(Plain):
     repeats_training: float | None
     period_s: float | None
     warnings: tuple[str, ...]
+    judged: bool = False
 
     def rows(self) -> list[dict[str, Any]]:
         """One dictionary a joint, as for `pandas.DataFrame(evaluation.rows())`."""
@@ -93,7 +94,8 @@ class Evaluation(Plain):
     def title(self) -> str:
         """What was compared with what, and whether that flatters."""
         what = "held-out samples" if self.part == "held_out" else "samples"
-        unseen = "" if not self.in_training else ", which it was trained on: these figures flatter"
+        unseen = ", which it was trained on: these figures flatter" if self.in_training else ""
+        unseen = ", as judged before it learnt them" if self.judged else unseen
         return f"{self.model} version {self.version} on {self.samples_used} {what} of {self.dataset}{unseen}"
 
     def __str__(self) -> str:

@@ -6,7 +6,7 @@ import { nmse, percent, shortNames } from "../format.js";
 import { narrowJoints } from "./model/coverage.js";
 
 /** What the columns mean, to stand below such a table. */
-export const QUALITY_HINT = "nMSE and “in 95\u00a0%” are means of the joints, on what each training held out; bars show each joint. nMSE: lower is better, 1 is no better than the mean torque. “In 95\u00a0%” should be near 95\u00a0%: less means that the bands are too narrow.";
+export const QUALITY_HINT = "nMSE and “in 95\u00a0%” are means of the joints, judged on held-out rows before the version was trained on all rows. Bars show each joint. nMSE: lower is better, 1 is no better than the mean torque. “In 95\u00a0%” should be near 95\u00a0%: less means that the bands are too narrow.";
 
 /** Columns for rows whose quality and joints `of` returns: {quality, joints: names or null}. */
 export function qualityColumns(of) {

@@ -9,6 +9,7 @@ import { warned } from "../data/prose.js";
 import { known, narrowJoints } from "../model/coverage.js";
 import { promoted } from "../model/promotion.js";
 import { selectionCard } from "../model/selection.js";
+import { JUDGED } from "./words.js";
 
 const ADVICE = {
   cannot_hold_out: "Hold out less, or in another way, or nothing.",
@@ -46,7 +47,7 @@ async function judged(job, signal) {
     promoted(version),
     warned([...version.warnings, ...(held?.warnings ?? [])]),
     held?.nmse
-      ? figures(`On ${count(held.samples)} samples that were held out`, held, version)
+      ? [figures(`On ${count(held.samples)} samples that were held out`, held, version), held.learnt ? h("p", { class: "hint" }, JUDGED) : null]
       : h("p", { class: "banner" }, "Nothing was held out, so how well it predicts is not known. Evaluate it on a recording that it has not seen."),
     !held?.nmse && seen?.nmse ? figures(`On ${count(seen.samples)} samples it was trained on: these figures flatter`, seen, version) : null,
   );

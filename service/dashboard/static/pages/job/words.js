@@ -11,7 +11,9 @@ const STAGES = {
   geometry: "searching for the joint axes",
   hyperparameters: "fitting hyperparameters",
   posterior: "computing the posterior",
+  statistics: "summing up all rows",
   evaluating: "evaluating on the held-out part",
+  all_rows: "training on all rows, held out or not",
   saving: "saving the version",
   done: "done",
 };
@@ -28,6 +30,9 @@ export function left({ progress: at }) {
   return at.remaining_s === null ? "" : `at most about ${seconds(Math.ceil(at.remaining_s))}`;
 }
 
+/** Of figures of a version that has learnt what was held out: which fit they are of. */
+export const JUDGED = "Judged on held-out rows; the version was then trained on all rows.";
+
 /** What was held out, in a sentence. */
 export function heldOut(holdout) {
   if (!holdout) return "nothing";
@@ -39,5 +44,5 @@ export function heldOut(holdout) {
     episodes: `${share}, in whole episodes chosen by seed ${holdout.seed}`,
     blocks: `${share}, in some of ${holdout.blocks} blocks chosen by seed ${holdout.seed}`,
   };
-  return `${what[holdout.kind]}${guard}`;
+  return `${what[holdout.kind]}${guard}${holdout.only ? ", and never learnt" : ""}`;
 }

@@ -1,10 +1,14 @@
 // What makes figures look better than they are, said before they are seen.
 
 import { h } from "../../dom.js";
+import { JUDGED } from "../job/words.js";
 
 /** Sentences about an evaluation or a trace; nothing where its samples are new to the version. */
 export function flattery({ version, revision, in_training: trained, part }) {
   const said = [];
+  if (trained && part === "held_out") {
+    return [h("p", { class: "hint" }, `${JUDGED} Figures are of the judged fit. Plots of the torque are of version ${version} itself, which has learnt these rows.`)];
+  }
   if (trained) {
     said.push(h("div", { class: "banner", role: "note" },
       h("strong", {}, "These samples flatter. "),

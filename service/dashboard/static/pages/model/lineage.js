@@ -3,7 +3,7 @@
 import { h, replace } from "../../dom.js";
 import { bytes, count, number, percent, scientific, seconds, shortNames, when } from "../../format.js";
 import { badge, card, facts, link, table } from "../../ui.js";
-import { heldOut } from "../job/words.js";
+import { heldOut, JUDGED } from "../job/words.js";
 import { selectionCard } from "./selection.js";
 
 /** The tab of a version's lineage. */
@@ -80,7 +80,7 @@ function figuresCard(version, from) {
   return card(
     "Figures as trained",
     table(columns, version.joint_names.map((_name, joint) => joint), { caption: said }),
-    from.holdout ? h("p", { class: "hint" }, `Held out: ${heldOut(from.holdout.split)}.`) : h("p", { class: "hint" }, "Nothing was held out. Evaluate it on a recording that it has not seen."),
+    from.holdout ? h("p", { class: "hint" }, `Held out: ${heldOut(from.holdout.split)}. ${from.holdout.learnt ? JUDGED : ""}`) : h("p", { class: "hint" }, "Nothing was held out. Evaluate it on a recording that it has not seen."),
   );
 }
 

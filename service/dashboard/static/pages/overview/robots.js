@@ -89,7 +89,7 @@ function standing(model, live) {
 function quality({ quality: judged, recent }, names) {
   const lately = recent?.rows ? recent : null;
   if (!judged && !lately) return h("p", { class: "hint" }, "Not judged yet: nothing was held out of its training, and no stream has come.");
-  const note = judged && lately ? "Bars: held out. Lines: last hour." : judged ? "On what was held out." : "In the last hour.";
+  const note = judged && lately ? "Bars: judged on held-out rows. Lines: last hour." : judged ? "Judged on held-out rows." : "In the last hour.";
   return [qualityCharts(names, judged ?? lately, judged ? lately : null), h("p", { class: "hint" }, note)];
 }
 

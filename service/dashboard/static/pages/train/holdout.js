@@ -30,16 +30,18 @@ export function holdoutChoice(named = null) {
   const blocks = number("holdout.blocks", 10, { min: 2, max: 1000, step: 1 });
   const seed = number("holdout.seed", 0, { min: 0, max: 2147483647, step: 1 });
   const guard = h("input", { type: "number", name: "holdout.guard_s", min: "0", max: "3600", step: "any", placeholder: "one period of the low-pass" });
+  const only = h("input", { type: "checkbox", name: "holdout.only" });
   const about = h("p", { class: "hint" });
   const fields = {
     share: field("Share, %", share),
     blocks: field("Blocks", blocks),
     seed: field("Seed of the choice", seed),
-    guard: field("Guard, s", guard, "Samples this close to the border are used for neither."),
+    guard: field("Guard, s", guard, "Samples this close to the border are not used to judge, nor learnt before."),
+    only: field("Never learn this part", only),
   };
   const show = () => {
     about.textContent = SAID[kind.value];
-    fields.guard.hidden = kind.value === "";
+    fields.guard.hidden = fields.only.hidden = kind.value === "";
     fields.share.hidden = kind.value === "" || kind.value === "stretches";
     fields.blocks.hidden = kind.value !== "blocks";
     fields.seed.hidden = kind.value !== "blocks" && kind.value !== "episodes";
@@ -52,13 +54,15 @@ export function holdoutChoice(named = null) {
       "fieldset",
       {},
       h("legend", {}, "Hold out"),
-      h("p", { class: "hint" }, "The model does not learn from this part; it is judged on it."),
+      h("p", { class: "hint" }, "The model is judged on this part without having learnt it. Then it is trained on all rows."),
       h("div", { class: "grid" }, field("Which part", kind), fields.share, fields.blocks, fields.seed, fields.guard),
+      fields.only,
       about,
     ),
     value: () => {
       if (!kind.value) return null;
       const chosen = { kind: kind.value, ...(kind.value === "stretches" ? { stretches: named } : { share: share.valueAsNumber / 100 }) };
+      if (only.checked) chosen.only = true;
       if (kind.value === "blocks") chosen.blocks = blocks.valueAsNumber;
       if (kind.value !== "last" && kind.value !== "stretches") chosen.seed = seed.valueAsNumber;
       return guard.value ? { ...chosen, guard_s: guard.valueAsNumber } : chosen;

@@ -1,0 +1,76 @@
+"""Figures of how well torques were predicted: of an evaluation, and of the judged fit in a version's lineage."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from lipcore.data import metrics
+from lipcore.data.coverage import CoverageInterval, coverage_interval
+from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Answer, Metrics
+from lipcore.data.samples import Array, Samples
+from service.foundation.fields import finite
+from service.models.schema import Interval, Reliability, Stretches
+
+FEWEST_EPISODES, MOST_EPISODES = 5, 200
+"""Episodes stand for stretches where there are so many; fewer make no box plot, more are mostly a few samples long."""
+EQUAL = 10
+
+
+def stretches(samples: Samples, mean: Array) -> Stretches:
+    """Mean squared error of each stretch / variance of the measured torque over all samples; mean: (N, n) N·m.
+
+    The variance is that of all samples: a joint that rests for a while has a variance near zero then, and any error
+    would look enormous.
+    """
+    episodes = samples.episodes()
+    by_episode = FEWEST_EPISODES <= len(episodes) <= MOST_EPISODES
+    if not by_episode:
+        edges = np.linspace(0, len(samples), min(EQUAL, len(samples)) + 1).astype(np.int64).tolist()
+        episodes = [slice(first, last) for first, last in pairwise(edges)]
+    squared = (samples.tau - mean) ** 2
+    varies = np.ptp(samples.tau, axis=0) > 0  # rounding gives a constant column a variance above zero
+    variance = samples.tau.var(axis=0)
+    means = np.array([squared[each].mean(axis=0) for each in episodes])
+    return Stretches(
+        kind="episodes" if by_episode else "equal",
+        samples=[each.stop - each.start for each in episodes],
+        nmse=[
+            (column / variance[joint]).tolist() if varies[joint] else [None] * len(episodes)
+            for joint, column in enumerate(means.T)
+        ],
+    )
+
+
+def evaluation(samples: Samples, answer: Answer) -> dict[str, Any]:
+    """Return the fields of `Evaluation` that say how well an answer predicts samples."""
+    found = metrics.evaluate(samples.tau, *answer)
+    return {
+        "samples_used": len(samples),
+        "level": found.level,
+        **joint_figures(found),
+        **known(coverage_interval(samples, answer)),
+        "coverages": [
+            Interval(level=each, coverage=coverage.tolist(), interval_width=width.tolist())
+            for each, coverage, width in zip(LEVELS, found.coverages, found.widths, strict=True)
+        ],
+        "reliability": Reliability(nominal=list(RELIABILITY_LEVELS), observed=found.reliability.T.tolist()),
+        "stretches": stretches(samples, answer.mean),
+    }
+
+
+def joint_figures(metrics: Metrics) -> dict[str, Any]:
+    """Figures of each joint, nmse null where its torque does not vary."""
+    per_joint = {name: getattr(metrics, name).tolist() for name in ("rmse", "coverage", "nlpd")}
+    return {"nmse": finite(metrics.nmse), **per_joint, "interval_width": metrics.width.tolist()}
+
+
+def known(interval: CoverageInterval) -> dict[str, list[float]]:
+    """How far coverages are known, as the API and lineages name it."""
+    return {
+        "independent": interval.independent.tolist(),
+        "coverage_low": interval.low.tolist(),
+        "coverage_high": interval.high.tolist(),
+    }
