@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from lipcore.arm import right_angles
 from lipcore.arm.posing import make_problem, mode_of, surroundings, with_samples, with_stribeck
 from lipcore.arm.problem import UNIT_WIDTH, Point, Problem, root_of
-from lipcore.arm.right_angles import Candidate
+from lipcore.arm.right_angles import NEAR_NATS, Candidate, Layout
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Pool, SearchResult, search
 from lipcore.data.samples import Array, Samples
@@ -35,8 +35,6 @@ POLISHED, POLISHING = 4, 40
 """Optima of few rows that are followed on all rows, and steps of that."""
 ROUNDS, ROUND_STEPS = 3, 15
 """Times that scales and geometry are fitted in turn, and steps of each."""
-NEAR = 7.0
-"""nats: an arm that much less likely than the best counts for a thousandth."""
 DIFFERS = 0.3
 """An alternative arm matters where its torque differs by this share of the spread that is stated anyway."""
 CHECKS = 200
@@ -103,7 +101,7 @@ def learn(
         counting = _Counting(task.contiguous(CORRELATED), order, shared_rows(samples, len(rows)))
         problem = counting.applied(problem, ends[0], at_rest=False)
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
-        found, stribeck_nats = _refined(problem, ends, counting, watch, mode == "learn")
+        found, stribeck_nats = _refined(problem, ends, counting, watch, known if mode == "learn" else None)
         best, problem = found[0].point, found[0].problem
         misfit, _ = counting.misfit(problem, best, best.sigma**2)
         watch.step("posterior", best.value, 0.95)
@@ -174,21 +172,22 @@ def _search(
 
 
 def _refined(
-    problem: Problem, ends: Sequence[Point], counting: _Counting, watch: _Watch, learnt: bool
+    problem: Problem, ends: Sequence[Point], counting: _Counting, watch: _Watch, known: Sequence[Geometry] | None
 ) -> tuple[list[Candidate], float]:
-    """The best end and the others that are nearly as likely, with the scales and noise of the best, and how many nats
-    friction's fourth term gains, which is there where the evidence wants it.
+    """Return the most likely arm and the others that are nearly as likely, with the scales and the noise of the first,
+    and how many nats friction's fourth term gains, which is there if the evidence wants it.
 
-    learnt: whether the geometry is learnt from nothing, so that layouts at right angles are ends, too.
+    known: geometries whose layouts at right angles are tried, if the geometry is learnt from nothing; else None.
     """
     best, problem = _in_turn(problem, ends[0], ROUNDS, 0.85, watch)
-    free = (None,) * problem.n_joints
-    starts = [(free, problem.expected, best), *((free, problem.expected, end) for end in ends[1:])]
-    if learnt:
-        chosen = right_angles.likely(problem, [best, *ends[1:]], watch.stop)
-        starts = [(each.layout, each.problem.expected, each.point) for each in chosen] + starts
-        _, expected, best = starts[0]
-        best, problem = _in_turn(replace(problem, expected=expected), best, STRIBECK_ROUNDS, 0.87, watch)
+    free: Layout = (None,) * problem.n_joints
+    others = [end for end in ends[1:] if end.value < ends[0].value + 2 * NEAR_NATS]
+    starts = [(free, problem.expected, end) for end in (best, *others)]
+    if known is not None:
+        chosen = right_angles.likely_layouts(problem, [best, *ends[1:]], known, watch.stop)
+        starts = [*((each.layout, each.problem.expected, each.point) for each in chosen), *starts]
+        problem = replace(problem, expected=starts[0][1])
+        best, problem = _in_turn(problem, starts[0][2], STRIBECK_ROUNDS, 0.87, watch)
     wider = with_stribeck(problem)
     start = wider.at(best.geometry, best.sigma)
     gain = rescale(problem, best).value - rescale(wider, start).value
@@ -200,12 +199,12 @@ def _refined(
             problem, problem.at(best.geometry, best.sigma), STRIBECK_ROUNDS, 0.9 + 0.02 * number, watch
         )
     found = [right_angles.weigh(problem, best, starts[0][0])]
-    for layout, expected, start in starts[1:]:
+    for layout, expected, other in starts[1:]:
         posed = replace(problem, expected=expected)
-        end = posed.descend(start.geometry, best.sigma, ROUND_STEPS, watch.stop, noise=False)
+        end = posed.descend(other.geometry, best.sigma, ROUND_STEPS, watch.stop, noise=False)
         found.append(right_angles.weigh(posed, end, layout))
     found.sort(key=lambda each: each.evidence)
-    return [each for each in found if each.evidence < found[0].evidence + NEAR], gain
+    return [each for each in found if each.evidence < found[0].evidence + NEAR_NATS], gain
 
 
 def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch: _Watch) -> tuple[Point, Problem]:

@@ -118,7 +118,7 @@ def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -
 
 
 def with_stribeck(problem: Problem) -> Problem:
-    """The same with friction's fourth term, whose weights may be as large as a joint's torque, like the Coulomb ones."""
+    """The same with friction's fourth term, whose weights may be as large as a joint's torque, as the Coulomb ones."""
     n, first = problem.n_joints, problem.bodies
     coulomb = FRICTION_TERMS.index("coulomb")
 

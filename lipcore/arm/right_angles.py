@@ -8,7 +8,7 @@ ones anywhere; layouts are weighed by their evidence, with the geometry integrat
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -18,15 +18,24 @@ from lipcore.data.samples import Array
 from lipcore.kernels.geometry import Geometry, aligned, rotation_of
 
 DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
+AXES = "xXyYzZ"
+TYPICAL_LAYOUTS = {7: ("zyzyzyz", "zyzYzyz"), 6: ("zyyxyx", "zyyyzy")}
+"""Axes of common arms at their zero pose, base to tip; capitals point backwards."""
 TURN_WIDTH = 0.01
 """How far an axis at a right angle may lie from it, standard deviation in rad."""
 NEAR_RAD = np.radians(12.0)
-"""An axis within this angle of a direction is tried there at once."""
+"""An axis within this angle of a direction is put there at once."""
 RIGHT_SHARE = 0.9
-"""Share of all axes that lie at right angles."""
-ROWS, BEAM, STEPS, SWEEPS, NEAR_NATS, GAIN_NATS = 80, 3, 5, 3, 7.0, 1.0
+"""Share of all axes that are built at right angles."""
+SEARCH_ROWS, SEARCH_STEPS = 80, 5
+"""Rows of a problem that layouts are compared on, and steps of each descent."""
+MAX_KEPT, MAX_SWEEPS = 3, 3
+"""Layouts that are improved and kept, and times that all joints are tried in turn."""
+NEAR_NATS, GAIN_NATS = 7.0, 1.0
+"""A candidate that much less likely than the best counts for a thousandth; what a sweep has to gain to be repeated."""
 
 Layout = tuple[int | None, ...]
+"""For each joint, base to tip, the row of DIRECTIONS that its axis points to, or None for a free axis."""
 
 
 @dataclass(frozen=True)
@@ -40,83 +49,113 @@ class Candidate:
 
 
 def weigh(problem: Problem, point: Point, layout: Layout) -> Candidate:
-    """Weigh a point of a problem under a layout; raise LinAlgError where that cannot be computed."""
-    assert problem.expected is not None
+    """Weigh a point of a problem under a layout.
+
+    A geometry that is fixed has nothing to integrate out. Raise LinAlgError if the evidence cannot be computed.
+    """
+    if problem.expected is None:
+        return Candidate(layout, problem, point, point.value)
     snapped = sum(each is not None for each in layout)
     share = snapped * np.log(RIGHT_SHARE / len(DIRECTIONS)) + (len(layout) - snapped) * np.log(1 - RIGHT_SHARE)
     occam = float(np.log(problem.expected.widths).sum())
     return Candidate(layout, problem, point, problem.laplace(point) + occam - share)
 
 
-def likely(problem: Problem, ends: Sequence[Point], stop: Callable[[], bool] | None = None) -> list[Candidate]:
-    """Layouts near some optima that are more likely than the first of these is without one: at most BEAM, best first.
+def likely_layouts(
+    problem: Problem, ends: Sequence[Point], known: Sequence[Geometry] = (), stop: Callable[[], bool] | None = None
+) -> list[Candidate]:
+    """Return the layouts that are more likely than the first of some optima is without one: at most MAX_KEPT.
 
-    They are looked for on few rows of the problem, which count for all: axes near a direction are put there, then each
-    joint in turn is tried in all directions, the surest first, until that gains nothing.
+    They are compared on few rows of the problem, which count for all. A search starts at the optima, with the axes that
+    lie near a direction put there, at known geometries, and at TYPICAL_LAYOUTS. The best of these are improved: each
+    joint in turn is tried in all directions until that gains nothing.
     """
-    rows = np.unique(np.linspace(0, len(problem.tau) - 1, ROWS).round().astype(np.int64))
+    rows = np.unique(np.linspace(0, len(problem.tau) - 1, SEARCH_ROWS).round().astype(np.int64))
     few = problem.rows(rows)
     few = replace(few, counts=few.counts * (len(problem.tau) / len(rows)))
-    sigma, found = ends[0].sigma, dict[Layout, Candidate]()
+    search = _Search(few, ends[0].sigma, stop)
+    typical = [tuple(AXES.index(axis) for axis in axes) for axes in TYPICAL_LAYOUTS.get(problem.n_joints, ())]
+    starts = [
+        *(search.nearest(end.geometry, NEAR_RAD) for end in ends[:MAX_KEPT]),
+        *(search.nearest(geometry, np.inf) for geometry in known),
+        *(search.settle(ends[0].geometry, layout) for layout in typical),
+    ]
+    for start in sorted({each.layout: each for each in starts}.values(), key=_evidence)[:MAX_KEPT]:
+        search.improve(start)
+    limit = weigh(few, few.at(ends[0].geometry, ends[0].sigma), (None,) * problem.n_joints).evidence
+    ranked = sorted(search.found.values(), key=_evidence)
+    return [each for each in ranked[:MAX_KEPT] if each.evidence < min(limit, ranked[0].evidence + NEAR_NATS)]
 
-    def settled(geometry: Geometry, layout: Layout) -> Candidate:
-        if layout not in found:
-            found[layout] = _settled(few, geometry, layout, sigma)
-        return found[layout]
 
-    for end in ends[:BEAM]:
-        geometry, off = _turned(end.geometry)
-        nearest = (DIRECTIONS @ _axes(geometry).T).argmax(axis=0)
-        best = settled(geometry, tuple(int(d) if angle < NEAR_RAD else None for d, angle in zip(nearest, off, strict=True)))
-        for _ in range(SWEEPS):
+@dataclass
+class _Search:
+    """The layouts that were tried on some rows, with a noise of sigma, (n,) N·m."""
+
+    problem: Problem
+    sigma: Array
+    stop: Callable[[], bool] | None
+    found: dict[Layout, Candidate] = field(default_factory=dict)
+
+    def settle(self, geometry: Geometry, layout: Layout) -> Candidate:
+        """Return the optimum of a layout, to which a geometry leads the first time."""
+        if layout not in self.found:
+            start = laid_out(geometry, layout)
+            posed = replace(self.problem, expected=expected_layout(start, layout))
+            try:
+                end = weigh(posed, posed.descend(start, self.sigma, SEARCH_STEPS, noise=False), layout)
+            except LinAlgError:
+                end = Candidate(layout, posed, posed.at(start, self.sigma), np.inf)
+            self.found[layout] = end
+        return self.found[layout]
+
+    def nearest(self, geometry: Geometry, within: float) -> Candidate:
+        """Put the axes of a geometry that lie within an angle of a direction there, rad."""
+        turned, off = _turned(geometry)
+        nearest = (DIRECTIONS @ _axes(turned).T).argmax(axis=0)
+        return self.settle(
+            turned, tuple(int(at) if angle < within else None for at, angle in zip(nearest, off, strict=True))
+        )
+
+    def improve(self, best: Candidate) -> None:
+        """Try each joint in all directions until that gains nothing."""
+        for _ in range(MAX_SWEEPS):
             before = best.evidence
-            for joint in np.argsort(off):
+            for joint in range(len(best.layout)):
                 for direction in (*range(len(DIRECTIONS)), None):
+                    if self.stop is not None and self.stop():
+                        return
                     layout = (*best.layout[:joint], direction, *best.layout[joint + 1 :])
-                    trial = settled(best.point.geometry, layout)
-                    best = min(best, trial, key=lambda each: each.evidence)
-                    if stop is not None and stop():
-                        break
+                    best = min(best, self.settle(best.point.geometry, layout), key=_evidence)
             if best.evidence > before - GAIN_NATS:
-                break
-    limit = weigh(few, few.at(ends[0].geometry, sigma), (None,) * problem.n_joints).evidence
-    ranked = sorted(found.values(), key=lambda each: each.evidence)
-    return [each for each in ranked[:BEAM] if each.evidence < min(limit, ranked[0].evidence + NEAR_NATS)]
+                return
+
+
+def _evidence(candidate: Candidate) -> float:
+    return candidate.evidence
 
 
 def shares(found: Sequence[Candidate]) -> Array:
-    """Probabilities of candidates, (K,)."""
+    """Return the probabilities of candidates, (K,)."""
     evidence = np.array([each.evidence for each in found])
     odds = np.exp(np.maximum(evidence.min() - evidence, -2 * NEAR_NATS))  # none of zero: a covariance is made of them
     return np.asarray(odds / odds.sum())
 
 
 def certainty(found: Sequence[Candidate]) -> Array:
-    """How probable it is that each axis lies at right angles, (n,)."""
+    """Return how probable it is that each axis lies at right angles, (n,)."""
     snapped = np.array([[direction is not None for direction in each.layout] for each in found])
     return np.asarray(shares(found) @ snapped)
 
 
-def _settled(problem: Problem, geometry: Geometry, layout: Layout, sigma: Array, steps: int = STEPS) -> Candidate:
-    """The optimum of a layout that a geometry leads to."""
-    start = laid_out(geometry, layout)
-    problem = replace(problem, expected=expected(start, layout))
-    try:
-        return weigh(problem, problem.descend(start, sigma, steps, noise=False), layout)
-    except LinAlgError:
-        return Candidate(layout, problem, problem.at(start, sigma), np.inf)
-
-
-def expected(geometry: Geometry, layout: Layout) -> Expected:
-    """What a layout expects around a geometry that has it: axes there, shifts within LENGTH of none."""
-    turn = np.array([ANGLE if each is None else TURN_WIDTH for each in layout])
-    joints = np.concatenate([np.full(count, joint) for joint, count in enumerate(geometry.screws)]).astype(int)
+def expected_layout(geometry: Geometry, layout: Layout) -> Expected:
+    """Return what a layout expects around a geometry that has it: axes there, shifts within LENGTH of none."""
+    turn = np.array([ANGLE if each is None else TURN_WIDTH for each in layout]).repeat(geometry.screws)
     around = replace(geometry, translation=np.zeros_like(geometry.translation))
-    return Expected(np.where(geometry.turns, turn[joints], LENGTH), around)
+    return Expected(np.where(geometry.turns, turn, LENGTH), around)
 
 
 def laid_out(geometry: Geometry, layout: Layout) -> Geometry:
-    """The geometry with its axes turned into a layout; where they are, and free axes, stay."""
+    """Return the geometry with its axes turned into a layout. The places of all axes and the free ones stay."""
     turns, places = geometry.placements(np.zeros(geometry.n_joints))
     for joint, direction in enumerate(layout):
         if direction is not None:

@@ -24,15 +24,18 @@ from lipcore.kernels.arm_prior import KINDS
 from lipcore.kernels.compiled.arm import PARAMETERS
 
 MAX_LOG_SHARE = 2.5
-"""Largest logarithm, either way, of the numbers that the deviations of masses and rotors are made of: a factor of 12."""
+"""Largest logarithm, either way, of what the deviations of masses and rotors are made of: a factor of 12."""
 MIN_FRICTION_SHARE = 0.1
 """Smallest deviation of a friction torque, as a share of its joint's root mean square torque, which is the largest."""
 POOLING_WIDTH = 0.7
 """Prior width of the logarithm of a joint's friction deviation around the mean of all joints."""
-COUNTS_POWER = 0.5
-"""Power of the counts with which torques enter the evidence of deviations: between all rows (0), with which masses
-follow errors that last, and independent samples (1), with which friction and masses seem to be nothing where these are
-few."""
+MIN_COUNT = 40.0
+"""Measurements of a joint that the evidence of deviations counts at least, however few of a recording are independent.
+
+With few of them friction and masses seem to be nothing and are taken for noise; with all rows masses follow errors
+that last. Tried on recordings of seven arms, each left out in turn: with a URDF 30 and 60 differ by 2 %, and no such
+limit is 25 % worse (geometric mean of nMSE); without a URDF all three are within 8 %.
+"""
 ITERATIONS = 60
 BODY_KINDS = 3
 
@@ -58,13 +61,14 @@ def rescale(problem: Problem, point: Point) -> Scaled:
     point = problem.with_noise(problem.at(point.geometry, point.sigma))
     evidence = _Evidence.around(problem, point)
     parts, masses = _parts(n, k), BODY_KINDS + n + 1
-    bounds = [(-MAX_LOG_SHARE, MAX_LOG_SHARE)] * masses + [(np.log(MIN_FRICTION_SHARE), 0.0)] * (k - problem.bodies)
+    frictions = k - problem.bodies
+    bounds = [(-MAX_LOG_SHARE, MAX_LOG_SHARE)] * masses + [(float(np.log(MIN_FRICTION_SHARE)), 0.0)] * frictions
+    width = np.repeat([problem.scale_width, POOLING_WIDTH], [masses, frictions])
 
     def negative(shares: Array) -> tuple[float, Array]:
         value, slopes = evidence(parts @ shares)
         friction = shares[masses:].reshape(n, -1)
-        off = np.concatenate([shares[:masses] / problem.scale_width, ((friction - friction.mean(0)) / POOLING_WIDTH).reshape(-1)])
-        width = np.concatenate([np.full(masses, problem.scale_width), np.full(k - problem.bodies, POOLING_WIDTH)])
+        off = np.concatenate([shares[:masses], (friction - friction.mean(0)).reshape(-1)]) / width
         return value + 0.5 * float(off @ off), parts.T @ slopes + off / width
 
     start = np.linalg.lstsq(parts, np.log(problem.scale / problem.unit))[0]
@@ -74,10 +78,16 @@ def rescale(problem: Problem, point: Point) -> Scaled:
     return Scaled(problem, problem.with_noise(problem.at(point.geometry, point.sigma)), float(best.fun))
 
 
+def tempered(counts: Array) -> Array:
+    """Counts with which torques enter the evidence of deviations: at least MIN_COUNT of a joint on average."""
+    return np.asarray(counts * max(1.0, MIN_COUNT / float(counts.sum(0).mean())))
+
+
 @dataclass(frozen=True)
 class _Evidence:
-    """Sums over samples, in units of the noise: the Gram matrix (k + g, k + g) and right-hand side of all features, Σ τ²;
-    log_noise: Σ N_j log σ_j; the prior's mean and deviations (k + g,), the first `scaled` of which for unit weights."""
+    """Sums over samples in units of the noise: the Gram matrix (k + g, k + g) and right-hand side of all features, and
+    Σ τ²; log_noise: Σ N_j log σ_j; mean and deviations of the prior, (k + g,), the first `scaled` of which are units.
+    """
 
     gram: Array
     right: Array
@@ -92,7 +102,7 @@ class _Evidence:
         both = np.concatenate([point.features / problem.scale, problem.shapes(point)], axis=2)
         steps = np.zeros(0) if problem.expected is None else problem.expected.step(point.geometry)
         widths = np.zeros(0) if problem.expected is None else problem.expected.widths
-        counts = problem.counts**COUNTS_POWER
+        counts = tempered(problem.counts)
         weight = np.sqrt(counts) / point.sigma
         flat, target = (both * weight[:, :, None]).reshape(-1, both.shape[2]), (problem.tau * weight).reshape(-1)
         return cls(

@@ -20,9 +20,14 @@ MASS_FLOOR = 0.02
 """Smallest mass scale of a body, as a share of the whole arm's: a link without mass in the URDF may still have some."""
 URDF_SHARE: dict[Prior, float] = {"urdf": 0.1, "zero": 1.0}
 """Relative deviation from a URDF's parameters that a fit starts from."""
-TURN_WIDTH, SHIFT_WIDTH = 0.02, 0.01
-"""How far a calibrated geometry may lie from its URDF, standard deviations in rad and m: what mounting and machining
-leave, and a tool that the URDF has a little elsewhere."""
+MACHINED_TURN, MACHINED_SHIFT = 0.005, 0.003
+"""How far the axes of two units of one type, or of a unit and its URDF, lie from each other: standard deviations in rad
+and m. Machining leaves less, but what an earlier posterior says of single numbers leaves out what is known only of
+several together. This and `UNIT_WIDTH` of `lipcore.arm.problem` were chosen on simulated arms (50 and 51 of
+`benchmarks/studies/learnt_arm.py transfer`): a fifth of it ended at times in a poor optimum that takes part of the
+torque for noise."""
+MOUNTED_TURN = 0.02
+"""How far their bases lean from each other, rad."""
 
 
 @dataclass(frozen=True)
@@ -131,8 +136,10 @@ def arm_of_robot(robot: RigidBody, gravity: bool = True, prior: Prior = "urdf", 
 
 
 def widths_of(geometry: Geometry) -> Array:
-    """How far a calibrated geometry may lie from its URDF, (g,)."""
-    return np.where(geometry.turns, TURN_WIDTH, SHIFT_WIDTH)
+    """How far a unit's geometry may lie from that of its type, (g,) rad and m."""
+    widths = np.where(geometry.turns, MACHINED_TURN, MACHINED_SHIFT)
+    widths[: geometry.screws[0]] = MOUNTED_TURN
+    return widths
 
 
 def unit_of(robot: RigidBody, rotor: float) -> Array:

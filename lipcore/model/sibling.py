@@ -18,20 +18,13 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.kernels.arm import SCALES, ArmKernel
-from lipcore.kernels.arm_prior import KINDS, Arm
+from lipcore.kernels.arm_prior import KINDS, Arm, widths_of
 from lipcore.kernels.compiled.arm_recursion import PARAMETERS
 from lipcore.model.parameters import precision, weight_posterior
 from lipcore.model.torque_model import TorqueModel
 
 UNIT_SHARE = 0.1
 """Relative deviation of masses and rotor inertias between units of one type, that a fit starts from."""
-MACHINED_TURN, MACHINED_SHIFT = 0.005, 0.003
-"""How far axes of two units of one type lie from each other, standard deviations in rad and m. Machining leaves less;
-but what V leaves out of what is known only together wants room, too. This and `UNIT_WIDTH` of `arm.problem` were chosen
-on arms 50 and 51 of `learnt_arm.py transfer` (benchmarks/studies), where a fifth of it ended at times in a poor optimum
-that takes part of the torque for noise."""
-MOUNTED_TURN = 0.02
-"""How far their bases lean from each other, rad."""
 
 
 def arm_of_sibling(base: TorqueModel) -> Arm:
@@ -49,8 +42,7 @@ def arm_of_sibling(base: TorqueModel) -> Arm:
     size = _sizes(weights.mean**2 + weights.std**2, n)
     unit = np.sqrt(variance[: rotors.stop] + (UNIT_SHARE * size) ** 2)
     geometry = term.geometry(weights.mean)
-    machined = np.where(geometry.turns, MACHINED_TURN, MACHINED_SHIFT)
-    machined[: geometry.screws[0]] = MOUNTED_TURN
+    machined = widths_of(geometry)
     steps = variance[term.steps] if arm.steps else np.zeros(geometry.size)
     means = weights.mean[bodies].reshape(n, PARAMETERS)[arm.order]
     return Arm(

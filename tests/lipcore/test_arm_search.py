@@ -10,12 +10,12 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from lipcore import FitOptions, Samples, load, save, train
-from lipcore.arm import learning
+from lipcore.arm import learning, right_angles
 from lipcore.arm import search as searching
 from lipcore.arm.learning import learn
 from lipcore.arm.posing import make_problem
 from lipcore.arm.problem import NOISE_WIDTH, Point, Problem, root_of
-from lipcore.arm.scales import _Evidence, rescale
+from lipcore.arm.scales import MAX_LOG_SHARE, MIN_FRICTION_SHARE, _Evidence, rescale, tempered
 from lipcore.arm.search import SearchResult, search
 from lipcore.data.metrics import evaluate
 from lipcore.data.signals import noise_level
@@ -319,46 +319,67 @@ def test_descent_ends_no_higher_than_it_began(posed: tuple[Problem, Point]) -> N
     np.testing.assert_array_equal(fixed.geometry.rotation, point.geometry.rotation)
 
 
-def linearised(problem: Problem, point: Point, scale: np.ndarray, sigma: np.ndarray) -> float:
-    """−log evidence of weights and geometry together, to first order in the latter, and the penalty of the noise."""
+def linearised(problem: Problem, point: Point, scale: np.ndarray) -> float:
+    """−log evidence of weights and geometry together, to first order in the latter, with tempered counts."""
     expected = problem.expected
     assert expected is not None
     both = np.concatenate([plain_features(problem, point.geometry), problem.shapes(point)], axis=2)
     mean = np.concatenate([problem.centre, expected.step(point.geometry)])
     std = np.concatenate([scale, expected.widths])
-    return dense(problem, both, mean, std, sigma) + off_noise(problem, sigma)
+    return dense(replace(problem, counts=tempered(problem.counts)), both, mean, std, point.sigma)
 
 
 def test_scales_are_never_worse_than_before(posed: tuple[Problem, Point]) -> None:
     problem, point = posed
-    problem = replace(problem, counts=np.full(problem.tau.shape, 0.7))
+    # a floor that the dense covariance can be factored with
+    problem = replace(problem, counts=np.full(problem.tau.shape, 0.7), floor=point.sigma)
+    point = problem.with_noise(problem.at(point.geometry, point.sigma))
     scaled = rescale(problem, point)
-    before = linearised(problem, point, problem.scale, point.sigma)
-    after = linearised(problem, point, scaled.problem.scale, scaled.sigma)
-    assert after <= scaled.value + 1e-5  # which counts how far the scales moved, too
-    assert scaled.value <= before + 1e-5
+    before = linearised(problem, point, problem.scale)
+    after = linearised(problem, point, scaled.problem.scale)
+    assert after <= scaled.value + 1e-5  # which adds the priors of the scales
     assert after < before - 1.0
-    assert (scaled.sigma >= problem.floor * (1 - 1e-12)).all()
     np.testing.assert_array_equal(scaled.problem.centre, problem.centre)
+
+
+def problem_noise(problem: Problem, point: Point) -> np.ndarray:
+    """Standard deviation of the residuals over the degrees of freedom that a dense ridge leaves, (n,)."""
+    size, n = problem.tau.shape
+    flat = problem.features(point.geometry).reshape(size * n, -1)
+    weight = np.sqrt(problem.counts).reshape(-1) / np.tile(point.sigma, size)
+    scaled = flat * weight[:, None]
+    hat = scaled @ np.linalg.solve(scaled.T @ scaled + np.eye(flat.shape[1]), scaled.T)
+    left = size - hat.diagonal().reshape(size, n).sum(0)
+    return np.sqrt((problem.residual(point) ** 2).sum(0) / left)
+
+
+def test_scales_keep_within_their_limits(posed: tuple[Problem, Point]) -> None:
+    problem, point = posed
+    few = replace(problem, counts=np.full(problem.tau.shape, 1e-3))
+    shares = np.log(rescale(few, point).problem.scale / problem.unit)
+    masses, friction = shares[: problem.bodies], shares[problem.bodies :]
+    assert (np.abs(masses) <= 2 * MAX_LOG_SHARE + 1e-9).all()
+    assert ((friction >= np.log(MIN_FRICTION_SHARE) - 1e-9) & (friction <= 1e-9)).all()
+
+
+def test_noise_does_not_depend_on_how_few_samples_count(posed: tuple[Problem, Point]) -> None:
+    problem, point = posed
+    few = replace(problem, counts=np.full(problem.tau.shape, 0.01))
+    counted = few.at(point.geometry, point.sigma)
+    np.testing.assert_allclose(few.with_noise(counted).sigma, problem_noise(few, counted), rtol=1e-6)
 
 
 def test_slopes_of_the_scales(posed: tuple[Problem, Point]) -> None:
     problem, point = posed
-    rng, n, k = np.random.default_rng(4), problem.n_joints, len(problem.scale)
+    rng, k = np.random.default_rng(4), len(problem.scale)
     evidence = _Evidence.around(problem, point)
-    at = np.concatenate([np.log(point.sigma), rng.normal(0, 0.3, k)])
-    value, by_noise, by_scale = evidence(at[:n], at[n:])
-    sigma, scale = np.exp(at[:n]), problem.scale * np.exp(at[n:])
-    assert value + off_noise(problem, sigma) == pytest.approx(linearised(problem, point, scale, sigma), abs=1e-5)
-    slopes = np.concatenate([by_noise, by_scale])
-    for index in [*range(n), *rng.choice(k, 15, replace=False) + n]:
-        step = np.zeros(n + k)
+    at = np.log(problem.scale / problem.unit) + rng.normal(0, 0.3, k)
+    value, slopes = evidence(at)
+    assert value == pytest.approx(linearised(problem, point, problem.unit * np.exp(at)), abs=1e-5)
+    for index in rng.choice(k, 15, replace=False):
+        step = np.zeros(k)
         step[index] = 1e-4
-        near, far = (
-            evidence((at + s * step)[:n], (at + s * step)[n:])[0]
-            - evidence((at - s * step)[:n], (at - s * step)[n:])[0]
-            for s in (1, 2)
-        )
+        near, far = (evidence(at + s * step)[0] - evidence(at - s * step)[0] for s in (1, 2))
         assert slopes[index] == pytest.approx((8 * near - far) / 12e-4, rel=1e-5, abs=1e-4)
 
 
@@ -382,9 +403,11 @@ def test_optima_that_answer_otherwise_stand_side_by_side(learnt: tuple[Problem, 
     place = np.arange(problem.n_joints)
     turned = best.geometry.moved(np.where(best.geometry.turns, 0.3, 0.1))
     other = problem.at(turned, best.sigma)
-    one, _ = learning._arm(problem, best, [best], place, "learn")
+    free = (None,) * problem.n_joints
+    first, second = (right_angles.weigh(problem, each, free) for each in (best, other))
+    one, _ = learning._arm([first, first], place, "learn")
     assert one.alternatives == ()
-    both, params = learning._arm(problem, best, [other], place, "learn")
+    both, params = learning._arm([first, second], place, "learn")
     assert [each.geometry for each in both.alternatives] == [best.geometry, turned]
     odds = problem.laplace(best) - problem.laplace(other)
     assert both.alternatives[1].probability == pytest.approx(np.exp(odds) / (1 + np.exp(odds)), rel=1e-6, abs=1e-6)

@@ -172,7 +172,7 @@ def test_what_training_says_of_an_arm_of_another_geometry_is_what_its_samples_sa
             linear.append(0.5 * (np.linalg.solve(memory.root, w - carrier.mean) ** 2).sum())
             exact.append(samples_say)
     # far away a draw may lie where torque bends more than a memory of few motions tells
-    assert np.median(off) < 0.01
+    assert np.median(off) < 0.02
     assert np.sort(off)[-3] < 0.05
     assert np.median(exact) > 5 * np.median(linear)
 
