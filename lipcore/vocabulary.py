@@ -30,7 +30,7 @@ ComponentName = Literal[
 COMPONENTS: tuple[ComponentName, ...] = get_args(ComponentName)
 
 AUTO = "auto"
-"""Of several estimators, the one that predicts best what it has not seen (`lipcore.training.auto`)."""
+"""Of several estimators, the simplest unless another one is surely better (`lipcore.training.auto`)."""
 DEFAULT_ESTIMATOR = AUTO
 CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", "rigid-body", "rigid-body+lip-chain")
 """What may be asked for: `auto`, and the estimators of `lipcore.fitting.estimators`."""

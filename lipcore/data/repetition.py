@@ -6,6 +6,7 @@ A held-out part that repeats motion of the training flatters: it is predicted we
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +68,16 @@ def groups(states: Array, edges: Numbers) -> Numbers:
 
     linked = np.array([like.mean(axis=0) >= REPEATED for like in _likes(states, edges)])
     return np.asarray(connected_components(csr_array(linked), directed=False)[1], np.int64)
+
+
+def nearest(states: Array, edges: Numbers) -> Iterator[tuple[Numbers, Array]]:
+    """Yield, block by block, some of its instants and their distances from the nearest instant of each block.
+
+    states: (N, k), in order of time; edges: (B + 1,), where blocks begin and end. Rows (asked,), distances (asked, B).
+    """
+    for first, last in pairwise(edges.tolist()):
+        rows = _evenly(first, last, ASKED)
+        yield rows, np.sqrt(np.minimum.reduceat(_squares(states[rows], states), edges[:-1], axis=1))
 
 
 class Repetition(NamedTuple):
@@ -138,10 +149,8 @@ def _return(distances: Array, limit: float) -> int | None:
 def _likes(states: Array, edges: Numbers) -> Iterator[Mask]:
     """For each of B blocks, which of the instants that are looked at have their like in which block: (asked, B)."""
     limits = _limits(states, states)
-    for block in range(len(edges) - 1):
-        rows = _evenly(edges[block], edges[block + 1], ASKED)
-        nearest = np.minimum.reduceat(_squares(states[rows], states), edges[:-1], axis=1)
-        yield np.sqrt(nearest) <= limits[rows, None]
+    for rows, distances in nearest(states, edges):
+        yield distances <= limits[rows, None]
 
 
 def _limits(states: Array, all_states: Array) -> Array:

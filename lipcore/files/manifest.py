@@ -225,9 +225,9 @@ def _check_selection(name: str, value: Any, n: int) -> None:
         check_text(f"{name}.{key}", value[key])
     check_text(f"{name}.reason", value["reason"], MOST_TEXT)
     held = value["held_out"]
-    check_keys(f"{name}.held_out", held, HeldOut.__annotations__)
-    for key in ("rows", "blocks"):
-        check_numbers(f"{name}.held_out.{key}", held[key], low=0, high=LARGEST)
+    check_keys(f"{name}.held_out", held, HeldOut.__required_keys__, HeldOut.__optional_keys__)
+    for key in ("rows", "blocks", "edge_rows", "edge_blocks"):
+        check_numbers(f"{name}.held_out.{key}", held.get(key, 0), low=0, high=LARGEST)
     if not isinstance(held["repeats"], bool):
         raise wrong(f"{name}.held_out.repeats", held["repeats"], "true or false")
     if not isinstance(value["table"], list) or not 1 <= len(value["table"]) <= MAX_CANDIDATES:
@@ -237,7 +237,7 @@ def _check_selection(name: str, value: Any, n: int) -> None:
 
 
 def _check_candidate(name: str, row: Any, n: int) -> None:
-    check_keys(name, row, Candidate.__annotations__)
+    check_keys(name, row, Candidate.__required_keys__, Candidate.__optional_keys__)
     check_text(f"{name}.estimator", row["estimator"])
     check_numbers(f"{name}.seconds", row["seconds"], low=0, high=LARGEST)
     if row["error"] is not None:
@@ -245,8 +245,9 @@ def _check_candidate(name: str, row: Any, n: int) -> None:
     for key in ("log_density", "difference", "standard_error"):
         if row[key] is not None:
             check_numbers(f"{name}.{key}", row[key])
-    for key in ("nmse", "coverage"):
-        for joint, each in enumerate(() if row[key] is None else check_list(f"{name}.{key}", row[key], n)):
+    for key in ("nmse", "edge_nmse", "coverage"):
+        values = row.get(key)
+        for joint, each in enumerate(() if values is None else check_list(f"{name}.{key}", values, n)):
             if each is not None:
                 check_numbers(f"{name}.{key}[{joint}]", each, low=0)
 

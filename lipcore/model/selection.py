@@ -1,9 +1,7 @@
 """How an estimator was chosen, in plain data: for manifests, answers and pages."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
-from typing import TypedDict
+from typing import NotRequired, TypedDict
 
 import numpy as np
 
@@ -14,32 +12,36 @@ MOST_TEXT = 300
 
 
 class Candidate(TypedDict):
-    """How an estimator did on held-out samples.
-
-    log_density: log predictive density, noise included, summed over the joints, nats a sample; difference: from that of
-    the best, with its standard error; nmse, coverage: (n,), None for a joint whose torque does not vary; seconds: that
-    it took; error: why it could not be trained. None where it was not judged.
-    """
+    """How an estimator did on held-out samples; None if it was not judged."""
 
     estimator: str
     log_density: float | None
+    """Log predictive density, noise included, summed over the joints, nats a sample."""
     difference: float | None
+    """Difference of the log density from that of the best."""
     standard_error: float | None
+    """Standard error of that difference."""
     nmse: list[float | None] | None
+    """(n,), None for a joint whose torque does not vary."""
+    edge_nmse: NotRequired[list[float | None] | None]
+    """(n,), of the rows at the edge of the data, over the variance of all held-out rows."""
     coverage: list[float | None] | None
+    """(n,), share of measurements inside the 95 % interval."""
     seconds: float
     error: str | None
+    """Why it could not be trained."""
 
 
 class HeldOut(TypedDict):
-    """What was judged on: how many rows, in how many blocks.
-
-    repeats: all motion of the recording repeats other motion of it, so that figures flatter.
-    """
+    """What was held out to judge by."""
 
     rows: int
     blocks: int
     repeats: bool
+    """Whether the recording repeats itself, so that figures flatter, except at the edge."""
+    edge_rows: NotRequired[int]
+    """Rows at the edge of the data."""
+    edge_blocks: NotRequired[int]
 
 
 class Selection(TypedDict):
@@ -52,12 +54,10 @@ class Selection(TypedDict):
     table: list[Candidate]
 
 
-def selection(
-    chosen: str, reason: str, table: list[Candidate], rows: int = 0, blocks: int = 0, repeats: bool = False
-) -> Selection:
-    """A choice of `auto`; rows, blocks and repeats of what was held out, nothing by default."""
-    held = HeldOut(rows=rows, blocks=blocks, repeats=repeats)
-    return Selection(asked=AUTO, chosen=chosen, reason=shortened(reason), held_out=held, table=table)
+def selection(chosen: str, reason: str, table: list[Candidate], held_out: HeldOut | None = None) -> Selection:
+    """Return a choice of `auto`; nothing was held out by default."""
+    held_out = held_out or HeldOut(rows=0, blocks=0, repeats=False, edge_rows=0, edge_blocks=0)
+    return Selection(asked=AUTO, chosen=chosen, reason=shortened(reason), held_out=held_out, table=table)
 
 
 def unjudged(estimator: str, seconds: float, error: Exception | None = None) -> Candidate:
@@ -68,6 +68,7 @@ def unjudged(estimator: str, seconds: float, error: Exception | None = None) -> 
         difference=None,
         standard_error=None,
         nmse=None,
+        edge_nmse=None,
         coverage=None,
         seconds=round(seconds, 3),
         error=None if error is None else shortened(f"{type(error).__name__}: {error}"),

@@ -1,8 +1,6 @@
-"""The estimator `auto`: several are trained, and the one is taken that predicts best what it has not seen.
+"""The estimator `auto`: several are trained, and one is chosen by what they predict of held-out samples.
 
-The measure is the log predictive density of held-out torque, noise included, summed over the joints, per sample. The
-best is chosen, unless one that knows more of the arm is within one standard error of it, or errs no more. It then
-learns all samples.
+The simplest is chosen unless another one is surely better (`lipcore.training.choice`). It then learns all samples.
 """
 
 from __future__ import annotations
@@ -14,27 +12,31 @@ import numpy as np
 
 from lipcore.arm.learning import Learnt, learn
 from lipcore.arm.posing import mode_of
-from lipcore.arm.search import known_geometries
+from lipcore.arm.search import EXPLAINED, known_geometries
 from lipcore.data.metrics import Answer, compare, evaluate
 from lipcore.data.samples import Samples
+from lipcore.data.signals import noise_level
 from lipcore.data.splits import SplitError, taken
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress, Progress
 from lipcore.fitting.task import Task
-from lipcore.model.selection import Candidate, plain, selection, unjudged
+from lipcore.model.selection import Candidate, HeldOut, plain, selection, unjudged
 from lipcore.model.torque_model import TorqueModel
+from lipcore.training.choice import HeldOutSamples, choose_estimator
 from lipcore.training.fit import fit_estimator
-from lipcore.training.held_out import hold_out
+from lipcore.training.held_out import HoldOut, hold_out
 from lipcore.training.refit import refit
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 RIGID, CHAIN, BOTH = "rigid-body", "lip-chain", "rigid-body+lip-chain"
 MOST_PHYSICS_FIRST = (RIGID, BOTH, CHAIN)
-"""Where two do as well, the earlier one is taken: what knows the arm errs less where nothing was measured."""
+"""The simplest first: an estimator that knows the arm errs less where nothing was measured."""
 AGAIN, ALL, FEW = "again", "all", "few"
 PLACES = {RIGID: (0, 0.25), BOTH: (0.25, 0.55), CHAIN: (0.55, 0.92), AGAIN: (0.92, 0.97), ALL: (0.97, 1), FEW: (0, 1)}
 """Which share of all the work each fit is, from and to."""
 JUDGED = 2000
 """Held-out samples at most that are predicted."""
+SMOOTH = 0.01
+"""Positions in order of time have differences that vanish: noise below this share of their spread."""
 FAILURES = (ArithmeticError, ValueError)
 """What an estimator may fail with on samples that do not suit it."""
 
@@ -46,18 +48,21 @@ def choose(task: Task) -> TorqueModel:
     """
     work = Fits(task, Overall(task.on_progress))
     try:
-        unseen = hold_out(task.samples, task.joint_types)
+        held = hold_out(task.samples, task.joint_types)
     except SplitError as error:
         return _unjudged(work, f"too little to hold some out and judge by: {error}")
-    parts = unseen.parts
-    contest = Contest(work, taken(task.samples, parts.train), taken(task.samples, parts.held_out))
+    contest = Contest(work, held)
     contest.run()
     chosen, reason = contest.verdict()
-    model, rows = _of_all(work, contest, chosen), int(parts.held_out.sum())
+    model = _of_all(work, contest, chosen)
+    rows, edge_rows = int(held.parts.held_out.sum()), int(held.edge.sum())
+    held_out = HeldOut(
+        rows=rows, blocks=held.blocks, repeats=held.repeats, edge_rows=edge_rows, edge_blocks=held.edge_blocks
+    )
     return replace(
         model,
         fit={**model.fit, "seconds": work.overall.elapsed},
-        selection=selection(chosen, reason, contest.table(), rows, unseen.blocks, unseen.repeats),
+        selection=selection(chosen, reason, contest.table(), held_out),
     )
 
 
@@ -147,21 +152,25 @@ class Contestant:
 
 
 class Contest:
-    """One contest; training, held: the samples of both sides."""
+    """One contest on the samples of a task."""
 
-    def __init__(self, work: Fits, training: Samples, held: Samples) -> None:
-        self.work, self.training = work, training
-        self.held = held.rows(np.unique(np.linspace(0, len(held) - 1, JUDGED).round().astype(np.int64)))
+    def __init__(self, work: Fits, hold: HoldOut) -> None:
+        self.work, parts = work, hold.parts
+        self.training, held = taken(work.task.samples, parts.train), taken(work.task.samples, parts.held_out)
+        rows = np.unique(np.linspace(0, len(held) - 1, JUDGED).round().astype(np.int64))
+        self.held = HeldOutSamples(held.rows(rows), hold.edge[parts.held_out][rows])
         self.entries: dict[str, Contestant] = {}
         self.learnt: Learnt | None = None
 
     def run(self) -> None:
-        """Train and judge all; raise what the first has failed with where all have.
+        """Train and judge the estimators; raise the error of the first if all have failed.
 
-        Where the chain predicts most joints better than the arm, the search for the arm may have missed it: it is taken
-        up again, once, for as long.
+        The others are not trained if the arm leaves only the sensor's noise. If the chain predicts most joints better
+        than the arm, the search may have missed the arm: it is repeated once, for as long.
         """
         self.entries[RIGID], self.learnt = self._rigid(RIGID)
+        if self._is_explained():
+            return
         self.entries[BOTH] = self._enter(BOTH, BOTH, self.learnt) if self.learnt else self.entries[RIGID]
         self.entries[CHAIN] = self._enter(CHAIN, CHAIN, self.learnt)
         if self.learnt and mode_of(self.work.task) == "learn" and self._chain_leads():
@@ -175,31 +184,24 @@ class Contest:
 
     def verdict(self) -> tuple[str, str]:
         """The estimator that is chosen, and why."""
-        best = self._best()
-        trained = [name for name in MOST_PHYSICS_FIRST if self.entries[name].model is not None]
-        for name in trained[: trained.index(best)]:
-            if self._ties(name, best):
-                return (
-                    name,
-                    f"{best} is within one standard error or errs no less: what knows more of the arm is taken",
-                )
-        if len(trained) == 1:
-            return best, "no other could be trained"
-        return best, "it predicts best what the training did not see"
+        if len(self.entries) == 1:
+            return RIGID, "it explains the held-out torque to the sensor's noise, so no other estimator was trained"
+        answers = {name: self.entries[name].answer for name in MOST_PHYSICS_FIRST}
+        return choose_estimator(self.held, {name: each for name, each in answers.items() if each is not None})
 
     def table(self) -> list[Candidate]:
-        """How each did, what knows most of the arm first."""
-        best = self.entries[self._best()]
+        """How each estimator did, the simplest first."""
+        best = max(self.entries.values(), key=lambda entry: entry.density)
         rows = []
-        for name in MOST_PHYSICS_FIRST:
-            entry = self.entries[name]
+        for name, entry in self.entries.items():
             row = unjudged(name, entry.seconds, entry.error)
             if entry.answer is not None and best.answer is not None:
-                metrics = evaluate(self.held.tau, *entry.answer)
                 row["log_density"], row["difference"] = entry.density, entry.density - best.density
-                row["nmse"], row["coverage"] = plain(metrics.nmse), plain(metrics.coverage)
+                row["nmse"] = plain(self.held.nmse(entry.answer))
+                row["edge_nmse"] = plain(self.held.edge_nmse(entry.answer))
+                row["coverage"] = plain(entry.answer.holds(self.held.samples.tau).mean(axis=0))
                 if entry is not best:
-                    total = compare(self.held, best.answer, entry.answer).total
+                    total = compare(self.held.samples, best.answer, entry.answer).total
                     row["standard_error"] = plain(total.standard_error)[0]
             rows.append(row)
         return rows
@@ -221,34 +223,29 @@ class Contest:
             raise FitCancelledError("the fit was cancelled")
         try:
             model = self.work.fit(self.training, name, place, learnt)
-            torque = model.predict(self.held.q, self.held.dq, self.held.ddq)
+            samples = self.held.samples
+            torque = model.predict(samples.q, samples.dq, samples.ddq)
             answer = torque.interval
-            density = -float(evaluate(self.held.tau, *answer).nlpd.sum())
+            density = -float(evaluate(samples.tau, *answer).nlpd.sum())
             if not np.isfinite(density):
                 raise ValueError("what it predicts is not finite")
         except FAILURES as error:
             return Contestant(time.monotonic() - began, error=error)
         return Contestant(time.monotonic() - began, model, answer, density)
 
+    def _is_explained(self) -> bool:
+        """Whether the arm predicts all joints to the sensor's noise, which signals in order of time tell."""
+        answer, signals = self.entries[RIGID].answer, self.work.task.signals
+        if answer is None:
+            return False
+        q, tau = (noise_level([array[part] for part in signals.episodes()]) for array in (signals.q, signals.tau))
+        error = np.sqrt(np.square(self.held.samples.tau - answer.mean).mean(axis=0))
+        return bool((q < SMOOTH * signals.q.std(axis=0)).all() and (error <= EXPLAINED * tau).all())
+
     def _chain_leads(self) -> bool:
         """Whether the chain predicts most joints better than the arm, by more than chance."""
         arm, chain = self.entries[RIGID].answer, self.entries[CHAIN].answer
         if arm is None or chain is None:
             return False
-        nlpd = compare(self.held, arm, chain).nlpd
-        return 2 * int(np.sum(nlpd.significant & (nlpd.mean < 0))) > self.held.n_joints
-
-    def _best(self) -> str:
-        return max(MOST_PHYSICS_FIRST, key=lambda name: self.entries[name].density)
-
-    def _ties(self, name: str, best: str) -> bool:
-        """Whether an estimator does as well as the best: its log density is within one standard error of it
-        (the rule of Breiman et al. 1984), or its mean nMSE is no larger.
-
-        Log density alone lets a few rows on which an arm was too sure decide for a black box that errs more.
-        """
-        first, second = self.entries[best].answer, self.entries[name].answer
-        if first is None or second is None:
-            return False
-        total = compare(self.held, first, second).total
-        return not bool(total.mean[0] > total.standard_error[0] and total.mean[1] > 0)
+        nlpd = compare(self.held.samples, arm, chain).nlpd
+        return 2 * int(np.sum(nlpd.significant & (nlpd.mean < 0))) > self.held.samples.n_joints

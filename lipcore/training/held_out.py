@@ -1,4 +1,4 @@
-"""What to judge on: parts of a recording whose motion the rest of it does not repeat, where there are any."""
+"""What to judge on: parts of a recording whose motion the rest of it does not repeat, and parts at its edge."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.data.repetition import REPEATED, features, groups, period, repeated, share_repeated
-from lipcore.data.samples import Samples
+from lipcore.data.repetition import REPEATED, features, groups, nearest, period, repeated, share_repeated
+from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import GUARD_S, Mask, Numbers, Parts, SplitError, choose, guarded
 
 LEAST_ROWS, LEAST_BLOCKS, MOST_BLOCKS = 60, 4, 20
@@ -22,21 +22,25 @@ MOST_EPISODES, MOST_SHARE = 50, 0.5
 
 
 @dataclass(frozen=True)
-class Unseen:
-    """Which rows to train on and which to judge by (`parts`).
-
-    blocks: how many are held out; repeats: every block of the recording repeats others, so that those held out do, too.
-    """
+class HoldOut:
+    """Which rows to train on and which to judge by."""
 
     parts: Parts
     blocks: int
+    """Blocks that are held out."""
     repeats: bool
+    """Whether the whole recording repeats itself, so that held-out blocks repeat others, except those of the edge."""
+    edge: Mask
+    """Held-out rows at the edge of the data, (N,)."""
+    edge_blocks: int
+    """Held-out blocks at the edge of the data."""
 
 
-def hold_out(samples: Samples, joint_types: Sequence[str]) -> Unseen:
-    """Hold about a quarter of the samples out, in blocks from all over the recording.
+def hold_out(samples: Samples, joint_types: Sequence[str]) -> HoldOut:
+    """Hold about a quarter of the samples out: blocks at the edge of the data, and blocks from all over the recording.
 
-    Raise SplitError where there is too little to hold any out.
+    Of fewer than six blocks one is held out, and none is at the edge. None is either if no group of blocks that repeat
+    each other is small enough. Raise SplitError if there is too little to hold any out.
     """
     if len(samples) < LEAST_ROWS:
         raise SplitError("rows", len(samples), f"at least {LEAST_ROWS} to hold some out")
@@ -47,13 +51,19 @@ def hold_out(samples: Samples, joint_types: Sequence[str]) -> Unseen:
         raise SplitError("seconds", round(lasts, 3), f"at least {LEAST_BLOCKS * BLOCK_S:g} to hold some out")
     edges = np.linspace(0, len(samples), count + 1).round().astype(np.int64)
     number = max(1, round(SHARE * count))
-    new = np.flatnonzero(repeated(features(samples.rows(order), joint_types), edges) < REPEATED)
-    repeats = len(new) < max(1, number // 2)
-    candidates = np.arange(count) if repeats else new
-    number = min(number, len(candidates))
-    chosen = candidates[((np.arange(number) + 0.5) * len(candidates) / number).astype(np.int64)]
-    held: Mask = np.isin(np.repeat(np.arange(count), np.diff(edges)), chosen)
-    return Unseen(guarded(samples.episode, samples.t, order, held, GUARD_S), number, repeats)
+    states = features(samples.rows(order), joint_types)
+    outer = _outer_blocks(states, edges, number // 2)
+    new = repeated(states, edges) < REPEATED
+    repeats = int(new.sum()) < max(1, number // 2)
+    inner = np.flatnonzero(~outer if repeats else new & ~outer)
+    several = min(number - int(outer.sum()), len(inner))
+    held = outer.copy()
+    held[inner[((np.arange(several) + 0.5) * len(inner) / several).astype(np.int64)]] = True
+    lengths = np.diff(edges)
+    parts = guarded(samples.episode, samples.t, order, np.repeat(held, lengths), GUARD_S)
+    edge = np.zeros(len(samples), dtype=bool)
+    edge[order] = np.repeat(outer, lengths)
+    return HoldOut(parts, int(held.sum()), repeats, edge & parts.held_out, int(outer.sum()))
 
 
 def unrepeated(samples: Samples, joint_types: Sequence[str], share: float, seed: int) -> list[tuple[int, int]] | None:
@@ -97,6 +107,33 @@ def _edges(samples: Samples, joint_types: Sequence[str]) -> Numbers | None:
         return np.array([0, *begins.tolist(), len(samples)], np.int64)
     count = _count(samples)
     return None if count < LEAST_BLOCKS else np.linspace(0, len(samples), count + 1).round().astype(np.int64)
+
+
+def _outer_blocks(states: Array, edges: Numbers, most: int) -> Mask:
+    """Whether each of B blocks is at the edge of the data, (B,): `most` blocks at most.
+
+    One group of blocks that repeat each other is chosen after another: the furthest from all blocks that are not chosen
+    yet. The distance is that of the median instant. Blocks next to its own are no part of it: motion enters and leaves
+    a block slowly. Arguments as of `nearest`.
+    """
+    group, outer = groups(states, edges), np.zeros(len(edges) - 1, dtype=bool)
+    distances = [each for _, each in nearest(states, edges)]
+
+    def distance(members: Mask) -> float:
+        alone = outer | members
+        parts = []
+        for block in np.flatnonzero(members):
+            others = ~alone
+            others[max(block - 1, 0) : block + 2] = False
+            parts.append(distances[block][:, others].min(axis=1))
+        return float(np.median(np.concatenate(parts)))
+
+    while True:
+        open_groups = [group == each for each in np.unique(group[~outer])]
+        small = [each for each in open_groups if int(each.sum()) <= most - int(outer.sum())]
+        if not small:
+            return outer
+        outer |= max(small, key=distance)
 
 
 def _count(samples: Samples) -> int:

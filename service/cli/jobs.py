@@ -122,8 +122,8 @@ def train(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help=f"One of {', '.join(CHOICES)}; {DEFAULT_ESTIMATOR} by default, which trains three and takes the one "
-            "that predicts best what it has not seen.",
+            help=f"One of {', '.join(CHOICES)}; {DEFAULT_ESTIMATOR} by default, which compares three on held-out "
+            "rows and takes the simplest unless another one is surely better.",
             autocompletion=lambda: list(CHOICES),
         ),
     ] = None,

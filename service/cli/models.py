@@ -279,7 +279,7 @@ def print_selection(selection: Selection) -> None:
     out.print(selection_table(selection))
     echo(f"  {selection.chosen} is chosen: {selection.reason}")
     if selection.held_out.repeats:
-        echo("  all of the motion repeats itself, also what was held out: these figures flatter")
+        echo("  the held-out motion repeats the training motion: these figures flatter, except at the edge")
 
 
 def print_held_out(version: VersionRecord) -> None:

@@ -70,18 +70,21 @@ def selection_table(selection: Selection) -> Table:
     held = selection.held_out
     title = "not judged"
     if held.blocks:
-        title = f"judged on {counted(held.blocks, 'stretch', 'stretches')} that the training did not see"
-    table = Table("estimator", "log density nats", "less than the best", "mean nMSE", "in 95 %", title=title)
+        stretches = counted(held.blocks, "stretch", "stretches")
+        title = f"judged on {stretches} held out, {held.edge_blocks} at the edge of the data"
+    table = Table(
+        "estimator", "log density nats", "less than the best", "mean nMSE", "at the edge", "in 95 %", title=title
+    )
     for each in selection.table:
         name = f"{each.estimator} (chosen)" if each.estimator == selection.chosen else each.estimator
         if each.error is not None:
-            table.add_row(name, f"failed: {escape(each.error)}", "", "", "")
+            table.add_row(name, f"failed: {escape(each.error)}", "", "", "", "")
             continue
         error = "" if each.standard_error is None else f" ± {each.standard_error:.2f}"
         less = None if each.difference is None else 0.0 - each.difference
-        figures = [_mean(each.nmse), _mean(each.coverage)]
-        row = [_figure(each.log_density, ".2f"), _figure(less, ".2f") + error]
-        table.add_row(name, *row, _figure(figures[0], ".2e"), _figure(figures[1], ".1%"))
+        errors = [_figure(_mean(nmse), ".2e") for nmse in (each.nmse, each.edge_nmse)]
+        row = [_figure(each.log_density, ".2f"), _figure(less, ".2f") + error, *errors]
+        table.add_row(name, *row, _figure(_mean(each.coverage), ".1%"))
     return table
 
 

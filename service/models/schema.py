@@ -27,6 +27,11 @@ class SelectionCandidate(BaseModel):
     difference: float | None = Field(description="Of the log density from that of the best")
     standard_error: float | None = Field(description="Of that difference")
     nmse: list[float | None] | None = Field(description="Of each joint; null where its torque does not vary")
+    edge_nmse: list[float | None] | None = Field(
+        None,
+        description="Of each joint, squared error at the edge of the data over the torque's variance in all rows that "
+        "were held out; null if none of them are at the edge, and for versions of earlier releases",
+    )
     coverage: list[float | None] | None = Field(description="Share within the 95 % interval, of each joint")
     seconds: float
     error: str | None = Field(description="Why it could not be trained")
@@ -37,7 +42,11 @@ class SelectionHeldOut(BaseModel):
 
     rows: int
     blocks: int = Field(description="Contiguous stretches that these rows are")
-    repeats: bool = Field(description="All motion of the recording repeats other motion of it: figures flatter")
+    repeats: bool = Field(
+        description="All motion of the recording repeats other motion of it: figures flatter, except at the edge"
+    )
+    edge_rows: int = Field(0, description="Rows at the edge of the data: their states are the furthest from all others")
+    edge_blocks: int = Field(0, description="Contiguous stretches that the rows at the edge are")
 
 
 class Selection(BaseModel):
@@ -47,7 +56,7 @@ class Selection(BaseModel):
     chosen: str
     reason: str
     held_out: SelectionHeldOut
-    table: list[SelectionCandidate] = Field(description="All that were trained, what knows most of the arm first")
+    table: list[SelectionCandidate] = Field(description="The estimators that were trained, the simplest first")
 
 
 class Promotion(BaseModel):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from lipcore.robots.dirt import Dirt
 from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard, Visit
 from tests.browser.visitor import DESKTOP, PHONE, Visitor
@@ -152,13 +153,14 @@ def test_a_version_that_waits_says_why_and_is_let_answer(visitor: Visitor, dashb
 
 
 def test_how_auto_has_chosen_is_shown_with_the_job_and_with_the_version(visitor: Visitor, dashboard: Dashboard) -> None:
-    dataset = upload(dashboard.client, stream(samples=120, seed=9), name="chosen.npz")
+    dataset = upload(dashboard.client, stream(samples=120, seed=9, dirt=Dirt()), name="chosen.npz")
     options = {**QUICK, "posterior_samples": 100, "search_seconds": 1.0, "starts": 1}
     job = train(dashboard.client, "chosen", dataset["id"], estimator="auto", options=options)
     chosen = dashboard.client.get("/v1/models/chosen/versions/1").json()["estimator"]
     for page in (visitor.open(f"#/jobs/{job['id']}"), visitor.open("#/models/chosen?tab=lineage")):
         card = page.get_by_role("region", name="How the estimator was chosen")
-        expect(card.get_by_text("Judged on 2 stretches that the training did not see")).to_be_visible()
+        expect(card.get_by_text("Judged on 2 stretches held out")).to_be_visible()
+        expect(card.get_by_role("columnheader", name="nMSE at the edge")).to_be_visible()
         expect(card.locator("tbody tr")).to_have_count(3)
         expect(card.locator("strong").first).to_have_text(chosen)
         visitor.settled()

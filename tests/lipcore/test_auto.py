@@ -2,6 +2,7 @@
 
 from copy import deepcopy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from lipcore.training.held_out import LEAST_ROWS, hold_out
 from lipcore.training.train import train
 from tests.choosing import slow
 
+REAL_ARMS = Path(__file__).parents[3] / "shared/data/real_arms.npz"
 ARM = "finger-edu"
 TYPES = ("revolute",) * 3
 OPTIONS = FitOptions(
@@ -32,6 +34,20 @@ NAMES = ["rigid-body", "rigid-body+lip-chain", "lip-chain"]
 
 def recorded(rows=200, seed=3, speed=4.0):
     return simulate(load_robot(ARM), Stream(rows, rate=10.0, speed=speed, noise=0.0005, coulomb=0.005), seed)
+
+
+def disturbed(samples):
+    """The samples with a torque that no state explains."""
+    return replace(
+        samples, tau=samples.tau + 0.003 * np.sin(2 * np.pi * samples.t[:, None] / np.array([5.0, 6.0, 7.0]))
+    )
+
+
+def with_fast_stretch():
+    """Slow motion, and three seconds of fast motion in its middle."""
+    slow, fast = recorded(170, speed=1.5), recorded(30, seed=4, speed=6.0)
+    parts = Samples.concatenate([slow.rows(slice(0, 85)), fast, slow.rows(slice(85, None))])
+    return replace(parts, t=np.arange(200) / 10.0, episode=np.zeros(200, np.int64))
 
 
 def periodic(rows=400, period=5.03):
@@ -46,7 +62,7 @@ def periodic(rows=400, period=5.03):
 @pytest.fixture(scope="module")
 def chosen():
     seen = []
-    model = train(recorded(), TYPES, options=OPTIONS, on_progress=seen.append)
+    model = train(disturbed(recorded()), TYPES, options=OPTIONS, on_progress=seen.append)
     return model, seen
 
 
@@ -59,10 +75,34 @@ def test_of_a_rigid_arm_the_rigid_body_is_chosen(chosen):
     best = max(row["log_density"] for row in found["table"])
     for row in found["table"]:
         assert row["error"] is None
-        assert len(row["nmse"]) == len(row["coverage"]) == 3
+        assert len(row["nmse"]) == len(row["edge_nmse"]) == len(row["coverage"]) == 3
         assert row["difference"] == pytest.approx(row["log_density"] - best)
-    assert found["held_out"] == {"rows": found["held_out"]["rows"], "blocks": 3, "repeats": False}
-    assert 0.15 * 200 < found["held_out"]["rows"] < 0.3 * 200
+    held_out = dict(found["held_out"])
+    rows, edge_rows = held_out.pop("rows"), held_out.pop("edge_rows")
+    assert held_out == {"blocks": 3, "repeats": False, "edge_blocks": 1}
+    assert 0.15 * 200 < rows < 0.3 * 200
+    assert 0 < edge_rows < 0.5 * rows
+
+
+def test_of_an_arm_that_is_explained_no_other_estimator_is_trained():
+    model = train(recorded(), TYPES, options=OPTIONS)
+    assert model.estimator.name == model.selection["chosen"] == "rigid-body"
+    assert [row["estimator"] for row in model.selection["table"]] == ["rigid-body"]
+    assert model.selection["reason"].startswith("it explains the held-out torque to the sensor's noise")
+
+
+def test_rows_in_no_order_do_not_tell_the_noise():
+    samples = disturbed(recorded())
+    shuffled = samples.rows(np.random.default_rng(0).permutation(len(samples)))
+    model = train(replace(shuffled, t=samples.t), TYPES, options=OPTIONS)
+    assert [row["estimator"] for row in model.selection["table"]] == NAMES
+
+
+def test_an_estimator_that_bends_fails_at_the_edge():
+    model = train(disturbed(with_fast_stretch()), TYPES, options=OPTIONS)
+    error = {row["estimator"]: np.mean(row["edge_nmse"]) for row in model.selection["table"]}
+    assert error["lip-chain"] > 2 * error["rigid-body"]
+    assert model.selection["chosen"] == "rigid-body"
 
 
 def test_the_chosen_one_has_learnt_all_samples(chosen):
@@ -94,6 +134,10 @@ def test_progress_never_falls_and_names_the_estimator_at_work(chosen):
         (lambda s: s.update(table=[]), "selection.table is"),
         (lambda s: s["held_out"].update(repeats=1), "selection.held_out.repeats is 1, expected true or false"),
         (lambda s: s["held_out"].update(rows=-1), "selection.held_out.rows is -1"),
+        (lambda s: s["held_out"].update(edge_blocks="one"), "selection.held_out.edge_blocks is 'one'"),
+        (lambda s: s["held_out"].update(corners=1), "selection.held_out has the entry 'corners'"),
+        (lambda s: s["table"][1].update(edge_nmse=[1.0]), r"selection.table\[1\].edge_nmse is .* expected a list of 3"),
+        (lambda s: s["table"][1].update(edge_nmse=[-1.0] * 3), r"selection.table\[1\].edge_nmse\[0\] is -1"),
         (lambda s: s["table"][1].update(nmse=[1.0]), r"selection.table\[1\].nmse is .* expected a list of 3"),
         (lambda s: s["table"][0].update(log_density="good"), r"selection.table\[0\].log_density is 'good'"),
         (lambda s: s["table"][0].update(error=""), r"selection.table\[0\].error is"),
@@ -108,18 +152,44 @@ def test_the_choice_is_saved_and_loaded_and_a_malformed_one_refused(chosen, tmp_
         read_manifest_bytes(manifest_bytes(manifest))
 
 
+def test_a_choice_of_an_earlier_release_is_read(chosen, tmp_path):
+    manifest = save(chosen[0], tmp_path / "model")
+    manifest["selection"] = deepcopy(manifest["selection"])
+    for key in ("edge_rows", "edge_blocks"):
+        del manifest["selection"]["held_out"][key]
+    for row in manifest["selection"]["table"]:
+        del row["edge_nmse"]
+    assert read_manifest_bytes(manifest_bytes(manifest))["selection"] == manifest["selection"]
+
+
 @pytest.mark.slow
-def test_of_an_arm_with_springs_the_chain_is_chosen():
+def test_of_an_arm_with_springs_a_chain_is_chosen():
     samples = recorded(300, speed=8.0)
     # of the energy 0.1 sin²q₂ sin q₃: gravity has no second harmonic
     _, second, third = samples.q.T
     spring = [0 * second, np.sin(2 * second) * np.sin(third), np.sin(second) ** 2 * np.cos(third)]
     options = replace(OPTIONS, hyperparameter_samples=50, max_iterations=40)
     model = train(replace(samples, tau=samples.tau + 0.1 * np.stack(spring, axis=1)), TYPES, options=options)
-    assert model.selection["chosen"] == model.estimator.name == "lip-chain", model.selection
+    assert model.selection["chosen"] == model.estimator.name != "rigid-body", model.selection
     rows = {row["estimator"]: row for row in model.selection["table"]}
     assert rows["rigid-body"]["difference"] < -2 * rows["rigid-body"]["standard_error"] < 0
     assert model.fit["samples_posterior"] == len(samples)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL_ARMS.exists(), reason=f"no recordings at {REAL_ARMS}")
+def test_of_a_real_kuka_the_arm_is_chosen_and_predicts_a_motion_twice_as_fast():
+    with np.load(REAL_ARMS) as arms:
+        parts = [
+            {name: arms[f"kuka|{part}|{name}"].astype(float) for name in ("t", "episode", "q", "dq", "ddq", "tau")}
+            for part in ("train", "other")
+        ]
+    names = tuple(f"joint{number}" for number in range(1, 8))
+    training, other = (Samples(names, **{**each, "episode": each["episode"].astype(np.int64)}) for each in parts)
+    model = train(training, ("revolute",) * 7)
+    assert model.estimator.name == "rigid-body", model.selection
+    error = model.predict(other.q, other.dq, other.ddq).tau - other.tau
+    assert np.mean(np.mean(error**2, axis=0) / other.tau.var(axis=0)) < 0.5
 
 
 def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
@@ -129,7 +199,7 @@ def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
     monkeypatch.setattr(auto.Fits, "learn", fails)
     model = train(recorded(), TYPES, options=OPTIONS)
     assert model.selection["chosen"] == model.estimator.name == "lip-chain"
-    assert model.selection["reason"] == "no other could be trained"
+    assert model.selection["reason"] == "no other estimator was trained"
     rows = {row["estimator"]: row for row in model.selection["table"]}
     assert rows["rigid-body"]["error"] == "NotPositiveDefiniteError: nothing can be learnt"
     assert rows["rigid-body"]["log_density"] is None
@@ -146,12 +216,12 @@ def test_few_rows_are_not_held_out():
     found = model.selection
     assert found["chosen"] == model.estimator.name == "rigid-body"
     assert found["reason"].startswith("too little to hold some out and judge by: rows is 50, expected at least 60")
-    assert found["held_out"] == {"rows": 0, "blocks": 0, "repeats": False}
+    assert found["held_out"] == {"rows": 0, "blocks": 0, "repeats": False, "edge_rows": 0, "edge_blocks": 0}
     assert [row["estimator"] for row in found["table"]] == ["rigid-body"]
 
 
 def test_a_robot_is_for_those_that_have_a_use_for_it():
-    samples = recorded()
+    samples = disturbed(recorded())
     robot = RigidBody.from_profile(ARM, samples.joint_names, TYPES)
     model = train(samples, TYPES, options=OPTIONS, robot=robot)
     assert all(row["error"] is None for row in model.selection["table"])
@@ -169,7 +239,7 @@ def test_it_can_be_cancelled(at_work):
         return any(each.estimator == at_work for each in seen)
 
     with pytest.raises(FitCancelledError):
-        train(recorded(), TYPES, options=OPTIONS, on_progress=seen.append, cancelled=cancelled)
+        train(disturbed(recorded()), TYPES, options=OPTIONS, on_progress=seen.append, cancelled=cancelled)
     assert seen[-1].estimator == at_work
 
 
@@ -179,7 +249,7 @@ def test_where_the_chain_leads_the_search_is_taken_up_again_and_both_stand_aroun
     monkeypatch.setattr(auto, "learn", lambda *given: (seeds.append(given[-1]), learn(*given))[1])
     monkeypatch.setattr(auto.Contest, "_chain_leads", lambda self: True)
     monkeypatch.setattr(auto.Contest, "verdict", lambda self: ("rigid-body+lip-chain", "both are wanted"))
-    model = train(recorded(), TYPES, options=replace(OPTIONS, posterior_samples=300))
+    model = train(disturbed(recorded()), TYPES, options=replace(OPTIONS, posterior_samples=300))
     assert seeds[:2] == [0, 1]
     assert model.selection["chosen"] == model.estimator.name == "rigid-body+lip-chain"
     assert model.fit["samples_given"] == len(recorded())
@@ -197,9 +267,38 @@ def test_motion_that_is_seen_nowhere_else_is_held_out():
     assert not (found.parts.held_out & found.parts.train).any()
 
 
+def test_the_fastest_block_is_held_out_at_the_edge():
+    found = hold_out(with_fast_stretch(), TYPES)
+    edge = np.flatnonzero(found.edge)
+    assert found.edge_blocks == 1
+    assert 85 <= edge.min() <= edge.max() < 115
+    assert found.edge[found.parts.held_out].sum() == len(edge) < found.parts.held_out.sum()
+
+
+def test_blocks_at_the_edge_that_repeat_each_other_are_held_out_together():
+    first = with_fast_stretch()
+    twice = Samples.concatenate([first, first])
+    found = hold_out(replace(twice, t=np.arange(400) / 10.0, episode=np.zeros(400, np.int64)), TYPES)
+    assert found.repeats
+    assert found.edge_blocks == 2
+    assert np.unique(np.flatnonzero(found.edge) // 20).tolist() == [4, 14]
+
+
+def test_rows_of_the_edge_are_those_of_the_samples_in_any_order():
+    samples = with_fast_stretch()
+    order = np.random.default_rng(1).permutation(len(samples))
+    assert np.array_equal(hold_out(samples.rows(order), TYPES).edge, hold_out(samples, TYPES).edge[order])
+
+
+def test_of_few_blocks_none_is_at_the_edge():
+    found = hold_out(recorded(60), TYPES)
+    assert (found.blocks, found.edge_blocks, int(found.edge.sum())) == (1, 0, 0)
+
+
 def test_a_recording_that_repeats_itself_is_known():
     found = hold_out(periodic(), TYPES)
     assert found.repeats
+    assert found.edge_blocks == 0
     held = np.flatnonzero(np.diff(found.parts.held_out.astype(int)) == 1)
     assert found.blocks == 5 == len(held)
     assert np.diff(held).min() > 60  # they are spread over it

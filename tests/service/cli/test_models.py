@@ -103,15 +103,17 @@ def judged(estimator, nmse, **given):
 
 def test_how_an_estimator_was_chosen_is_printed(capsys):
     failed = judged("lip-chain", None, log_density=None, error="no [factor]")
-    best = judged("rigid-body", [0.01, 0.03], difference=0.0, standard_error=None)
-    held = SelectionHeldOut(rows=90, blocks=6, repeats=True)
+    best = judged("rigid-body", [0.01, 0.03], difference=0.0, standard_error=None, edge_nmse=[0.05, 0.09])
+    held = SelectionHeldOut(rows=90, blocks=6, repeats=True, edge_rows=30, edge_blocks=2)
     made = {"asked": "auto", "chosen": "rigid-body", "reason": "it errs least", "held_out": held}
     print_selection(Selection(**made, table=[best, judged("rigid-body+lip-chain", None)]))
     out = capsys.readouterr().out
     parts = (
         "6 stretches",
+        "2 at the edge",
         "rigid-body (chosen)",
         "2.00e-02",
+        "7.00e-02",
         "90.0 %",
         "0.25 ± 0.10",
         "it errs least",

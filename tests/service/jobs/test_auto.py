@@ -2,6 +2,7 @@
 
 import pytest
 
+from lipcore.robots.dirt import Dirt
 from tests.service.data import QUICK, ended, stream, train, upload
 
 NAMES = ["rigid-body", "rigid-body+lip-chain", "lip-chain"]
@@ -10,7 +11,7 @@ OPTIONS = {**QUICK, "posterior_samples": 100, "search_seconds": 1.0, "starts": 1
 
 @pytest.fixture(scope="module")
 def made(api):
-    dataset = upload(api, stream(samples=120, seed=9))["id"]
+    dataset = upload(api, stream(samples=120, seed=9, dirt=Dirt()))["id"]
     return train(api, "chosen", dataset, estimator="auto", options=OPTIONS)
 
 
@@ -21,8 +22,10 @@ def test_the_version_keeps_how_its_estimator_was_chosen(api, made):
     assert (found["asked"], found["chosen"]) == ("auto", version["estimator"])
     assert version["estimator"] in NAMES
     assert [row["estimator"] for row in found["table"]] == NAMES
+    assert all(len(row["edge_nmse"]) == 2 for row in found["table"])
     assert found["held_out"]["rows"] > 10
-    assert found["held_out"]["blocks"] == 2
+    assert (found["held_out"]["blocks"], found["held_out"]["edge_blocks"]) == (2, 1)
+    assert 0 < found["held_out"]["edge_rows"] < found["held_out"]["rows"]
     assert made["progress"]["fraction"] == 1.0
     assert api.get("/v1/models/panda-sim").status_code == 200
     assert api.get("/v1/models/panda-sim/versions/1").json()["selection"] is None

@@ -76,12 +76,16 @@ class SelectionHeldOut(Record, frozen=True, kw_only=True):
     """What `auto` held out to choose by; the chosen estimator has learnt it afterwards.
 
     blocks: Contiguous stretches that these rows are
-    repeats: All motion of the recording repeats other motion of it: figures flatter
+    repeats: All motion of the recording repeats other motion of it: figures flatter, except at the edge
+    edge_rows: Rows at the edge of the data: their states are the furthest from all others
+    edge_blocks: Contiguous stretches that the rows at the edge are
     """
 
     rows: int
     blocks: int
     repeats: bool
+    edge_rows: int = 0
+    edge_blocks: int = 0
 
 
 class SelectionCandidate(Record, frozen=True, kw_only=True):
@@ -91,6 +95,8 @@ class SelectionCandidate(Record, frozen=True, kw_only=True):
     difference: Of the log density from that of the best
     standard_error: Of that difference
     nmse: Of each joint; null where its torque does not vary
+    edge_nmse: Of each joint, squared error at the edge of the data over the torque's variance in all rows that were
+        held out; null if none of them are at the edge, and for versions of earlier releases
     coverage: Share within the 95 % interval, of each joint
     error: Why it could not be trained
     """
@@ -100,6 +106,7 @@ class SelectionCandidate(Record, frozen=True, kw_only=True):
     difference: float | None
     standard_error: float | None
     nmse: list[float | None] | None
+    edge_nmse: list[float | None] | None = None
     coverage: list[float | None] | None
     seconds: float
     error: str | None
@@ -108,7 +115,7 @@ class SelectionCandidate(Record, frozen=True, kw_only=True):
 class Selection(Record, frozen=True, kw_only=True):
     """How `auto` has chosen the estimator.
 
-    table: All that were trained, what knows most of the arm first
+    table: The estimators that were trained, the simplest first
     """
 
     asked: str

@@ -12,10 +12,10 @@ export function selectionCard({ selection }) {
   return card(
     "How the estimator was chosen",
     h("p", {}, h("strong", {}, selection.chosen), `: ${selection.reason}.`),
-    held.repeats ? h("p", { class: "banner" }, "The held-out motion repeats the training motion: these figures flatter.") : null,
+    held.repeats ? h("p", { class: "banner" }, "The held-out motion repeats the training motion: all figures flatter, except those at the edge.") : null,
     held.blocks ? judged(selection, held) : null,
     failed.map((each) => h("p", { class: "hint" }, `${each.estimator} could not be trained: ${each.error}`)),
-    held.blocks ? h("p", { class: "hint" }, "A higher log density means better predictions and truer uncertainty. An estimator that knows more of the arm wins if it is within one standard error of the best, or its errors are no larger. It was then trained on the held-out samples, too.") : null,
+    held.blocks ? h("p", { class: "hint" }, "A higher log density means better predictions and truer uncertainty. The first estimator is chosen unless a later one has a higher log density beyond chance and no larger error, also at the edge of the data. The chosen estimator was then trained on the held-out samples, too.") : null,
   );
 }
 
@@ -26,9 +26,10 @@ function judged({ chosen, table: rows }, held) {
     { label: "Log density, nats a sample", numeric: true, cell: (row) => shown(row.log_density, number) },
     { label: "Less than the best", numeric: true, cell: (row) => less(row) },
     { label: "nMSE, mean of the joints", numeric: true, cell: (row) => shown(mean(row.nmse), scientific) },
+    { label: "nMSE at the edge", numeric: true, cell: (row) => shown(mean(row.edge_nmse), scientific) },
     { label: "Within the 95 % band", numeric: true, cell: (row) => shown(mean(row.coverage), percent) },
   ];
-  return table(columns, rows, { caption: `Judged on ${stretches} that the training did not see: ${counted(held.rows, "sample")}` });
+  return table(columns, rows, { caption: `Judged on ${stretches} held out (${counted(held.rows, "sample")}), ${held.edge_blocks} at the edge of the data` });
 }
 
 function less({ difference, standard_error: error }) {

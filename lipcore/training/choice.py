@@ -1,0 +1,79 @@
+"""The choice between estimators, by what they predict of held-out samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from lipcore.data.metrics import Answer, compare
+from lipcore.data.samples import Array, Samples
+from lipcore.data.splits import Mask
+
+
+@dataclass(frozen=True)
+class HeldOutSamples:
+    """Samples to judge estimators by."""
+
+    samples: Samples
+    edge: Mask
+    """Rows at the edge of the data, (N,)."""
+
+    def nmse(self, answer: Answer) -> Array:
+        """Return the mean squared error of each joint over the variance of its torque, (n,); NaN if that is zero."""
+        return np.asarray(self._errors(answer).mean(axis=0))
+
+    def edge_nmse(self, answer: Answer) -> Array:
+        """Return the same of the rows at the edge, over the variance of all rows, (n,); NaN if there are none."""
+        errors = self._errors(answer)[self.edge]
+        return errors.mean(axis=0) if len(errors) else np.full(self.samples.n_joints, np.nan)
+
+    def _errors(self, answer: Answer) -> Array:
+        tau = self.samples.tau
+        # rounding gives a constant column a variance above zero
+        variance = np.where(np.ptp(tau, axis=0) > 0, tau.var(axis=0), np.nan)
+        return np.asarray(np.square(tau - answer.mean) / variance)
+
+
+def choose_estimator(held_out: HeldOutSamples, answers: Mapping[str, Answer]) -> tuple[str, str]:
+    """Return the name of the estimator to train on all samples, and the reason.
+
+    The first is chosen unless a later one is surely better: its log density is higher beyond chance (95 %), and its
+    error is no larger, neither on all rows nor at the edge. Once the first is replaced, one standard error of the log
+    density is enough: the simplest of those that are as good is chosen.
+    answers: what each estimator predicts of the samples, the simplest estimator first, at least one.
+    """
+    first, *others = answers
+    chosen, reasons = first, []
+    for name in others:
+        objection = _objection(held_out, answers[chosen], answers[name], surely=chosen == first)
+        if objection is None:
+            reasons.append(f"{name} is better than {chosen}, also at the edge of the data")
+            chosen = name
+        else:
+            reasons.append(f"{name} does not replace {chosen}: {objection}")
+    return chosen, "; ".join(reasons) or "no other estimator was trained"
+
+
+def _objection(held_out: HeldOutSamples, simple: Answer, other: Answer, *, surely: bool) -> str | None:
+    """Return why another estimator should not replace a simpler one, None if it should.
+
+    surely: the difference of the log densities counts only if it is significant, not from one standard error on.
+    """
+    total = compare(held_out.samples, simple, other).total
+    margin = total.half_width if surely else total.standard_error
+    if not total.mean[0] < -margin[0]:
+        return f"its log density is not higher {'beyond chance' if surely else 'by more than one standard error'}"
+    if not held_out.edge.any():
+        return "no states at the edge of the data could be held out"
+    for nmse, place in ((held_out.nmse, ""), (held_out.edge_nmse, " at the edge of the data")):
+        if not _mean(nmse(other)) <= _mean(nmse(simple)):
+            return f"its error is larger{place}"
+    return None
+
+
+def _mean(values: Array) -> float:
+    """Return the mean of the values that are numbers, NaN if there are none."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else np.nan

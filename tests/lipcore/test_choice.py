@@ -1,0 +1,103 @@
+"""The choice between estimators: a rule on what they predict of held-out samples."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lipcore.data.metrics import Answer
+from lipcore.data.samples import Samples
+from lipcore.training.choice import HeldOutSamples, choose_estimator
+
+ARM, BOTH, CHAIN = "rigid-body", "rigid-body+lip-chain", "lip-chain"
+ROWS, JOINTS, RATE = 1200, 2, 20.0
+TIME = np.arange(ROWS) / RATE
+EDGE = np.mod(TIME, 10.0) >= 8.0
+TAU = np.stack([np.sin(TIME), 3 * np.cos(TIME)], axis=1)
+
+
+def held_out(edge=EDGE, seconds=TIME[-1] + 1) -> HeldOutSamples:
+    shape = (ROWS, JOINTS)
+    samples = Samples(
+        ("a", "b"), TIME, np.zeros(ROWS, np.int64), np.zeros(shape), np.zeros(shape), np.zeros(shape), TAU
+    )
+    rows = seconds > TIME
+    return HeldOutSamples(samples.rows(rows), edge[rows])
+
+
+def answer(inside: float, edge: float, stated: float | None = None, seconds=TIME[-1] + 1, seed=0) -> Answer:
+    """What errs by these shares of each joint's spread, in and not at the edge, and states the first or another."""
+    scale = np.random.default_rng(seed).normal(size=(ROWS, 1)) * TAU.std(axis=0)
+    mean = TAU + np.where(EDGE, edge, inside)[:, None] * scale
+    rows = seconds > TIME
+    return Answer(
+        mean[rows], np.zeros((int(rows.sum()), JOINTS)), (inside if stated is None else stated) * TAU.std(axis=0)
+    )
+
+
+CASES = {
+    "equal": ({ARM: (0.1, 0.1), BOTH: (0.1, 0.1), CHAIN: (0.1, 0.1)}, ARM, "not higher beyond chance"),
+    "a little better": ({ARM: (0.1, 0.1), CHAIN: (0.0999, 0.0999)}, ARM, "not higher beyond chance"),
+    "better everywhere": (
+        {ARM: (0.3, 0.3), BOTH: (0.1, 0.1), CHAIN: (0.3, 0.3)},
+        BOTH,
+        "better than rigid-body,",
+    ),
+    "the last is better": (
+        {ARM: (0.3, 0.3), BOTH: (0.2, 0.2), CHAIN: (0.1, 0.1)},
+        CHAIN,
+        "better than rigid-body+lip-chain,",
+    ),
+    "the last is as good": (
+        {ARM: (0.3, 0.3), BOTH: (0.1, 0.1), CHAIN: (0.1, 0.1)},
+        BOTH,
+        "by more than one standard error",
+    ),
+    "bends at the edge": (
+        {ARM: (0.3, 0.3), CHAIN: (0.05, 0.32, 0.3)},
+        ARM,
+        "its error is larger at the edge of the data",
+    ),
+    "errs more": ({ARM: (0.1, 0.1, 0.02), CHAIN: (0.2, 0.1)}, ARM, "its error is larger"),
+    "one alone": ({CHAIN: (0.3, 0.3)}, CHAIN, "no other estimator was trained"),
+    "no arm": ({BOTH: (0.3, 0.3), CHAIN: (0.1, 0.1)}, CHAIN, "better than rigid-body+lip-chain,"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_simplest_is_chosen_unless_another_is_surely_better(case):
+    given, expected, why = CASES[case]
+    answers = {name: answer(*each, seed=seed) for seed, (name, each) in enumerate(given.items())}
+    chosen, reason = choose_estimator(held_out(), answers)
+    assert chosen == expected, reason
+    assert why in reason
+    assert len(reason) < 300
+
+
+def test_the_simplest_is_chosen_if_nothing_tells_that_another_is_better():
+    better = {ARM: (0.3, 0.3), CHAIN: (0.1, 0.1)}
+    answers = {name: answer(*each) for name, each in better.items()}
+    assert choose_estimator(held_out(), answers)[0] == CHAIN
+    chosen, reason = choose_estimator(held_out(edge=np.zeros(ROWS, dtype=bool)), answers)
+    assert chosen == ARM
+    assert reason.endswith("no states at the edge of the data could be held out")
+    one_block = {name: answer(*each, None, 0.9) for name, each in better.items()}
+    assert choose_estimator(held_out(np.ones(ROWS, dtype=bool), 0.9), one_block)[0] == ARM
+
+
+def test_error_at_the_edge_is_relative_to_the_torque_of_all_rows():
+    held = held_out()
+    given = answer(0.1, 0.5)
+    expected = np.mean(np.square(TAU - given.mean)[EDGE], axis=0) / TAU.var(axis=0)
+    assert held.edge_nmse(given) == pytest.approx(expected)
+    assert held.nmse(given) == pytest.approx(np.mean(np.square(TAU - given.mean), axis=0) / TAU.var(axis=0))
+    assert np.isnan(held_out(np.zeros(ROWS, dtype=bool)).edge_nmse(given)).all()
+
+
+def test_a_joint_without_torque_has_no_error():
+    held = held_out()
+    tau = TAU.copy()
+    tau[:, 1] = 0.1
+    held = replace(held, samples=replace(held.samples, tau=tau))
+    assert np.isfinite(held.nmse(answer(0.1, 0.1))).tolist() == [True, False]
+    assert choose_estimator(held, {ARM: answer(0.3, 0.3), CHAIN: answer(0.1, 0.1)})[0] in {ARM, CHAIN}
