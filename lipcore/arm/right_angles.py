@@ -29,8 +29,8 @@ RIGHT_SHARE = 0.9
 """Share of all axes that are built at right angles."""
 SEARCH_ROWS, SEARCH_STEPS = 80, 5
 """Rows of a problem that layouts are compared on, and steps of each descent."""
-MAX_KEPT, MAX_SWEEPS = 3, 3
-"""Layouts that are improved and kept, and times that all joints are tried in turn."""
+MAX_KEPT, MAX_IMPROVED, MAX_SWEEPS = 3, 2, 3
+"""Layouts that are kept, those that are improved, and times that all joints are tried in turn."""
 NEAR_NATS, GAIN_NATS = 7.0, 1.0
 """A candidate that much less likely than the best counts for a thousandth; what a sweep has to gain to be repeated."""
 
@@ -62,26 +62,32 @@ def weigh(problem: Problem, point: Point, layout: Layout) -> Candidate:
 
 
 def likely_layouts(
-    problem: Problem, ends: Sequence[Point], known: Sequence[Geometry] = (), stop: Callable[[], bool] | None = None
+    problem: Problem,
+    ends: Sequence[Point],
+    known: Sequence[Geometry] = (),
+    sweeps: int = MAX_SWEEPS,
+    stop: Callable[[], bool] | None = None,
 ) -> list[Candidate]:
     """Return the layouts that are more likely than the first of some optima is without one: at most MAX_KEPT.
 
     They are compared on few rows of the problem, which count for all. A search starts at the optima, with the axes that
     lie near a direction put there, at known geometries, and at TYPICAL_LAYOUTS. The best of these are improved: each
-    joint in turn is tried in all directions until that gains nothing.
+    joint in turn is tried in all directions, `sweeps` times at most, until that gains nothing. Without sweeps only the
+    optima and known geometries are looked at, to which an earlier search has led.
     """
     rows = np.unique(np.linspace(0, len(problem.tau) - 1, SEARCH_ROWS).round().astype(np.int64))
     few = problem.rows(rows)
     few = replace(few, counts=few.counts * (len(problem.tau) / len(rows)))
     search = _Search(few, ends[0].sigma, stop)
-    typical = [tuple(AXES.index(axis) for axis in axes) for axes in TYPICAL_LAYOUTS.get(problem.n_joints, ())]
+    usual = TYPICAL_LAYOUTS.get(problem.n_joints, ()) if sweeps else ()
+    typical = [tuple(AXES.index(axis) for axis in axes) for axes in usual]
     starts = [
         *(search.nearest(end.geometry, NEAR_RAD) for end in ends[:MAX_KEPT]),
         *(search.nearest(geometry, np.inf) for geometry in known),
         *(search.settle(ends[0].geometry, layout) for layout in typical),
     ]
-    for start in sorted({each.layout: each for each in starts}.values(), key=_evidence)[:MAX_KEPT]:
-        search.improve(start)
+    for start in sorted({each.layout: each for each in starts}.values(), key=_evidence)[:MAX_IMPROVED]:
+        search.improve(start, sweeps)
     limit = weigh(few, few.at(ends[0].geometry, ends[0].sigma), (None,) * problem.n_joints).evidence
     ranked = sorted(search.found.values(), key=_evidence)
     return [each for each in ranked[:MAX_KEPT] if each.evidence < min(limit, ranked[0].evidence + NEAR_NATS)]
@@ -116,9 +122,9 @@ class _Search:
             turned, tuple(int(at) if angle < within else None for at, angle in zip(nearest, off, strict=True))
         )
 
-    def improve(self, best: Candidate) -> None:
+    def improve(self, best: Candidate, sweeps: int) -> None:
         """Try each joint in all directions until that gains nothing."""
-        for _ in range(MAX_SWEEPS):
+        for _ in range(sweeps):
             before = best.evidence
             for joint in range(len(best.layout)):
                 for direction in (*range(len(DIRECTIONS)), None):
