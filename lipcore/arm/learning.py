@@ -124,7 +124,7 @@ def learn(
         }
         if mode == "learn":
             sure = right_angles.certainty(found)[np.argsort(order)]
-            report["right_angles"] = " ".join(f"{each:.3f}" for each in sure)
+            report |= {f"right_angle_{joint + 1}": round(float(each), 3) for joint, each in enumerate(sure)}
         arm, params = _arm(found, order, mode)
         place, n = np.argsort(order), problem.n_joints
         friction = problem.weights(best)[(PARAMETERS + 1) * n :].reshape(n, -1)

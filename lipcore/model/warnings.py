@@ -67,7 +67,7 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
 
     parameters: the report of `lipcore.model.parameters.report`.
     """
-    arm, fit, out = model.arm, model.fit, []
+    arm, fit, out = model.arm, model.fit, _fallback(model)
     if REFIT_ERROR in fit:
         out.append(
             f"The last fit, on all rows, failed ({fit[REFIT_ERROR]}). The model has not learnt the rows held out."
@@ -77,7 +77,6 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
         f"Its joints moved together, like {moved:.1f} independent ones of {model.n_joints}: torque of other motion may "
         "be off by more than tau_std says. A recording in which each moves by itself tells more."
     )
-    out = _fallback(model)
     if arm is None:
         return [*out, together] if moved < TOGETHER * model.n_joints else out
     if len(arm.alternatives) > 1:
