@@ -45,6 +45,7 @@ ORDER = (
     "reference/stream-protocol.md",
     "reference/archives.md",
     "reproduction/results.md",
+    "reproduction/real.md",
 )
 """Pages beside the index, as the guide lists them. What is not listed here is not a page."""
 SLUGS = {"reproduction/results.md": "reproduction"}
