@@ -127,7 +127,7 @@ def learn(
             report |= {f"right_angle_{joint + 1}": round(float(each), 3) for joint, each in enumerate(sure)}
         arm, params = _arm(found, order, mode)
         place, n = np.argsort(order), problem.n_joints
-        friction = problem.weights(best)[(PARAMETERS + 1) * n :].reshape(n, -1)
+        friction = problem.weights(best)[problem.bodies :].reshape(n, -1)
         misfit = misfit.with_friction(friction[:, FRICTION_TERMS.index("coulomb")]).of_joints(place)
         return Learnt(arm, params, rows, problem.counts[:, place], misfit, report)
 
@@ -227,7 +227,7 @@ def _arm(found: Sequence[Candidate], order: NDArray[np.int64], mode: GeometryMod
     """The arm of the most likely candidate, with the others that answer otherwise."""
     problem, best = found[0].problem, found[0].point
     n, place = problem.n_joints, np.argsort(order)
-    first = (PARAMETERS + 1) * n
+    first = problem.bodies
     body = problem.scale[: PARAMETERS * n].reshape(n, PARAMETERS)[place].reshape(-1)
     unit = np.concatenate([body, problem.scale[PARAMETERS * n : first][place]])
     friction = problem.scale[first:].reshape(n, -1)[place]
@@ -262,8 +262,7 @@ def _arm(found: Sequence[Candidate], order: NDArray[np.int64], mode: GeometryMod
 
 def _alternative(problem: Problem, point: Point, place: NDArray[np.int64], share: float) -> Alternative:
     n = problem.n_joints
-    weights = problem.weights(point)
-    first = (PARAMETERS + 1) * n
+    weights, first = problem.weights(point), problem.bodies
     rotor, friction = weights[PARAMETERS * n : first][place], weights[first:].reshape(n, -1)[place]
     return Alternative(point.geometry, problem.parameters(point), rotor, friction, share)
 

@@ -120,14 +120,9 @@ def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -
 def with_stribeck(problem: Problem) -> Problem:
     """The same with friction's fourth term, whose weights may be as large as a joint's torque, as the Coulomb ones."""
     n, first = problem.n_joints, problem.bodies
-    coulomb = FRICTION_TERMS.index("coulomb")
-
-    def wider(friction: Array) -> Array:
-        each = friction.reshape(n, -1)
-        return np.concatenate([each, each[:, coulomb, None]], axis=1).reshape(-1)
-
-    unit = wider(problem.unit[first:])
-    scale = np.concatenate([problem.scale[first:].reshape(n, -1), unit.reshape(n, -1)[:, -1:]], axis=1).reshape(-1)
+    known, scaled = (each[first:].reshape(n, -1) for each in (problem.unit, problem.scale))
+    coulomb = known[:, FRICTION_TERMS.index("coulomb"), None]
+    unit, scale = (np.concatenate([each, coulomb], axis=1).reshape(-1) for each in (known, scaled))
     return replace(
         problem,
         friction=joint_friction(problem.motions[:, 1], stribeck=True),

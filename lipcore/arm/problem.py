@@ -103,7 +103,7 @@ class Problem:
 
     @property
     def bodies(self) -> int:
-        """Weights of masses and rotors, those before friction's."""
+        """Number of the weights of masses and rotors, which come before those of friction."""
         return (PARAMETERS + 1) * self.n_joints
 
     @property
@@ -195,7 +195,7 @@ class Problem:
         return self.tau - point.features @ (self.weights(point) / self.scale)
 
     def with_noise(self, point: Point) -> Point:
-        """The point with the noise that its residuals say: their variance over the degrees of freedom that are left.
+        """Return the point with the noise of its residuals: their squares over the degrees of freedom that are left.
 
         Every row tells of the noise, however few of them are independent: errors that last are as large as others.
         """

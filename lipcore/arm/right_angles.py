@@ -180,14 +180,10 @@ def _axes(geometry: Geometry) -> Array:
 
 def _turned(geometry: Geometry) -> tuple[Geometry, Array]:
     """The arm turned about the vertical so that most axes lie at right angles, and how far off each is, (n,) rad."""
-    best, turned, off = np.inf, geometry, np.zeros(geometry.n_joints)
-    for yaw in np.radians(np.arange(0.0, 90.0, 0.5)):
-        turn = rotation_of(np.array([0.0, 0.0, yaw]))
-        angle = np.arccos(np.clip((_axes(geometry) @ turn.T @ DIRECTIONS.T).max(axis=1), -1, 1))
-        score = float(np.minimum(angle, np.radians(20)).sum())
-        if score < best:
-            best, off = score, angle
-            rotation, translation = geometry.rotation.copy(), geometry.translation.copy()
-            rotation[0], translation[0] = turn @ rotation[0], turn @ translation[0]
-            turned = replace(geometry, rotation=rotation, translation=translation)
-    return turned, off
+    axes = _axes(geometry)
+    turns = [rotation_of(np.array([0.0, 0.0, yaw])) for yaw in np.radians(np.arange(0.0, 90.0, 0.5))]
+    angles = [np.arccos(np.clip((axes @ turn.T @ DIRECTIONS.T).max(axis=1), -1, 1)) for turn in turns]
+    best = int(np.argmin([np.minimum(each, np.radians(20)).sum() for each in angles]))
+    rotation, translation = geometry.rotation.copy(), geometry.translation.copy()
+    rotation[0], translation[0] = turns[best] @ rotation[0], turns[best] @ translation[0]
+    return replace(geometry, rotation=rotation, translation=translation), angles[best]

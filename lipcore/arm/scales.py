@@ -24,7 +24,7 @@ from lipcore.kernels.arm_prior import KINDS
 from lipcore.kernels.compiled.arm import PARAMETERS
 
 MAX_LOG_SHARE = 2.5
-"""Largest logarithm, either way, of what the deviations of masses and rotors are made of: a factor of 12."""
+"""Limit on the shares of masses and rotors, as a logarithm either way: a factor of 12."""
 MIN_FRICTION_SHARE = 0.1
 """Smallest deviation of a friction torque, as a share of its joint's root mean square torque, which is the largest."""
 POOLING_WIDTH = 0.7
