@@ -32,11 +32,11 @@ COMPONENTS: tuple[ComponentName, ...] = get_args(ComponentName)
 AUTO = "auto"
 """Of several estimators, the simplest unless another one is surely better (`lipcore.training.auto`)."""
 DEFAULT_ESTIMATOR = AUTO
-CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", "rigid-body", "rigid-body+lip-chain")
-"""What may be asked for: `auto`, and the estimators of `lipcore.fitting.estimators`."""
-CHAINED_ARM = "rigid-body+lip-chain"
-ROBOT_ESTIMATORS = ("rigid-body", CHAINED_ARM)
+RIGID, LOCAL, CHAINED_ARM = "rigid-body", "rigid-body+local", "rigid-body+lip-chain"
+ROBOT_ESTIMATORS = (RIGID, LOCAL, CHAINED_ARM)
 """Estimators with the term `rigid_body`, which take a robot."""
+CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", *ROBOT_ESTIMATORS)
+"""What may be asked for: `auto`, and the estimators of `lipcore.fitting.estimators`."""
 
 DIFFERENTIATED = ("se", "gip", "lse")
 """Estimators that torch differentiates as they are trained: the extra `train`. What they answer needs none."""

@@ -19,8 +19,9 @@ from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.training.train import train
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 
-COMPILED = ("lip", "lip-chain", "rigid-body", "rigid-body+lip-chain")
+COMPILED = ("lip", "lip-chain", *ROBOT_ESTIMATORS)
 """Estimators with compiled terms. What all have in common comes with each."""
 SAMPLES = 60
 LEAST = FitOptions(

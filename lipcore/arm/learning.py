@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from lipcore.arm import right_angles
 from lipcore.arm.posing import make_problem, mode_of, surroundings, with_samples, with_stribeck
 from lipcore.arm.problem import UNIT_WIDTH, Point, Problem, root_of
-from lipcore.arm.right_angles import MAX_SWEEPS, NEAR_NATS, Candidate, Layout
+from lipcore.arm.right_angles import NEAR_NATS, Candidate, Layout
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Pool, SearchResult, search
 from lipcore.data.samples import Array, Samples
@@ -101,8 +101,7 @@ def learn(
         counting = _Counting(task.contiguous(CORRELATED), order, shared_rows(samples, len(rows)))
         problem = counting.applied(problem, ends[0], at_rest=False)
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
-        layouts = (known, 0 if begin else MAX_SWEEPS) if mode == "learn" else None
-        found, stribeck_nats = _refined(problem, ends, counting, watch, layouts)
+        found, stribeck_nats = _refined(problem, ends, counting, watch, known if mode == "learn" else None)
         best, problem = found[0].point, found[0].problem
         misfit, _ = counting.misfit(problem, best, best.sigma**2)
         watch.step("posterior", best.value, 0.95)
@@ -177,20 +176,19 @@ def _refined(
     ends: Sequence[Point],
     counting: _Counting,
     watch: _Watch,
-    layouts: tuple[Sequence[Geometry], int] | None,
+    known: Sequence[Geometry] | None,
 ) -> tuple[list[Candidate], float]:
     """Return the most likely arm and the others that are nearly as likely, with the scales and the noise of the first,
     and how many nats friction's fourth term gains, which is there if the evidence wants it.
 
-    layouts: known geometries and sweeps of the search for right angles, if the geometry is learnt from nothing; else
-    None.
+    known: geometries for the search for right angles, if the geometry is learnt from nothing; else None.
     """
     best, problem = _in_turn(problem, ends[0], ROUNDS, 0.85, watch)
     free: Layout = (None,) * problem.n_joints
     others = [end for end in ends[1:] if end.value < ends[0].value + 2 * NEAR_NATS]
     starts = [(free, problem.expected, end) for end in (best, *others)]
-    if layouts is not None:
-        chosen = right_angles.likely_layouts(problem, [best, *ends[1:]], *layouts, watch.stop)
+    if known is not None:
+        chosen = right_angles.likely_layouts(problem, [best, *ends[1:]], known, watch.stop)
         starts = [*((each.layout, each.problem.expected, each.point) for each in chosen), *starts]
         problem = replace(problem, expected=starts[0][1])
         best, problem = _in_turn(problem, starts[0][2], STRIBECK_ROUNDS, 0.87, watch)

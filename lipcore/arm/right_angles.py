@@ -65,29 +65,26 @@ def likely_layouts(
     problem: Problem,
     ends: Sequence[Point],
     known: Sequence[Geometry] = (),
-    sweeps: int = MAX_SWEEPS,
     stop: Callable[[], bool] | None = None,
 ) -> list[Candidate]:
     """Return the layouts that are more likely than the first of some optima is without one: at most MAX_KEPT.
 
     They are compared on few rows of the problem, which count for all. A search starts at the optima, with the axes that
     lie near a direction put there, at known geometries, and at TYPICAL_LAYOUTS. The best of these are improved: each
-    joint in turn is tried in all directions, `sweeps` times at most, until that gains nothing. Without sweeps only the
-    optima and known geometries are looked at, to which an earlier search has led.
+    joint in turn is tried in all directions, MAX_SWEEPS times at most, until that gains nothing.
     """
     rows = np.unique(np.linspace(0, len(problem.tau) - 1, SEARCH_ROWS).round().astype(np.int64))
     few = problem.rows(rows)
     few = replace(few, counts=few.counts * (len(problem.tau) / len(rows)))
     search = _Search(few, ends[0].sigma, stop)
-    usual = TYPICAL_LAYOUTS.get(problem.n_joints, ()) if sweeps else ()
-    typical = [tuple(AXES.index(axis) for axis in axes) for axes in usual]
+    typical = [tuple(map(AXES.index, axes)) for axes in TYPICAL_LAYOUTS.get(problem.n_joints, ())]
     starts = [
         *(search.nearest(end.geometry, NEAR_RAD) for end in ends[:MAX_KEPT]),
         *(search.nearest(geometry, np.inf) for geometry in known),
         *(search.settle(ends[0].geometry, layout) for layout in typical),
     ]
     for start in sorted({each.layout: each for each in starts}.values(), key=_evidence)[:MAX_IMPROVED]:
-        search.improve(start, sweeps)
+        search.improve(start)
     limit = weigh(few, few.at(ends[0].geometry, ends[0].sigma), (None,) * problem.n_joints).evidence
     ranked = sorted(search.found.values(), key=_evidence)
     return [each for each in ranked[:MAX_KEPT] if each.evidence < min(limit, ranked[0].evidence + NEAR_NATS)]
@@ -122,9 +119,9 @@ class _Search:
             turned, tuple(int(at) if angle < within else None for at, angle in zip(nearest, off, strict=True))
         )
 
-    def improve(self, best: Candidate, sweeps: int) -> None:
+    def improve(self, best: Candidate) -> None:
         """Try each joint in all directions until that gains nothing."""
-        for _ in range(sweeps):
+        for _ in range(MAX_SWEEPS):
             before = best.evidence
             for joint in range(len(best.layout)):
                 for direction in (*range(len(DIRECTIONS)), None):

@@ -143,6 +143,11 @@ class Answer(NamedTuple):
         """Which torques, (N, n), lie inside its 95 % intervals."""
         return np.asarray(np.abs(tau - self.mean) <= quantile(LEVEL) * self.scale * self.spread)
 
+    def shortfall(self, tau: Array) -> Array:
+        """Factor on its 95 % intervals with which they hold 95 % of the torques of each joint, (n,), at least 1."""
+        parts = np.abs(tau - self.mean) / (quantile(LEVEL) * self.scale * self.spread)
+        return np.asarray(np.quantile(parts, LEVEL, axis=0).clip(1.0))
+
 
 @dataclass(frozen=True)
 class Comparison:

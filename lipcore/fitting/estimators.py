@@ -21,6 +21,7 @@ from lipcore.kernels.chain import ChainKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lip import LipKernel
+from lipcore.kernels.local import LocalKernel
 from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.robots.urdf import JointMismatchError, RigidBody
 from lipcore.vocabulary import AUTO, CHOICES, ROBOT_ESTIMATORS, JointType
@@ -65,6 +66,7 @@ ESTIMATORS: dict[str, Maker] = {
     "gip": lambda types, tied: {"torque": GeometricallyInspiredKernel(types)},
     "lse": lambda types, tied: {"torque": LagrangianSEKernel(types)},
     "rigid-body": lambda types, tied: {},
+    "rigid-body+local": lambda types, tied: {"local": LocalKernel(len(types))},
     "rigid-body+lip-chain": lambda types, tied: {"energy": _ResidualChainKernel(types)},
 }
 
@@ -86,7 +88,7 @@ def make_estimator(
     friction = FrictionKernel(len(types), arm is not None and arm.stribeck)
     terms = {**ESTIMATORS[name](types, tied), "friction": friction}
     if (name in ROBOT_ESTIMATORS) != (arm is not None):
-        raise ValueError(f"estimator {name!r}: expected an arm for {' and '.join(ROBOT_ESTIMATORS)}, and for no other")
+        raise ValueError(f"estimator {name!r}: expected an arm for {', '.join(ROBOT_ESTIMATORS)}, and for no other")
     if arm is None:
         return Estimator(name, terms)
     of_arm = tuple(arm.geometry.joint_types[place] for place in arm.place)
@@ -129,6 +131,7 @@ FUNCTION_STD_FACTOR = {
     "lip-chain": 1.1,
     "rigid-body": 1.0,
     "rigid-body+lip-chain": 1.1,
+    "rigid-body+local": 1.0,
     "se": 1.75,
     "gip": 1.2,
     "lse": 1.8,

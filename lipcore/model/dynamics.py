@@ -187,7 +187,7 @@ def _push(q: Array, joint: int) -> Motion:
 
 
 def _dynamics_terms(estimator: Estimator) -> list[TorqueKernel]:
-    return [term for name, term in estimator.terms.items() if name not in ("friction", "others")]
+    return [term for name, term in estimator.terms.items() if name not in ("friction", "local", "others")]
 
 
 def _energy_terms(estimator: Estimator) -> list[EnergyKernel]:

@@ -34,6 +34,7 @@ from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.linalg import block_diagonal, eigen
 from lipcore.posterior.statistics import known
 from lipcore.robots.urdf import PARAMETERS
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 ROOM = 10.0
 """Prior variance that a payload's parameters get, in units of their own: Σ ≤ k diag Σ holds for every covariance of k
@@ -80,7 +81,7 @@ class Carrier:
         if self.model.arm is None:
             raise NoArmError(
                 f"estimator {self.model.estimator.name!r} knows no rigid bodies, expected a model of estimator "
-                "rigid-body or rigid-body+lip-chain"
+                f"{', '.join(ROBOT_ESTIMATORS)}"
             )
 
     def knows_as(self, other: Carrier) -> bool:

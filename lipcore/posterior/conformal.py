@@ -6,7 +6,8 @@ was fitted to all blocks, hyperparameters and what the basis is linearised aroun
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,10 @@ class Conformal:
             raise ValueError(f"guaranteed is {list(self.guaranteed)}, expected a share from 0 to 1 for each scale")
         if self.blocks < 1:
             raise ValueError(f"blocks is {self.blocks}, expected at least 1")
+
+    def widened(self, factors: Sequence[float]) -> Conformal:
+        """The same with scales times factors, (n,), at least 1."""
+        return replace(self, scale=tuple(np.multiply(self.scale, factors).tolist()))
 
 
 def conform(posterior: CompactPosterior, samples: Samples, variance: Array) -> Conformal:

@@ -22,16 +22,24 @@ from lipcore.fitting.task import Task
 from lipcore.model.selection import Candidate, HeldOut, plain, selection, unjudged
 from lipcore.model.torque_model import TorqueModel
 from lipcore.training.choice import HeldOutSamples, choose_estimator
+from lipcore.training.correction import corrected_joints
 from lipcore.training.fit import fit_estimator
 from lipcore.training.held_out import HoldOut, hold_out
-from lipcore.training.refit import refit
-from lipcore.vocabulary import ROBOT_ESTIMATORS
+from lipcore.training.refit import refit, widened
+from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
 
-RIGID, CHAIN, BOTH = "rigid-body", "lip-chain", "rigid-body+lip-chain"
-MOST_PHYSICS_FIRST = (RIGID, BOTH, CHAIN)
+CHAIN = "lip-chain"
+MOST_PHYSICS_FIRST = (RIGID, LOCAL, CHAIN)
 """The simplest first: an estimator that knows the arm errs less where nothing was measured."""
 AGAIN, ALL, FEW = "again", "all", "few"
-PLACES = {RIGID: (0, 0.25), BOTH: (0.25, 0.55), CHAIN: (0.55, 0.92), AGAIN: (0.92, 0.97), ALL: (0.97, 1), FEW: (0, 1)}
+PLACES = {
+    RIGID: (0, 0.25),
+    LOCAL: (0.25, 0.3),
+    CHAIN: (0.3, 0.92),
+    AGAIN: (0.92, 0.97),
+    ALL: (0.97, 1),
+    FEW: (0, 1),
+}
 """Which share of all the work each fit is, from and to."""
 JUDGED = 2000
 """Held-out samples at most that are predicted."""
@@ -70,7 +78,7 @@ def _of_all(work: Fits, contest: Contest, chosen: str) -> TorqueModel:
     """The chosen model as it is when it has learnt all samples."""
     model = contest.entries[chosen].model
     assert model is not None  # what is chosen was trained
-    return refit(model, replace(work.task, on_progress=work.overall.of(chosen, ALL)))
+    return refit(widened(model, contest.held.samples), replace(work.task, on_progress=work.overall.of(chosen, ALL)))
 
 
 def _unjudged(work: Fits, reason: str) -> TorqueModel:
@@ -171,13 +179,13 @@ class Contest:
         self.entries[RIGID], self.learnt = self._rigid(RIGID)
         if self._is_explained():
             return
-        self.entries[BOTH] = self._enter(BOTH, BOTH, self.learnt) if self.learnt else self.entries[RIGID]
+        self.entries[LOCAL] = self._enter(LOCAL, LOCAL, self.learnt) if self.learnt else self.entries[RIGID]
         self.entries[CHAIN] = self._enter(CHAIN, CHAIN, self.learnt)
         if self.learnt and mode_of(self.work.task) == "learn" and self._chain_leads():
             entry, learnt = self._rigid(AGAIN, self.learnt)
             if learnt and entry.density > self.entries[RIGID].density:
                 self.entries[RIGID], self.learnt = entry, learnt
-                self.entries[BOTH] = self._enter(BOTH, AGAIN, learnt)
+                self.entries[LOCAL] = self._enter(LOCAL, AGAIN, learnt)
         errors = [each.error for each in self.entries.values() if each.error is not None]
         if len(errors) == len(self.entries):
             raise errors[0]
@@ -187,6 +195,9 @@ class Contest:
         if len(self.entries) == 1:
             return RIGID, "it explains the held-out torque to the sensor's noise, so no other estimator was trained"
         answers = {name: self.entries[name].answer for name in MOST_PHYSICS_FIRST}
+        local = self.entries[LOCAL].model
+        if local is None or not corrected_joints(local.fit):
+            del answers[LOCAL]
         return choose_estimator(self.held, {name: each for name, each in answers.items() if each is not None})
 
     def table(self) -> list[Candidate]:

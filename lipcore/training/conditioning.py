@@ -15,6 +15,8 @@ from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.linalg import unpack_symmetric
 from lipcore.posterior.statistics import Statistics
 from lipcore.posterior.summing import CHUNK, Summing, Total
+from lipcore.training.correction import side_by_side
+from lipcore.vocabulary import LOCAL
 
 SHARD = 2048
 """Samples that are summed up by themselves, whoever does it: about a second of one core for seven joints."""
@@ -80,11 +82,14 @@ def sum_samples(
 def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> TorqueModel:
     """The model with the posterior of `count` samples with these sums, instead of those of its fit.
 
-    Hyperparameters and basis stay.
+    Hyperparameters and basis stay, and so does a local correction: the sums are of the arm beside it.
     """
     posterior = model.posterior
-    a = unpack_symmetric("a", sums.a)
-    statistics = Statistics(a, sums.b, sums.weight)
+    statistics = Statistics(unpack_symmetric("a", sums.a), sums.b, sums.weight)
+    if model.estimator.name == LOCAL and posterior.statistics is not None:
+        known, first = posterior.statistics, len(posterior.basis.outputs)
+        correction = Statistics(known.a[:first, :first], known.b[:first], known.samples)
+        statistics = side_by_side(correction, Statistics(statistics.a[first:, first:], sums.b[first:], sums.weight))
     updated = CompactPosterior.build(
         posterior.kernel,
         posterior.basis,

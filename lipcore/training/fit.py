@@ -12,10 +12,10 @@ from lipcore.arm.search import known_geometries
 from lipcore.data.independence import motion_dimensions
 from lipcore.data.samples import Samples
 from lipcore.fitting.estimators import Estimator, calibrate, check_estimator, make_estimator
-from lipcore.fitting.hyperparameters import fit
+from lipcore.fitting.hyperparameters import FitProgress, fit
 from lipcore.fitting.options import FitOptions
 from lipcore.fitting.task import Task
-from lipcore.kernels.base import Params
+from lipcore.kernels.base import Params, SumKernel
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.parameters import friction_coefficients
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
@@ -24,7 +24,8 @@ from lipcore.posterior.compression import Compression, compressed, linear
 from lipcore.posterior.conformal import Conformal, conform
 from lipcore.posterior.misfit import Misfit, estimate, shared_rows
 from lipcore.posterior.statistics import collect
-from lipcore.vocabulary import ROBOT_ESTIMATORS
+from lipcore.training.correction import correct
+from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
 
 LEAST_SAMPLES = 50
 """That hyperparameters are fitted to."""
@@ -33,13 +34,17 @@ CONTIGUOUS = 4000
 
 
 def fit_estimator(
-    task: Task, name: str, learnt: Learnt | None = None, geometries: Sequence[Geometry] = ()
+    task: Task,
+    name: str,
+    learnt: Learnt | None = None,
+    geometries: Sequence[Geometry] = (),
+    corrected: Sequence[int] = (),
 ) -> TorqueModel:
     """Train one estimator on the samples of a task.
 
     name: one of `lipcore.fitting.estimators.ESTIMATORS`; learnt: what these samples have led to of the rigid bodies,
     where that is known already, which tells estimators without them how unsure friction at rest is; geometries: base to
-    tip, that a search for one looks at first.
+    tip, that a search for one looks at first; corrected: joints that an earlier fit has corrected.
     Raise ValueError as `check_estimator` does, FitCancelledError, or NotPositiveDefiniteError.
     """
     samples, types, options = task.samples, task.joint_types, task.options
@@ -54,13 +59,18 @@ def fit_estimator(
     estimator = make_estimator(name, types, options.tied, None if learnt is None else learnt.arm)
     calibration = calibrate(name)
     factor = calibration.function_std_factor
-    if learnt is not None and name == "rigid-body":
+    if learnt is not None and name in (RIGID, LOCAL):
         report = {**learnt.report, "jitter": 0.0}
         used = samples.rows(learnt.rows)
         variance = np.exp(2 * learnt.params["noise.log_std"]) / learnt.counts
-        compression = linear(
-            estimator.kernel, learnt.params, used, variance, options.compact_tolerance, factor, learnt.misfit
-        )
+        arm = SumKernel(*(term for kind, term in estimator.terms.items() if kind != "local"))
+        compression = linear(arm, learnt.params, used, variance, options.compact_tolerance, factor, learnt.misfit)
+        if name == LOCAL:
+            if task.on_progress is not None:
+                task.on_progress(FitProgress("posterior", 0, 0, float(learnt.report["objective"]), 0.0, 0.0))
+            correction = correct(estimator.kernel, compression.posterior, samples, corrected)
+            compression = replace(compression, posterior=correction.posterior)
+            report |= correction.report()
         conformal = conform(compression.posterior, used, variance)
     else:
         # not the noise: what rigid bodies leave of the torque is what the other term is there for

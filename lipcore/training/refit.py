@@ -3,37 +3,60 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 
 from lipcore.arm.learning import learn
 from lipcore.data.independence import motion_dimensions
+from lipcore.data.samples import Samples
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
 from lipcore.fitting.task import Task
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.selection import spread_out
+from lipcore.training.correction import corrected_joints
 from lipcore.training.fit import compact, fit_estimator
+from lipcore.vocabulary import LOCAL, RIGID
+
+WIDENED = "widened_"
+"""How the entries of a fit's report begin that say how much wider a joint's intervals are than its training says."""
+
+
+def widened(model: TorqueModel, samples: Samples) -> TorqueModel:
+    """Return the model with intervals that hold 95 % of the torques of samples that it has not learnt, or its own."""
+    factors = model.predict(samples.q, samples.dq, samples.ddq).interval.shortfall(samples.tau)
+    known = {joint: float(model.fit.get(f"{WIDENED}{joint + 1}", 1.0)) * each for joint, each in enumerate(factors)}
+    report = {f"{WIDENED}{joint + 1}": round(each, 3) for joint, each in known.items() if each > 1}
+    return _wider(replace(model, fit={**model.fit, **report}), factors.tolist())
+
+
+def _wider(model: TorqueModel, factors: Sequence[float]) -> TorqueModel:
+    return model if model.conformal is None else replace(model, conformal=model.conformal.widened(factors))
 
 
 def refit(model: TorqueModel, task: Task) -> TorqueModel:
     """Return the model trained on the samples of a task, from where its own training ended.
 
-    `rigid-body` follows the geometries of the model without a search. The other estimators keep their arm and
-    hyperparameters; their basis and posterior are made anew. `selection` and the report of the search are kept.
+    An arm follows the geometries of the model without a search; what is corrected beside it stays so. The other
+    estimators keep their arm and hyperparameters; their basis and posterior are made anew. `selection`, the report of
+    the search and what `widened` says are kept.
 
     task: of the model's robot, with its joints, torque convention and options.
     Raise FitCancelledError, ValueError as `learn` does, or NotPositiveDefiniteError.
     """
     began, name = time.monotonic(), model.estimator.name
-    if name == "rigid-body":
+    if name in (RIGID, LOCAL):
         assert model.arm is not None  # it is what the estimator is made of
         learnt = learn(task, begin=model.arm.geometries)
         searched = {key: value for key, value in model.fit.items() if key.startswith("search_")}
-        again = fit_estimator(task, name, replace(learnt, report={**learnt.report, **searched}))
+        learnt = replace(learnt, report={**learnt.report, **searched})
+        again = fit_estimator(task, name, learnt, corrected=corrected_joints(model.fit))
         again = replace(again, selection=model.selection)
     else:
         again = _with_posterior_of(model, task)
-    seconds = float(model.fit["seconds"]) + time.monotonic() - began
-    return replace(again, fit={**again.fit, "seconds": seconds})
+    kept = {key: value for key, value in model.fit.items() if key.startswith(WIDENED)}
+    kept["seconds"] = float(model.fit["seconds"]) + time.monotonic() - began
+    again = replace(again, fit={**again.fit, **kept})
+    return _wider(again, [float(kept.get(f"{WIDENED}{joint + 1}", 1.0)) for joint in range(model.n_joints)])
 
 
 def _with_posterior_of(model: TorqueModel, task: Task) -> TorqueModel:

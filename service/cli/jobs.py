@@ -122,8 +122,8 @@ def train(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help=f"One of {', '.join(CHOICES)}; {DEFAULT_ESTIMATOR} by default, which compares three on held-out "
-            "rows and takes the simplest unless another one is surely better.",
+            help=f"One of {', '.join(CHOICES)}; {DEFAULT_ESTIMATOR} by default, which compares arms and `lip-chain` "
+            "on held-out rows and takes the simplest unless another one is surely better.",
             autocompletion=lambda: list(CHOICES),
         ),
     ] = None,

@@ -16,7 +16,7 @@ from lipcore.model import dynamics
 from lipcore.model.functionals import Estimate
 from lipcore.model.payload import NoArmError
 from lipcore.model.torque_model import TorqueModel
-from lipcore.vocabulary import ComponentName, TorqueConvention
+from lipcore.vocabulary import ROBOT_ESTIMATORS, ComponentName, TorqueConvention
 from service.foundation.errors import invalid_request
 from service.inference.payload import Payload
 from service.inference.schema import PredictRequest
@@ -123,7 +123,7 @@ def carrying(served: Served, payload: Payload | None) -> TorqueModel:
     try:
         return served.declared.model(payload.numbers)
     except NoArmError:
-        rigid = "knows no rigid bodies to add it to, one of rigid-body or rigid-body+lip-chain does"
+        rigid = f"knows no rigid bodies to add it to, one of {', '.join(ROBOT_ESTIMATORS)} does"
         expected = f"no payload: a model with the estimator {served.model.estimator.name} {rigid}"
         raise invalid_request("payload", "given", expected) from None
     except ValueError as error:  # names a field of the payload first, and last what was expected

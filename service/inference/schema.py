@@ -107,8 +107,8 @@ class PredictRequest(VersionChoice):
     payload: Payload | None = Field(
         None,
         description="Answer for the arm with this on its last link, and nothing else that it did not have in training. "
-        "For models with `rigid-body` or `rigid-body+lip-chain`. It is taken as exact: `tau_std` is what the model "
-        "does not know of the arm with it. A model of gravity-compensated torques leaves out its weight, too",
+        "For models with rigid bodies, as of `rigid-body`. It is taken as exact: `tau_std` is what the model does not "
+        "know of the arm with it. A model of gravity-compensated torques leaves out its weight, too",
     )
 
 

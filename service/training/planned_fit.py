@@ -6,6 +6,7 @@ import logging
 from dataclasses import dataclass, replace
 from typing import Any
 
+from lipcore.data.samples import Samples
 from lipcore.files.checks import MAX_NAME
 from lipcore.fitting.hyperparameters import Progress
 from lipcore.fitting.options import FitOptions
@@ -14,7 +15,7 @@ from lipcore.model.selection import shortened
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import REFIT_ERROR
 from lipcore.training.conditioning import should_condition
-from lipcore.training.refit import refit
+from lipcore.training.refit import refit, widened
 from lipcore.training.train import fit_model
 from lipcore.vocabulary import JointType
 from service.foundation.settings import Settings
@@ -62,12 +63,16 @@ class PlannedFit:
         task = self._task(pulse.progress, pulse)
         return self._on_all_rows(settings, fit_model(task, estimator, material.geometries), pulse)
 
-    def last(self, settings: Settings, judged: TorqueModel, pulse: Pulse) -> TorqueModel:
-        """Fit the model that was judged to all rows. If that fails, return it as judged; its report then says so."""
+    def last(self, settings: Settings, judged: TorqueModel, held_out: Samples, pulse: Pulse) -> TorqueModel:
+        """Fit the model that was judged to all rows. If that fails, return it as judged; its report then says so.
+
+        held_out: what it was judged on, of which its intervals are to hold 95 %.
+        """
         pulse.plan(LAST_FIT_ROWS, self.pass_rows)
         pulse.stage(LAST_FIT)
         try:
-            return self._on_all_rows(settings, refit(judged, self._task(pulse.last_fit, pulse)), pulse)
+            again = refit(widened(judged, held_out), self._task(pulse.last_fit, pulse))
+            return self._on_all_rows(settings, again, pulse)
         except (ArithmeticError, ValueError) as error:
             logger.exception("the fit on all rows failed: the version is the model that was judged")
             why = shortened(f"{type(error).__name__}: {error}")[:MAX_NAME]

@@ -79,8 +79,8 @@ class JobRequest(BaseModel):
     estimator: str = Field(
         DEFAULT_ESTIMATOR,
         max_length=40,
-        description=f"One of {', '.join(CHOICES)}; `auto` compares three on held-out rows and takes the simplest "
-        "unless another one is surely better",
+        description=f"One of {', '.join(CHOICES)}; `auto` compares arms and `lip-chain` on held-out rows and takes "
+        "the simplest unless another one is surely better",
     )
     joint_types: list[JointType] | None = Field(
         None, description="One a joint; by default those of the robot that a data set was uploaded with, else revolute"

@@ -135,8 +135,8 @@ def _version(
         pulse.stage("evaluating")
         lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(settings, trained, material)}
     judged, learnt = _judged(settings, database, files, claim, material, trained, lineage), material
-    if last is not None:
-        trained = last.last(settings, trained, pulse)
+    if last is not None and material.held_out is not None:
+        trained = last.last(settings, trained, material.held_out.thinned(settings.max_evaluation_samples), pulse)
         if REFIT_ERROR not in trained.fit:
             lineage["holdout"]["learnt"], learnt = True, last.material
     lineage |= {

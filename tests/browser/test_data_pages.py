@@ -101,7 +101,7 @@ def test_the_form_offers_the_estimators_there_are(visitor: Visitor) -> None:
     page = visitor.open("#/train")
     page.get_by_text("More estimators").click()
     assert [each.get_attribute("value") for each in page.get_by_role("radio").all()] == list(
-        dict.fromkeys(["auto", "rigid-body", "lip-chain", "rigid-body+lip-chain", *ESTIMATORS])
+        dict.fromkeys(["auto", "rigid-body", "rigid-body+local", "lip-chain", "rigid-body+lip-chain", *ESTIMATORS])
     )
     for name in ESTIMATORS:
         page.locator(f'input[type=radio][value="{name}"]').check()

@@ -6,6 +6,7 @@ import re
 
 import pytest
 
+from lipcore.fitting.estimators import ESTIMATORS
 from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard
 from tests.browser.visitor import Visitor
@@ -25,7 +26,7 @@ def test_two_estimators_are_seen_and_all_others_behind_more(visitor: Visitor, da
     expect(estimators.get_by_role("radio", name=re.compile("^rigid-body with .*[Pp]anda"))).to_be_visible()
     estimators.get_by_text("More estimators").click()
     known = {each.get_attribute("value") for each in estimators.get_by_role("radio").filter(visible=True).all()}
-    assert known == {"auto", "rigid-body", "lip-chain", "rigid-body+lip-chain", "lip", "se", "gip", "lse"}
+    assert known == {"auto", *ESTIMATORS}
     assert audit(page) == []
 
 

@@ -61,7 +61,7 @@ def test_refit_learns_rows_that_the_model_has_not_seen(estimator):
     task, part = parted(resting(), estimator)
     part = replace(part, selection=selection(estimator, "it was chosen", []))
     whole = refit(part, task)
-    assert nmse(whole, unseen())[2] < 0.3 * nmse(part, unseen())[2]
+    assert nmse(whole, unseen())[2] < 0.5 * nmse(part, unseen())[2]
     assert whole.estimator.name == part.estimator.name
     assert whole.selection == part.selection
     assert (part.fit["samples_given"], whole.fit["samples_given"]) == (CUT, 200)

@@ -106,7 +106,11 @@ PANDA = RobotKind(("a", "b"), ("revolute", "prismatic"), "gravity_included")
     ("given", "field", "message"),
     [
         ({"order": None}, "base", "'m:1', expected a version whose estimator has an arm, rigid-body or rigid-body"),
-        ({"estimator": "lip"}, "estimator", "'lip', expected one of auto, rigid-body, rigid-body+lip-chain with a"),
+        (
+            {"estimator": "lip"},
+            "estimator",
+            "'lip', expected one of auto, rigid-body, rigid-body+local, rigid-body+lip-chain with a",
+        ),
         ({"data": replace(PANDA, joint_names=("a", "c"))}, "base", "joint_names of the data, a, c; it has a, b"),
         (
             {"data": replace(PANDA, joint_types=("revolute",) * 2)},

@@ -47,7 +47,7 @@ def test_a_first_training_compiles_nothing_more(name: str) -> None:
     model = train(samples, ("revolute", "prismatic", "revolute"), name, options)
     model.predict(q, dq, ddq, covariance=True)
     model.evaluator.one(np.ascontiguousarray(np.stack([q[0], dq[0], ddq[0]])))
-    energies = [term for term in model.estimator.terms.values() if not hasattr(term, "stribeck")]
+    energies = [term for kind, term in model.estimator.terms.items() if kind not in ("friction", "local")]
     kinetic_energy(model.posterior, energies, Motion.from_arrays(q[:2], dq[:2], ddq[:2]))
     if model.arm is not None:
         friction = np.zeros((3, 4 if model.arm.stribeck else 3))
@@ -57,7 +57,7 @@ def test_a_first_training_compiles_nothing_more(name: str) -> None:
 
 
 def test_only_what_there_is_can_be_named() -> None:
-    with pytest.raises(ValueError, match=r"expected names out of lip, lip-chain, rigid-body, rigid-body\+lip-chain"):
+    with pytest.raises(ValueError, match="expected names out of lip, lip-chain, rigid-body"):
         warm_up("lip", "gpu")
 
 

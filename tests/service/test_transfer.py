@@ -48,8 +48,12 @@ def test_a_unit_starts_from_another_which_may_go(api, first, second):
 @pytest.mark.parametrize(
     ("given", "field", "message"),
     [
-        ({"estimator": "lip-chain"}, "estimator", "one of auto, rigid-body, rigid-body+lip-chain with a base"),
-        ({"base": "pendulum:1"}, "base", "a version whose estimator has an arm, rigid-body or rigid-body+lip-chain"),
+        (
+            {"estimator": "lip-chain"},
+            "estimator",
+            "one of auto, rigid-body, rigid-body+local, rigid-body+lip-chain with",
+        ),
+        ({"base": "pendulum:1"}, "base", "a version whose estimator has an arm, rigid-body or rigid-body"),
         ({"joint_types": ["prismatic"] * 7}, "base", "joint_types of the data, prismatic, prismatic"),
         ({"robot": "panda"}, "robot", "none with a base"),
         ({"options": {"geometry": "learn"}}, "options.geometry", "auto, calibrate or fixed with a base"),

@@ -52,7 +52,7 @@ def show(learners: Learners, model: str) -> Payloads:
         watched = owner.options(session, model).payloads
     reason = None
     if carrier is None:
-        reason = f"estimator {served.model.estimator.name} knows no arm: train rigid-body, rigid-body+lip-chain or auto"
+        reason = f"estimator {served.model.estimator.name} knows no arm: train rigid-body or auto"
     elif not watched:
         reason = "the option `payloads` of learning is switched off"
     return Payloads(
@@ -97,7 +97,7 @@ def _say(learners: Learners, model: str, stream_id: str | None, known: dict[str,
     if served.carrier is None:
         raise ConflictError(
             f"version {served.version} of model {model!r}, estimator {served.model.estimator.name}, knows no arm that "
-            "could carry anything: train rigid-body, rigid-body+lip-chain or auto"
+            "could carry anything: train rigid-body or auto"
         )
     monitor = learners.monitor(model)
     with learners.turn(model):

@@ -9,7 +9,7 @@ from lipcore import Samples
 from lipcore.data.outliers import CorruptError
 from lipcore.files import persistence
 from lipcore.files.probing import probe
-from lipcore.vocabulary import JOINT_TYPES
+from lipcore.vocabulary import JOINT_TYPES, ROBOT_ESTIMATORS
 from service.cli.verify import verify_home
 from service.foundation.settings import Settings
 from service.models import archive_import
@@ -44,7 +44,7 @@ def recording(seed, joint_types, position, torque, uneven, slow=1.0, aside=0.0):
 @given(
     seed=st.integers(50, 51),
     joint_types=st.lists(st.sampled_from(JOINT_TYPES), min_size=1, max_size=6),
-    estimator=st.sampled_from(["lip-chain", "lip", "rigid-body", "rigid-body+lip-chain", "se", "gip", "lse"]),
+    estimator=st.sampled_from(["lip-chain", "lip", *ROBOT_ESTIMATORS, "se", "gip", "lse"]),
     torque=st.floats(-9.0, 12.0).map(lambda power: 10.0**power) | st.just(LARGE),
     position=st.floats(-6.0, 4.0).map(lambda power: 10.0**power) | st.just(1.0),
     uneven=st.sampled_from([1.0, 1.0, 1e-3, 1e-6]),

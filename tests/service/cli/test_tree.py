@@ -65,7 +65,11 @@ def test_commands_and_options_are_completed(completed):
     assert completed("lipserve mo") == ["models"]
     assert completed("lipserve models pro") == ["promote"]
     assert completed("lipserve predict --comp") == ["--components"]
-    assert completed("lipserve train x.csv --estimator rigid") == ["rigid-body", "rigid-body+lip-chain"]
+    assert completed("lipserve train x.csv --estimator rigid") == [
+        "rigid-body",
+        "rigid-body+local",
+        "rigid-body+lip-chain",
+    ]
     assert "--queries" in completed("lipserve bench latency arm --qu")
     assert "latency" in completed("lipserve bench la")
 

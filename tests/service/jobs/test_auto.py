@@ -5,7 +5,7 @@ import pytest
 from lipcore.robots.dirt import Dirt
 from tests.service.data import QUICK, ended, stream, train, upload
 
-NAMES = ["rigid-body", "rigid-body+lip-chain", "lip-chain"]
+NAMES = ["rigid-body", "rigid-body+local", "lip-chain"]
 OPTIONS = {**QUICK, "posterior_samples": 100, "search_seconds": 1.0, "starts": 1}
 
 

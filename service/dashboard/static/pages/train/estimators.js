@@ -4,8 +4,9 @@ import { h } from "../../dom.js";
 
 /** [name, what it knows and when to use it, whether it can use a robot's URDF]. */
 export const ESTIMATORS = [
-  ["auto", "Compares three estimators on held-out motion. Keeps the simplest unless another one is surely better. Up to three minutes.", true],
+  ["auto", "Compares rigid-body and lip-chain on held-out motion. Keeps the simplest unless another one is surely better. Up to three minutes.", true],
   ["rigid-body", "An arm of rigid bodies: learns its joint axes, masses and friction. For stiff arms.", true],
+  ["rigid-body+local", "The same, corrected near the recorded motion. For robots that repeat it.", true],
   ["lip-chain", "Lagrange's equations of a serial chain. For arms with springs, belts or links that bend.", false],
   ["rigid-body+lip-chain", "Both: the chain learns what rigid bodies miss. For much data.", true],
   ["lip", "The kernel of the paper, to get the paper's results.", false],

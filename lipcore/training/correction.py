@@ -1,0 +1,122 @@
+"""A local correction beside an arm: what it leaves over, where another part of the recording predicts that.
+
+What an arm leaves over lasts: next to a sample it is the same, whether or not the arm comes back to it. So blocks of
+the recording are left out in turn, with the instants next to them, and predicted from the others. A joint is corrected
+if its error falls so by more than chance. The arm stays as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import eigh
+
+from lipcore.data.samples import Array, Samples
+from lipcore.data.splits import GUARD_S, guarded
+from lipcore.kernels.base import TorqueKernel
+from lipcore.kernels.local import LocalKernel, nearness
+from lipcore.posterior.basis import Basis
+from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.linalg import block_diagonal
+from lipcore.posterior.selection import pivots
+from lipcore.posterior.statistics import Statistics, collect
+
+ROWS, BLOCKS = 1000, 10
+"""Rows at most that are looked at, and blocks that they are divided into."""
+NOISE_SHARES = (1e-3, 1e-2, 0.1, 0.3, 1.0)
+"""Noise variances that are tried, as shares of the correction's."""
+GAIN, CHANCE = 0.2, 1.83
+"""What a joint gains at least: a share of its squared error, and standard errors (95 % point of t for ten blocks)."""
+REPORTED = "local_"
+"""How the entries of a fit's report begin that say how well a joint is corrected."""
+NOTHING = 1e-8
+"""Prior variance of a joint that is not corrected, as a share of what is left over."""
+MOST_OUTPUTS, KNOWN = 400, 0.01
+"""Torques at most that the correction is remembered at, and share of its variance that they may leave open."""
+
+
+@dataclass(frozen=True)
+class Correction:
+    """posterior: of arm and correction; errors: (n,), squared error of blocks that are left out, with the correction
+    over without it, 1 for joints that are not corrected."""
+
+    posterior: CompactPosterior
+    errors: Array
+
+    def report(self) -> dict[str, float]:
+        """Errors of the joints that are corrected, for the manifest."""
+        return {f"{REPORTED}{j + 1}": round(float(each), 3) for j, each in enumerate(self.errors) if each < 1}
+
+
+def corrected_joints(report: Mapping[str, object]) -> list[int]:
+    """Joints that a fit's report names as corrected, from 0."""
+    return [int(key.removeprefix(REPORTED)) - 1 for key in report if key.startswith(REPORTED)]
+
+
+def correct(kernel: TorqueKernel, arm: CompactPosterior, samples: Samples, joints: Sequence[int] = ()) -> Correction:
+    """Return the posterior of an arm with a correction of what it leaves over of N samples.
+
+    kernel: the arm's, friction and the local one; joints: which to correct in any case, as an earlier fit did.
+    The noise of a joint that is corrected is what is left of it in blocks that are left out. No joint is corrected of a
+    recording too short to leave BLOCKS of it out in turn.
+    """
+    order = np.lexsort((samples.t, samples.episode))
+    samples = samples.rows(order[np.unique(np.linspace(0, len(samples) - 1, ROWS).round().astype(np.int64))])
+    motion, n = samples.motion(), samples.n_joints
+    left = samples.tau - arm.mean(motion)
+    local = LocalKernel(n)
+    own = local.initial(motion, left)
+    power, near = np.exp(own["local.log_scale"]), nearness(own, motion)
+    with_it, without = _errors(samples, left / np.sqrt(power), near)
+    best = with_it.mean(axis=0).argmin(axis=0)
+    gain = without - with_it[:, best, np.arange(n)]
+    error, chance = without.mean(axis=0), CHANCE * gain.std(axis=0, ddof=1) / np.sqrt(len(gain))
+    corrected = (gain.mean(axis=0) > np.maximum(GAIN * error, chance)) | np.isin(np.arange(n), joints)
+    errors = np.ones(n)
+    errors[corrected] = np.minimum(1 - gain.mean(axis=0)[corrected] / error[corrected], 1.0)
+    own["local.log_scale"] = np.log(np.where(corrected, 1.0, NOTHING) * power)
+    params = {**arm.params, **own, "noise.log_std": arm.params["noise.log_std"] + 0.5 * np.log(errors)}
+    kept = arm.basis.inducing
+    if corrected.any():
+        kept = motion[np.sort(pivots(near, 1, MOST_OUTPUTS // int(corrected.sum()), KNOWN).outputs)]
+    outputs = (np.arange(len(kept))[:, None] * n + np.flatnonzero(corrected)).reshape(-1)
+    taught = collect(Basis.build(local, own, kept, outputs), np.array(NOISE_SHARES)[best] * power, motion, left)
+    assert arm.statistics is not None  # as trained
+    posterior = CompactPosterior.build(
+        kernel,
+        Basis.build(kernel, params, kept, outputs),
+        side_by_side(taught, arm.statistics),
+        arm.noise_variance * errors,
+        arm.std_factor,
+        arm.misfit,
+    )
+    return Correction(posterior, errors)
+
+
+def side_by_side(correction: Statistics, arm: Statistics) -> Statistics:
+    """Statistics of a correction, and of an arm that knows nothing of it."""
+    a, b = block_diagonal([correction.a, arm.a]), np.concatenate([correction.b, arm.b])
+    return Statistics(a, b, arm.samples)
+
+
+def _errors(samples: Samples, left: Array, near: Array) -> tuple[Array, Array]:
+    """Mean squared errors of B blocks that are predicted from the others: for each of NOISE_SHARES, (B, S, n), and
+    without a correction, (B, n); all the same if a block is too short.
+
+    samples: in order; left: (N, n), in units of its root mean square; near: (N, N).
+    """
+    block = np.arange(len(samples)) * BLOCKS // len(samples)
+    with_it, without = [], []
+    for each in range(BLOCKS):
+        parts = guarded(samples.episode, samples.t, np.arange(len(samples)), block == each, GUARD_S)
+        if not (parts.train.any() and parts.held_out.any()):
+            return np.ones((2, len(NOISE_SHARES), left.shape[1])), np.ones((2, left.shape[1]))
+        values, vectors = eigh(near[np.ix_(parts.train, parts.train)])
+        turned, across = vectors.T @ left[parts.train], near[np.ix_(parts.held_out, parts.train)] @ vectors
+        asked = left[parts.held_out]
+        answers = [across @ (turned / (values.clip(0.0) + share)[:, None]) for share in NOISE_SHARES]
+        with_it.append([np.square(asked - answer).mean(axis=0) for answer in answers])
+        without.append(np.square(asked).mean(axis=0))
+    return np.array(with_it), np.array(without)
