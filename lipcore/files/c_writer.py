@@ -2,7 +2,7 @@
 
 Torque is linear in the weights w of arm and friction, tau = Φ w with w ~ N(ŵ, C). The mean is written as one recursion
 over the bodies and their change with the learnt step (no features), the standard deviation as |Uᵀ φ_b|, see
-`c_weights`. A chain of energies adds its covariances with stored torques, see `c_energy`. Each joint's frame is turned
+`c_weights`. A nonlinear term adds its covariances with stored torques, see `c_rest`. Each joint's frame is turned
 so that its axis is z, and the two vectors across it, which the steps of the geometry are about, are x and y.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.samples import Array
-from lipcore.files.c_energy import Energy
+from lipcore.files.c_rest import Rest
 from lipcore.files.c_weights import Learnt, UnsupportedEstimatorError, axes_of, moved, regrouped
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.compiled.answer import ACCELERATED
@@ -28,11 +28,10 @@ from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.model.body import Body
 from lipcore.model.torque_model import TorqueModel
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 TEMPLATES = Path(__file__).parent / "c"
-SOURCE, HEADER, ENERGY = "lipserve_model.c", "lipserve_model.h", "energy.c"
-SUPPORTED = ("rigid-body", "rigid-body+lip-chain")
-"""Estimators whose models can be written."""
+SOURCE, HEADER = "lipserve_model.c", "lipserve_model.h"
 WIDE = 8
 """Columns of a panel of the root."""
 LINE = 100
@@ -55,10 +54,10 @@ class Origin:
 
 def c_files(model: TorqueModel, origin: Origin) -> dict[str, str]:
     """The texts of SOURCE and HEADER by name, ASCII. Raise UnsupportedEstimatorError for an estimator that is not of
-    SUPPORTED."""
-    if model.estimator.name not in SUPPORTED:
+    ROBOT_ESTIMATORS."""
+    if model.estimator.name not in ROBOT_ESTIMATORS:
         raise UnsupportedEstimatorError(
-            f"estimator is {model.estimator.name!r}, expected one of {', '.join(SUPPORTED)} for C"
+            f"estimator is {model.estimator.name!r}, expected one of {', '.join(ROBOT_ESTIMATORS)} for C"
         )
     learnt = Learnt.of(model)
     fields = _texts(model, origin) | _tables(model, learnt) | {"stack": _stack(model)}
@@ -124,7 +123,7 @@ def _tables(model: TorqueModel, learnt: Learnt) -> dict[str, str]:
         "arms": arms,
         "share": share,
         "root": _braced(_panels(root)),
-        **_energy(Energy.of(posterior), shared),
+        **_rest(Rest.of(posterior), shared),
         "misfit": _braced(posterior.misfit.packed()),
         "floor": _braced(posterior.floor),
         "range": _braced(np.array(limits)),
@@ -185,26 +184,21 @@ def _arm_table(geometry: Geometry, step: Array, bodies: Array, change: Array, ow
     return "{\n" + ",\n".join(fields) + "}"
 
 
-def _energy(energy: Energy | None, shared: Array) -> dict[str, str]:
-    """What `energy.c.in` becomes: nothing for rigid bodies alone. shared: V of `Learnt.root`."""
-    if energy is None:
-        return {"outputs": "0", "energy": ""}
+def _rest(rest: Rest | None, shared: Array) -> dict[str, str]:
+    """What a nonlinear term adds; nothing for rigid bodies alone. shared: V of `Learnt.root`."""
+    if rest is None:
+        return {"outputs": "0", "alpha": "{0}", "learnt": "{0}", "shared": "{0}", "factor": "0", "term": ""}
     padded = np.pad(shared, ((0, -len(shared) % WIDE), (0, 0)))
-    names = ("constant", "cosine", "sine")
-    fields = {
-        "outputs": str(len(energy.alpha)),
-        "groups": str(len(energy.samples)),
-        **{name: _braced(column) for name, column in zip(names, energy.shares.T, strict=True)},
-        "scales": _braced(energy.scales),
-        "weights": _braced(np.tril(energy.weights)),
-        "samples": _braced(energy.samples),
-        "places": "{" + ",\n".join(_integers(row) for row in energy.places) + "}",
-        "alpha": _braced(energy.alpha),
-        "learnt": _braced(_panels(energy.factor * energy.learnt.T)),
+    tables = {name: _braced(values) for name, values in rest.tables.items()}
+    places = "{" + ",\n".join(_integers(row) for row in rest.places) + "}"
+    return {
+        "outputs": str(len(rest.alpha)),
+        "alpha": _braced(rest.alpha),
+        "learnt": _braced(_panels(rest.factor * rest.learnt.T)),
         "shared": _braced(padded.reshape(-1, WIDE, padded.shape[1]).transpose(0, 2, 1).reshape(-1)),
-        "factor": repr(energy.factor**2),
+        "factor": repr(rest.factor**2),
+        "term": _template(rest.template).substitute(tables, groups=str(rest.groups), places=places),
     }
-    return {"outputs": fields["outputs"], "energy": _template(ENERGY).substitute(fields)}
 
 
 def _stack(model: TorqueModel) -> str:

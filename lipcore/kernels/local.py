@@ -53,9 +53,14 @@ class LocalKernel(PairKernel):
         return {"local.log_scale": np.log(power(tau)), "local.log_lengthscales": np.log(lengths)}
 
 
+def scaled(params: Params, motion: Motion) -> Array:
+    """Inputs over their lengthscales, (N, 4 n). params: `local.log_lengthscales`."""
+    return np.concatenate(_inputs(motion), axis=1) * np.exp(-params["local.log_lengthscales"])
+
+
 def nearness(params: Params, x: Motion) -> Array:
     """Correlation of each joint's correction between all samples, (N, N). params: `local.log_lengthscales`."""
-    inputs = _scaled(params, x)
+    inputs = scaled(params, x)
     return np.asarray(np.exp(-0.5 * cdist(inputs, inputs, "sqeuclidean")))
 
 
@@ -65,7 +70,7 @@ class _LocalCross(Cross):
     def __init__(self, params: Params, inducing: Motion) -> None:
         self.size, self.n_joints = len(inducing), inducing.n_joints
         self._rate, self._scale = np.exp(-params["local.log_lengthscales"]), np.exp(params["local.log_scale"])
-        self._anchors = _scaled(params, inducing)
+        self._anchors = scaled(params, inducing)
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write the covariances of one query; see `Cross.fill`."""
@@ -78,8 +83,3 @@ class _LocalCross(Cross):
 
 def _inputs(motion: Motion) -> list[Array]:
     return [motion.q, motion.dq, motion.ddq, np.tanh(motion.dq / SIGN_WIDTH)]
-
-
-def _scaled(params: Params, motion: Motion) -> Array:
-    """Inputs over their lengthscales, (N, 4 n)."""
-    return np.concatenate(_inputs(motion), axis=1) * np.exp(-params["local.log_lengthscales"])

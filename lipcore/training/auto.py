@@ -62,23 +62,17 @@ def choose(task: Task) -> TorqueModel:
     contest = Contest(work, held)
     contest.run()
     chosen, reason = contest.verdict()
-    model = _of_all(work, contest, chosen)
     rows, edge_rows = int(held.parts.held_out.sum()), int(held.edge.sum())
     held_out = HeldOut(
         rows=rows, blocks=held.blocks, repeats=held.repeats, edge_rows=edge_rows, edge_blocks=held.edge_blocks
     )
-    return replace(
-        model,
-        fit={**model.fit, "seconds": work.overall.elapsed},
-        selection=selection(chosen, reason, contest.table(), held_out),
-    )
-
-
-def _of_all(work: Fits, contest: Contest, chosen: str) -> TorqueModel:
-    """The chosen model as it is when it has learnt all samples."""
     model = contest.entries[chosen].model
     assert model is not None  # what is chosen was trained
-    return refit(widened(model, contest.held.samples), replace(work.task, on_progress=work.overall.of(chosen, ALL)))
+    model = replace(
+        widened(model, contest.held.samples), selection=selection(chosen, reason, contest.table(), held_out)
+    )
+    model = refit(model, replace(task, on_progress=work.overall.of(chosen, ALL)))
+    return replace(model, fit={**model.fit, "seconds": work.overall.elapsed})
 
 
 def _unjudged(work: Fits, reason: str) -> TorqueModel:

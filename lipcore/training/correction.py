@@ -27,11 +27,11 @@ ROWS, BLOCKS = 1000, 10
 """Rows at most that are looked at, and blocks that they are divided into."""
 NOISE_SHARES = (1e-3, 1e-2, 0.1, 0.3, 1.0)
 """Noise variances that are tried, as shares of the correction's."""
-GAIN, CHANCE = 0.2, 1.83
-"""What a joint gains at least: a share of its squared error, and standard errors (95 % point of t for ten blocks)."""
+GAIN, CHANCE = 0.2, 2.82
+"""What a joint gains at least: a share of its squared error, and standard errors (99 % point of t for ten blocks)."""
 REPORTED = "local_"
 """How the entries of a fit's report begin that say how well a joint is corrected."""
-NOTHING = 1e-8
+NOTHING = 1e-12
 """Prior variance of a joint that is not corrected, as a share of what is left over."""
 MOST_OUTPUTS, KNOWN = 400, 0.01
 """Torques at most that the correction is remembered at, and share of its variance that they may leave open."""

@@ -11,6 +11,7 @@ from lipcore.data.independence import motion_dimensions
 from lipcore.data.samples import Samples
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
 from lipcore.fitting.task import Task
+from lipcore.model.selection import shortened
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.selection import spread_out
 from lipcore.training.correction import corrected_joints
@@ -36,9 +37,10 @@ def _wider(model: TorqueModel, factors: Sequence[float]) -> TorqueModel:
 def refit(model: TorqueModel, task: Task) -> TorqueModel:
     """Return the model trained on the samples of a task, from where its own training ended.
 
-    An arm follows the geometries of the model without a search; what is corrected beside it stays so. The other
-    estimators keep their arm and hyperparameters; their basis and posterior are made anew. `selection`, the report of
-    the search and what `widened` says are kept.
+    An arm follows the geometries of the model without a search; what is corrected beside it stays so. If `auto` has
+    chosen an arm alone, it is corrected where only all rows tell that motion repeats. The other estimators keep their
+    arm and hyperparameters; their basis and posterior are made anew. `selection`, the report of the search and what
+    `widened` says are kept.
 
     task: of the model's robot, with its joints, torque convention and options.
     Raise FitCancelledError, ValueError as `learn` does, or NotPositiveDefiniteError.
@@ -51,12 +53,22 @@ def refit(model: TorqueModel, task: Task) -> TorqueModel:
         learnt = replace(learnt, report={**learnt.report, **searched})
         again = fit_estimator(task, name, learnt, corrected=corrected_joints(model.fit))
         again = replace(again, selection=model.selection)
+        if name == RIGID and model.selection is not None and LOCAL not in model.selection["reason"]:
+            again = _corrected(again, fit_estimator(task, LOCAL, learnt))
     else:
         again = _with_posterior_of(model, task)
     kept = {key: value for key, value in model.fit.items() if key.startswith(WIDENED)}
     kept["seconds"] = float(model.fit["seconds"]) + time.monotonic() - began
     again = replace(again, fit={**again.fit, **kept})
     return _wider(again, [float(kept.get(f"{WIDENED}{joint + 1}", 1.0)) for joint in range(model.n_joints)])
+
+
+def _corrected(arm: TorqueModel, local: TorqueModel) -> TorqueModel:
+    """An arm that `auto` has chosen, or the same with a correction if all rows show that one gains."""
+    if arm.selection is None or not corrected_joints(local.fit):
+        return arm
+    reason = shortened(f"{arm.selection['reason']}; {LOCAL} replaces {RIGID}: with all rows it gains")
+    return replace(local, selection={**arm.selection, "chosen": LOCAL, "reason": reason})
 
 
 def _with_posterior_of(model: TorqueModel, task: Task) -> TorqueModel:

@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import IO, Any
 
 from lipcore.files import persistence
-from lipcore.files.c_writer import SUPPORTED, Origin, c_files
+from lipcore.files.c_writer import Origin, c_files
 from lipcore.files.manifest import MANIFEST, TENSORS, ModelFormatError
 from lipcore.files.urdf_writer import urdf_of_parameters
+from lipcore.vocabulary import ROBOT_ESTIMATORS
 from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, problem
 from service.models import registry, signing
 from service.models.archive_reading import BLOCK, CHECKSUMS, EXPORT, FORMAT, FORMAT_VERSION, padding
@@ -60,7 +61,7 @@ def export(
         try:
             written = c_files(decoded, origin)
         except ValueError as error:
-            item = problem("version", row.version, f"a version of estimator {' or '.join(SUPPORTED)}")
+            item = problem("version", row.version, f"a version of estimator {', '.join(ROBOT_ESTIMATORS)}")
             message = f"version {row.version} of model {row.model!r} cannot be written as C: {error}"
             raise InvalidRequestError(message, [item]) from error
         file = _packed(loaded, {name: text.encode() for name, text in written.items()})

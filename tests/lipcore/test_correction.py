@@ -12,6 +12,7 @@ from lipcore.files.persistence import load, save
 from lipcore.fitting.options import FitOptions
 from lipcore.fitting.task import Task
 from lipcore.kernels.local import LocalKernel
+from lipcore.model.selection import selection
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
@@ -149,3 +150,16 @@ def test_the_last_fit_corrects_the_same_joints_and_keeps_how_much_wider_interval
     assert wider.predict(rest.q, rest.dq, rest.ddq).interval.holds(shifted.tau).mean(axis=0)[2] >= 0.95
     assert whole.fit["widened_3"] == wider.fit["widened_3"] > 2
     assert whole.scale[2] > 2 > refit(part, task).scale[2]
+
+
+def test_what_auto_has_not_corrected_is_corrected_if_all_rows_tell_that_it_repeats():
+    samples = recorded()
+    task = Task(samples, TYPES, OPTIONS, robot=RigidBody.from_profile(ARM, samples.joint_names, TYPES))
+    part = fit_model(task.on(samples.rows(slice(200))), "rigid-body")
+    assert refit(part, task).estimator.name == "rigid-body"  # as it was asked for
+    part = replace(part, selection=selection("rigid-body", "it is the simplest", []))
+    whole = refit(part, task)
+    assert whole.estimator.name == whole.selection["chosen"] == "rigid-body+local"
+    assert "it is the simplest; rigid-body+local replaces rigid-body" in whole.selection["reason"]
+    refused = replace(part, selection=selection("rigid-body", "rigid-body+local does not replace rigid-body", []))
+    assert refit(refused, task).estimator.name == "rigid-body"

@@ -87,7 +87,9 @@ def test_other_estimators_and_formats_are_refused(api, arm):
     refusal = error(api.get("/v1/models/c-none/export", params={"format": "c"}), 422, "invalid_request")
     assert "version 1 of model 'c-none' cannot be written as C: estimator is" in refusal["message"]
     assert refusal["detail"][0]["field"] == "version"
-    assert refusal["detail"][0]["expected"] == "a version of estimator rigid-body or rigid-body+lip-chain"
+    assert (
+        refusal["detail"][0]["expected"] == "a version of estimator rigid-body, rigid-body+local, rigid-body+lip-chain"
+    )
     refusal = error(api.get(f"/v1/models/{arm}/export", params={"format": "java"}), 422, "invalid_request")
     assert "format" in str(refusal["detail"])
     for params, status in (({"version": 3}, 404), ({"alias": "no"}, 404), ({"alias": "no", "version": 1}, 422)):
