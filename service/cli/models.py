@@ -313,6 +313,22 @@ def _print_guarantee(conformal: dict[str, Any]) -> None:
     echo(f"  intervals {wider}: {blocks} left out in turn guarantee {100 * least:.0f} % of such motion{few}")
 
 
+OF_JOINTS = {
+    "right_angle_": "axes at right angles, how probably",
+    "local_": "corrected where the motion repeats, error that is left",
+    "widened_": "intervals widened by what was held out",
+}
+"""Entries of a fit's report that end with a joint's number, and what they are called."""
+
+
+def print_of_joints(version: VersionRecord) -> None:
+    """What the fit reports joint by joint."""
+    for prefix, text in OF_JOINTS.items():
+        found = {int(key.removeprefix(prefix)): value for key, value in version.fit.items() if key.startswith(prefix)}
+        if found:
+            echo(f"  {text}: {', '.join(f'{version.joint_names[j - 1]} {found[j]:.2g}' for j in sorted(found))}")
+
+
 def _print_version(version: VersionRecord) -> None:
     names = version.joint_names
     echo(f"version {version.version}: {version.estimator}, {counted(len(names), 'joint')}: {', '.join(names)}")
@@ -328,6 +344,7 @@ def _print_version(version: VersionRecord) -> None:
         echo(f"  {counted(version.fit['samples_given'], 'sample')}, worth {round(independent)} independent ones")
     if version.conformal is not None:
         _print_guarantee(version.conformal)
+    print_of_joints(version)
     if lineage.get("holdout") is not None:
         print_held_out(version)
     else:

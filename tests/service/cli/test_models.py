@@ -1,10 +1,12 @@
 """`lipserve models`: versions, aliases, archives."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from lipcore.robots.urdf import describe
 from lipserve.records.models import Selection, SelectionCandidate, SelectionHeldOut
-from service.cli.models import print_selection
+from service.cli.models import print_of_joints, print_selection
 from tests.service.models.versions import JOINTS, WARNING
 
 
@@ -124,3 +126,13 @@ def test_how_an_estimator_was_chosen_is_printed(capsys):
     print_selection(Selection(**{**made, "held_out": nothing}, table=[failed]))
     out = capsys.readouterr().out
     assert ("not judged" in out, "failed: no [factor]" in out, "flatter" in out) == (True, True, False)
+
+
+def test_what_a_fit_says_of_each_joint_is_shown(capsys):
+    fit = {"right_angle_2": 0.25, "right_angle_10": 1.0, "local_2": 0.131, "iterations": 9}
+    names = [f"j{number}" for number in range(1, 11)]
+    print_of_joints(SimpleNamespace(joint_names=names, fit=fit))
+    said = capsys.readouterr().out
+    assert "axes at right angles, how probably: j2 0.25, j10 1" in said
+    assert "error that is left: j2 0.13" in said
+    assert "widened" not in said

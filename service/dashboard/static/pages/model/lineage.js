@@ -84,6 +84,9 @@ function figuresCard(version, from) {
   );
 }
 
+/** Entries of a fit's report that end with a joint's number: what they are called. */
+const OF_JOINTS = { right_angle_: "Axis at right angles, how probably", local_: "Corrected where motion repeats, error left", widened_: "Intervals widened by what was held out" };
+
 function fit({ fit: said, compact, calibration, conformal, lineage: from }) {
   const found = [
     ["Converged", badge(said.converged ? "yes" : "no", said.converged ? "good" : "warn")],
@@ -101,6 +104,10 @@ function fit({ fit: said, compact, calibration, conformal, lineage: from }) {
       ["Intervals widened by", conformal.scale.map((each) => number(each, 3)).join(", ")],
       ["Guaranteed of their 95 %", conformal.guaranteed.map((each) => percent(each)).join(", ")],
     );
+  }
+  for (const [prefix, text] of Object.entries(OF_JOINTS)) {
+    const joints = Object.keys(said).filter((key) => key.startsWith(prefix)).map((key) => Number(key.slice(prefix.length))).sort((a, b) => a - b);
+    if (joints.length) found.push([text, joints.map((joint) => `joint ${joint}: ${number(said[prefix + joint], 2)}`).join(", ")]);
   }
   if (compact) {
     found.push(
