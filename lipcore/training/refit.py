@@ -53,7 +53,7 @@ def refit(model: TorqueModel, task: Task) -> TorqueModel:
         learnt = replace(learnt, report={**learnt.report, **searched})
         again = fit_estimator(task, name, learnt, corrected=corrected_joints(model.fit))
         again = replace(again, selection=model.selection)
-        if name == RIGID and model.selection is not None and LOCAL not in model.selection["reason"]:
+        if name == RIGID and model.selection is not None:
             again = _corrected(again, fit_estimator(task, LOCAL, learnt))
     else:
         again = _with_posterior_of(model, task)
@@ -67,7 +67,7 @@ def _corrected(arm: TorqueModel, local: TorqueModel) -> TorqueModel:
     """An arm that `auto` has chosen, or the same with a correction if all rows show that one gains."""
     if arm.selection is None or not corrected_joints(local.fit):
         return arm
-    reason = shortened(f"{arm.selection['reason']}; {LOCAL} replaces {RIGID}: with all rows it gains")
+    reason = shortened(f"{LOCAL} replaces {RIGID}: of all rows it gains; before: {arm.selection['reason']}")
     return replace(local, selection={**arm.selection, "chosen": LOCAL, "reason": reason})
 
 

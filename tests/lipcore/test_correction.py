@@ -160,6 +160,4 @@ def test_what_auto_has_not_corrected_is_corrected_if_all_rows_tell_that_it_repea
     part = replace(part, selection=selection("rigid-body", "it is the simplest", []))
     whole = refit(part, task)
     assert whole.estimator.name == whole.selection["chosen"] == "rigid-body+local"
-    assert "it is the simplest; rigid-body+local replaces rigid-body" in whole.selection["reason"]
-    refused = replace(part, selection=selection("rigid-body", "rigid-body+local does not replace rigid-body", []))
-    assert refit(refused, task).estimator.name == "rigid-body"
+    assert whole.selection["reason"].startswith("rigid-body+local replaces rigid-body: of all rows it gains; before")
