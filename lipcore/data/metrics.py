@@ -139,14 +139,18 @@ class Answer(NamedTuple):
         """Standard deviation of a measurement, (N, n), as the model believes."""
         return np.asarray(np.hypot(self.std, self.noise_std))
 
+    @property
+    def half_width(self) -> Array:
+        """Half the width of its 95 % intervals, (N, n)."""
+        return np.asarray(quantile(LEVEL) * self.scale * self.spread)
+
     def holds(self, tau: Array) -> NDArray[np.bool_]:
         """Which torques, (N, n), lie inside its 95 % intervals."""
-        return np.asarray(np.abs(tau - self.mean) <= quantile(LEVEL) * self.scale * self.spread)
+        return np.asarray(np.abs(tau - self.mean) <= self.half_width)
 
     def shortfall(self, tau: Array) -> Array:
-        """Factor on its 95 % intervals with which they hold 95 % of the torques of each joint, (n,), at least 1."""
-        parts = np.abs(tau - self.mean) / (quantile(LEVEL) * self.scale * self.spread)
-        return np.asarray(np.quantile(parts, LEVEL, axis=0).clip(1.0))
+        """Return how many times wider its 95 % intervals must be to hold 95 % of each joint's torques, (n,), from 1."""
+        return np.asarray(np.quantile(np.abs(tau - self.mean) / self.half_width, LEVEL, axis=0).clip(1.0))
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ NOISE_SHARES = (1e-3, 1e-2, 0.1, 0.3, 1.0)
 GAIN, CHANCE = 0.2, 2.82
 """What a joint gains at least: a share of its squared error, and standard errors (99 % point of t for ten blocks)."""
 REPORTED = "local_"
-"""How the entries of a fit's report begin that say how well a joint is corrected."""
+"""Prefix of entries of a fit's report, one a corrected joint: the share of its squared error that is left."""
 NOTHING = 1e-12
 """Prior variance of a joint that is not corrected, as a share of what is left over."""
 MOST_OUTPUTS, KNOWN = 400, 0.01

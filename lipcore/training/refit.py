@@ -11,7 +11,7 @@ from lipcore.data.independence import motion_dimensions
 from lipcore.data.samples import Samples
 from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
 from lipcore.fitting.task import Task
-from lipcore.model.selection import shortened
+from lipcore.model.selection import Selection, shortened
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.selection import spread_out
 from lipcore.training.correction import corrected_joints
@@ -19,11 +19,11 @@ from lipcore.training.fit import compact, fit_estimator
 from lipcore.vocabulary import LOCAL, RIGID
 
 WIDENED = "widened_"
-"""How the entries of a fit's report begin that say how much wider a joint's intervals are than its training says."""
+"""Prefix of entries of a fit's report, one a joint: factor on its intervals that held-out rows have proved."""
 
 
 def widened(model: TorqueModel, samples: Samples) -> TorqueModel:
-    """Return the model with intervals that hold 95 % of the torques of samples that it has not learnt, or its own."""
+    """Return the model with intervals widened until they hold 95 % of the torques of samples that it has not learnt."""
     factors = model.predict(samples.q, samples.dq, samples.ddq).interval.shortfall(samples.tau)
     known = {joint: float(model.fit.get(f"{WIDENED}{joint + 1}", 1.0)) * each for joint, each in enumerate(factors)}
     report = {f"{WIDENED}{joint + 1}": round(each, 3) for joint, each in known.items() if each > 1}
@@ -39,8 +39,8 @@ def refit(model: TorqueModel, task: Task) -> TorqueModel:
 
     An arm follows the geometries of the model without a search; what is corrected beside it stays so. If `auto` has
     chosen an arm alone, it is corrected where only all rows tell that motion repeats. The other estimators keep their
-    arm and hyperparameters; their basis and posterior are made anew. `selection`, the report of the search and what
-    `widened` says are kept.
+    arm and hyperparameters; their basis and posterior are made anew. `selection`, the report of the search and
+    the factors of `widened` are kept.
 
     task: of the model's robot, with its joints, torque convention and options.
     Raise FitCancelledError, ValueError as `learn` does, or NotPositiveDefiniteError.
@@ -54,7 +54,7 @@ def refit(model: TorqueModel, task: Task) -> TorqueModel:
         again = fit_estimator(task, name, learnt, corrected=corrected_joints(model.fit))
         again = replace(again, selection=model.selection)
         if name == RIGID and model.selection is not None:
-            again = _corrected(again, fit_estimator(task, LOCAL, learnt))
+            again = _corrected(again, model.selection, fit_estimator(task, LOCAL, learnt))
     else:
         again = _with_posterior_of(model, task)
     kept = {key: value for key, value in model.fit.items() if key.startswith(WIDENED)}
@@ -63,12 +63,12 @@ def refit(model: TorqueModel, task: Task) -> TorqueModel:
     return _wider(again, [float(kept.get(f"{WIDENED}{joint + 1}", 1.0)) for joint in range(model.n_joints)])
 
 
-def _corrected(arm: TorqueModel, local: TorqueModel) -> TorqueModel:
-    """An arm that `auto` has chosen, or the same with a correction if all rows show that one gains."""
-    if arm.selection is None or not corrected_joints(local.fit):
+def _corrected(arm: TorqueModel, before: Selection, local: TorqueModel) -> TorqueModel:
+    """Return an arm that `auto` has chosen before, or its corrected twin if all rows show that a correction gains."""
+    if not corrected_joints(local.fit):
         return arm
-    reason = shortened(f"{LOCAL} replaces {RIGID}: of all rows it gains; before: {arm.selection['reason']}")
-    return replace(local, selection={**arm.selection, "chosen": LOCAL, "reason": reason})
+    reason = shortened(f"{LOCAL} replaces {RIGID}: of all rows it gains; before: {before['reason']}")
+    return replace(local, selection={**before, "chosen": LOCAL, "reason": reason})
 
 
 def _with_posterior_of(model: TorqueModel, task: Task) -> TorqueModel:
