@@ -98,7 +98,7 @@ def learn(
             polished.add(problem.descend(geometry, sigma, POLISHING, watch.stop))
         ends = polished.points
         watch.step("hyperparameters", ends[0].value, 0.85)
-        counting = _Counting(task.contiguous(CORRELATED), order, shared_rows(samples, len(rows)))
+        counting = _Counting(task.contiguous(CORRELATED), order, shared_rows(samples, task.joint_types, len(rows)))
         problem = counting.applied(problem, ends[0], at_rest=False)
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
         found, stribeck_nats = _refined(problem, ends, counting, watch, known if mode == "learn" else None)

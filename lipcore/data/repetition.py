@@ -114,6 +114,22 @@ def share_repeated(known: Array, states: Array) -> float:
     return float(np.concatenate(shares).mean())
 
 
+def distinct(samples: Samples, joint_types: Sequence[str]) -> float:
+    """Share of a recording that is left where motion that comes again counts once, from 0 to 1.
+
+    samples: at least one row, in order of time within its episodes; joint_types: (n,). An instant that the recording
+    passes k times counts 1 / k; between two passes it is left by twice the limit of likeness.
+    """
+    states = features(samples, joint_types)
+    limits, passes = _limits(states, states), []
+    for row in _evenly(0, len(states), JUDGED):
+        distances = np.sqrt(_squares(states[row : row + 1], states)[0])
+        near, left = distances <= limits[row], distances > 2 * limits[row]
+        inside = near[near | left]
+        passes.append(inside[0] + np.count_nonzero(inside[1:] & ~inside[:-1]))
+    return float(np.mean(1 / np.array(passes)))
+
+
 def period(samples: Samples, joint_types: Sequence[str]) -> float | None:
     """Time after which a motion repeats itself, s; None where it has no one such time.
 

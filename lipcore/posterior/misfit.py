@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.independence import INDEPENDENT_HZ, recording_weights
 from lipcore.data.motion import Motion
+from lipcore.data.repetition import distinct
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
 from lipcore.kernels.compiled.answer import ACCELERATED
@@ -110,9 +111,12 @@ class Misfit:
         return noise + (rows - 1) * self.lasting + rows * self.at_rest(dq)
 
 
-def shared_rows(samples: Samples, count: int) -> float:
-    """Of `count` rows chosen from all over a recording, how many have an error in common where it lasts: at least 1."""
-    seconds = float(recording_weights(samples.t, samples.episode, 1 / LASTS_S).sum())
+def shared_rows(samples: Samples, joint_types: Sequence[str], count: int) -> float:
+    """Of `count` rows chosen from all over a recording, how many have an error in common where it lasts: at least 1.
+
+    Such errors are functions of motion, so motion that repeats itself has the same again. joint_types: (n,).
+    """
+    seconds = float(recording_weights(samples.t, samples.episode, 1 / LASTS_S).sum()) * distinct(samples, joint_types)
     return max(1.0, count / seconds) if seconds > 0 else 1.0
 
 

@@ -75,8 +75,10 @@ def test_what_lasts_is_no_white_noise(seconds: float) -> None:
 
 def test_rows_of_one_second_share_what_lasts() -> None:
     samples = dirty(1)
-    assert shared_rows(samples, 200) == pytest.approx(10.0)  # of twenty seconds
-    assert shared_rows(samples, 5) == 1.0
+    assert shared_rows(samples, TYPES, 200) == pytest.approx(10.0, rel=0.05)  # of twenty seconds
+    assert shared_rows(samples, TYPES, 5) == 1.0
+    again = Samples.concatenate([samples, samples, samples])  # the same motion, and so the same error, three times
+    assert shared_rows(again, TYPES, 600) == pytest.approx(30.0, rel=0.05)
     noise, dq = np.array([1.0, 1.0]), np.array([[0.0, 3.0]])
     one = np.ones(2)
     misfit = Misfit(0.5 * one, one, np.array([0.25, 1.0]), one, one)

@@ -17,6 +17,7 @@ from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, OnlineModel, uncovered
 from lipcore.online.transfer import Revision, consolidate
 from lipcore.posterior.compact import CompactPosterior
+from lipcore.posterior.misfit import shared_rows
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
 from lipcore.robots.urdf import RigidBody
@@ -148,24 +149,23 @@ def base() -> TorqueModel:
     return train(recorded(1), ("revolute",) * 2, "lip-chain", CLOSER)
 
 
-def row_noise(posterior: CompactPosterior, motion: Motion) -> np.ndarray:
-    """Variance of each torque in turn: what lasts for a second is that of ten rows."""
+def row_noise(posterior: CompactPosterior, motion: Motion, shared: float = 10.0) -> np.ndarray:
+    """Variance of each torque in turn: what lasts is that of `shared` rows, of a stream those of a second."""
     misfit, dq = posterior.misfit, motion.dq
     resting = misfit.rest * np.exp(-((dq / misfit.slow) ** 2))
-    noise: np.ndarray = posterior.noise_variance + 9 * misfit.lasting + 10 * resting
+    noise: np.ndarray = posterior.noise_variance + (shared - 1) * misfit.lasting + shared * resting
     return noise.reshape(-1)
 
 
 def regression(
-    posterior: CompactPosterior, motion: Motion, tau: np.ndarray, weights: np.ndarray, centre: np.ndarray
+    posterior: CompactPosterior, motion: Motion, tau: np.ndarray, noise: np.ndarray, centre: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of the whitened variables by conditioning on all torques, in the space of the torques."""
     features = posterior.basis.features(motion)
     prior = posterior.kernel.variance(posterior.params, motion).diagonal(axis1=1, axis2=2)
     open_ = np.maximum(prior.reshape(-1) - np.square(features).sum(0), 0.0)
     # the linear terms' features explain their share of the prior exactly
-    noise = row_noise(posterior, motion) + open_
-    gram = features.T @ features + np.diag(noise / np.repeat(weights, motion.n_joints))
+    gram = features.T @ features + np.diag(noise + open_)
     gain = features @ np.linalg.inv(gram)
     mean = centre + gain @ (tau.reshape(-1) - features.T @ centre)
     return mean, np.eye(len(centre)) - gain @ features.T
@@ -182,8 +182,11 @@ def test_learning_is_the_posterior_of_all_samples_old_and_new(base: TorqueModel,
     old = recorded(1)
     motion = Samples.concatenate([old, recorded(2)]).motion()
     tau = np.concatenate([old.tau, rows.tau])
+    shared = shared_rows(old, ("revolute",) * 2, len(old))  # the recording's motion repeats itself
+    assert shared > 10.0
+    noise = [row_noise(base.posterior, old.motion(), shared), row_noise(base.posterior, recorded(2).motion())]
     zeros = np.zeros(len(base.posterior.basis))
-    expected = regression(base.posterior, motion, tau, np.ones(len(motion)), zeros)
+    expected = regression(base.posterior, motion, tau, np.concatenate(noise), zeros)
     assert_solution(OnlineModel.start(base).learn(rows), *expected)
 
 
@@ -217,7 +220,9 @@ def test_a_changed_robot_is_learnt_anew_around_what_was_known(base: TorqueModel,
     loaded = as_rows(heavier, 5001.0)
     learnt = changed.learn(loaded)
     centre = known.now.solve().mean
-    expected = regression(base.posterior, heavier.motion(), heavier.tau, np.ones(len(loaded)), centre)
+    expected = regression(
+        base.posterior, heavier.motion(), heavier.tau, row_noise(base.posterior, heavier.motion()), centre
+    )
     assert_solution(learnt, *expected)
 
     unseen = recorded(4, payload=Payload(2.0), noise=0.0)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.data.repetition import NEAREST, features, groups, period, repetition, share_repeated
+from lipcore.data.repetition import NEAREST, distinct, features, groups, period, repetition, share_repeated
 from lipcore.data.samples import Samples
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
@@ -47,6 +47,18 @@ def test_motion_that_goes_on_is_new(course: str) -> None:
     assert found.share < 0.1
     assert not found.flatters
     assert found.period is None
+
+
+@pytest.mark.parametrize(("course", "passes"), [("sinusoids", 1), ("periodic", 4)])
+def test_motion_that_comes_again_counts_once(course: str, passes: int) -> None:
+    """Forty seconds, periodic ones of four periods: also with noisy signals, after a rest, and in an episode each."""
+    for dirt in (None, Dirt()):
+        samples = motion(course, speed=1.0, dirt=dirt)
+        assert distinct(samples, TYPES) == pytest.approx(1 / passes, rel=0.1)
+    apart = replace(samples, episode=np.arange(2000) // 500)
+    assert distinct(apart, TYPES) == distinct(samples, TYPES)
+    still = samples.rows(np.zeros(500, np.int64))
+    assert distinct(joined(still, samples), TYPES) == pytest.approx((500 + 2000 / passes) / 2500, rel=0.1)
 
 
 def test_motion_of_another_recording_is_known_again() -> None:
