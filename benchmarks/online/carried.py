@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field
 
 import msgspec
@@ -115,17 +116,21 @@ def known(client: HttpClient, model: str) -> tuple[str, Figure | None]:
 
 
 def carried(bed: Bed, model: str, arm: Arm, case: Case) -> Outcome:
-    """Stream a case to a model of its own, each batch asked for and then observed; judge the service on the way."""
+    """Stream a case to a model of its own at its own pace, each batch asked for and then observed; judge the service on
+    the way."""
     samples = arm.live(case)
     loaded, free = (arm.unseen(case, carries) for carries in (True, False))
     moments = {round((UP + after) * RATE): after for after in AFTER}
     up, down, end = (round(at * RATE) for at in (UP, DOWN, SECONDS))
     out, early = None, False
+    began = time.monotonic()
     with HttpClient(bed.tcp) as client:
         for number, start in enumerate(range(0, end, BATCH)):
             batch, now = samples.rows(slice(start, start + BATCH)), start + BATCH
             client.ask(_question(model, batch))
             ack = send(client, batch_request(model, STREAM, number, batch))
+            # payloads are noticed beside the acknowledgement: what is known when the next batch comes, as from a robot
+            time.sleep(max(0.0, began + now / RATE - time.monotonic()))
             if out is not None and out.detected is not None and now not in moments and now < down:
                 out.acks.append(ack.seconds)  # its report takes as long as some batches: only where it is asked for
                 continue

@@ -195,7 +195,7 @@ class Trials:
 
 
 def learners(service: int) -> list[int]:
-    """Process ids of the learner process of a service, which is its only spawned child while nothing is trained."""
+    """Process ids of what learns and weighs for a service, its only spawned children while nothing is trained."""
     found = []
     for child in (each for level in levels(service)[1:2] for each in level):
         with suppress(FileNotFoundError, ProcessLookupError):

@@ -132,8 +132,8 @@ def correct(desk: Desk, turn: int) -> None:
     path = f"/v1/models/{ARM}/observations/{ARM}"
     desk.ask("POST", f"{path}/{touched}/replay", 200, 409, 422, json={"codes": ["contact"]})
     desk.ask("DELETE", f"{path}/{touched}", 200, 409)
-    desk.ask("PUT", f"/v1/models/{ARM}/payload", json={"mass": 0.5, "com": [0.0, 0.0, 0.1], "stream_id": "other"})
-    desk.ask("DELETE", f"/v1/models/{ARM}/payload?stream_id=other")
+    desk.ask("PUT", f"/v1/models/{ARM}/payload", json={"mass": 0.5, "com": [0.0, 0.0, 0.1], "stream_id": ARM})
+    desk.ask("DELETE", f"/v1/models/{ARM}/payload?stream_id={ARM}")
     desk.ask("POST", f"/v1/models/{ARM}/learning/change", 200, 409, json={"decision": "ignore"})
 
 

@@ -202,6 +202,15 @@ class Carrier:
         room = ROOM * np.diagonal(covariance)[size:]
         return Load(np.concatenate([self.mean, body]), covariance, np.maximum(room, CERTAIN))
 
+    def warm_up(self) -> None:
+        """Answer once with a payload, and once with several arms that carry one: what is compiled is there then."""
+        n, geometry = self.model.n_joints, self.term.arm.geometry
+        load = self.known(np.zeros(PARAMETERS))
+        if self.bends:
+            other = self.alternative(self.mean, geometry, load.payload, 0.5)
+            load = replace(load, geometry=geometry, others=(other, other))
+        self.carrying(load).answer(np.zeros((3, n)))
+
     def carrying(self, load: Load) -> TorqueModel:
         """The model that answers with a payload, its intervals with what is not known of it."""
         posterior, around = self.model.posterior, Linearised(self, load)

@@ -6,6 +6,7 @@ Those of the training alone are made once; rows with a payload move them on (`pa
 
 from __future__ import annotations
 
+from collections.abc import Generator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -164,14 +165,18 @@ def linearised_around(carrier: Carrier, place: Place, payload: Array) -> Lineari
     return Linearised(carrier, Load(np.append(place.w, payload), nothing, np.ones(PARAMETERS), place.geometry))
 
 
-def arms(carrier: Carrier) -> tuple[Draw, ...]:
+def arms(carrier: Carrier) -> Generator[None, None, tuple[Draw, ...]]:
     """Draws from what the training alone says, with any payload; made once a version, by the revision that asks first,
-    and again where another has learnt more directions."""
+    and again where another has learnt more directions. It yields after each."""
     size = len(carrier.memory.slope) + len(carrier.memory.outside) + len(carrier.mean) + PARAMETERS
     known = _ARMS.get(carrier.term, ())
     if not known or len(known[0].noise) != size:
         training, draw = Training.of(carrier), np.random.default_rng(SEED)
-        known = _ARMS[carrier.term] = tuple(training.drawn(draw) for _ in range(DRAWS))
+        found = []
+        for _ in range(DRAWS):
+            found.append(training.drawn(draw))
+            yield
+        known = _ARMS[carrier.term] = tuple(found)
     return known
 
 

@@ -24,8 +24,8 @@ Seen = tuple[Motion, tuple[Array, Array]]
 @dataclass(frozen=True)
 class Estimate:
     """A payload as rows have it. eta, (10,): most likely; covariance: (10, 10) of it; load: with the arm's variables;
-    gain, contact: nats by which it explains the rows better than the arm without a payload, and
-    a contact does; draws: from the posterior, where it is not linear."""
+    gain, contact: nats by which it explains the rows better than the arm without a payload, and a contact does; draws:
+    from the posterior, where it is not linear; doubt: how many times a linear posterior's its deviations are."""
 
     eta: Array
     covariance: Array
@@ -33,6 +33,7 @@ class Estimate:
     gain: float
     contact: float
     draws: tuple[Draw, ...] = ()
+    doubt: float = 1.0
 
     @property
     def mass(self) -> tuple[float, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,9 +13,8 @@ from lipcore.model.body import Body
 from lipcore.model.payload import Carrier, Linearised, Load
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, WIDTH
-from lipcore.online.draws import arms
 from lipcore.online.held import Held, evenly, no_rows
-from lipcore.online.hypotheses import AFTER, BEFORE, CELL_S, LEAST_BEFORE, Cell, Window, cells_of
+from lipcore.online.hypotheses import AFTER, BEFORE, CELL_S, LEAST_BEFORE, Cell, Window, cells_of, split
 from lipcore.online.verdict import (
     ALIKE,
     AT_ONCE,
@@ -108,10 +107,10 @@ class Watch:
 
     def _seen_by(self, carrier: Carrier) -> Watch:
         """The same as another revision of the model sees it."""
-        if self.around is not None and self.around.carrier.knows_as(carrier):
+        if self.around is None:
+            return self._around(carrier)
+        if self.around.carrier.knows_as(carrier):
             return self
-        if self.around is None and carrier.bends:
-            arms(carrier)  # when something is taken up, they are asked for at once
         return replace(self, held=None if self.held is None else self.held.seen_by(carrier))._around(carrier)
 
     def _around(self, carrier: Carrier) -> Watch:
@@ -144,6 +143,7 @@ class Watch:
     def _take(self, carrier: Carrier, parts: Sequence[Rows]) -> Watch:
         """Take in cells, and judge the last ones."""
         assert self.around is not None
+        parts = split(self.around, parts)
         kept = CELLS * SPARSE[-1] if self.held is None else CELLS
         cells = (*self.cells, *cells_of(self.around, parts))[-kept:]
         watch = replace(self, recent=(*self.recent, *parts)[-kept:], cells=cells)
@@ -189,7 +189,7 @@ class Watch:
         if after < LASTING or self.held is not None:
             vague = PRECISE if estimate.gain - estimate.contact >= BETTER else 0.0
         strange = np.abs((estimate.eta - ANY.centre) / WIDTH).max() > STRANGE
-        if strange or np.sqrt(estimate.covariance[0, 0]) > vague:
+        if strange or np.sqrt(estimate.covariance[0, 0]) > vague * estimate.doubt:
             return replace(self, state="contact")
         watch = replace(self, state="payload", since=held.since, held=held, recent=self.recent[-after:], off=0)
         return watch._around(carrier)
@@ -235,6 +235,28 @@ class Watch:
         after = max(gained, key=lambda each: gained[each])
         return gained[after], after
 
+    def refinement(self) -> Generator[None, None, Held] | None:
+        """What is carried, refined step by step; see `Held.refinement`."""
+        return None if self.held is None or self.around is None else self.held.refinement(self.around.carrier)
+
+    def refined(self, refined: Held) -> Watch:
+        """The same with what was refined while rows came; as it is where something else is carried by now."""
+        assert self.around is not None
+        if self.held is None or self.held.since != refined.since or self.held.declared != refined.declared:
+            return self
+        return replace(self, held=self.held.with_refined(refined))._around(self.around.carrier)
+
+    def says(self, other: Watch) -> bool:
+        """Whether it says the same of what is carried as another one."""
+        mine, its = self.held, other.held
+        same = mine is its or (mine is not None and its is not None and mine.estimate is its.estimate)
+        return same and (self.state, self.since) == (other.state, other.since)
+
+    def outline(self) -> Watch:
+        """What is carried, without the rows that say so."""
+        held = None if self.held is None else self.held.outline()
+        return Watch(self.n, self.state, self.probabilities, self.since, held)
+
     def to_json(self) -> dict[str, Any]:
         """What a batch's report says of it; `from_json` gives back what is carried."""
         return {
@@ -243,6 +265,14 @@ class Watch:
             "probabilities": dict(self.probabilities or {"none": 1.0}),
             "held": None if self.held is None else self.held.to_json(),
         }
+
+    @staticmethod
+    def of_another(values: Mapping[str, Any], n: int, carrier: Carrier) -> Watch:
+        """What another version has written, by `to_json`, as one sees it whose frame of the last link is another."""
+        since, held = values["since"], values["held"]
+        if held is None:
+            return Watch(n, since=since)
+        return Watch(n, "payload", {"payload": 1.0}, since, Held.of_another(held, float(since), carrier))
 
     @staticmethod
     def from_json(values: Mapping[str, Any], n: int, carrier: Carrier, rows: Rows | None = None) -> Watch:

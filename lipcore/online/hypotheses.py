@@ -34,6 +34,8 @@ CELL_S = 0.05
 LIKE, REST_S = (1.0, 0.5), 0.3
 """Of errors that change with motion, see `errors.likeness`, and of what holds a joint at rest, s. Chosen on the dirty
 Panda of seed 50: with those of `errors` 0.5 kg are not seen, with twice as much fast motion looks like a payload."""
+LEAP = 6.0
+"""Deviations of the noise by which the residual differs from row to row where something has happened."""
 BEFORE, LEAST_BEFORE = 6, 4
 AFTER = (1, 2, 3, 4, 5, 6)
 """Cells that are compared: before the instant, at most and at least; and after it."""
@@ -59,6 +61,19 @@ class Cell:
     lasting: Array
     rest: Array
     features: Array
+
+
+def split(around: Linearised, parts: Sequence[Rows]) -> list[Rows]:
+    """The stretches of cells, parted where the residual leaps: a payload is taken up between two rows, and a mean over
+    both sides of that would fit neither."""
+    rows = parts[0] if len(parts) == 1 else Rows.concatenate(parts)
+    _, expected = around.all_rows(rows.motion())
+    white, lasting, rest = noise_parts(around.carrier, rows.motion())
+    usual = np.sqrt(2 * white + (lasting + rest)[1:])
+    leaps = (np.abs(np.diff(rows.tau - expected, axis=0)) > LEAP * usual).any(axis=1)
+    ends = np.cumsum([len(each) for each in parts])[:-1]
+    edges = np.union1d(ends, np.flatnonzero(leaps) + 1)
+    return [rows.take(each) for each in np.split(np.arange(len(rows)), edges)]
 
 
 def cells_of(around: Linearised, parts: Sequence[Rows]) -> tuple[Cell, ...]:

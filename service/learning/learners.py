@@ -107,7 +107,8 @@ class Status:
 class Learners:
     """Learning of all models; safe from several threads. Close it before the database.
 
-    process: the learner process. threads: those that take observations. live: the feed of those who follow models.
+    process: the learner process; weighing: what streams carry. threads: those that take observations. live: the feed of
+    those who follow models.
     when_published, when_contested: called with each such message of the learner process, in its reader's thread, after
     a revision answers; to be filled before the first batch.
     """
@@ -128,10 +129,12 @@ class Learners:
         loaded.when_deleted.append(self.forget)
         self.live = Feed(settings)
         self._intake = Intake(loaded, self._monitor, self.process.wake, self.live.note)
+        self.weighing = self._intake.weighing
 
     def close(self) -> None:
-        """Finish the batches that have begun, and end the learner process, which stores its state."""
+        """Finish the batches that have begun, and end the processes; the learner stores its state."""
         self.threads.close()
+        self.weighing.close()
         self.process.close()
 
     def observe(self, model: str, request: ObservationRequest) -> ObservationResponse:

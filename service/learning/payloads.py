@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -31,8 +32,8 @@ TEACHING = [LEARNT, CODES.index("payload")]
 
 @dataclass
 class Noted:
-    """What the log says of a stream: a batch's report, or a declaration. version: that predicted it, None for a
-    declaration; received: Unix time, s; rows: that a payload was seen on, where they were looked for."""
+    """What the log says of a stream: a batch's report, what was noticed, or a declaration. version: that predicted it,
+    None for a declaration; received: Unix time, s; rows: that a payload was seen on, where they were looked for."""
 
     values: Mapping[str, Any]
     version: int | None
@@ -43,7 +44,7 @@ class Noted:
     def watch(self, carrier: Carrier, version: int) -> Watch:
         """The watch of the stream from there on, of a version: the same one for as long as that is asked for, as models
         that answer are made for it. A version whose geometry was learnt has a frame of its own, in which a payload that
-        another one has seen means nothing: it is noticed anew."""
+        another one has seen lies elsewhere."""
         seen = self._seen
         if seen is None or seen[0] is not carrier or seen[1] != version:
             self._seen = seen = carrier, version, self._made(carrier, version)
@@ -53,7 +54,7 @@ class Noted:
         n = carrier.model.n_joints
         learnt = carrier.term.arm.mode == "learn"
         if learnt and self.version not in (None, version):
-            return Watch(n)
+            return Watch.of_another(self.values, n, carrier)
         if "body" not in self.values:
             return Watch.from_json(self.values, n, carrier, self.rows)
         body = self.values["body"]
@@ -72,16 +73,15 @@ class Watched:
 
 
 class Payloads:
-    """The watches of one model's streams, made from what the log says when they are first needed.
-
-    To be changed in the model's turn only; `all` may be read from any thread.
-    """
+    """The watches of one model's streams, made from what the log says when they are first needed; for any thread."""
 
     def __init__(self) -> None:
+        self._lock = threading.RLock()
         self._noted: dict[str, Noted] = {}
         self._default: Noted | None = None
         self._watches: dict[str, Watched] = {}
         self._models: dict[str, tuple[Estimate, Carrier, TorqueModel]] = {}
+        self._said: dict[str | None, int] = {}
 
     @classmethod
     def restored(cls, session: Session, model: str) -> Payloads:
@@ -104,51 +104,77 @@ class Payloads:
 
     def remember(self, event: EventRow) -> None:
         """Take in what an event of the log says."""
-        if event.kind == "payload":
-            detail = event.detail or {}
-            noted = Noted(detail, None, event.received)
-            if detail["stream_id"] is None:
-                self._default = noted
-                self._noted = dict.fromkeys({*self._noted, *self._watches}, noted)
-                self._watches = {}
-            else:
-                self.forget(detail["stream_id"])
-                self._noted[detail["stream_id"]] = noted
-        elif event.stream_id is not None and (values := (event.report or {}).get("payload")) is not None:
-            self._noted[event.stream_id] = Noted(values, event.version, event.received)
+        detail = event.detail or {}
+        with self._lock:
+            if event.kind == "payload" and "watch" in detail:
+                self._forget(detail["stream_id"])
+                self._noted[detail["stream_id"]] = Noted(detail["watch"], event.version, event.received)
+            elif event.kind == "payload":
+                noted, stream_id = Noted(detail, None, event.received), detail["stream_id"]
+                self._said[stream_id] = event.number
+                if stream_id is None:
+                    self._default = noted
+                    self._noted = dict.fromkeys({*self._noted, *self._watches}, noted)
+                    self._watches = {}
+                else:
+                    self._forget(stream_id)
+                    self._noted[stream_id] = noted
+            elif event.stream_id is not None and (values := (event.report or {}).get("payload")) is not None:
+                self._noted[event.stream_id] = Noted(values, event.version, event.received)
+
+    def said(self, stream_id: str) -> int:
+        """Number of the event with which the owner has said last what a stream carries, 0 before the first."""
+        return max(self._said.get(stream_id, 0), self._said.get(None, 0))
 
     def watch(self, stream_id: str, carrier: Carrier, version: int) -> Watch:
         """The watch of a stream before its next rows, which a version predicts."""
-        if (known := self._watches.get(stream_id)) is not None and known.version == version:
-            return known.watch
-        noted = self._noted.get(stream_id, self._default)
-        return Watch(carrier.model.n_joints) if noted is None else noted.watch(carrier, version)
+        with self._lock:
+            if (known := self._watches.get(stream_id)) is not None and known.version == version:
+                return known.watch
+            noted = self._noted.get(stream_id, self._default)
+            return Watch(carrier.model.n_joints) if noted is None else noted.watch(carrier, version)
 
-    def take(self, stream_id: str, watch: Watch, version: int, received: float) -> None:
-        """Keep the watch of a stream after its latest rows. What it says goes into the log, and back by `remember`."""
-        self._watches = {**self._watches, stream_id: Watched(watch, version, received)}
+    def take(self, stream_id: str, watch: Watch, version: int, received: float, said: int) -> bool:
+        """Keep what a stream carries, seen with the latest rows of `received`; not where its owner has said something
+        since event `said`. Return whether it is kept."""
+        with self._lock:
+            if self.said(stream_id) != said:
+                return False
+            self._watches[stream_id] = Watched(watch, version, received)
+            self._noted[stream_id] = Noted(watch.to_json(), version, received)  # for other versions
+            return True
+
+    def came(self, stream_id: str, carrier: Carrier, version: int, received: float) -> Watch:
+        """Note that rows of a stream have come, which a version has predicted; return its watch."""
+        with self._lock:
+            watch = self.watch(stream_id, carrier, version)
+            self._watches[stream_id] = Watched(watch, version, received)
+            return watch
 
     def forget(self, stream_id: str) -> None:
         """Keep nothing of a stream."""
-        self._noted.pop(stream_id, None)
-        self._models.pop(stream_id, None)
-        self._watches = {name: each for name, each in self._watches.items() if name != stream_id}
+        with self._lock:
+            self._forget(stream_id)
+
+    def _forget(self, stream_id: str) -> None:
+        for kept in (self._noted, self._models, self._watches):
+            kept.pop(stream_id, None)
 
     def all(self, carrier: Carrier, version: int) -> dict[str, tuple[Watch, float]]:
         """Watches by stream as a version sees them, and when what they know came, Unix time, s."""
-        out = {name: (each.watch(carrier, version), each.received) for name, each in dict(self._noted).items()}
-        for name, each in self._watches.items():
-            if each.version == version:
-                out[name] = each.watch, each.received
-        return out
+        with self._lock:
+            out = {name: (each.watch(carrier, version), each.received) for name, each in self._noted.items()}
+            seen = {name: each for name, each in self._watches.items() if each.version == version}
+            return out | {name: (each.watch, each.received) for name, each in seen.items()}
 
     def carried(self, carrier: Carrier, version: int) -> dict[str, Carried]:
         """What answers for each stream; with None for its model where nothing is carried. The default is that of ""."""
+        with self._lock:
+            watches = self.all(carrier, version)
+            if self._default is not None:
+                watches[""] = self._default.watch(carrier, version), self._default.received
         out: dict[str, Carried] = {}
-        watches = self.all(carrier, version)
-        if self._default is not None:
-            watches[""] = self._default.watch(carrier, version), self._default.received
-        for stream_id, (watch, received) in watches.items():
+        for stream_id, (watch, received) in watches.items():  # without the lock: a model takes milliseconds to make
             if watch.held is None:
                 out[stream_id] = Carried(None, None, received)
             else:

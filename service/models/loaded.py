@@ -324,6 +324,7 @@ class LoadedModels:
             loads = self._loads.setdefault((row.model, row.version), Loads())
         served = Served(row.model, row.version, base, base, learnt_from(row.manifest["lineage"]), scales, loads)
         if served.carrier is not None and loads.fresh:
+            served.carrier.warm_up()
             loads.take(self.learnt.carried(row.model, row.version, served.carrier))
         if (published := self._revisions.get((row.model, row.version))) is not None:
             revision, learnt = published

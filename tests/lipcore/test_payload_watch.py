@@ -150,3 +150,74 @@ def test_another_revision_of_the_model_sees_the_same_payload(carrier):
     kept = watch.step(same, few)
     floor = Carrier(OnlineModel.start(carrier.model).model(np.full(7, 0.1)))
     assert kept.step(floor, stream(300, 1.0, first=21.03, last=21.04)).held.estimate is kept.held.estimate
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_payload_is_noticed_wherever_in_a_cell_and_however_unevenly_its_rows_come(carrier, seed):
+    rng, rows = np.random.default_rng(seed), stream(300, 1.5, noise=0.01, last=20.6)
+    late = np.where(rng.random(len(rows)) < 0.3, rng.exponential(0.005, len(rows)), 0.0)
+    time = np.maximum.accumulate(rows.time + late) + 1e-5 * np.arange(len(rows))
+    rows = Rows(time, rows.q, rows.dq, rows.ddq, rows.tau, rows.code).take(slice(seed, None))
+    found = next(at for at, watch in followed(carrier, rows, block=3) if watch.held is not None)
+    assert UP < found < UP + 0.25
+
+
+def refined(watch):
+    steps = watch.refinement()
+    while True:
+        try:
+            next(steps)
+        except StopIteration as done:
+            return done.value
+
+
+def test_what_is_refined_stays_until_more_rows_are_refined(carrier):
+    rows = stream(300, 1.0, last=21.9)
+    first = followed(carrier, rows.take(rows.time < UP + 0.2))[-1][1]
+    found = refined(first)
+    later = rows.take((rows.time >= UP + 0.2) & (rows.time < UP + 0.25))
+    second = first.step(carrier, later).refined(found)
+    assert second.held.estimate is found.estimate
+    assert second.held.count == first.held.count + len(later)
+    assert second.refinement() is None
+    last = second.step(carrier, rows.take(rows.time >= UP + 0.25))
+    assert (last.held.estimate is found.estimate) == bool(found.estimate.draws)
+    assert refined(last).estimate.mass[0] == pytest.approx(1.0, abs=0.02)
+    assert last.put_down(30.0)._around(carrier).refined(found).held is None
+    other = last.declare(carrier, Body(1.0, np.array([0.0, 0.04, 0.08])), UP)._around(carrier)
+    assert other.refined(found).held is other.held
+    assert other.refinement() is None  # nothing was seen with it
+
+
+def test_an_outline_goes_on_as_the_watch_does(carrier):
+    rows = stream(300, 1.0, last=21.9)
+    watch = followed(carrier, rows.take(rows.time < UP + 0.5))[-1][1]
+    outline = watch.outline()
+    assert len(outline.held.rows) == 0
+    more = rows.take(rows.time >= UP + 0.5)
+    for block in range(0, len(more), 10):
+        part = more.take(slice(block, block + 10))
+        watch, outline = watch.step(carrier, part), outline.step(carrier, part)
+    for each in (watch, outline):
+        mass, std = each.held.estimate.mass
+        assert abs(mass - 1.0) < 4 * std + 0.005
+        assert std < 0.03
+
+
+def test_what_one_version_has_noticed_another_takes_for_about_there(carrier):
+    rows = stream(300, 1.5, last=21.9)
+    noticed = followed(carrier, rows.take(rows.time < UP + 0.5))[-1][1]
+    watch = Watch.of_another(noticed.to_json(), 7, carrier)
+    assert (watch.state, watch.since, watch.held.declared) == ("payload", noticed.since, False)
+    mass, std = watch.held.estimate.mass
+    assert mass == pytest.approx(1.5, abs=0.02)
+    assert 0.03 < std < 0.1
+    asked = rows.take(rows.time >= UP + 0.5)
+    vague, exact = (carrier.carrying(each.load).predict(asked.q, asked.dq, asked.ddq) for each in (watch, noticed))
+    assert (vague.tau_std.max(0) > 5 * exact.tau_std.max(0)).any()
+    assert (np.abs(vague.tau - asked.tau) < 1.96 * np.sqrt(vague.tau_std**2 + vague.noise_std**2)).mean() > 0.9
+    for block in range(0, len(asked), 10):
+        watch = watch.step(carrier, asked.take(slice(block, block + 10)))
+    assert watch.held.estimate.mass[1] < 0.03
+    nothing = Watch.of_another(Watch(7).put_down(3.0).to_json(), 7, carrier)
+    assert (nothing.held, nothing.since) == (None, 3.0)

@@ -27,9 +27,10 @@ PRELOADED = [
     "service.cli",
     "service.training.worker",
     "service.learning.learner.worker",
+    "service.learning.weigher.worker",
     __name__,
 ]
-STARTERS = ("service.compute.process", "service.learning.learner.process")
+STARTERS = ("service.compute.process", "service.compute.companion")
 """Modules that start processes of the service."""
 
 

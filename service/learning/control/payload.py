@@ -14,7 +14,7 @@ from lipcore.online.bodies import BELOW, DIAGONAL
 from lipcore.online.estimate import Estimate
 from lipcore.online.holding import Watch
 from lipcore.robots.urdf import RigidBody
-from service.foundation.errors import ConflictError, invalid_request
+from service.foundation.errors import ConflictError, NotFoundError, invalid_request, problem
 from service.journal import log
 from service.learning import owner
 from service.learning.control.payload_schema import (
@@ -76,7 +76,8 @@ def brief(monitor: Monitor, served: Served) -> list[LivePayload] | None:
 
 
 def declare(learners: Learners, model: str, request: PayloadRequest) -> Payloads:
-    """Say what an arm carries from now on; raise NotFoundError, InvalidRequestError or ConflictError."""
+    """Say what an arm carries from now on; raise NotFoundError, also for a stream that is not known,
+    InvalidRequestError or ConflictError."""
     inertia = None if request.inertia is None else np.array(request.inertia)
     try:
         with np.errstate(over="raise", invalid="raise"):  # numbers near the largest have no sums
@@ -102,6 +103,9 @@ def _say(learners: Learners, model: str, stream_id: str | None, known: dict[str,
     monitor = learners.monitor(model)
     with learners.turn(model):
         with learners.database.transaction(model) as session:
+            if stream_id is not None and log.stream(session, model, stream_id) is None:
+                expected = "a stream whose observations have come, or no stream_id: then it holds for all"
+                raise NotFoundError(f"no stream {stream_id!r}", [problem("stream_id", stream_id, expected)])
             event = log.append(session, model, "payload", {"stream_id": stream_id, "body": known}, time.time())
             declared = {"stream_id": stream_id, "body": known}
             audit.note(session, model, "payload declared", served.version, after=declared)

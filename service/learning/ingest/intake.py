@@ -10,12 +10,10 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
-from lipcore.online.holding import Watch
 from lipserve.wording import percent
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
@@ -27,6 +25,7 @@ from service.learning.ingest.judging import Verdict
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
 from service.learning.schema import LearningDisabledError, LearningOptions
+from service.learning.weigher.weighing import Weighing
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
 from service.storage.database import EventRow, ModelRow
@@ -40,8 +39,6 @@ ROW_NUMBERS, NUMBER_BYTES = 6, 8
 """What a row takes of the disk, for each joint: motion and torque, and half as much again for times and indices."""
 MOST_GAPS = 100
 """Gaps that an acknowledgement names."""
-PAYLOAD_ALARM_S = 60.0
-"""A robot that picks and places does so all day: of a model, payloads raise no more than one alarm in so long, s."""
 CONSEQUENCES = {
     "hold": "nothing is learnt until its owner has decided",
     "waits": "learning is held already, and none of this is learnt until its owner has decided",
@@ -63,7 +60,7 @@ class Intake:
     """Appends observations to the logs of models; safe from several threads, not for the event loop.
 
     monitor: gives the monitor of a model that is served. wake: tells the learner process that a model's log has grown.
-    show: called with each batch once it is durable.
+    show: called with each batch once it is durable. weighing: follows what arms carry.
     """
 
     def __init__(
@@ -77,6 +74,7 @@ class Intake:
         self.settings, self.database, self.disk = storage.settings, storage.database, storage.disk
         self.loaded, self.monitor = loaded, monitor
         self._wake, self._show = wake, show
+        self.weighing = Weighing(loaded, monitor, self.turn)
 
     @contextmanager
     def turn(self, monitor: Monitor, model: str) -> Iterator[None]:
@@ -120,8 +118,9 @@ class Intake:
         model = served.name
         rows = screened.own.stop - screened.own.start
         self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * rows)
-        before, watch = _followed(monitor, served, options, batch, screened)
-        handled = watch is not None and before is not None and (before.held is None) != (watch.held is None)
+        watch = None
+        if served.carrier is not None and options.payloads:
+            watch = monitor.payloads.came(batch.stream_id, served.carrier, served.version, batch.received)
         with self.database.transaction(model) as session:
             _check_kept(session, served)
             held = owner.held(session, model) is not None
@@ -139,7 +138,7 @@ class Intake:
                 scale = monitor.scale(batch.stream_id, served.version, served.base.scale)
                 adaptive = intervals.follow(scale, screened.seen)
                 # these errors were of the arm without what it carries, or with what it no longer does
-                if handled or screened.answered is not None:
+                if screened.answered is not None:
                     adaptive["scale"] = scale.to_json()
             record = None if verdict.record is None else verdict.record.to_json()
             judged = replace(batch, rows=verdict.rows, record=record)
@@ -154,9 +153,6 @@ class Intake:
                 _take_back(session, event)
             if verdict.change is not None:
                 _alarm(session, served, "waits" if held else options.on_change, verdict, event)
-            if watch is not None and handled and batch.received - monitor.payload_alarm_at >= PAYLOAD_ALARM_S:
-                monitor.payload_alarm_at = batch.received
-                _tell(session, served, watch, event)
             report = details | {
                 "model": model,
                 "version": served.version,
@@ -186,8 +182,8 @@ class Intake:
             event.report = report
         monitor.note(event, verdict.watch.innovations)
         if watch is not None and served.carrier is not None:
-            monitor.payloads.take(batch.stream_id, watch, served.version, batch.received)
             served.loads.take(monitor.payloads.carried(served.carrier, served.version))
+            self.weighing.follow(monitor, served, batch, screened)
         served.scales.take(monitor.factors(served.version) if options.adaptive_intervals else {})
         self._show(Judged(served, batch.stream_id, verdict.rows, screened))
         return report
@@ -200,35 +196,6 @@ class Intake:
                 retain(self.database, self.settings, model, time.time())
             except Exception as error:  # the batch is logged all the same
                 logger.error("the log of model %s was not brought within its limits", model, exc_info=error)
-
-
-def _followed(
-    monitor: Monitor, served: Served, options: LearningOptions, batch: NewBatch, screened: Screened
-) -> tuple[Watch | None, Watch | None]:
-    """The watch of a stream's payload before and after a batch; None where nothing is watched."""
-    carrier = served.carrier
-    if carrier is None or not options.payloads:
-        return None, None
-    before = monitor.payloads.watch(batch.stream_id, carrier, served.version)
-    rows = screened.rows.take(screened.asked)
-    try:
-        return before, before.step(carrier, rows.take(np.argsort(rows.time, kind="stable")))
-    except np.linalg.LinAlgError as error:  # the rows are logged all the same
-        logger.error("the payload of stream %r is watched anew: %s", batch.stream_id, error, exc_info=error)
-        return before, Watch(carrier.model.n_joints)
-
-
-def _tell(session: Session, served: Served, watch: Watch, event: EventRow) -> None:
-    """Raise the alarm of a payload that was taken up or put down."""
-    evidence = {"stream_id": event.stream_id, "sequence": event.sequence, "at": watch.since}
-    if watch.held is None:
-        owner.raise_alarm(
-            session, served.name, "payload", f"stream {event.stream_id} has put its payload down", evidence
-        )
-        return
-    mass, std = watch.held.estimate.mass
-    message = f"stream {event.stream_id} carries {mass:.2f} ± {std:.2f} kg more than it was trained with"
-    owner.raise_alarm(session, served.name, "payload", message, evidence | {"mass": {"mean": mass, "std": std}})
 
 
 def enabled(session: Session, model: str) -> LearningOptions:

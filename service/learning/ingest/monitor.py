@@ -159,6 +159,13 @@ class Monitor:
         known = self._scales.get(stream_id)
         return Adaptive.start(own) if known is None or known.version != version else known.state
 
+    def handled(self, event: EventRow) -> None:
+        """Take in that a stream has taken a payload up or put it down; the model's turn and `lock` are held. Its errors
+        on the way say nothing of its intervals."""
+        assert event.stream_id is not None
+        self._scales.pop(event.stream_id, None)
+        self.number = event.number
+
     def doubts(self, stream_id: str) -> bool:
         """Whether a stream did not fit from its first second on, and its owner had not decided at its last batch."""
         known = self._scales.get(stream_id)

@@ -9,12 +9,12 @@ from contextlib import suppress
 from math import inf
 from multiprocessing.connection import Connection
 
+from service.compute.companion import BEAT, BEAT_S, received
 from service.foundation.settings import Settings
 from service.journal import snapshots
 from service.learning.learner import publication
 from service.learning.learner.contest import Duels
 from service.learning.learner.follower import Follower
-from service.learning.learner.process import BEAT, BEAT_S
 from service.learning.learner.publication import Failed, Message
 from service.models import registry
 from service.storage.database import Database, LearnerRow
@@ -37,8 +37,8 @@ def run(settings: Settings, connection: Connection) -> None:
     try:
         with suppress(EOFError, BrokenPipeError):  # the service is gone
             beaten = time.monotonic()
-            while (models := _woken(connection, min(learner.pause(), BEAT_S))) is not None:
-                learner.wake(models)
+            while (work := received(connection, min(learner.pause(), BEAT_S))) is not None:
+                learner.wake({str(model) for model in work})
                 for message in learner.turn():
                     connection.send(message)
                 if time.monotonic() - beaten >= BEAT_S:  # by this thread, which does the work: no other one knows
@@ -47,18 +47,6 @@ def run(settings: Settings, connection: Connection) -> None:
         learner.close()
     finally:
         database.close()
-
-
-def _woken(connection: Connection, seconds: float) -> set[str] | None:
-    """Names of the models that the service wakes within so many seconds, None where it is time to end."""
-    models: set[str] = set()
-    while connection.poll(seconds):
-        names = connection.recv()
-        if names is None:
-            return None
-        models.update(names)
-        seconds = 0.0
-    return models
 
 
 class Learner:

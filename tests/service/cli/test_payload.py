@@ -2,6 +2,7 @@
 
 import pytest
 
+from tests.service.learning.payloads import lifting
 from tests.service.models.versions import publish_arm_at
 
 
@@ -12,8 +13,11 @@ def carrier(server):
     return "cli-carrier"
 
 
-def test_a_payload_is_declared_shown_and_removed(asked, carrier):
+def test_a_payload_is_declared_shown_and_removed(server, asked, carrier):
     assert f"no stream has told yet what an arm of {carrier} carries" in asked("payload", carrier)
+    for stream_id in ("cell-1", "cell-2"):
+        (first, *_) = lifting(stream_id, 0.0)
+        assert server.client.post(f"/v1/models/{carrier}/observations", json=first).status_code == 200
     declare = ("payload", carrier, "--mass", 1.5, "--com", "0,0.02,0.12")
     text = asked(*declare, "--stream", "cell-1")
     for line in (

@@ -6,6 +6,7 @@ from typing import Any
 
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
+from tests.service.data import eventually
 
 MASS = 1.5
 OFFSET = (0.0, 0.0, 0.1)
@@ -33,7 +34,13 @@ def lifting(stream_id: str, mass: float = MASS, push: float = 0.0) -> list[dict[
 
 
 def lift(client: Any, model: str, stream_id: str, mass: float = MASS, push: float = 0.0) -> None:
-    """Have a stream take it up."""
+    """Have a stream take it up, and wait until that is noticed."""
     for body in lifting(stream_id, mass, push):
         answer = client.post(f"/v1/models/{model}/observations", json=body)
         assert answer.status_code == 200, answer.text
+
+    def state() -> str | None:
+        streams = client.get(f"/v1/models/{model}/payload").json()["streams"]
+        return next((each["state"] for each in streams if each["stream_id"] == stream_id), None)
+
+    eventually(lambda: state() != "none")

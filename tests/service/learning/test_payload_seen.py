@@ -12,8 +12,9 @@ from lipcore.online.bodies import CENTRE, WIDTH
 from lipcore.online.bodies import body as parameters_of
 from lipserve import ApiError, AsyncClient, Client
 from service.learning.control import payload
+from tests.service.data import eventually
 from tests.service.learning.following import following
-from tests.service.learning.payloads import MASS, OFFSET, lift
+from tests.service.learning.payloads import MASS, OFFSET, lift, lifting
 from tests.service.models.versions import publish_arm_at
 
 CELL = "cell"
@@ -41,8 +42,17 @@ def gauges(server, model):
 
 
 def test_what_is_taken_up_is_seen_everywhere_alike(server, client, carrier):
-    seen = client.payload(carrier)
-    assert seen.as_dict() == server.client.get(f"/v1/models/{carrier}/payload").json()
+    def alike():
+        """What is seen, once nothing was refined between the first look and the last."""
+        looks = []
+        for _ in range(2):
+            (told,) = (each for each in next(client.live(carrier)).payloads if each.stream_id == CELL)
+            raw = server.client.get(f"/v1/models/{carrier}/payload").json()
+            looks.append((client.payload(carrier), raw, told, gauges(server, carrier)))
+        return looks[0] if looks[0] == looks[1] else None
+
+    seen, raw, told, metrics = eventually(alike)
+    assert seen.as_dict() == raw
     assert (seen.frame, seen.link, seen.reason, seen.default) == ("learnt", "panda_joint7", None, None)
     (stream,) = (each for each in seen.streams if each.stream_id == CELL)
     assert (stream.state, stream.declared) == ("payload", False)
@@ -50,19 +60,22 @@ def test_what_is_taken_up_is_seen_everywhere_alike(server, client, carrier):
     assert body.mass.mean == pytest.approx(MASS, abs=5 * body.mass.std)
     assert 0.0 < body.mass.std < 0.05
     np.testing.assert_array_less(np.abs(np.subtract(body.com.mean, OFFSET)), 5 * np.array(body.com.std))
-    (told,) = (each for each in next(client.live(carrier)).payloads if each.stream_id == CELL)
     for name in ("state", "declared", "since", "rows"):
         assert getattr(told, name) == getattr(stream, name), name
     assert told.mass == body.mass
-    metrics = gauges(server, carrier)
     assert metrics["lipserve_payload_mass_kg", CELL] == body.mass.mean
     assert metrics["lipserve_payload_mass_std_kg", CELL] == body.mass.std
     (alarm,) = (each for each in client.alarms(carrier) if each.kind == "payload")
-    assert re.search(rf"stream {CELL} carries 1\.(4[89]|5\d) ±", alarm.message)
+    assert re.search(rf"stream {CELL} carries 1\.\d\d ±", alarm.message)
 
 
 def test_it_is_declared_and_removed_for_one_robot_or_for_all(server, client, carrier):
     inertia = np.diag([0.01, 0.02, 0.02])
+    with pytest.raises(ApiError, match="no stream 'tool'") as caught:  # whoever mistypes a name is told
+        client.declare_payload(carrier, 2.0, np.array([0.0, 0.0, 0.1]), inertia, stream_id="tool")
+    assert caught.value.status == 404
+    (known, *_) = lifting("tool", 0.0)
+    assert server.client.post(f"/v1/models/{carrier}/observations", json=known).status_code == 200
     said = client.declare_payload(carrier, 2.0, np.array([0.0, 0.0, 0.1]), inertia, stream_id="tool")
     (tool,) = (each for each in said.streams if each.stream_id == "tool")
     assert (tool.state, tool.declared, tool.rows) == ("payload", True, 0)

@@ -117,3 +117,14 @@ def test_a_deleted_batch_is_not_taken_for_a_new_one(database):
     robot = source(database)
     assert (robot.forgotten, source(database, "robot-2").forgotten) == (6, 1)
     assert [log.is_forgotten(robot, k) for k in (3, 4, 5, 6, 7, 9)] == [False, True, True, True, False, False]
+
+
+def test_what_streams_were_last_said_or_noticed_to_carry_stays(database):
+    body = {"mass": 1.0, "com": [0.0, 0.0, 0.1], "inertia": None}
+    for stream_id in (None, "a", None, "a"):  # 1 to 4
+        note(database, "payload", {"stream_id": stream_id, "body": body})
+    note(database, "payload", {"stream_id": "b", "watch": {}})  # 5
+    write(database, batch(0))  # 6
+    snapshot(database, 6)
+    retain(database, batches=0)
+    assert kept(database) == [3, 4, 5, 6]

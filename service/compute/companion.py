@@ -1,0 +1,210 @@
+"""A process beside the service: given work, listened to, and started again when it dies or hangs.
+
+Nothing here imports numerics: the process takes its place on the machine before it does, see `compute.process`.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import signal
+import threading
+import time
+from collections.abc import Callable, Hashable, Iterable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from service.compute.process import Place, call, start_process
+from service.compute.progress import LOOK_S, Progress
+from service.foundation.settings import Settings
+
+logger = logging.getLogger(__name__)
+
+FIRST_PAUSE, LONGEST_PAUSE = 0.5, 30.0
+"""Seconds until a process that died is started again: each time twice as long, unless it lived for LONGEST_PAUSE."""
+END_SECONDS = 5.0
+"""Longest wait for the process to end what it does and end."""
+BEAT, BEAT_S = "beat", 1.0
+"""What the process says after a step, and how often it says so at most, s."""
+Work = dict[Hashable, list[Any]]
+"""What is to be done, by what it is about, in order."""
+
+
+class Companion:
+    """A process that is started when it gets work for the first time, and ends with the service.
+
+    name: for people; place: on the machine; run: module and function that the process runs, with the settings and a
+    connection over which it is given `Work`, None at the end; on_message: called in a thread of its own, with one
+    message after the other, in the order in which they were sent; at_start: what each process is told of first.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        place: Place,
+        settings: Settings,
+        run: tuple[str, str],
+        on_message: Callable[[Any], None],
+        at_start: Callable[[], Iterable[Hashable]] = tuple,
+    ) -> None:
+        self.name, self.place, self.settings = name, place, settings
+        self.on_message, self._run, self._at_start = on_message, run, at_start
+        self._changed = threading.Condition()
+        self._work: Work = {}
+        self._connection: Connection | None = None
+        self._process: BaseProcess | None = None
+        self._progress: Progress | None = None
+        self._threads: list[threading.Thread] = []
+        self._closing = False
+
+    @property
+    def pid(self) -> int | None:
+        """Id of the process, None while there is none."""
+        process = self._process
+        return None if process is None or not process.is_alive() else process.pid
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds for which the process has not got on; 0 while it does, or there is none."""
+        progress = self._progress
+        return 0.0 if progress is None else progress.silent_s
+
+    @property
+    def needed(self) -> bool:
+        """Whether there should be a process: it has got work, and the service is not closing."""
+        return bool(self._threads) and not self._closing
+
+    def give(self, about: Hashable, *items: Any, most: int | None = None) -> int:
+        """Give the process work. Never waits for it. Of what it has not taken yet at most the last `most` items are
+        kept; return how many were dropped."""
+        with self._changed:
+            if self._closing:
+                return 0
+            waiting = self._work.setdefault(about, [])
+            waiting += items
+            dropped = 0 if most is None else max(0, len(waiting) - most)
+            del waiting[:dropped]
+            if not self._threads:
+                self._threads = [threading.Thread(target=each, daemon=True) for each in (self._supervise, self._send)]
+                for thread in self._threads:
+                    thread.start()
+            self._changed.notify_all()
+            return dropped
+
+    def close(self) -> None:
+        """Let the process end; end it where that takes too long."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        if not self._threads:
+            return
+        supervisor, sender = self._threads
+        supervisor.join(END_SECONDS)
+        if supervisor.is_alive() and self._process is not None:
+            logger.warning("the %s process does not end: killed", self.name)
+            self._process.kill()
+        supervisor.join()
+        sender.join()
+
+    def _supervise(self) -> None:
+        pause = FIRST_PAUSE
+        while not self._closing:
+            began = time.monotonic()
+            try:
+                connection, self._process = self._start()
+            except Exception:  # no memory, too many processes: another time there may be
+                logger.exception("the %s process cannot be started: tried again", self.name)
+                pause = self._rest(pause)
+                continue
+            with self._changed:
+                self._connection = connection
+                for each in self._at_start():
+                    self._work.setdefault(each, [])
+                self._changed.notify_all()
+                if self._closing:  # while it was started: the sender has gone already
+                    self._process.kill()
+            self._listen(connection, self._process)
+            self._process.join()
+            with self._changed:
+                self._connection = self._progress = None
+                if self._closing:
+                    return
+                pause = FIRST_PAUSE if time.monotonic() - began >= LONGEST_PAUSE else pause
+                code = self._process.exitcode
+                logger.error("the %s process ended with exit code %s; it is started again", self.name, code)
+            pause = self._rest(pause)
+
+    def _rest(self, pause: float) -> float:
+        """Wait before the next start; return how long to wait before the one after that."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closing, pause)
+        return min(2 * pause, LONGEST_PAUSE)
+
+    def _start(self) -> tuple[Connection, BaseProcess]:
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        arguments = self.place, self._run, self.settings, theirs
+        process = context.Process(target=_begin, args=arguments, daemon=True, name=f"lipserve-{self.name}")
+        process.start()
+        theirs.close()  # the process has its own: with this one open, its end would go unnoticed
+        return ours, process
+
+    def _listen(self, connection: Connection, process: BaseProcess) -> None:
+        """Hand on the messages of the process, until it has ended; end it where it does not get on."""
+        pids = () if process.pid is None else (process.pid,)
+        quiet_s, step_s = self.settings.learner_heartbeat_s, self.settings.learner_step_s
+        progress = self._progress = Progress(lambda: pids, quiet_s, step_s)
+        while True:
+            try:
+                message = connection.recv() if connection.poll(min(LOOK_S, quiet_s / 4)) else None
+            except (EOFError, OSError):
+                return
+            if message is None:
+                if (reason := progress.look()) is not None and process.is_alive():
+                    logger.error("the %s process hangs and is killed: %s", self.name, reason)
+                    process.kill()
+                    return
+                continue
+            progress.step()
+            if message == BEAT:
+                continue
+            try:
+                self.on_message(message)
+            except Exception:  # the next one may be right
+                logger.exception("a message of the %s process was not taken: %s", self.name, message)
+
+    def _send(self) -> None:
+        """Hand over work: in a thread, because the process may be busy and the pipe full."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._closing or (self._connection is not None and self._work))
+                connection, closing = self._connection, self._closing
+                work, self._work = self._work, {}
+            if connection is not None:
+                with suppress(OSError):  # it has died
+                    connection.send(None if closing else work)
+            if closing:
+                return
+
+
+def received(connection: Connection, seconds: float) -> Work | None:
+    """The work that the service gives its companion within so many seconds, None where it is time to end; for the
+    process. Raise EOFError where the service is gone."""
+    work: Work = {}
+    while connection.poll(seconds):
+        given = connection.recv()
+        if given is None:
+            return None
+        for about, items in given.items():
+            work.setdefault(about, []).extend(items)
+        seconds = 0.0
+    return work
+
+
+def _begin(place: Place, run: tuple[str, str], settings: Settings, connection: Connection) -> None:
+    start_process(place)
+    # a signal to all processes of the service ends the parent in order, which then lets this one end
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    call(*run, settings, connection)  # numerics, see above

@@ -1,0 +1,57 @@
+"""What the weigher process is given, and what it answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lipcore.data.samples import Array
+from lipcore.online.batch import Rows
+from lipcore.online.holding import Watch
+
+Stream = tuple[str, int, str]
+"""A model, the version that answers, and one of its streams."""
+
+
+@dataclass(frozen=True)
+class Revised:
+    """What a version has learnt: weights and root of its posterior, see `CompactPosterior`."""
+
+    weights: Array
+    root: Array
+
+
+@dataclass(frozen=True)
+class Unweighed:
+    """Rows of a stream in the order of event time, which have an answer. received: Unix time, s; said: how often its
+    owner has said what the stream carries.
+
+    What the process may not know yet: revised: what the version has learnt; known: what the stream carries.
+    """
+
+    rows: Rows
+    received: float
+    said: int
+    revised: Revised | None = None
+    known: Watch | None = None
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """What a stream carries after its latest rows. watch: without these rows; received, said: of them; seconds: of CPU
+    that following them took."""
+
+    stream: Stream
+    watch: Watch
+    received: float
+    said: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Asked:
+    """The process does not know a stream, whose rows have come."""
+
+    stream: Stream
+
+
+Message = Weighed | Asked

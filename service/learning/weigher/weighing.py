@@ -1,0 +1,140 @@
+"""What streams carry, as the service sees it: rows go to the weigher process, and what it notices is answered with at
+once, then logged."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+
+import numpy as np
+from sqlalchemy import select
+
+from lipcore.online.holding import Watch
+from service.foundation.errors import ServiceError
+from service.journal import log
+from service.journal.log import NewBatch
+from service.learning import owner
+from service.learning.ingest.monitor import Monitor
+from service.learning.ingest.screening import Screened
+from service.learning.weigher.messages import Asked, Message, Revised, Stream, Unweighed, Weighed
+from service.learning.weigher.process import MOST_WAITING, WeigherProcess
+from service.models.loaded import LoadedModels, Served
+from service.storage.database import EventRow
+
+logger = logging.getLogger(__name__)
+
+ALARM_S = 60.0
+"""A robot that picks and places does so all day: of a model, payloads raise no more than one alarm in so long, s."""
+
+
+class Weighing:
+    """Follows what the streams of all models carry; safe from several threads.
+
+    process: the weigher process. monitor, turn: see `Intake`.
+    """
+
+    def __init__(
+        self,
+        loaded: LoadedModels,
+        monitor: Callable[[Served], Monitor],
+        turn: Callable[[Monitor, str], AbstractContextManager[None]],
+    ) -> None:
+        self.loaded, self.database = loaded, loaded.storage.database
+        self._monitor, self._turn = monitor, turn
+        self.process = WeigherProcess(loaded.storage.settings, self.take)
+        self._lock = threading.Lock()
+        self._knows: dict[Stream, tuple[int, int]] = {}  # which process, and up to which declaration
+        self._revisions: dict[tuple[str, int], tuple[int, int]] = {}  # which process, and which revision
+
+    def close(self) -> None:
+        """End the process."""
+        self.process.close()
+
+    def follow(self, monitor: Monitor, served: Served, batch: NewBatch, screened: Screened) -> None:
+        """Hand over a batch that is logged; its model's turn is held. Never waits for the process."""
+        assert served.carrier is not None
+        rows = screened.rows.take(screened.asked)
+        if not len(rows):
+            return
+        stream, version = (served.name, served.version, batch.stream_id), (served.name, served.version)
+        said, epoch = monitor.payloads.said(batch.stream_id), self.process.epoch
+        with self._lock:
+            knows = self._knows.get(stream) == (epoch, said)
+            same = self._revisions.get(version) == (epoch, served.revision)
+            self._knows[stream], self._revisions[version] = (epoch, said), (epoch, served.revision)
+        known = revised = None
+        if not knows:
+            known = monitor.payloads.watch(batch.stream_id, served.carrier, served.version).outline()
+        if not same:
+            posterior = served.model.posterior
+            revised = Revised(posterior.weights, posterior.root)
+        rows = rows.take(np.argsort(rows.time, kind="stable"))
+        if self.process.give(stream, Unweighed(rows, batch.received, said, revised, known), most=MOST_WAITING):
+            self._forget(stream)  # what was dropped may have said what was not known
+
+    def take(self, message: Message) -> None:
+        """Act on a message of the process; called in its reader's thread."""
+        if isinstance(message, Asked):
+            self._forget(message.stream)
+            return
+        model, version, stream_id = message.stream
+        served = self.loaded.served(model).get(version)
+        if served is None or served.carrier is None:
+            return
+        monitor = self._monitor(served)
+        before = monitor.payloads.watch(stream_id, served.carrier, version)
+        if not monitor.payloads.take(stream_id, message.watch, version, message.received, message.said):
+            return
+        served.loads.take(monitor.payloads.carried(served.carrier, version))
+        if (before.held is None, before.since) == (message.watch.held is None, message.watch.since):
+            return
+        try:
+            self._note(monitor, served, message)
+        except ServiceError as error:  # it is answered with, and the next batch's report says so
+            logger.error("what stream %r of model %r carries is not logged: %s", stream_id, model, error)
+
+    def _forget(self, stream: Stream) -> None:
+        with self._lock:
+            self._knows.pop(stream, None)
+            self._revisions.pop(stream[:2], None)
+
+    def _note(self, monitor: Monitor, served: Served, message: Weighed) -> None:
+        """Log what was taken up or put down, and take back what the rows since then have taught."""
+        model, _, stream_id = message.stream
+        watch, database = message.watch, self.database
+        with self._turn(monitor, model):
+            if monitor.payloads.said(stream_id) != message.said:
+                return
+            with database.transaction(model) as session:
+                detail = {"stream_id": stream_id, "watch": watch.to_json()}
+                if watch.held is not None and not watch.held.declared and watch.since is not None:
+                    taught = select(EventRow).where(
+                        EventRow.model == model,
+                        EventRow.stream_id == stream_id,
+                        EventRow.kind == "batch",
+                        EventRow.last >= watch.since,
+                        EventRow.learnt > 0,
+                        EventRow.void.is_(False),
+                    )
+                    for each in session.scalars(taught.order_by(EventRow.number)).all():
+                        log.unlearn(session, model, each, message.received)
+                event = log.append(session, model, "payload", detail, message.received)
+                event.stream_id, event.version = stream_id, served.version
+                if message.received - monitor.payload_alarm_at >= ALARM_S:
+                    monitor.payload_alarm_at = message.received
+                    text, mass = _told(stream_id, watch)
+                    evidence = {"stream_id": stream_id, "at": watch.since, **mass}
+                    owner.raise_alarm(session, model, "payload", text, evidence)
+            monitor.handled(event)
+            served.scales.take(monitor.factors(served.version))
+
+
+def _told(stream_id: str, watch: Watch) -> tuple[str, dict[str, object]]:
+    """What an alarm says, and its evidence."""
+    if watch.held is None:
+        return f"stream {stream_id} has put its payload down", {}
+    mean, std = watch.held.estimate.mass
+    text = f"stream {stream_id} carries {mean:.2f} ± {std:.2f} kg more than it was trained with"
+    return text, {"mass": {"mean": mean, "std": std}}
