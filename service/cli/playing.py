@@ -22,7 +22,7 @@ from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.vocabulary import TorqueConvention
 from lipserve import StreamClient, StreamError
-from lipserve.exchange import StreamAnswer, StreamLearnt
+from lipserve.exchange import StreamAnswer, StreamLearnt, StreamRefusal
 from service.cli.consoles import CommandError
 from service.cli.wording import in_shell
 from service.datasets.formats.opening import open_table
@@ -122,6 +122,17 @@ def learnt_figures(learnt: StreamLearnt) -> dict[str, Any]:
         "kept_out": dict(learnt.rejected),
         "revision": learnt.revision,
     }
+
+
+def refused_figures(refusals: Sequence[StreamRefusal]) -> list[dict[str, Any]]:
+    """Torques that were not logged, for JSON: those that follow each other for the same reason together."""
+    told: list[dict[str, Any]] = []
+    for each in refusals:
+        if told and (told[-1]["through"] + 1, told[-1]["message"]) == (each.first, each.message):
+            told[-1]["through"] = each.through
+        else:
+            told.append({"first": each.first, "through": each.through, "code": each.code, "message": each.message})
+    return told
 
 
 FEWEST = 10

@@ -251,15 +251,12 @@ def _print_second(second: int, part: Tally, stream: StreamClient, learn: bool, a
 
 
 def _print_all(total: Tally, stream: StreamClient, learn: bool, as_json: bool) -> None:
-    from service.cli.playing import learnt_figures  # noqa: PLC0415 - as above
+    from service.cli.playing import learnt_figures, refused_figures  # noqa: PLC0415 - as above
 
     figures = {**total.figures(), "joints": total.joints(stream.hello.joint_names)}
     if learn:
         figures["learnt"] = learnt_figures(stream.learnt)
-        figures["not_logged"] = [
-            {"first": each.first, "through": each.through, "code": each.code, "message": each.message}
-            for each in stream.refusals
-        ]
+        figures["not_logged"] = refused_figures(stream.refusals)
     if as_json:
         print_json({"summary": figures}, one_line=True)
         return

@@ -186,6 +186,7 @@ class Learners:
     def forget(self, model: str) -> None:
         """Keep nothing of a model that has been deleted."""
         self.live.forget(model)
+        self.weighing.forget(model)
         with self._lock:
             self._monitors.pop(model, None)
             self._status = {key: status for key, status in self._status.items() if key[0] != model}

@@ -109,6 +109,7 @@ class Payloads:
             if event.kind == "payload" and "watch" in detail:
                 self._forget(detail["stream_id"])
                 self._noted[detail["stream_id"]] = Noted(detail["watch"], event.version, event.received)
+                self._said[detail["stream_id"]] = event.number
             elif event.kind == "payload":
                 noted, stream_id = Noted(detail, None, event.received), detail["stream_id"]
                 self._said[stream_id] = event.number
@@ -123,7 +124,8 @@ class Payloads:
                 self._noted[event.stream_id] = Noted(values, event.version, event.received)
 
     def said(self, stream_id: str) -> int:
-        """Number of the event with which the owner has said last what a stream carries, 0 before the first."""
+        """Number of the event that says what a stream carries: the owner's last one, or what another service, or this
+        one before it was started, has noticed since; 0 before the first."""
         return max(self._said.get(stream_id, 0), self._said.get(None, 0))
 
     def watch(self, stream_id: str, carrier: Carrier, version: int) -> Watch:

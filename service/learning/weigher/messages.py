@@ -10,6 +10,8 @@ from lipcore.online.holding import Watch
 
 Stream = tuple[str, int, str]
 """A model, the version that answers, and one of its streams."""
+MOST_STREAMS = 1000
+"""Streams that the process knows; the one that was silent for longest is forgotten, and asked for again."""
 
 
 @dataclass(frozen=True)

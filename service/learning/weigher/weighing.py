@@ -18,7 +18,7 @@ from service.journal.log import NewBatch
 from service.learning import owner
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
-from service.learning.weigher.messages import Asked, Message, Revised, Stream, Unweighed, Weighed
+from service.learning.weigher.messages import MOST_STREAMS, Asked, Message, Revised, Stream, Unweighed, Weighed
 from service.learning.weigher.process import MOST_WAITING, WeigherProcess
 from service.models.loaded import LoadedModels, Served
 from service.storage.database import EventRow
@@ -61,6 +61,8 @@ class Weighing:
         stream, version = (served.name, served.version, batch.stream_id), (served.name, served.version)
         said, epoch = monitor.payloads.said(batch.stream_id), self.process.epoch
         with self._lock:
+            if len(self._knows) > MOST_STREAMS:  # what the process has not forgotten is told again
+                self._knows.clear()
             knows = self._knows.get(stream) == (epoch, said)
             same = self._revisions.get(version) == (epoch, served.revision)
             self._knows[stream], self._revisions[version] = (epoch, said), (epoch, served.revision)
@@ -72,12 +74,20 @@ class Weighing:
             revised = Revised(posterior.weights, posterior.root)
         rows = rows.take(np.argsort(rows.time, kind="stable"))
         if self.process.give(stream, Unweighed(rows, batch.received, said, revised, known), most=MOST_WAITING):
-            self._forget(stream)  # what was dropped may have said what was not known
+            self._ask(stream)  # what was dropped may have said what was not known
+
+    def forget(self, model: str) -> None:
+        """Keep nothing of a model that has been deleted."""
+        with self._lock:
+            self._knows = {stream: each for stream, each in self._knows.items() if stream[0] != model}
+            self._revisions = {version: each for version, each in self._revisions.items() if version[0] != model}
+        if self.process.needed:
+            self.process.give(model)
 
     def take(self, message: Message) -> None:
         """Act on a message of the process; called in its reader's thread."""
         if isinstance(message, Asked):
-            self._forget(message.stream)
+            self._ask(message.stream)
             return
         model, version, stream_id = message.stream
         served = self.loaded.served(model).get(version)
@@ -95,7 +105,8 @@ class Weighing:
         except ServiceError as error:  # it is answered with, and the next batch's report says so
             logger.error("what stream %r of model %r carries is not logged: %s", stream_id, model, error)
 
-    def _forget(self, stream: Stream) -> None:
+    def _ask(self, stream: Stream) -> None:
+        """Say all of a stream with its next rows."""
         with self._lock:
             self._knows.pop(stream, None)
             self._revisions.pop(stream[:2], None)

@@ -21,7 +21,7 @@ from lipcore.online.holding import Watch
 from lipcore.online.payload import estimate
 from service.compute.companion import BEAT, BEAT_S, received
 from service.foundation.settings import Settings
-from service.learning.weigher.messages import Asked, Message, Revised, Stream, Unweighed, Weighed
+from service.learning.weigher.messages import MOST_STREAMS, Asked, Message, Revised, Stream, Unweighed, Weighed
 from service.models import registry
 from service.storage.database import Database
 from service.storage.files import Files
@@ -30,8 +30,6 @@ logger = logging.getLogger(__name__)
 
 REFINING_SHARE, REFINING_S = 0.15, 1.0
 """CPU time that refining may take, s a second, and at most at once: what was just taken up is refined first of all."""
-MOST_STREAMS = 1000
-"""Streams that are known; the one that was silent for longest is forgotten, and asked for again."""
 
 
 def run(settings: Settings, connection: Connection) -> None:
@@ -42,10 +40,12 @@ def run(settings: Settings, connection: Connection) -> None:
         with suppress(EOFError, BrokenPipeError):  # the service is gone
             beaten = time.monotonic()
             while (work := received(connection, min(weigher.pause(), BEAT_S))) is not None:
-                for stream, given in work.items():
-                    assert isinstance(stream, tuple)
-                    for message in weigher.follow(stream, given):
-                        connection.send(message)
+                for about, given in work.items():
+                    if isinstance(about, tuple):
+                        for message in weigher.follow(about, given):
+                            connection.send(message)
+                    else:  # a model that was deleted
+                        weigher.forget(str(about))
                 for message in weigher.refine():
                     connection.send(message)
                 if time.monotonic() - beaten >= BEAT_S:
@@ -72,6 +72,11 @@ class Versions:
         if len(self._known) > self._most:
             self._known.popitem(last=False)
         return self._known[key]
+
+    def forget(self, model: str) -> None:
+        """Keep nothing of a model: another one may get its name."""
+        for key in [key for key in self._known if key[0] == model]:
+            del self._known[key]
 
 
 @dataclass
@@ -127,6 +132,16 @@ class Weigher:
             followed.refining = followed.watch.refinement()
         yield from self._told(stream, followed, time.process_time() - began)
         self._warm_up(stream[:2], rows)
+
+    def forget(self, model: str) -> None:
+        """Keep nothing of a model that was deleted."""
+        self._versions.forget(model)
+        for stream in [each for each in self._streams if each[0] == model]:
+            del self._streams[stream]
+        for version in [each for each in self._carriers if each[0] == model]:
+            del self._carriers[version]
+            self._preparing.pop(version, None)
+        self._warm = {key for key in self._warm if key[0] != model}
 
     def refine(self) -> Iterator[Weighed]:
         """Go on with what is refined, one step of the stream that has come last, where there is time for it."""

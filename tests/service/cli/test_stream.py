@@ -9,8 +9,8 @@ import pytest
 import typer
 
 from lipserve import StreamClient, StreamError
-from lipserve.exchange import StreamAnswer
-from service.cli.playing import Tally, recorded
+from lipserve.exchange import StreamAnswer, StreamRefusal
+from service.cli.playing import Tally, recorded, refused_figures
 from service.cli.simulate import app as simulating
 from service.cli.stream import app as streaming_app
 from tests.service.data import eventually, stream, train, upload
@@ -206,3 +206,15 @@ def test_latency_is_timed_over_stream_and_http(lipserve, streaming):
     for figures in timed["milliseconds"].values():
         assert 0 < figures["p50"] <= figures["p99"] <= figures["largest"]
     assert set(timed["milliseconds"]) == {"stream", "HTTP"}
+
+
+def test_what_is_kept_out_for_one_reason_is_said_once():
+    off, full = ("learning_disabled", "learning is switched off"), ("storage_full", "the disk is full")
+    given = [(1, 11, off), (12, 20, off), (21, 22, full), (30, 31, full), (32, 40, off)]
+    told = refused_figures([StreamRefusal(first, through, *why, []) for first, through, why in given])
+    assert [(each["first"], each["through"], each["code"]) for each in told] == [
+        (1, 20, off[0]),
+        (21, 22, full[0]),
+        (30, 31, full[0]),
+        (32, 40, off[0]),
+    ]

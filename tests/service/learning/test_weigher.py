@@ -49,6 +49,9 @@ def weigher(model):
             assert (name, version) == KEY[:2]
             return model
 
+        def forget(self, name):
+            assert name == KEY[0]
+
     return Weigher(Versions())
 
 
@@ -144,6 +147,25 @@ def test_the_stream_that_was_silent_for_longest_is_forgotten(weigher, batches, m
     other = (*KEY[:2], "other")
     list(weigher.follow(other, [Unweighed(batches[0], 0.0, 0, known=Watch(7))]))
     assert follow(weigher, batches[2]) == [Asked(KEY)]
+
+
+def test_nothing_is_kept_of_a_model_that_was_deleted(weigher, batches):
+    told(weigher, batches[:11])
+    weigher.forget(KEY[0])
+    assert weigher.pause() == np.inf
+    assert follow(weigher, batches[11]) == [Asked(KEY)]
+
+
+def test_another_model_of_the_same_name_is_another(panda):
+    client = panda.client
+    publish_arm_at(panda.home, "arm")
+    lift(client, "arm", "cell")
+    assert client.delete("/v1/models/arm").status_code == 204
+    publish_arm_at(panda.home, "arm")
+    assert client.get("/v1/models/arm/payload").json()["streams"] == []
+    lift(client, "arm", "cell")
+    (shown,) = client.get("/v1/models/arm/payload").json()["streams"]
+    assert shown["payload"]["mass"]["mean"] == pytest.approx(1.5, abs=0.05)
 
 
 @pytest.fixture
