@@ -167,7 +167,9 @@ class Settings(BaseSettings):
     )
 
     max_observation_rows: Count = Field(5000, description="Most samples of one observation batch.")
-    max_observation_streams: Count = Field(1000, description="Most sources of observations of one model.")
+    max_observation_streams: Count = Field(
+        1000, description="Most sources of observations of a model; a new one takes the place of the longest silent."
+    )
     stream_flush_rows: Count = Field(100, description="Frames of a stream that are logged together, at most.")
     stream_flush_s: float = Field(0.1, gt=0, description="Longest wait in s of a frame to learn from for others.")
     max_velocity: float = Field(50.0, ge=0.01, le=1e4, description="Largest |dq| in rad/s or m/s that is learnt from.")

@@ -29,6 +29,8 @@ UNTIMED = [CODES.index("non_finite"), CODES.index("time_jump")]
 """Codes of rows whose own time says nothing."""
 MOST_RANGES = 1000
 """Ranges that are remembered; the lowest are given up first, being the least likely to be filled."""
+IN_USE_S = 10.0
+"""Seconds without a batch after which a stream makes room for a new one, if it was silent for longest."""
 ARRAYS = tuple(field.name for field in fields(Rows))
 """Of the safetensors archive that an event's rows are kept as."""
 
@@ -119,7 +121,7 @@ def append_batch(session: Session, model: str, batch: NewBatch, most_streams: in
     """Log a batch and what its stream still misses; return its event, which is written with the session's next flush.
 
     Raise ConflictError where the stream is of another kind, where frames do not go on after the last, or where the
-    batch may have been learnt before and is no longer kept; BusyError beyond `most_streams` streams of the model. That
+    batch may have been learnt before and is no longer kept; BusyError beyond `most_streams` streams in use. That
     no batch of this sequence is kept is checked with `find_batch` before, in the same transaction.
     """
     names = ("stream_id", "sequence", "last_sequence", "digest", "version", "revision", "report", "record")
@@ -290,12 +292,9 @@ def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: i
     """Note in the row of a stream which sequences are there; a new row for a new stream."""
     source = stream(session, model, batch.stream_id)
     if source is None:
-        known = session.scalar(select(func.count()).select_from(StreamRow).where(StreamRow.model == model)) or 0
-        if most_streams is not None and known >= most_streams:
-            raise BusyError(
-                f"model {model!r} has {known} sources of observations, the most it may have: go on with one of their "
-                "stream_ids, or raise LIPSERVE_MAX_OBSERVATION_STREAMS"
-            )
+        _check_new(session, model, batch)
+        if most_streams is not None:
+            _make_room(session, model, most_streams, batch.received)
         source = StreamRow(model=model, stream_id=batch.stream_id, kind=batch.kind, offset=batch.offset)
         source.created_at = now()
         gaps = Gaps(batch.sequence, batch.last_sequence)
@@ -303,7 +302,36 @@ def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: i
     else:
         _check_stream(source, batch)
         gaps = Gaps.from_json(source.missing, source.last).arrived(batch.sequence, batch.last_sequence)
-    source.last, source.missing = gaps.last, gaps.to_json()
+    source.last, source.missing, source.received = gaps.last, gaps.to_json(), batch.received
+
+
+def _check_new(session: Session, model: str, batch: NewBatch) -> None:
+    """Raise ConflictError where the log has later batches of a stream that was silent for so long that it is no longer
+    known."""
+    of_stream = EventRow.model == model, EventRow.stream_id == batch.stream_id
+    last = session.scalar(select(func.max(EventRow.last_sequence)).where(*of_stream))
+    if last is not None and batch.sequence <= last:
+        raise ConflictError(
+            f"stream {batch.stream_id!r} was silent for so long that nobody knows any more which of its batches up to "
+            f"{last} have come: go on with higher sequences, or with a stream_id of its own"
+        )
+
+
+def _make_room(session: Session, model: str, most: int, received: float) -> None:
+    """Forget the stream that was silent for longest where there are too many; raise BusyError where all are in use."""
+    of_model = StreamRow.model == model
+    known = session.scalar(select(func.count()).select_from(StreamRow).where(of_model)) or 0
+    if known < most:
+        return
+    used = func.coalesce(StreamRow.received, 0.0)
+    oldest = session.scalars(select(StreamRow).where(of_model).order_by(used).limit(1)).one()
+    if (oldest.received or 0.0) > received - IN_USE_S:
+        raise BusyError(
+            f"model {model!r} has {known} sources of observations in use, the most it may have: go on with one of "
+            "their stream_ids, or raise LIPSERVE_MAX_OBSERVATION_STREAMS"
+        )
+    session.delete(oldest)
+    session.flush()
 
 
 def check_kind(source: StreamRow | None, kind: StreamKind) -> None:

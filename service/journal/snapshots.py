@@ -175,7 +175,10 @@ def _deletable(session: Session, model: str) -> list[ColumnElement[bool]]:
     """Conditions of the events that nothing needs."""
     through = min(contained(session, model), log.newest(session, model) - 1)
     stream = EventRow.detail["stream_id"].as_string()
-    payloads = select(func.max(EventRow.number)).where(EventRow.model == model, EventRow.kind == "payload")
+    known = select(StreamRow.stream_id).where(StreamRow.model == model)
+    payloads = select(func.max(EventRow.number)).where(
+        EventRow.model == model, EventRow.kind == "payload", or_(stream.is_(None), stream.in_(known))
+    )
     in_force = or_(
         and_(EventRow.kind == "settings", EventRow.void.is_(False)),
         and_(EventRow.kind == "payload", EventRow.number.in_(payloads.group_by(stream))),
@@ -199,6 +202,8 @@ def _batch(event: EventRow) -> int | None:
 def _forget(session: Session, event: EventRow) -> None:
     """Note in the row of a batch's stream that it cannot be known again."""
     if event.kind == "batch":
-        source = session.get_one(StreamRow, (event.model, event.stream_id))
+        source = session.get(StreamRow, (event.model, event.stream_id))
+        if source is None:  # it has made room for others
+            return
         known = [last for last in (source.forgotten, event.last_sequence) if last is not None]
         source.forgotten = max(known)

@@ -215,7 +215,8 @@ class StreamRow(Base):
     """A source of observations. Event time = its own time + offset, s.
 
     kind: "batches" or "frames"; last: highest sequence seen; missing: ranges [first, last] of sequences below it that
-    have not come; forgotten: highest sequence whose batch is no longer kept, so that it cannot be known again.
+    have not come; forgotten: highest sequence whose batch is no longer kept, so that it cannot be known again;
+    received: when the last one came, Unix time, s, None for what an earlier release has written.
     """
 
     __tablename__ = "streams"
@@ -228,6 +229,7 @@ class StreamRow(Base):
     missing: Mapped[dict[str, Any]]
     forgotten: Mapped[int | None] = mapped_column(BigInteger)
     created_at: Mapped[str]
+    received: Mapped[float | None]
 
 
 class EventRow(Base):

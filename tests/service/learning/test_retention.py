@@ -1,9 +1,14 @@
 """The log stays within its size and age, and nothing goes that a version has still to learn."""
 
+import pytest
+from sqlalchemy import select
+
+from service.foundation.errors import BusyError, ConflictError
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.journal.log import Memory, encode
-from service.storage.database import LearnerRow, ServingRow, SnapshotRow, now
+from service.storage.database import LearnerRow, ServingRow, SnapshotRow, StreamRow, now
+from tests.choosing import slow
 from tests.service.learning.batches import MODEL, OTHER, batch, everything, note, rows, source, take_back, write
 
 SIZE = len(encode(rows()))
@@ -123,8 +128,39 @@ def test_what_streams_were_last_said_or_noticed_to_carry_stays(database):
     body = {"mass": 1.0, "com": [0.0, 0.0, 0.1], "inertia": None}
     for stream_id in (None, "a", None, "a"):  # 1 to 4
         note(database, "payload", {"stream_id": stream_id, "body": body})
-    note(database, "payload", {"stream_id": "b", "watch": {}})  # 5
-    write(database, batch(0))  # 6
-    snapshot(database, 6)
+    for stream_id in ("b", "forgotten"):  # 5, 6
+        note(database, "payload", {"stream_id": stream_id, "watch": {}})
+    write(database, *(batch(0, stream_id=stream_id) for stream_id in ("a", "b")))  # 7, 8
+    snapshot(database, 8)
     retain(database, batches=0)
-    assert kept(database) == [3, 4, 5, 6]
+    assert kept(database) == [3, 4, 5, 8]
+
+
+@pytest.mark.parametrize("runs", [60, slow(10_000)])
+def test_every_run_has_a_stream_of_its_own_and_the_longest_silent_makes_room(database, runs):
+    def run(number, received, **fields):
+        with database.transaction() as session:
+            arrived = batch(0, stream_id=f"run-{number}", received=received, **fields)
+            log.append_batch(session, MODEL, arrived, most_streams=20)
+
+    for number in range(runs):
+        run(number, 1000.0 + number)
+    with database.session() as session:
+        left = set(session.scalars(select(StreamRow.stream_id)))
+    assert left == {f"run-{number}" for number in range(runs - 20, runs)}
+    with pytest.raises(ConflictError, match="batches up to 0 have come: go on with higher sequences"):
+        run(0, 1e5)
+    write(database, batch(1, stream_id="run-0", received=1e5))
+    snapshot(database, runs + 1)
+    assert retain(database, batches=0) == runs  # also those of streams that nobody knows any more
+
+
+def test_streams_in_use_make_no_room(database):
+    for number in range(3):
+        write(database, batch(0, stream_id=f"robot-{number}", received=1000.0 + number))
+    with database.transaction() as session, pytest.raises(BusyError, match="3 sources of observations in use"):
+        log.append_batch(session, MODEL, batch(0, stream_id="new", received=1009.0), most_streams=3)
+    with database.transaction() as session:
+        log.append_batch(session, MODEL, batch(0, stream_id="new", received=1011.0), most_streams=3)
+    assert source(database, "robot-0") is None
+    assert source(database, "robot-1") is not None
