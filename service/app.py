@@ -193,6 +193,7 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     if recovered := jobs.recover():
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
     learners = Learners(loaded)
+    learners.weighing.expect()
     attach(learners, jobs)
     return storage, jobs, learners
 

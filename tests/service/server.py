@@ -55,7 +55,12 @@ class Server:
             return False
 
     def workers(self) -> list[int]:
-        """Process ids of the training processes that the service has started."""
+        """Process ids of those that train or learn for the service, where settings have these give way to it."""
+        own = os.getpriority(os.PRIO_PROCESS, self.process.pid)
+        return [pid for pid in self.started() if os.getpriority(os.PRIO_PROCESS, pid) > own]
+
+    def started(self) -> list[int]:
+        """Process ids of all that the service has spawned: these, and the one that weighs."""
         return [pid for pid in children(self.process.pid) if "spawn_main" in command(pid)]
 
     def kill(self) -> None:

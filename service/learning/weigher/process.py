@@ -23,8 +23,8 @@ def weigher_place(settings: Settings) -> Place:
 
 
 class WeigherProcess(Companion):
-    """Started with the first rows of a model that knows an arm. epoch: how often a process was started, each of which
-    knows nothing. on_message: see `Companion`."""
+    """Started with the service if a version in memory knows an arm, else with the first rows of one. epoch: how often a
+    process was started, each of which knows nothing. on_message: see `Companion`."""
 
     def __init__(self, settings: Settings, on_message: Callable[[Message], None]) -> None:
         self.epoch = 0

@@ -52,6 +52,14 @@ class Weighing:
         """End the process."""
         self.process.close()
 
+    def expect(self) -> None:
+        """Have the process ready for streams of the versions that answer: started with their first rows, it would come
+        seconds late."""
+        for model, version in self.loaded.held():
+            served = self.loaded.peek(model)
+            if served is not None and served.version == version and served.carrier is not None:
+                self.process.give((model, version, ""))
+
     def follow(self, monitor: Monitor, served: Served, batch: NewBatch, screened: Screened) -> None:
         """Hand over a batch that is logged; its model's turn is held. Never waits for the process."""
         assert served.carrier is not None

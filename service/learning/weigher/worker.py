@@ -41,7 +41,9 @@ def run(settings: Settings, connection: Connection) -> None:
             beaten = time.monotonic()
             while (work := received(connection, min(weigher.pause(), BEAT_S))) is not None:
                 for about, given in work.items():
-                    if isinstance(about, tuple):
+                    if isinstance(about, tuple) and not given:
+                        weigher.expect(about[0], about[1])
+                    elif isinstance(about, tuple):
                         for message in weigher.follow(about, given):
                             connection.send(message)
                     else:  # a model that was deleted
@@ -53,6 +55,10 @@ def run(settings: Settings, connection: Connection) -> None:
                     beaten = time.monotonic()
     finally:
         database.close()
+
+
+EXPECTED, RATE = 60, 100.0
+"""Rows that are made up, and how many a second."""
 
 
 class Versions:
@@ -98,7 +104,6 @@ class Weigher:
         self._versions = versions
         self._streams: OrderedDict[Stream, Followed] = OrderedDict()  # in the order of their last rows
         self._carriers: dict[tuple[str, int], tuple[TorqueModel, Carrier]] = {}
-        self._warm: set[tuple[str, int]] = set()
         self._preparing: dict[tuple[str, int], Generator[None, None, object]] = {}
         self._left, self._counted = REFINING_S, time.monotonic()
 
@@ -107,6 +112,19 @@ class Weigher:
         if self._preparing:
             return 0.0
         return np.inf if self._refined_next() is None else max(0.0, -self._credit() / REFINING_SHARE)
+
+    def expect(self, model: str, version: int) -> None:
+        """Make ready for streams of a version: load it, and take something up once, so that all is compiled."""
+        try:
+            carrier = self._carrier((model, version), ())
+            limits, n, draw = carrier.model.training_range, carrier.model.n_joints, np.random.default_rng(0).uniform
+            q, dq, ddq = (draw(limits[name]["min"], limits[name]["max"], (EXPECTED, n)) for name in ("q", "dq", "ddq"))
+            time_ = np.arange(EXPECTED) / RATE
+            tau = carrier.model.predict(q, dq, ddq).tau
+            Watch(n).step(carrier, Rows(time_, q, dq, ddq, tau, np.zeros(EXPECTED, np.uint8)))
+            estimate(carrier, Rows(time_, q, dq, ddq, 1.1 * tau, np.zeros(EXPECTED, np.uint8)).take(slice(0, 10)))
+        except Exception:  # streams say what is wrong
+            logger.exception("version %d of model %s cannot be made ready for payloads", version, model)
 
     def follow(self, stream: Stream, given: Sequence[Unweighed]) -> Iterator[Message]:
         """Follow rows of a stream, and tell what has become of what it carries."""
@@ -131,7 +149,6 @@ class Weigher:
         if followed.refining is None:
             followed.refining = followed.watch.refinement()
         yield from self._told(stream, followed, time.process_time() - began)
-        self._warm_up(stream[:2], rows)
 
     def forget(self, model: str) -> None:
         """Keep nothing of a model that was deleted."""
@@ -141,7 +158,6 @@ class Weigher:
         for version in [each for each in self._carriers if each[0] == model]:
             del self._carriers[version]
             self._preparing.pop(version, None)
-        self._warm = {key for key in self._warm if key[0] != model}
 
     def refine(self) -> Iterator[Weighed]:
         """Go on with what is refined, one step of the stream that has come last, where there is time for it."""
@@ -182,13 +198,6 @@ class Weigher:
         self._left = min(self._left + REFINING_SHARE * (now - self._counted), REFINING_S)
         self._counted = now
         return self._left
-
-    def _warm_up(self, key: tuple[str, int], rows: Rows) -> None:
-        """Estimate something once a version, so that what is compiled is there when a payload is taken up."""
-        if key not in self._warm and len(rows):
-            self._warm.add(key)
-            with suppress(np.linalg.LinAlgError):
-                estimate(self._carriers[key][1], rows)
 
     def _followed(self, stream: Stream, given: Sequence[Unweighed]) -> Followed | None:
         """The stream as far as it is known; None where the service does not say what is not known here."""

@@ -183,10 +183,10 @@ def test_a_weigher_that_is_killed_is_started_again_and_knows_what_was_known(pand
     client = panda.client
     lift(client, "panda-sim", "one")
     eventually(lambda: masses(client)["one"])
-    killed = panda.workers()
+    killed = panda.started()
     for pid in killed:
         os.kill(pid, signal.SIGKILL)
-    eventually(lambda: len(panda.workers()) == len(killed) and not {*panda.workers()} & {*killed})
+    eventually(lambda: len(panda.started()) == len(killed) and not {*panda.started()} & {*killed})
     lift(client, "panda-sim", "two")
     assert masses(client)["two"] == pytest.approx(1.5, abs=0.05)
     assert masses(client)["one"] == pytest.approx(1.5, abs=0.05)
