@@ -19,7 +19,7 @@ from lipcore.online.payload import estimate, refine
 
 MOST_ROWS, BEFORE_ROWS, GROWTH, ANEW = 100, 10, 1.45, 2.0
 """Rows that a payload is estimated from, evenly spread over the time since; rows before it; by how many times they have
-to grow until it is estimated or refined again, and until what is known by linear means or ruled out is drawn anew."""
+to grow until it is estimated or refined again, and until draws begin anew."""
 DECLARED, WRONG = np.array([0.02, *[0.005] * 3, *[0.3] * 3, *[0.005] * 3]), 4.0
 """Standard deviations of η of a payload that was declared: of log mass, m, of log m, m; and how many of them it lies
 off where rows show that something else is carried."""

@@ -14,7 +14,7 @@ from lipcore.model.payload import Carrier, Linearised, Load
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, WIDTH
 from lipcore.online.held import Held, evenly, no_rows
-from lipcore.online.hypotheses import AFTER, BEFORE, CELL_S, LEAST_BEFORE, Cell, Window, cells_of, split
+from lipcore.online.hypotheses import AFTER, BEFORE, CELL_S, LEAST_BEFORE, Cell, Window, cells_of, parted
 from lipcore.online.verdict import (
     ALIKE,
     AT_ONCE,
@@ -143,9 +143,9 @@ class Watch:
     def _take(self, carrier: Carrier, parts: Sequence[Rows]) -> Watch:
         """Take in cells, and judge the last ones."""
         assert self.around is not None
-        parts = split(self.around, parts)
+        parts, new = parted(self.around, parts)
         kept = CELLS * SPARSE[-1] if self.held is None else CELLS
-        cells = (*self.cells, *cells_of(self.around, parts))[-kept:]
+        cells = (*self.cells, *new)[-kept:]
         watch = replace(self, recent=(*self.recent, *parts)[-kept:], cells=cells)
         if len(cells) <= LEAST_BEFORE:
             return watch if watch.held is None else watch._learn(carrier, parts)

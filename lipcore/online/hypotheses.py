@@ -63,29 +63,38 @@ class Cell:
     features: Array
 
 
-def split(around: Linearised, parts: Sequence[Rows]) -> list[Rows]:
-    """The stretches of cells, parted where the residual leaps: a payload is taken up between two rows, and a mean over
-    both sides of that would fit neither."""
-    rows = parts[0] if len(parts) == 1 else Rows.concatenate(parts)
-    _, expected = around.all_rows(rows.motion())
+def parted(around: Linearised, parts: Sequence[Rows]) -> tuple[list[Rows], tuple[Cell, ...]]:
+    """Part stretches of rows where the residual leaps; return the parts and their cells. A payload is taken up between
+    two rows, and a mean over both sides fits neither."""
+    rows = _joined(parts)
+    features, expected = around.all_rows(rows.motion())
     white, lasting, rest = noise_parts(around.carrier, rows.motion())
     usual = np.sqrt(2 * white + (lasting + rest)[1:])
     leaps = (np.abs(np.diff(rows.tau - expected, axis=0)) > LEAP * usual).any(axis=1)
     ends = np.cumsum([len(each) for each in parts])[:-1]
     edges = np.union1d(ends, np.flatnonzero(leaps) + 1)
-    return [rows.take(each) for each in np.split(np.arange(len(rows)), edges)]
+    parts = [rows.take(each) for each in np.split(np.arange(len(rows)), edges)]
+    return parts, _means(around, parts, rows, features, expected)
 
 
 def cells_of(around: Linearised, parts: Sequence[Rows]) -> tuple[Cell, ...]:
     """The cells of stretches of rows, seen from an arm with the payload that it has, or none."""
-    rows = parts[0] if len(parts) == 1 else Rows.concatenate(parts)
+    rows = _joined(parts)
+    return _means(around, parts, rows, *around.all_rows(rows.motion()))
+
+
+def _joined(parts: Sequence[Rows]) -> Rows:
+    return parts[0] if len(parts) == 1 else Rows.concatenate(parts)
+
+
+def _means(around: Linearised, parts: Sequence[Rows], rows: Rows, features: Array, expected: Array) -> tuple[Cell, ...]:
+    """The cells of parts that are these rows together; features, expected: of each row, see `Linearised.all_rows`."""
     counts = np.array([len(each) for each in parts])
     first = np.cumsum(counts) - counts
 
     def mean(values: Array) -> Array:
         return np.asarray(np.add.reduceat(values, first, axis=-2) / counts[:, None])
 
-    features, expected = around.all_rows(rows.motion())
     features, left = mean(features), mean(rows.tau - expected)
     q, dq, ddq = (mean(each) for each in (rows.q, rows.dq, rows.ddq))
     white, lasting, rest = noise_parts(around.carrier, Motion.from_arrays(q, dq, ddq))

@@ -97,26 +97,6 @@ def refine(
     return problem.estimate(min([at, other], key=lambda each: each.energy), points)
 
 
-def refined(
-    carrier: Carrier,
-    rows: Rows,
-    before: Rows | None = None,
-    prior: Known = ANY,
-    start: Estimate | None = None,
-    anew: bool = False,
-) -> Estimate:
-    """What `refine` returns, waited for; without an arm that bends what `estimate` does."""
-    if not carrier.bends:
-        return estimate(carrier, rows, before, prior, start)
-    steps = refine(carrier, rows, before, prior, start, anew)
-    while True:
-        try:
-            next(steps)
-        except StopIteration as done:
-            found: Estimate = done.value
-            return found
-
-
 def _carrying(arm: Draw, at: Point) -> Draw:
     """An arm that carries what is most likely."""
     return replace(arm, place=replace(arm.place, eta=at.place.eta))

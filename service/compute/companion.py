@@ -152,7 +152,7 @@ class Companion:
         return ours, process
 
     def _listen(self, connection: Connection, process: BaseProcess) -> None:
-        """Hand on the messages of the process, until it has ended; end it where it does not get on."""
+        """Pass on the messages of the process until it ends; kill it if it hangs."""
         pids = () if process.pid is None else (process.pid,)
         quiet_s, step_s = self.settings.learner_heartbeat_s, self.settings.learner_step_s
         progress = self._progress = Progress(lambda: pids, quiet_s, step_s)

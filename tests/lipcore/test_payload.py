@@ -13,10 +13,11 @@ from lipcore.model.payload import Carrier, Linearised, Load, NoArmError
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, body, eta_of
 from lipcore.online.estimate import known
-from lipcore.online.payload import estimate, refined
+from lipcore.online.payload import estimate, refine
 from lipcore.robots.library import load_robot, pinocchio
 from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody
+from tests.lipcore.stepping import finished
 
 SHIPPED = Path(__file__).parents[2] / "models" / "panda-sim"
 CARRIED = Payload(1.5, 0.0, (0.03, 0.02, 0.1))
@@ -35,6 +36,10 @@ def recorded():
     seen = simulate(robot, Stream(1000, 100.0, speed=5.0, noise=0.05, payload=CARRIED), 7)
     other = simulate(robot, Stream(3000, 100.0, speed=5.0, noise=0.0, payload=CARRIED, n_sinusoids=100), 11)
     return seen, other.rows(slice(None, None, 10))
+
+
+def refined(*given, **more):
+    return finished(refine(*given, **more))
 
 
 def as_rows(samples):

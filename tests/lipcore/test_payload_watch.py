@@ -13,6 +13,7 @@ from lipcore.online.holding import Watch
 from lipcore.online.learner import OnlineModel
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
+from tests.lipcore.stepping import finished
 
 SHIPPED = Path(__file__).parents[2] / "models" / "panda-sim"
 RATE, UP, DOWN = 100.0, 20.0, 22.0
@@ -163,12 +164,7 @@ def test_a_payload_is_noticed_wherever_in_a_cell_and_however_unevenly_its_rows_c
 
 
 def refined(watch):
-    steps = watch.refinement()
-    while True:
-        try:
-            next(steps)
-        except StopIteration as done:
-            return done.value
+    return finished(watch.refinement())
 
 
 def test_what_is_refined_stays_until_more_rows_are_refined(carrier):

@@ -24,8 +24,7 @@ class Revised:
 
 @dataclass(frozen=True)
 class Unweighed:
-    """Rows of a stream in the order of event time, which have an answer. received: Unix time, s; said: how often its
-    owner has said what the stream carries.
+    """Rows of a stream that have an answer. received: Unix time, s; said: see `Payloads.said`.
 
     What the process may not know yet: revised: what the version has learnt; known: what the stream carries.
     """
@@ -39,14 +38,12 @@ class Unweighed:
 
 @dataclass(frozen=True)
 class Weighed:
-    """What a stream carries after its latest rows. watch: without these rows; received, said: of them; seconds: of CPU
-    that following them took."""
+    """What a stream carries after its latest rows. watch: without these rows; received, said: of them."""
 
     stream: Stream
     watch: Watch
     received: float
     said: int
-    seconds: float
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 
-import numpy as np
 from sqlalchemy import select
 
 from lipcore.online.holding import Watch
@@ -80,7 +79,6 @@ class Weighing:
         if not same:
             posterior = served.model.posterior
             revised = Revised(posterior.weights, posterior.root)
-        rows = rows.take(np.argsort(rows.time, kind="stable"))
         if self.process.give(stream, Unweighed(rows, batch.received, said, revised, known), most=MOST_WAITING):
             self._ask(stream)  # what was dropped may have said what was not known
 

@@ -123,12 +123,11 @@ class Weigher:
             tau = carrier.model.predict(q, dq, ddq).tau
             Watch(n).step(carrier, Rows(time_, q, dq, ddq, tau, np.zeros(EXPECTED, np.uint8)))
             estimate(carrier, Rows(time_, q, dq, ddq, 1.1 * tau, np.zeros(EXPECTED, np.uint8)).take(slice(0, 10)))
-        except Exception:  # streams say what is wrong
+        except Exception:  # its streams show the error again
             logger.exception("version %d of model %s cannot be made ready for payloads", version, model)
 
     def follow(self, stream: Stream, given: Sequence[Unweighed]) -> Iterator[Message]:
         """Follow rows of a stream, and tell what has become of what it carries."""
-        began = time.process_time()
         try:
             followed = self._followed(stream, given)
             if followed is None:
@@ -148,7 +147,7 @@ class Weigher:
             return
         if followed.refining is None:
             followed.refining = followed.watch.refinement()
-        yield from self._told(stream, followed, time.process_time() - began)
+        yield from self._told(stream, followed)
 
     def forget(self, model: str) -> None:
         """Keep nothing of a model that was deleted."""
@@ -177,9 +176,8 @@ class Weigher:
         except np.linalg.LinAlgError as error:
             followed.refining = None
             logger.warning("the payload of stream %r of model %s is not refined: %s", stream[2], stream[0], error)
-        seconds = time.process_time() - began
-        self._left -= seconds
-        yield from self._told(stream, followed, seconds)
+        self._left -= time.process_time() - began
+        yield from self._told(stream, followed)
 
     def _refined_next(self) -> Stream | None:
         return next((each for each in reversed(self._streams) if self._streams[each].refining is not None), None)
@@ -230,9 +228,9 @@ class Weigher:
                 self._preparing.setdefault(key, arms(carrier))
         return self._carriers[key][1]
 
-    def _told(self, stream: Stream, followed: Followed, seconds: float) -> Iterator[Weighed]:
+    def _told(self, stream: Stream, followed: Followed) -> Iterator[Weighed]:
         """Tell what the stream carries where the service does not know."""
         if followed.told is not None and followed.told.says(followed.watch):
             return
         followed.told = followed.watch
-        yield Weighed(stream, followed.watch.outline(), followed.received, followed.said, seconds)
+        yield Weighed(stream, followed.watch.outline(), followed.received, followed.said)
