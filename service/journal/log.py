@@ -302,6 +302,7 @@ def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: i
     else:
         _check_stream(source, batch)
         gaps = Gaps.from_json(source.missing, source.last).arrived(batch.sequence, batch.last_sequence)
+    source.offset = source.offset or batch.offset
     source.last, source.missing, source.received = gaps.last, gaps.to_json(), batch.received
 
 

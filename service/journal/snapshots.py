@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from datetime import datetime
 
-from sqlalchemy import ColumnElement, Select, and_, delete, func, not_, or_, select
+from sqlalchemy import ColumnElement, Select, and_, delete, func, not_, select
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
@@ -127,8 +127,8 @@ def retain(database: Database, settings: Settings, model: str, now: float) -> in
     """Delete the oldest events of a model that are too old or too many; return how many batches and replays went.
 
     now: Unix time, s. Events stay, whatever their age, while a learning version has no snapshot that contains them or
-    has still to unlearn them. So do settings, which say what a rollback returns to, what each stream was last said or
-    noticed to carry, and the newest event, which the next number follows.
+    has still to unlearn them. So do settings, which say what a rollback returns to, and the newest event, which the
+    next number follows.
     """
     gone = 0
     while True:
@@ -174,15 +174,7 @@ def _chosen(session: Session, settings: Settings, model: str, now: float) -> lis
 def _deletable(session: Session, model: str) -> list[ColumnElement[bool]]:
     """Conditions of the events that nothing needs."""
     through = min(contained(session, model), log.newest(session, model) - 1)
-    stream = EventRow.detail["stream_id"].as_string()
-    known = select(StreamRow.stream_id).where(StreamRow.model == model)
-    payloads = select(func.max(EventRow.number)).where(
-        EventRow.model == model, EventRow.kind == "payload", or_(stream.is_(None), stream.in_(known))
-    )
-    in_force = or_(
-        and_(EventRow.kind == "settings", EventRow.void.is_(False)),
-        and_(EventRow.kind == "payload", EventRow.number.in_(payloads.group_by(stream))),
-    )
+    in_force = and_(EventRow.kind == "settings", EventRow.void.is_(False))
     within = [EventRow.model == model, EventRow.number <= through, not_(in_force)]
     pending = select(EventRow).where(EventRow.model == model, EventRow.number > through, EventRow.kind == "unlearn")
     if batches := {batch for event in session.scalars(pending) if (batch := _batch(event)) is not None}:

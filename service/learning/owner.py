@@ -76,6 +76,11 @@ def held(session: Session, model: str) -> dict[str, Any] | None:
     return None if row is None else row.held
 
 
+def declare(session: Session, model: str, payload: dict[str, Any]) -> None:
+    """Keep what was declared of the payload of all streams, see `streams.PayloadRecord`."""
+    _row(session, model).payload = payload
+
+
 def raise_alarm(session: Session, model: str, kind: AlarmKind, message: str, evidence: dict[str, Any]) -> AlarmRow:
     """Add an alarm; it is visible once the session commits."""
     row = AlarmRow(model=model, kind=kind, at=now(), message=message, evidence=evidence)

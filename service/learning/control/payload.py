@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any
 
@@ -10,6 +11,7 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.model.body import Body
+from lipcore.model.payload import Carrier
 from lipcore.online.bodies import BELOW, DIAGONAL
 from lipcore.online.estimate import Estimate
 from lipcore.online.holding import Watch
@@ -29,6 +31,7 @@ from service.learning.control.payload_schema import (
 )
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
+from service.learning.streams import PayloadRecord
 from service.models.served import Served
 from service.web.access import audit
 
@@ -41,15 +44,15 @@ def show(learners: Learners, model: str) -> Payloads:
     """What the arm carries, stream by stream; raise NotFoundError."""
     monitor = learners.monitor(model)
     served = learners.loaded.get(model, None)
-    streams, default, carrier = [], None, served.carrier
+    streams, default, carrier = list[StreamPayload](), None, served.carrier
     tip = None if served.model.robot is None else _tip(served.model.robot)
-    if carrier is not None:
-        for stream_id, (watch, _) in sorted(monitor.payloads.all(carrier, served.version).items()):
-            streams.append(_shown(stream_id, watch, tip))
-        held = monitor.payloads.watch("", carrier, served.version).held  # no stream has this name
-        default = None if held is None else _of(held.estimate, tip)
     with learners.database.session() as session:
         watched = owner.options(session, model).payloads
+    if carrier is not None:
+        known = _watches(monitor, carrier, served.version)
+        streams = [_shown(name, watch, tip) for name, watch in known if watched or watch.held is not None]
+        held = monitor.payloads.watch("", carrier, served.version).held  # no stream has this name
+        default = None if held is None else _of(held.estimate, tip)
     reason = None
     if carrier is None:
         reason = f"estimator {served.model.estimator.name} knows no arm: train rigid-body or auto"
@@ -71,8 +74,8 @@ def brief(monitor: Monitor, served: Served) -> list[LivePayload] | None:
     """What each stream's robot carries, as a version sees it; None where it knows no arm."""
     if served.carrier is None:
         return None
-    watches = sorted(monitor.payloads.all(served.carrier, served.version).items())
-    return [LivePayload(**_carrying(name, watch), mass=_mass(watch)) for name, (watch, _) in watches]
+    watches = _watches(monitor, served.carrier, served.version)
+    return [LivePayload(**_carrying(name, watch), mass=_mass(watch)) for name, watch in watches]
 
 
 def declare(learners: Learners, model: str, request: PayloadRequest) -> Payloads:
@@ -103,16 +106,32 @@ def _say(learners: Learners, model: str, stream_id: str | None, known: dict[str,
     monitor = learners.monitor(model)
     with learners.turn(model):
         with learners.database.transaction(model) as session:
-            if stream_id is not None and log.stream(session, model, stream_id) is None:
+            source = None if stream_id is None else log.stream(session, model, stream_id)
+            if stream_id is not None and source is None:
                 expected = "a stream whose observations have come, or no stream_id: then it holds for all"
                 raise NotFoundError(f"no stream {stream_id!r}", [problem("stream_id", stream_id, expected)])
-            event = log.append(session, model, "payload", {"stream_id": stream_id, "body": known}, time.time())
-            declared = {"stream_id": stream_id, "body": known}
+            declared, received = {"stream_id": stream_id, "body": known}, time.time()
+            event = log.append(session, model, "payload", declared, received)
+            payload = PayloadRecord(event.number, received, body=known)
+            if source is None:
+                owner.declare(session, model, payload.to_json())
+            else:
+                event.stream_id = stream_id
+                source.record = replace(monitor.streams.get(source.stream_id), payload=payload).to_json()
             audit.note(session, model, "payload declared", served.version, after=declared)
-        monitor.declared(event)
+        if stream_id is None:
+            monitor.streams.default = payload
+        else:
+            monitor.streams.change(stream_id, payload=payload)
+        monitor.number = event.number
         served.loads.take(monitor.payloads.carried(served.carrier, served.version))
     learners.process.wake(model)
     return show(learners, model)
+
+
+def _watches(monitor: Monitor, carrier: Carrier, version: int) -> list[tuple[str, Watch]]:
+    """What each stream carries, as a version sees it."""
+    return [(name, monitor.payloads.watch(name, carrier, version)) for name in sorted(monitor.streams.all())]
 
 
 def _tip(robot: RigidBody) -> Tip | None:

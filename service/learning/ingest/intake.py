@@ -24,7 +24,9 @@ from service.learning.ingest import judging
 from service.learning.ingest.judging import Verdict
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
+from service.learning.intervals import ScaleRecord
 from service.learning.schema import LearningDisabledError, LearningOptions
+from service.learning.streams import StreamRecord
 from service.learning.weigher.weighing import Weighing
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
@@ -102,7 +104,7 @@ class Intake:
                     if served.carrier is not None:
                         served.loads.take(monitor.payloads.carried(served.carrier, version))
             for version, scales in self.loaded.scales(model).items():
-                scales.take(monitor.factors(version) if kept else {})
+                scales.take(monitor.streams.factors(version) if kept else {})
 
     def append(
         self,
@@ -118,46 +120,52 @@ class Intake:
         model = served.name
         rows = screened.own.stop - screened.own.start
         self.disk.take(ROW_NUMBERS * NUMBER_BYTES * served.model.n_joints * rows)
+        streams, stream_id = monitor.streams, batch.stream_id
         watch = None
         if served.carrier is not None and options.payloads:
-            watch = monitor.payloads.came(batch.stream_id, served.carrier, served.version, batch.received)
+            watch = monitor.payloads.watch(stream_id, served.carrier, served.version)
         with self.database.transaction(model) as session:
             _check_kept(session, served)
             held = owner.held(session, model) is not None
             if monitor.held and not held:
                 monitor.decided()
+                streams.change_all(session, model, StreamRecord.decided)
             usual = partial(monitor.usual, batch.received)
             since = None if watch is None or watch.held is None else watch.since
-            new = log.stream(session, model, batch.stream_id) is None
-            known = monitor.watch(batch.stream_id, new)
-            verdict = judging.judge(screened, known, held, options, usual, since, served.base.scale)
+            new = log.stream(session, model, stream_id) is None
+            if new:
+                streams.forget(stream_id)  # one of this name that has made room for others
+            verdict = judging.judge(
+                screened, monitor.watch(stream_id, new), held, options, usual, since, served.base.scale
+            )
             if verdict.change is not None and options.on_change == "adapt" and not held:
                 log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
-            adaptive = {}
-            if options.adaptive_intervals and screened.seen is not None:
-                scale = monitor.scale(batch.stream_id, served.version, served.base.scale)
-                adaptive = intervals.follow(scale, screened.seen)
-                # these errors were of the arm without what it carries, or with what it no longer does
-                if screened.answered is not None:
-                    adaptive["scale"] = scale.to_json()
+            scale, answered = _scaled(monitor, served, options, stream_id, screened)
             record = None if verdict.record is None else verdict.record.to_json()
             judged = replace(batch, rows=verdict.rows, record=record)
             start = log.start_of(session, model, served.version)
             event = log.append_batch(session, model, judged, self.settings.max_observation_streams)
             event.rows = rows  # without those that had waited, which other batches count
-            source = log.stream(session, model, batch.stream_id)
+            source = log.stream(session, model, stream_id)
             assert source is not None
-            if source.offset == 0:
-                source.offset = batch.offset
             if verdict.opened is not None and verdict.held:
                 _take_back(session, event)
             if verdict.change is not None:
                 _alarm(session, served, "waits" if held else options.on_change, verdict, event)
+            doubted = verdict.held and (verdict.opened is not None or streams.get(stream_id).doubted)
+            known: dict[str, Any] = {
+                "gate": verdict.watch.gate,
+                "opening": verdict.watch.opening,
+                "doubted": doubted,
+                "scale": scale,
+                "received": batch.received,
+            }
+            source.record = replace(streams.get(stream_id), **known).to_json()
             report = details | {
                 "model": model,
                 "version": served.version,
                 "revision": event.number - start,
-                "stream_id": batch.stream_id,
+                "stream_id": stream_id,
                 "sequence": batch.sequence,
                 "rows": rows,
                 "accepted": event.learnt,
@@ -169,23 +177,24 @@ class Intake:
                 # for the batches that follow, for other services, and for one that starts again
                 "own": [screened.own.start, screened.own.stop],
                 "open": verdict.watch.gate.open,
-                "gate": verdict.watch.gate.to_json(),
                 "departure": None if verdict.watch.departure is None else verdict.watch.departure.to_json(),
-                "opening": None if verdict.watch.opening is None else verdict.watch.opening.to_json(),
                 "waited": held,
-                "doubted": verdict.held and (verdict.opened is not None or monitor.doubts(batch.stream_id)),
+                "doubted": doubted,
                 "until": screened.until,
-                **adaptive,
-                **({} if watch is None else {"payload": watch.to_json()}),
+                **answered,
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
             }
             event.report = report
+            if new:
+                session.flush()
+                streams.keep(session, model)
+        streams.change(stream_id, **known)
         monitor.note(event, verdict.watch.innovations)
         if watch is not None and served.carrier is not None:
             served.loads.take(monitor.payloads.carried(served.carrier, served.version))
             self.weighing.follow(monitor, served, batch, screened)
-        served.scales.take(monitor.factors(served.version) if options.adaptive_intervals else {})
-        self._show(Judged(served, batch.stream_id, verdict.rows, screened))
+        served.scales.take(streams.factors(served.version) if options.adaptive_intervals else {})
+        self._show(Judged(served, stream_id, verdict.rows, screened))
         return report
 
     def follow_up(self, monitor: Monitor, model: str) -> None:
@@ -204,6 +213,21 @@ def enabled(session: Session, model: str) -> LearningOptions:
     if not options.enabled:
         raise LearningDisabledError(f"learning of model {model!r} is switched off: nothing is logged")
     return options
+
+
+def _scaled(
+    monitor: Monitor, served: Served, options: LearningOptions, stream_id: str, screened: Screened
+) -> tuple[ScaleRecord | None, dict[str, Any]]:
+    """The scale of a stream's intervals after a batch, None where it does not adapt, and what the report says of it."""
+    seen = screened.seen
+    if not options.adaptive_intervals or seen is None:
+        return None, {}
+    state = monitor.scale(stream_id, served.version, served.base.scale)
+    report = {"answered": intervals.inside(state, seen)}
+    # other errors were of the arm without what it carries, or with what it no longer does
+    if screened.answered is None:
+        state = state.step(seen.time, seen.score, intervals.factor(state, seen))
+    return ScaleRecord(state, served.version), report
 
 
 def _check_kept(session: Session, served: Served) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import reduce
@@ -23,11 +23,11 @@ from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.settings import Settings
 from service.journal import log
 from service.learning import intervals
-from service.learning.ingest.judging import ContactGate, Innovations, Watch
+from service.learning.ingest.judging import Innovations, Watch
 from service.learning.ingest.opening import Opening
-from service.learning.intervals import HeldIntervals, Known
+from service.learning.intervals import HeldIntervals
 from service.learning.payloads import Payloads
-from service.models.scales import Factor
+from service.learning.streams import Streams
 from service.storage.database import EventRow
 
 PARTS = 60
@@ -88,15 +88,15 @@ class Window:
 
 
 class Monitor:
-    """One model's windows of quality, its gates and its detector of changes.
+    """One model's windows of quality, the records of its streams, and its detector of changes.
 
-    joint_names: in whose order records are. payloads: what its streams carry; payload_alarm_at: when an alarm was last
-    raised of one, Unix time, s. lock: held while a batch is judged and logged, one at a time; whoever only reads
-    windows and counts needs none. counts: rows by code and "learnt", "batches" and "duplicates", since the start and
-    that this service has taken. held: whether learning waited for a decision at the last batch. number: of the last
-    event that was taken in.
+    joint_names: in whose order records are. streams: what is known of each; payloads: what they carry, as versions see
+    it; payload_alarm_at: when an alarm was last raised of one, Unix time, s. lock: held while a batch is judged and
+    logged, one at a time; whoever only reads needs none. counts: rows by code and "learnt", "batches" and "duplicates",
+    since the start and that this service has taken. held: whether learning waited for a decision at the last batch.
+    number: of the last event that was taken in.
 
-    Several services take batches of one model in turn, and each follows the log before it judges: gates, detector and
+    Several services take batches of one model in turn, and each follows the log before it judges: streams, detector and
     windows are then the same to the last bit as if one service had taken all, from the first batch on that all of them
     know. Innovations are those of this service's own batches, because the log has no predictions: friction is told from
     a payload on fewer rows then.
@@ -109,23 +109,21 @@ class Monitor:
         self.counts: Counter[str] = Counter()
         self.held, self.number = False, 0
         self._since_due = 0
-        self._patience, self._most_streams = settings.contact_patience_s, settings.max_observation_streams
-        self._gates: OrderedDict[str, ContactGate] = OrderedDict()
-        self._scales: dict[str, Known] = {}
-        self._openings: dict[str, Opening] = {}
         self._detector, self._innovations = ChangeDetector(), Innovations.empty(n)
         self._departure: Departure | None = None
-        self.payloads = Payloads()
+        self.streams = Streams(settings.contact_patience_s)
+        self.payloads = Payloads(self.streams)
         self.payload_alarm_at = -np.inf
 
     @classmethod
     def rebuilt(
         cls, session: Session, model: str, joint_names: tuple[str, ...], settings: Settings, now: float
     ) -> Monitor:
-        """The monitor of a model from its log. now: Unix time, s."""
+        """The monitor of a model from its log and its streams' records. now: Unix time, s."""
         made = cls(joint_names, settings)
-        made.number, made._scales = log.newest(session, model), intervals.restored(session, model)
-        made.payloads = Payloads.restored(session, model)
+        made.number = log.newest(session, model)
+        made.streams.read(session, model)
+        made.payloads = Payloads.restored(session, model, made.streams)
         since = now - max(*settings.quality_windows_s, DETECTOR_S)
         lately = (EventRow.received > since, EventRow.number <= made.number)
         events = list(_batches(session, model, *lately)) or list(_batches(session, model, most=1))
@@ -134,46 +132,33 @@ class Monitor:
         return made
 
     def follow(self, session: Session, model: str) -> None:
-        """Take in the batches that other services have logged since `number`; `lock` is held."""
-        declared = select(EventRow).where(
-            EventRow.model == model, EventRow.kind == "payload", EventRow.number > self.number
-        )
-        events = [*_batches(session, model, EventRow.number > self.number), *session.scalars(declared)]
-        for event in sorted(events, key=lambda each: each.number):
-            if event.kind == "batch":
-                self._remember(event, True)
-            if event.stream_id is not None:
-                self.payloads.forget(event.stream_id)  # another service has followed its rows since
-            self.payloads.remember(event)
+        """Take in what other services have logged since `number`; `lock` is held."""
+        decided, streams = False, set[str]()
+        since = EventRow.model == model, EventRow.kind == "payload", EventRow.number > self.number
+        payloads = session.execute(select(EventRow.stream_id, EventRow.number).where(*since)).all()
+        for event in _batches(session, model, EventRow.number > self.number):
+            held = self.held
+            self._remember(event, True)
+            decided |= held and not (event.report or {}).get("waited", True)
             self.number = event.number
+            streams.add(event.stream_id or "")
+        for stream_id, number in payloads:
+            self.number = max(self.number, number)
+            streams.add(stream_id or "")
+        if streams:  # a decision is in the records of all
+            self.streams.read(session, model, None if decided else streams)
 
     def watch(self, stream_id: str, new: bool = False) -> Watch:
         """State of judging before the next rows of a stream. new: whether none of its rows is known."""
-        gate = self._gates.get(stream_id) or ContactGate.start(self._patience)
-        opening = Opening.start(len(self.joint_names)) if new else self._openings.get(stream_id)
-        return Watch(gate, self._detector, self._innovations, self._departure, opening)
+        known = self.streams.get(stream_id)
+        opening = Opening.start(len(self.joint_names)) if new else known.opening
+        return Watch(known.gate, self._detector, self._innovations, self._departure, opening)
 
     def scale(self, stream_id: str, version: int, own: Array) -> Adaptive:
         """The scale of a stream's intervals before its next rows, which a version predicts: another one begins anew,
         from its `own`, (n,)."""
-        known = self._scales.get(stream_id)
+        known = self.streams.get(stream_id).scale
         return Adaptive.start(own) if known is None or known.version != version else known.state
-
-    def handled(self, event: EventRow) -> None:
-        """Take in that a stream has taken a payload up or put it down; the model's turn and `lock` are held. Its errors
-        on the way say nothing of its intervals."""
-        assert event.stream_id is not None
-        self._scales.pop(event.stream_id, None)
-        self.number = event.number
-
-    def doubts(self, stream_id: str) -> bool:
-        """Whether a stream did not fit from its first second on, and its owner had not decided at its last batch."""
-        known = self._scales.get(stream_id)
-        return known is not None and known.doubted
-
-    def factors(self, version: int) -> dict[str, Factor]:
-        """What the intervals of a version are wide by now, stream by stream."""
-        return intervals.factors(self._scales, version)
 
     def usual(self, now: float) -> Record:
         """Record of the shortest window before a Unix time, s."""
@@ -186,11 +171,6 @@ class Monitor:
         self.counts.update({"batches": 1, **_counts(event.report or {})})
         self._since_due += 1
 
-    def declared(self, event: EventRow) -> None:
-        """Take in what the owner has said of a payload; the model's turn and `lock` are held."""
-        self.payloads.remember(event)
-        self.number = event.number
-
     def due(self, batches: int) -> bool:
         """Whether so many batches have been noted since the last time that this was true."""
         with self.lock:
@@ -200,10 +180,9 @@ class Monitor:
             return True
 
     def decided(self) -> None:
-        """Learning goes on after it was held; `lock` is held. What has changed is no contact."""
+        """Learning goes on after it was held; `lock` is held."""
         self.held = False
         self._departure = self._departure and self._departure.decided()
-        self._gates.update({stream_id: gate.stand_back() for stream_id, gate in self._gates.items()})
 
     def _remember(self, event: EventRow, recent: bool) -> None:
         """Take in a batch as it was judged when it was logged. recent: whether the detector still looks back to it."""
@@ -219,25 +198,6 @@ class Monitor:
         self.held, waits = report["held"], report["held"] or report["open"]
         departure = report.get("departure")  # not in what an earlier release has logged
         self._departure = None if departure is None else Departure.from_json(departure)
-        if event.stream_id is not None:
-            if (values := report.get("gate")) is not None:
-                gate = ContactGate.from_json(values, self._patience)
-            else:  # logged by an earlier release
-                gate = ContactGate.start(self._patience)
-                gate = gate.stand_back() if waits else gate
-            self._gates[event.stream_id] = gate
-            self._gates.move_to_end(event.stream_id)
-            self._openings.pop(event.stream_id, None)
-            if (begun := report.get("opening")) is not None:
-                self._openings[event.stream_id] = Opening.from_json(begun)
-            self._scales.pop(event.stream_id, None)
-            if (scale := intervals.known(event)) is not None:
-                self._scales[event.stream_id] = scale
-            if len(self._gates) > self._most_streams:
-                oldest = self._gates.popitem(last=False)[0]
-                self._scales.pop(oldest, None)
-                self._openings.pop(oldest, None)
-                self.payloads.forget(oldest)
         at = report.get("until", event.last)
         if at is None or not recent:
             return

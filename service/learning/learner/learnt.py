@@ -16,9 +16,10 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.online.record import Record, error_floor
 from lipcore.online.transfer import consolidate
 from service.journal import log, snapshots
-from service.learning import intervals
+from service.learning import owner
 from service.learning.learner.restore import Restored, restore
 from service.learning.payloads import Payloads
+from service.learning.streams import Streams
 from service.models.loads import Carried
 from service.models.scales import Factor
 from service.models.served import Learnt
@@ -110,12 +111,13 @@ class LearntVersions:
     def carried(self, model: str, version: int, carrier: Carrier) -> Mapping[str, Carried]:
         """Return what answers for its streams with what their last batches say that they carry."""
         with self._database.session() as session:
-            return Payloads.restored(session, model).carried(carrier, version)
+            return Payloads.restored(session, model, Streams.restored(session, model)).carried(carrier, version)
 
     def factors(self, model: str, version: int) -> Mapping[str, Factor]:
         """Return the factors on its intervals that the last batches of its streams have led to."""
         with self._database.session() as session:
-            return intervals.factors(intervals.restored(session, model), version)
+            kept = owner.options(session, model).adaptive_intervals
+            return Streams.restored(session, model).factors(version) if kept else {}
 
     def consolidated(self, model: str, version: int, base: TorqueModel) -> Learnt | None:
         """Return all that a version has learnt as a model that can be saved, None where that is nothing; see `find`. It

@@ -7,6 +7,7 @@ import logging
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 
 from sqlalchemy import select
 
@@ -17,6 +18,7 @@ from service.journal.log import NewBatch
 from service.learning import owner
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
+from service.learning.streams import PayloadRecord
 from service.learning.weigher.messages import MOST_STREAMS, Asked, Message, Revised, Stream, Unweighed, Weighed
 from service.learning.weigher.process import MOST_WAITING, WeigherProcess
 from service.models.loaded import LoadedModels, Served
@@ -66,7 +68,7 @@ class Weighing:
         if not len(rows):
             return
         stream, version = (served.name, served.version, batch.stream_id), (served.name, served.version)
-        said, epoch = monitor.payloads.said(batch.stream_id), self.process.epoch
+        said, epoch = monitor.payloads.event(batch.stream_id), self.process.epoch
         with self._lock:
             if len(self._knows) > MOST_STREAMS:  # what the process has not forgotten is told again
                 self._knows.clear()
@@ -122,7 +124,7 @@ class Weighing:
         model, _, stream_id = message.stream
         watch, database = message.watch, self.database
         with self._turn(monitor, model):
-            if monitor.payloads.said(stream_id) != message.said:
+            if monitor.payloads.event(stream_id) != message.said:
                 return
             with database.transaction(model) as session:
                 detail = {"stream_id": stream_id, "watch": watch.to_json()}
@@ -139,13 +141,17 @@ class Weighing:
                         log.unlearn(session, model, each, message.received)
                 event = log.append(session, model, "payload", detail, message.received)
                 event.stream_id, event.version = stream_id, served.version
+                if (source := log.stream(session, model, stream_id)) is not None:
+                    payload = PayloadRecord(event.number, message.received, watch.to_json(), served.version)
+                    source.record = replace(monitor.streams.get(stream_id), payload=payload, scale=None).to_json()
                 if message.received - monitor.payload_alarm_at >= ALARM_S:
                     monitor.payload_alarm_at = message.received
                     text, mass = _told(stream_id, watch)
                     evidence = {"stream_id": stream_id, "at": watch.since, **mass}
                     owner.raise_alarm(session, model, "payload", text, evidence)
-            monitor.handled(event)
-            served.scales.take(monitor.factors(served.version))
+            monitor.number = event.number
+            monitor.streams.change(stream_id, scale=None)  # its errors on the way say nothing of its intervals
+            served.scales.take(monitor.streams.factors(served.version))
 
 
 def _told(stream_id: str, watch: Watch) -> tuple[str, dict[str, object]]:

@@ -202,13 +202,15 @@ class LearnerRow(Base):
 
 
 class LearningRow(Base):
-    """How a model learns, as its owner has set it, and whether it holds still after a change."""
+    """How a model learns, as its owner has set it, whether it holds still after a change, and the payload that was
+    declared for all of its streams (see `service.learning.streams.PayloadRecord`)."""
 
     __tablename__ = "learning"
 
     model: Mapped[str] = mapped_column(ForeignKey("models.name"), primary_key=True)
     options: Mapped[dict[str, Any]]
     held: Mapped[dict[str, Any] | None]
+    payload: Mapped[dict[str, Any] | None]
 
 
 class StreamRow(Base):
@@ -216,7 +218,8 @@ class StreamRow(Base):
 
     kind: "batches" or "frames"; last: highest sequence seen; missing: ranges [first, last] of sequences below it that
     have not come; forgotten: highest sequence whose batch is no longer kept, so that it cannot be known again;
-    received: when the last one came, Unix time, s, None for what an earlier release has written.
+    received: when the last one came, Unix time, s; record: see `service.learning.streams.StreamRecord`; both are None
+    for what an earlier release has written.
     """
 
     __tablename__ = "streams"
@@ -230,6 +233,7 @@ class StreamRow(Base):
     forgotten: Mapped[int | None] = mapped_column(BigInteger)
     created_at: Mapped[str]
     received: Mapped[float | None]
+    record: Mapped[dict[str, Any] | None]
 
 
 class EventRow(Base):

@@ -1,6 +1,7 @@
 """Databases of earlier releases: brought up to date with all that is in them, whoever comes first."""
 
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -9,9 +10,12 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, select
 
+from service.learning.ingest.judging import ContactGate
+from service.learning.streams import Streams
 from service.storage.database import Base, Database, JobRow, ModelRow, SnapshotRow, VersionRow, migrations
 from service.storage.database.migrations import HEAD
 from tests.service.database.starting import check_starts_together
+from tests.service.learning import batches
 
 BEFORE = (Path(__file__).parent / "before_migrations.sql").read_text()
 FILE = "lipserve.sqlite3"
@@ -50,6 +54,39 @@ def test_what_an_earlier_release_stored_is_kept(earlier):
         assert (job.id, job.state, job.history, job.retry_of) == ("job_1", "queued", [], None)
         assert session.scalars(select(SnapshotRow.sha256)).all() == [None]
     database.close()
+
+
+def test_what_reports_and_events_said_of_streams_becomes_their_records(tmp_path):
+    body = {"mass": 2.0, "com": [0.0, 0.0, 0.1], "inertia": None}
+    report = {
+        "accepted": 4,
+        "rejected": {},
+        "gate": ContactGate.start(0.5).stand_back().to_json(),
+        "opening": None,
+        "doubted": True,
+    }
+    scale, watch = {"log": [0.0, 0.1], "owed": [0.0, 0.0], "last": 3.0}, {"state": "none", "held": None}
+    database = batches.opened(tmp_path)
+    batches.write(database, batches.batch(0, report=report | {"scale": scale}))  # event 1
+    batches.note(database, "payload", {"stream_id": None, "body": body})  # 2
+    batches.write(database, batches.batch(1, stream_id="later", report=report | {"payload": watch}))  # 3
+    batches.note(database, "payload", {"stream_id": "robot-1", "body": None})  # 4
+    database.close()
+    with closing(sqlite3.connect(tmp_path / FILE)) as connection:
+        for change in ("streams DROP COLUMN record", "learning DROP COLUMN payload"):
+            connection.execute(f"ALTER TABLE {change}")
+        connection.execute("UPDATE alembic_version SET version_num = '0006'")
+        connection.commit()
+    database = Database(tmp_path)
+    with database.session() as session:
+        known = Streams.restored(session, batches.MODEL)
+    database.close()
+    first, later = known.get("robot-1"), known.get("later")
+    assert (first.gate.to_json(), first.doubted, first.received) == (report["gate"], True, 1000.0)
+    assert (first.scale.version, first.scale.state.log.tolist()) == (1, scale["log"])
+    assert (known.payload("robot-1").event, known.payload("robot-1").body) == (4, None)
+    assert (later.payload.watch, later.payload.event, later.payload.version) == (watch, 2, 1)
+    assert (known.payload("").event, known.payload("another").body) == (2, body)
 
 
 def test_a_migration_that_fails_leaves_everything_as_it_was(earlier):

@@ -253,7 +253,7 @@ def test_a_gate_that_stood_back_returns_once_rows_fit():
     assert judging.judge(screened(10, 20.0, 5.0), watch, False, options, nothing).rows.rejected() == {"contact": 10}
 
 
-HIDDEN = ("_gates", "_detector", "_departure", "held", "number")
+HIDDEN = ("_detector", "_departure", "held", "number")
 
 
 def comparable(value: Any) -> Any:
@@ -269,7 +269,8 @@ def comparable(value: Any) -> Any:
 
 def state(monitor: Monitor) -> dict[str, Any]:
     return {name: comparable(getattr(monitor, name)) for name in HIDDEN} | {
-        "windows": [comparable(window._buckets) for window in monitor.windows]
+        "windows": [comparable(window._buckets) for window in monitor.windows],
+        "streams": comparable(dict(monitor.streams.all())),
     }
 
 
@@ -310,7 +311,7 @@ def test_a_collision_a_change_and_a_decision(beside):
     pupil.post("learning/change", {"decision": "adapt"})
     drive(pupil, range(8, 10), stream_id="other")  # its gate stands back too, and no batch of "arm" has come since
     assert beside.agree()
-    assert beside.follower._gates["arm"].open
+    assert beside.follower.streams.get("arm").gate.open
     drive(pupil, range(16, 19), push=PUSH)
     drive(pupil, range(19, 25))
     assert beside.agree()
@@ -323,7 +324,7 @@ def test_a_monitor_of_a_service_that_starts_again_has_the_gates_as_they_were(bes
     with service.database.session() as session:
         names = beside.follower.joint_names
         again = Monitor.rebuilt(session, beside.pupil.model, names, service.settings, time.time())
-    assert again._gates["arm"].patience.contacts > 0
+    assert again.streams.get("arm").gate.patience.contacts > 0
     assert state(again) == state(service.learners.monitor(beside.pupil.model))
 
 

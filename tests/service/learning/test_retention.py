@@ -124,18 +124,6 @@ def test_a_deleted_batch_is_not_taken_for_a_new_one(database):
     assert [log.is_forgotten(robot, k) for k in (3, 4, 5, 6, 7, 9)] == [False, True, True, True, False, False]
 
 
-def test_what_streams_were_last_said_or_noticed_to_carry_stays(database):
-    body = {"mass": 1.0, "com": [0.0, 0.0, 0.1], "inertia": None}
-    for stream_id in (None, "a", None, "a"):  # 1 to 4
-        note(database, "payload", {"stream_id": stream_id, "body": body})
-    for stream_id in ("b", "forgotten"):  # 5, 6
-        note(database, "payload", {"stream_id": stream_id, "watch": {}})
-    write(database, *(batch(0, stream_id=stream_id) for stream_id in ("a", "b")))  # 7, 8
-    snapshot(database, 8)
-    retain(database, batches=0)
-    assert kept(database) == [3, 4, 5, 8]
-
-
 @pytest.mark.parametrize("runs", [60, slow(10_000)])
 def test_every_run_has_a_stream_of_its_own_and_the_longest_silent_makes_room(database, runs):
     def run(number, received, **fields):

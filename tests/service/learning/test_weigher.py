@@ -2,10 +2,13 @@
 
 import os
 import signal
+import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
+from sqlalchemy import select
 
 import lipcore
 from lipcore.model.body import Body
@@ -15,13 +18,14 @@ from lipcore.online.holding import Watch
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
 from service.foundation.settings import Settings
-from service.learning import payloads
+from service.journal.snapshots import retain
 from service.learning.weigher import worker
 from service.learning.weigher.messages import Asked, Revised, Unweighed, Weighed
 from service.learning.weigher.worker import Weigher
-from service.storage.database import Database
+from service.storage.database import Database, EventRow
+from tests.choosing import slow
 from tests.service.data import eventually
-from tests.service.learning.payloads import lift
+from tests.service.learning.payloads import lift, lifting
 from tests.service.models.versions import publish_arm_at
 from tests.service.server import Server
 
@@ -219,11 +223,34 @@ def test_another_version_carries_what_was_noticed_and_says_what_it_does_not_know
     assert max(vague["tau_std"]) > 3 * max(exact["tau_std"])
 
 
-def test_what_was_noticed_is_known_after_thousands_of_batches_of_others_and_a_start(tmp_path, monkeypatch):
-    with Server(tmp_path / "home", warm=True) as server:
-        lift(server.client, "panda-sim", "arm")
-        eventually(lambda: server.client.get("/v1/models/panda-sim/alarms").json()["items"])  # logged, too
-    monkeypatch.setattr(payloads, "MOST_EVENTS", 0)  # as if so many had come since
-    with Database.of(Settings(home=tmp_path / "home")).session() as session:
-        restored = payloads.Payloads.restored(session, "panda-sim")
-    assert restored._noted["arm"].values["held"]["eta"][0] == pytest.approx(np.log(1.5), abs=0.05)
+@pytest.mark.parametrize("others", [20, slow(5000)])
+def test_a_payload_outlives_a_rollback_batches_of_other_streams_retention_and_a_restart(tmp_path, others):
+    name, home = "panda-sim", tmp_path / "home"
+    with Server(home, warm=True) as server:
+        client = server.client
+        lift(client, name, "arm")
+        for body in lifting("declared", mass=0.0):
+            assert client.post(f"/v1/models/{name}/observations", json=body).status_code == 200
+        body = {"mass": 2.0, "com": [0.0, 0.0, 0.1], "stream_id": "declared"}
+        assert client.put(f"/v1/models/{name}/payload", json=body).status_code == 200
+        eventually(lambda: client.get(f"/v1/models/{name}/alarms").json()["items"])  # logged, too
+        assert client.post(f"/v1/models/{name}/rollback", json={"revision": 0}).status_code == 200
+        first = lifting("other", mass=0.0)[0]
+        for number in range(others):
+            times = (np.array(first["t"]) + 0.25 * number).tolist()
+            body = first | {"sequence": number, "t": times}
+            assert client.post(f"/v1/models/{name}/observations", json=body).status_code == 200
+        learning = f"/v1/models/{name}/learning"
+        eventually(lambda: client.get(learning).json()["status"]["lag_events"] == 0)
+        server.terminate()
+    settings = Settings(home=home, observation_retention_s=1.0)
+    with closing(Database.of(settings)) as database:
+        retain(database, settings, name, time.time() + 1e6)
+        with database.session() as session:
+            kinds = session.scalars(select(EventRow.kind).where(EventRow.model == name))
+            assert "payload" not in set(kinds)
+    with Server(home, warm=True) as server:
+        after = masses(server.client)
+    assert {stream: mass for stream, mass in after.items() if mass} == pytest.approx(
+        {"arm": 1.5, "declared": 2.0}, abs=0.05
+    )

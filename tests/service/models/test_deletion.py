@@ -30,6 +30,7 @@ from service.storage.database import (
 )
 from service.storage.files import Files
 from tests.service.data import error, service_of
+from tests.service.learning.batches import batch
 from tests.service.models.versions import QUERY, predict, publish
 
 
@@ -183,10 +184,10 @@ def test_a_batch_that_was_predicted_by_what_is_deleted_is_not_logged(api, arm):
     monitor, screened = service.learners.monitor(arm), SimpleNamespace(own=slice(0, 1))
     assert delete(api, arm).status_code == 204
     with pytest.raises(NotFoundError, match="no model"):
-        intake.append(monitor, served, None, None, screened, {})
+        intake.append(monitor, served, None, batch(0), screened, {})
     publish(api, arm)
     with pytest.raises(ConflictError, match=r"version 3 .* was deleted meanwhile"):
-        intake.append(monitor, served, None, None, screened, {})
+        intake.append(monitor, served, None, batch(0), screened, {})
 
 
 def test_who_asks_for_a_pointer_is_answered_though_it_moves_and_the_version_before_goes(api, arm, monkeypatch):

@@ -1,0 +1,171 @@
+"""What is known of each stream of a model: one record a stream, in its row of the database.
+
+A record lasts as long as its row: over restarts, other versions, rollbacks and the retention of the log. Services that
+share a database read it again once another one has logged rows of the stream.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from service.learning.ingest.judging import ContactGate
+from service.learning.ingest.opening import Opening
+from service.learning.intervals import ScaleRecord
+from service.models.scales import Factor
+from service.storage.database import LearningRow, StreamRow
+
+FORMAT = 1
+"""Of a record's JSON; a later release that changes it reads this one, too."""
+
+
+@dataclass(frozen=True)
+class PayloadRecord:
+    """What a stream carries, as it was said or noticed last.
+
+    event: number of the event that has said or noticed it; received: Unix time, s, of the latest rows that tell of it.
+    watch: see `Watch.to_json`, as `version` has seen it; body: what the owner has declared, None for nothing. One of
+    the two is given: it is a declaration where there is no `watch`.
+    """
+
+    event: int
+    received: float
+    watch: Mapping[str, Any] | None = None
+    version: int | None = None
+    body: Mapping[str, Any] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """All fields as JSON has them; `PayloadRecord(**values)` reads them."""
+        return {name: getattr(self, name) for name in self.__dataclass_fields__}
+
+
+@dataclass(frozen=True)
+class StreamRecord:
+    """What is known of a stream after its last batch; immutable.
+
+    gate: which of its rows are contacts; opening: its first second, None once that is judged; doubted: whether that did
+    not fit, and nobody has confirmed the stream since; scale: of its intervals, None where they do not adapt; payload:
+    what it carries, None where nothing was said or noticed; received: when the batch came, Unix time, s.
+    """
+
+    gate: ContactGate
+    opening: Opening | None = None
+    doubted: bool = False
+    scale: ScaleRecord | None = None
+    payload: PayloadRecord | None = None
+    received: float = 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """As the stream's row has it."""
+        return {
+            "format": FORMAT,
+            "gate": self.gate.to_json(),
+            "opening": None if self.opening is None else self.opening.to_json(),
+            "doubted": self.doubted,
+            "scale": None if self.scale is None else self.scale.to_json(),
+            "payload": None if self.payload is None else self.payload.to_json(),
+        }
+
+    def decided(self) -> StreamRecord:
+        """The same after learning was held: what has changed is no contact."""
+        return replace(self, gate=self.gate.stand_back())
+
+    @classmethod
+    def of(cls, row: StreamRow, patience_s: float) -> StreamRecord:
+        """Read what a row has. patience_s: how long contacts are kept out, as it is set now."""
+        values, received = row.record, row.received or 0.0
+        if values is None:  # written by a service of an earlier release
+            return cls(ContactGate.start(patience_s), received=received)
+        opening, scale, payload = (values[name] for name in ("opening", "scale", "payload"))
+        return cls(
+            ContactGate.from_json(values["gate"], patience_s),
+            None if opening is None else Opening.from_json(opening),
+            values["doubted"],
+            None if scale is None else ScaleRecord.from_json(scale),
+            None if payload is None else PayloadRecord(**payload),
+            received,
+        )
+
+
+class Streams:
+    """The records of one model's streams; for any thread. A record is written by whoever has the model's turn.
+
+    patience_s: how long contacts are kept out, for those who judge rows; default: what was declared for all streams,
+    None where nothing was.
+    """
+
+    def __init__(self, patience_s: float = 0.0) -> None:
+        self._patience_s, self._lock = patience_s, threading.Lock()
+        self._records: Mapping[str, StreamRecord] = {}
+        self.default: PayloadRecord | None = None
+
+    @classmethod
+    def restored(cls, session: Session, model: str) -> Streams:
+        """Those that the database has, for those who judge no rows."""
+        made = cls()
+        made.read(session, model)
+        return made
+
+    def read(self, session: Session, model: str, stream_ids: Collection[str] | None = None) -> None:
+        """Read what other services have written: of these streams, of all where None."""
+        query = select(StreamRow).where(StreamRow.model == model)
+        if stream_ids is not None:
+            query = query.where(StreamRow.stream_id.in_(stream_ids))
+        rows = {row.stream_id: StreamRecord.of(row, self._patience_s) for row in session.scalars(query)}
+        declared = session.scalar(select(LearningRow.payload).where(LearningRow.model == model))
+        with self._lock:
+            self._records = rows if stream_ids is None else {**self._records, **rows}
+            self.default = None if declared is None else PayloadRecord(**declared)
+
+    def all(self) -> Mapping[str, StreamRecord]:
+        """Every record, by stream."""
+        return self._records
+
+    def get(self, stream_id: str) -> StreamRecord:
+        """The record of a stream, that of a new one where none is known."""
+        return self._records.get(stream_id) or StreamRecord(ContactGate.start(self._patience_s))
+
+    def payload(self, stream_id: str) -> PayloadRecord | None:
+        """What a stream carries: what was said last, of it or of all streams. Of "": what was declared for all."""
+        own = self.get(stream_id).payload
+        if own is None or (self.default is not None and self.default.event > own.event):
+            return self.default
+        return own
+
+    def factors(self, version: int) -> dict[str, Factor]:
+        """The factors on the widths of a version's intervals, of streams whose last batch it predicted."""
+        return {
+            name: Factor(record.scale.state.factor, record.received, record.doubted)
+            for name, record in self._records.items()
+            if record.scale is not None and record.scale.version == version
+        }
+
+    def change(self, stream_id: str, **fields: Any) -> StreamRecord:
+        """Put fields of a record in the place of those that are known, and return it."""
+        with self._lock:
+            record = replace(self.get(stream_id), **fields)
+            self._records = {**self._records, stream_id: record}
+        return record
+
+    def change_all(self, session: Session, model: str, act: Callable[[StreamRecord], StreamRecord]) -> None:
+        """Change all records, also in the database."""
+        with self._lock:
+            self._records = {name: act(record) for name, record in self._records.items()}
+        for row in session.scalars(select(StreamRow).where(StreamRow.model == model)):
+            row.record = self.get(row.stream_id).to_json()
+
+    def forget(self, stream_id: str) -> None:
+        """Forget a stream."""
+        with self._lock:
+            self._records = {name: record for name, record in self._records.items() if name != stream_id}
+
+    def keep(self, session: Session, model: str) -> None:
+        """Forget the streams that the database no longer has."""
+        known = set(session.scalars(select(StreamRow.stream_id).where(StreamRow.model == model)))
+        with self._lock:
+            self._records = {name: record for name, record in self._records.items() if name in known}
