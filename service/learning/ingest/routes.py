@@ -105,7 +105,8 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
     if not is_json(scope):
         return None
     learners: Learners = scope["app"].state.learners
-    reply = await learners.threads.run(_decoded, learners, scope["path_params"]["model"], body)
+    model = scope["path_params"]["model"]
+    reply = await learners.threads.run(model, _decoded, learners, model, body)
     return None if reply is None else Reply(reply)
 
 
@@ -122,7 +123,7 @@ async def observe(learners: LearnersDep, model: str, request: ObservationRequest
     stream; a robot whose clock was set goes on under another `stream_id`. Of joints in another order, say
     `joint_names`. Batches of about a tenth of a second to a second serve best.
     """
-    return await learners.threads.run(learners.observe, model, request)
+    return await learners.threads.run(model, learners.observe, model, request)
 
 
 hot.add_api_route(

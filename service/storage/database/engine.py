@@ -7,6 +7,7 @@ There a transaction tells the others of which model it has changed what: Postgre
 from __future__ import annotations
 
 import logging
+import threading
 from collections.abc import Generator, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from itertools import chain
@@ -53,6 +54,18 @@ class Sqlite:
             pool_timeout=timeout_s,
         )
         event.listen(self.engine, "connect", _configure)
+        self._timeout_s, self._writers = timeout_s, threading.Lock()
+
+    @contextmanager
+    def queue(self) -> Iterator[None]:
+        """Wait for the other writers of this process. SQLite by itself tries again only after up to 0.1 s, and then
+        another one may have come first. After `timeout_s` it is SQLite that refuses."""
+        held = self._writers.acquire(timeout=self._timeout_s)
+        try:
+            yield
+        finally:
+            if held:
+                self._writers.release()
 
     def lock(self, connection: Connection, model: str | None = None) -> None:
         """Take the write lock, of which there is one: what is read from now on cannot change before it is written."""
@@ -238,7 +251,7 @@ class Database:
         model: where given, only rows of this model are written, so that those of other models need not wait (which
         SQLite's writers do all the same); else it is the only writer.
         """
-        with self._sessions() as session:
+        with self.adapter.queue(), self._sessions() as session:
             self.adapter.lock(session.connection(), model)
             yield session
             if self.shared:

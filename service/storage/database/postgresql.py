@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 from zlib import crc32
 
@@ -50,6 +50,10 @@ class Postgresql:
         self.engine = _engine(url, timeout_s, max(1, connections - turns))
         # who has a turn needs another connection, which none of those that wait for a turn may have
         self._turns = _engine(url, timeout_s, turns)
+
+    def queue(self) -> AbstractContextManager[None]:
+        """Nothing to wait for: the server knows who comes next."""
+        return nullcontext()
 
     def lock(self, connection: Connection, model: str | None = None) -> None:
         """Wait until no other writer of the model, or none at all, is left; the lock ends with the transaction."""
