@@ -194,9 +194,7 @@ class Settings(BaseSettings):
     max_snapshots: int = Field(20, ge=2, description="Snapshots kept of a version: how far a rollback reaches.")
     publish_every_s: float = Field(0.5, gt=0, description="Shortest time between two revisions of a version, s.")
     max_learning_models: Count = Field(4, description="Versions whose statistics the learner process keeps in memory.")
-    learner_niceness: int = Field(
-        10, ge=0, le=19, description="Niceness of the learner process and of the threads that take observations."
-    )
+    learner_niceness: int = Field(10, ge=0, le=19, description="Niceness of the learner process.")
     learner_heartbeat_s: float = Field(
         45.0,
         ge=1,

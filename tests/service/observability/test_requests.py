@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import re
+import threading
 
 import pytest
 from fastapi.testclient import TestClient
@@ -13,7 +14,6 @@ from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanE
 
 from lipcore.extras import EXTRAS, Extra, MissingExtraError
 from service.app import create_app
-from service.compute.process import Place
 from service.foundation.settings import Settings
 from service.inference import predicting as inference
 from service.learning.learners import IngestThreads
@@ -130,13 +130,32 @@ def test_an_accepted_stream_has_an_id():
 def test_threads_that_take_observations_know_the_request():
     async def ask():
         request_id.set("batch-7")
-        return await threads.run(request_id.get)
+        return await threads.run("arm", request_id.get)
 
-    threads = IngestThreads(Place(threads=1))
+    threads = IngestThreads()
     try:
         assert asyncio.run(ask()) == "batch-7"
     finally:
         threads.close()
+
+
+def test_batches_of_a_model_come_in_turn_and_keep_no_thread_from_another():
+    gate, order = threading.Event(), []
+
+    async def ask():
+        slow = [asyncio.create_task(threads.run("slow", gate.wait)) for _ in range(5)]
+        slow += [asyncio.create_task(threads.run("slow", order.append, number)) for number in range(5)]
+        await asyncio.sleep(0)
+        order.append(await threads.run("other", str, "other"))  # while all of them wait
+        gate.set()
+        await asyncio.gather(*slow)
+
+    threads = IngestThreads()
+    try:
+        asyncio.run(ask())
+    finally:
+        threads.close()
+    assert order == ["other", *range(5)]
 
 
 HOT = "/v1/models/{model}/predict"
