@@ -151,6 +151,20 @@ class ChangeDetector:
         change = following._sudden() or following._drift()
         return replace(following, alarm=change), change
 
+    def moved(self, seconds: float) -> ChangeDetector:
+        """The same with all its times later by so much."""
+
+        def later(bucket: Bucket) -> Bucket:
+            return Bucket(bucket.start + seconds, bucket.end + seconds, bucket.record)
+
+        return replace(
+            self,
+            buckets=tuple(later(each) for each in self.buckets),
+            open=None if self.open is None else later(self.open),
+            since=None if self.since is None else self.since + seconds,
+            alarm=None if self.alarm is None else replace(self.alarm, at=self.alarm.at + seconds),
+        )
+
     def acknowledged(self) -> ChangeDetector:
         """The detector that takes what has arrived since the last alarm for the new reference."""
         if not self.alarm:

@@ -49,6 +49,9 @@ OFF = 12
 GAP_S = 0.5
 """A longer time between two rows: what came before is not compared with what comes after."""
 
+BACK_S = 60.0
+"""Rows that are older than the latest by more, s, are those of a clock that was set back: they begin anew."""
+
 
 @dataclass(frozen=True, eq=False)
 class Watch:
@@ -75,6 +78,8 @@ class Watch:
         watch = self._seen_by(carrier)
         assert watch.around is not None
         carrier = watch.around.carrier
+        if watch._last is not None and len(rows) and rows.time[-1] < watch._last - BACK_S:
+            watch = replace(watch, waiting=None, recent=(), cells=())
         if watch._last is not None:
             rows = rows.take(rows.time > watch._last)
         if not len(rows):

@@ -6,16 +6,18 @@ dense and rise in the order of commits, and an event is durable once the transac
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
-from sqlalchemy import Select, bindparam, delete, func, select, update
+from sqlalchemy import Select, bindparam, case, delete, func, select, update
 from sqlalchemy.orm import Session, undefer
 
+from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import BusyError, ConflictError
@@ -29,6 +31,8 @@ UNTIMED = [CODES.index("non_finite"), CODES.index("time_jump")]
 """Codes of rows whose own time says nothing."""
 MOST_RANGES = 1000
 """Ranges that are remembered; the lowest are given up first, being the least likely to be filled."""
+AHEAD_S = 1.0
+"""By how much the rows of a batch may be dated after its arrival, s, where they are learnt."""
 IN_USE_S = 10.0
 """Seconds without a batch after which a stream makes room for a new one, if it was silent for longest."""
 ARRAYS = tuple(field.name for field in fields(Rows))
@@ -39,6 +43,9 @@ _OF_STREAM = select(EventRow).where(EventRow.model == bindparam("model"), EventR
 _BEFORE = _OF_STREAM.where(EventRow.sequence < bindparam("sequence")).order_by(EventRow.sequence.desc()).limit(1)
 _AFTER = _OF_STREAM.where(EventRow.sequence > bindparam("sequence")).order_by(EventRow.sequence).limit(1)
 _NEWEST = select(EventRow.number).where(EventRow.model == bindparam("model")).order_by(EventRow.number.desc()).limit(1)
+_OF_MODEL = EventRow.model == bindparam("model")
+_LATEST = select(EventRow.received, EventRow.clock).where(_OF_MODEL).order_by(EventRow.number.desc()).limit(1)
+_OPTIONS = select(LearningRow.options).where(LearningRow.model == bindparam("model"))
 _START = select(LearnerRow.start).where(
     LearnerRow.model == bindparam("model"), LearnerRow.version == bindparam("version")
 )
@@ -255,6 +262,34 @@ def start_of(session: Session, model: str, version: int) -> int:
     return fetch(session, _START, model=model, version=version).scalar() or 0
 
 
+def clock(session: Session, model: str, received: float) -> float:
+    """Time of a model's own clock at an arrival, Unix time, s. It goes on with arrivals, never back, and in a pause by
+    no more than the shortest time constant that is set: no clock that is wrong, or set right, makes it forget more."""
+    latest = session.execute(_LATEST, {"model": model}).first()
+    if latest is None:
+        return received
+    options = fetch(session, _OPTIONS, model=model).scalar() or {}
+    constants = [options.get(name) for name in ("forgetting_s", "friction_walk_s")]
+    longest = min((each for each in constants if each is not None), default=math.inf)
+    before, last = latest
+    return (before if last is None else last) + min(max(received - before, 0.0), longest)
+
+
+def learning_time(event: EventRow, time: Array | float) -> Array:
+    """Event times of an event, s, by the model's own clock: as late as they were when it arrived, and never later than
+    its arrival by more than AHEAD_S."""
+    if event.clock is None:  # logged by an earlier release
+        return np.asarray(time)
+    return np.asarray(event.clock + np.minimum(time - event.received, AHEAD_S))
+
+
+def learning_rows(event: EventRow) -> Rows:
+    """The rows of a batch or a replay, which are read only now, at times of the model's own clock."""
+    rows = rows_of(event)
+    # those of a replay have times of that clock already: they are as old as their batch
+    return rows if event.kind == "replay" else replace(rows, time=learning_time(event, rows.time))
+
+
 def encode(rows: Rows) -> bytes:
     """Write rows, bit for bit."""
     return save({name: np.ascontiguousarray(getattr(rows, name)) for name in ARRAYS})
@@ -279,6 +314,7 @@ def _append(
     session: Session, event: EventRow, model: str, kind: EventKind, received: float, rows: Rows | None
 ) -> EventRow:
     event.model, event.kind, event.received = model, kind, received
+    event.clock = clock(session, model, received)
     if rows is not None:
         event.payload, event.rows, event.learnt = encode(rows), len(rows), int(np.sum(rows.code == LEARNT))
         times = rows.time[np.isfinite(rows.time) & ~np.isin(rows.code, UNTIMED)]
@@ -325,8 +361,9 @@ def _make_room(session: Session, model: str, most: int, received: float) -> None
     if known < most:
         return
     used = func.coalesce(StreamRow.received, 0.0)
-    oldest = session.scalars(select(StreamRow).where(of_model).order_by(used).limit(1)).one()
-    if (oldest.received or 0.0) > received - IN_USE_S:
+    silent = case((used > received + IN_USE_S, 0.0), else_=used)  # by a clock that was set right since
+    oldest = session.scalars(select(StreamRow).where(of_model).order_by(silent).limit(1)).one()
+    if abs((oldest.received or 0.0) - received) < IN_USE_S:
         raise BusyError(
             f"model {model!r} has {known} sources of observations in use, the most it may have: go on with one of "
             "their stream_ids, or raise LIPSERVE_MAX_OBSERVATION_STREAMS"

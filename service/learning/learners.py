@@ -121,7 +121,8 @@ class Learners:
         loaded.learn_from(self.process.wake)
         loaded.when_deleted.append(self.forget)
         self.live = Feed(settings)
-        self._intake = Intake(loaded, self._monitor, self.process.wake, self.live.note)
+        self._intake = Intake(loaded, self._monitor, self.monitors, self.process.wake, self.live.note)
+        self._intake.set_back()
         self.weighing = self._intake.weighing
 
     def close(self) -> None:

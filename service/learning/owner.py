@@ -14,7 +14,7 @@ from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, 
 from service.web.access import audit
 from service.web.rows import Page, newest
 
-AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion"]
+AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock"]
 _SET = select(LearningRow.options, LearningRow.held).where(LearningRow.model == bindparam("model"))
 
 

@@ -168,13 +168,19 @@ class ObservationResponse(BaseModel):
     sequence: int
     rows: int = Field(description="Rows that came")
     accepted: int = Field(description="Rows to be learnt")
+    effective_samples: float | None = Field(
+        None,
+        description="Independent samples that these count as now: rows of a fast stream tell nearly the same, and with "
+        "`forgetting_s` late rows count less; null for a batch that an earlier release has logged",
+    )
     duplicate: bool = Field(description="Whether the batch had come before: then this is what was said the first time")
     state: State = Field(description="What has become of the batch since")
     rejected: dict[str, int] = Field(
         description="Rows that are kept but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`, "
         "`stationary`, `contact`, `change` (a changed robot, or a stream that did not fit, and its owner has not "
         "decided), `payload` (the arm carries something, of which the row teaches instead), `edge` (acceleration not "
-        "derivable; where the stream goes on, these are learnt with the next batch)"
+        "derivable; where the stream goes on, these are learnt with the next batch), `late` (came so late that by "
+        "`forgetting_s` it counts less than a thousandth)"
     )
     gaps: list[list[int]] = Field(
         description="Ranges [first, last] of sequences of the stream that have not come, the latest ones"

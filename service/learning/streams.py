@@ -50,7 +50,8 @@ class StreamRecord:
 
     gate: which of its rows are contacts; opening: its first second, None once that is judged; doubted: whether that did
     not fit, and nobody has confirmed the stream since; scale: of its intervals, None where they do not adapt; payload:
-    what it carries, None where nothing was said or noticed; received: when the batch came, Unix time, s.
+    what it carries, None where nothing was said or noticed; leapt: whether its clock has leapt ahead of its rows'
+    arrival; received: when the batch came, Unix time, s.
     """
 
     gate: ContactGate
@@ -58,6 +59,7 @@ class StreamRecord:
     doubted: bool = False
     scale: ScaleRecord | None = None
     payload: PayloadRecord | None = None
+    leapt: bool = False
     received: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
@@ -69,6 +71,7 @@ class StreamRecord:
             "doubted": self.doubted,
             "scale": None if self.scale is None else self.scale.to_json(),
             "payload": None if self.payload is None else self.payload.to_json(),
+            "leapt": self.leapt,
         }
 
     def decided(self) -> StreamRecord:
@@ -88,6 +91,7 @@ class StreamRecord:
             values["doubted"],
             None if scale is None else ScaleRecord.from_json(scale),
             None if payload is None else PayloadRecord(**payload),
+            values["leapt"],
             received,
         )
 
@@ -151,6 +155,12 @@ class Streams:
             record = replace(self.get(stream_id), **fields)
             self._records = {**self._records, stream_id: record}
         return record
+
+    def set_clock(self, step: float) -> None:
+        """Go with a clock of this machine that was set by `step`, s, as the database does."""
+        with self._lock:
+            moved = {name: replace(record, received=record.received + step) for name, record in self._records.items()}
+            self._records = moved
 
     def change_all(self, session: Session, model: str, act: Callable[[StreamRecord], StreamRecord]) -> None:
         """Change all records, also in the database."""

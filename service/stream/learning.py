@@ -18,6 +18,7 @@ from lipcore.data.samples import Array
 from lipserve.frames import NUMBER, REQUEST
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
 from service.learning.ingest.batches import Frames
+from service.learning.ingest.host_clock import SET_S
 from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.web.storage_errors import translated
@@ -51,7 +52,6 @@ class Learning:
     def __init__(self, learners: Learners, stream_id: str, send: Callable[[str], Awaitable[None]]) -> None:
         self._learners, self._stream_id, self._send = learners, stream_id, send
         self._most, self._wait = learners.settings.stream_flush_rows, learners.settings.stream_flush_s
-        # event time goes on evenly though the clock of the host be set while the stream is open
         self._clock = time.time() - perf_counter()
         self._waiting: deque[Taught] = deque()
         self._sequence, self._time = -1, -np.inf
@@ -157,7 +157,10 @@ class Learning:
         return Frames(served.name, self._stream_id, served, sequences, time, q, dq, ddq, tau, mean, std, factor, loaded)
 
     def _times(self, block: list[Taught]) -> Array:
-        """Times of arrival, Unix time in s, each later than the one before."""
+        """Times of arrival, Unix time in s, each later than the one before, unless the host's clock was set."""
+        clock = time.time() - perf_counter()
+        if abs(clock - self._clock) > SET_S:
+            self._clock, self._time = clock, -np.inf
         ticks = TICK * np.arange(1, len(block) + 1)
         arrived = np.array([each.arrived for each in block]) + self._clock
         times: Array = np.maximum.accumulate(np.maximum(arrived - ticks, self._time)) + ticks

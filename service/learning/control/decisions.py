@@ -203,14 +203,16 @@ def replay(
 
 def admit(session: Session, batch: EventRow, codes: Collection[str], received: float) -> dict[str, int]:
     """Log a replay: the rows of a batch with these codes that no earlier replay has learnt; return their counts.
-    Nothing is logged where there are none. Rows whose time was wrong count as of their arrival."""
+    Nothing is logged where there are none. Rows whose time was wrong count as of their arrival. Times are those of the
+    model's own clock."""
     pending = set(codes) - _replayed(session, batch)
-    rows = log.rows_of(batch)
+    rows = log.learning_rows(batch)
     chosen = _complete(rows) & np.isin(rows.code, [CODES.index(code) for code in pending])
     taken = rows.take(chosen)
     counts = taken.rejected()
     if counts:
-        times = np.where(taken.code == TIME_JUMP, batch.received, taken.time)
+        arrived = batch.received if batch.clock is None else batch.clock
+        times = np.where(taken.code == TIME_JUMP, arrived, taken.time)
         learnt = replace(taken, time=times, code=np.full(len(taken), LEARNT, np.uint8))
         detail = {"event": batch.number, "codes": list(counts)}
         log.append(session, batch.model, "replay", detail, received, learnt)

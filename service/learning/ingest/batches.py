@@ -4,7 +4,6 @@ frames of a stream, rows that are predicted already, one a sequence, in order.""
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -39,7 +38,7 @@ ONCE = "a sequence is used once, so a new run needs a stream_id of its own, or h
 def observe_batch(intake: Intake, model: str, request: ObservationRequest) -> ObservationResponse:
     """Take a batch; once this returns it is durable. Raise NotFoundError, LearningDisabledError, InvalidRequestError,
     ConflictError, ExpiredError, BusyError or StorageFullError."""
-    served, received = intake.loaded.get(model, None), time.time()
+    served, received = intake.loaded.get(model, None), intake.arrival()
     batch = measured(request, served.model, intake.settings)
     content = digest(batch)
     monitor = intake.monitor(served)
@@ -73,13 +72,14 @@ def _take(
         before, after = log.neighbours(session, *key)
         clock = StreamTime.of(source, sequence, before, after, received)
         previous = before.last if before is not None and clock.adjacent else None
-        dated = dating.dated(batch, clock, bounds, previous)
+        dated = dating.dated(batch, clock, bounds, previous, options.forgetting_s)
         rows, own, derived = dated.rows, slice(0, len(batch)), None
         if batch.ddq is None and batch.t is not None:
             rows, own, derived = deriving.derive(session, *key, rows, batch.t, bounds)
     screened = screening.predict(rows, served, own, derived, carrying=served.loads.of(stream_id))
     new = _new(served, stream_id, "batches", (sequence, sequence), content, rows, dated.offset, received)
-    details = {"derived": None if derived is None else Derivation(ddq=derived).model_dump(), "span": dated.span}
+    waited = None if derived is None else Derivation(ddq=derived).model_dump()
+    details = {"derived": waited, "span": dated.span, "leap": dated.leap}
     return ObservationResponse.model_validate(intake.append(monitor, served, options, new, screened, details))
 
 
@@ -218,6 +218,7 @@ def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
         if sequence <= before:
             raise _order(frames, sequence)
     monitor = intake.monitor(frames.served)
+    intake.arrival()
     with intake.turn(monitor, frames.model):
         with intake.database.session() as session:
             options = enabled(session, frames.model)

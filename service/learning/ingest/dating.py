@@ -15,13 +15,20 @@ from lipcore.data import independence
 from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.gates import RowLimits, check_rows, time_span
-from lipcore.vocabulary import CODES
+from lipcore.vocabulary import CODES, LEARNT
 from service.storage.database import EventRow, StreamRow
 
-NON_FINITE, LIMIT, TIME_JUMP = (CODES.index(code) for code in ("non_finite", "limit", "time_jump"))
+NON_FINITE, LIMIT, TIME_JUMP, LATE = (CODES.index(code) for code in ("non_finite", "limit", "time_jump", "late"))
 
 FAR_AHEAD = 86400.0
 """How far ahead of its arrival a row may be dated, s: as long a recording may be sent in one go."""
+
+
+LEAP_S = 60.0
+"""A clock that leaps further ahead of its rows' arrival, s, is wrong: so much time has not passed. A recording that is
+sent faster than it was measured comes to lie as far ahead step by step."""
+FORGOTTEN = 7.0
+"""Time constants of forgetting after which a row counts a thousandth, and teaches nothing."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +94,15 @@ class StreamTime:
         leaping[usable] = alone[: len(times)] & (times + offset > self.arrived + gap)
         return leaping
 
+    def leap(self, t: Array, usable: NDArray[np.bool_], offset: float, gap: float) -> tuple[int, float] | None:
+        """The row from which on a clock has leapt ahead of the rows' arrival, and how far, s; None where it has not."""
+        places = np.flatnonzero(usable)
+        ahead = t[places] + offset - self.arrived
+        first = ahead[:1] if self.after is None else self.after + offset - self.arrived
+        before = np.append(first, ahead[:-1])[: len(ahead)]
+        leapt = np.flatnonzero((ahead > LEAP_S) & (before <= LEAP_S) & (ahead - before > gap))
+        return (int(places[leapt[0]]), float(ahead[leapt[0]])) if len(leapt) else None
+
     def event_time(self, t: Array | None, offset: float, rows: int) -> Array:
         """Event times (N,), s, finite: a row without a time has that of the row before it."""
         if t is None:
@@ -97,12 +113,6 @@ class StreamTime:
         return np.where(np.isfinite(times), times, self.arrived)
 
 
-def span(t: Array | None, codes: NDArray[np.uint8]) -> list[float] | None:
-    """First and last time of a batch, by its stream's clock, that its neighbours lie before and after."""
-    times = None if t is None else time_span(t, codes)
-    return None if times is None else list(times)
-
-
 def _span(event: EventRow | None) -> list[float] | None:
     times: list[float] | None = None if event is None or event.report is None else event.report["span"]
     return times
@@ -110,29 +120,44 @@ def _span(event: EventRow | None) -> list[float] | None:
 
 @dataclass(frozen=True)
 class Dated:
-    """Rows with event times and the codes of `check_rows`. offset: of the stream, s; span: see `span`."""
+    """Rows with event times and the codes of `check_rows`. offset: of the stream, s; span: first and last time of the
+    batch, by its stream's clock, that its neighbours lie before and after; leap: how far its clock has leapt ahead of
+    the rows' arrival, s, None where it has not."""
 
     rows: Rows
     offset: float
     span: list[float] | None
+    leap: float | None
 
 
-def dated(measured: Measured, clock: StreamTime, bounds: RowLimits, previous: float | None) -> Dated:
-    """Check, date and weigh rows. previous: event time of the row right before them, s, where it is known. Weights come
-    from the batch itself where it has a spacing, so that they do not depend on the order of arrival."""
+def dated(
+    measured: Measured, clock: StreamTime, bounds: RowLimits, previous: float | None, forgetting_s: float | None = None
+) -> Dated:
+    """Check, date and weigh rows. previous: event time of the row right before them, s, where it is known;
+    forgetting_s: how the model forgets. Weights come from the batch itself where it has a spacing, so that they do not
+    depend on the order of arrival."""
     t = measured.t
     numbers = measured.q, measured.dq, measured.ddq, measured.tau
     codes = check_rows(t, *numbers, bounds, clock.after, clock.before)
     usable = ~np.isin(codes, (NON_FINITE, TIME_JUMP))
     gap = np.inf if bounds.max_gap_s is None else bounds.max_gap_s
-    offset = clock.settled(t, usable, gap)
+    offset, span, leap = clock.settled(t, usable, gap), None, None
     if t is not None:
         codes[clock.leaps(t, usable, offset, gap) & (codes != LIMIT)] = TIME_JUMP
+        span = time_span(t, codes)
+        leap = clock.leap(t, usable & (codes != TIME_JUMP), offset, gap)
+    if t is not None and leap is not None:
+        codes[(np.arange(len(t)) >= leap[0]) & (codes != NON_FINITE)] = TIME_JUMP
+        span = time_span(t[: leap[0]], codes[: leap[0]])
+        if span is None and clock.after is not None:
+            span = clock.after, clock.after  # the next batch is compared with what came before the leap, too
     ddq = np.full_like(measured.q, np.nan) if measured.ddq is None else measured.ddq
     time = clock.event_time(t, offset, len(measured))
+    if forgetting_s is not None:
+        codes[(codes == LEARNT) & (time < clock.arrived - FORGOTTEN * forgetting_s)] = LATE
     if t is None or len(measured) == 1:
         weights = independence.stream_weights(time, previous)
     else:
         weights = independence.even_weights(t)
     rows = Rows(time, measured.q, measured.dq, ddq, measured.tau, codes, weights)
-    return Dated(rows, offset, span(t, codes))
+    return Dated(rows, offset, None if span is None else list(span), None if leap is None else leap[1])

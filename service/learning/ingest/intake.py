@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from sqlalchemy import select
+import numpy as np
+from sqlalchemy import case, func, select, update
 from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
@@ -21,6 +23,8 @@ from service.journal.log import NewBatch
 from service.journal.snapshots import retain
 from service.learning import intervals, owner
 from service.learning.ingest import judging
+from service.learning.ingest.dating import LEAP_S
+from service.learning.ingest.host_clock import HostClock
 from service.learning.ingest.judging import Verdict
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
@@ -30,7 +34,7 @@ from service.learning.streams import StreamRecord
 from service.learning.weigher.weighing import Weighing
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
-from service.storage.database import EventRow, ModelRow
+from service.storage.database import EventRow, ModelRow, StreamRow
 from service.web.access import audit
 
 logger = logging.getLogger(__name__)
@@ -61,22 +65,54 @@ class Judged(NamedTuple):
 class Intake:
     """Appends observations to the logs of models; safe from several threads, not for the event loop.
 
-    monitor: gives the monitor of a model that is served. wake: tells the learner process that a model's log has grown.
-    show: called with each batch once it is durable. weighing: follows what arms carry.
+    monitor: gives the monitor of a model that is served; monitors: those that there are. wake: tells the learner
+    process that a model's log has grown. show: called with each batch once it is durable. weighing: follows what arms
+    carry.
     """
 
     def __init__(
         self,
         loaded: LoadedModels,
         monitor: Callable[[Served], Monitor],
+        monitors: Callable[[], Mapping[str, Monitor]],
         wake: Callable[[str], None],
         show: Callable[[Judged], None],
     ) -> None:
         storage = loaded.storage
         self.settings, self.database, self.disk = storage.settings, storage.database, storage.disk
-        self.loaded, self.monitor = loaded, monitor
+        self.loaded, self.monitor, self._monitors = loaded, monitor, monitors
         self._wake, self._show = wake, show
         self.weighing = Weighing(loaded, monitor, self.turn)
+        self._host, self._host_lock = HostClock(), threading.Lock()
+
+    def arrival(self) -> float:
+        """When a batch that is here now arrived: Unix time, s. Where the host's clock was set meanwhile, all that is
+        dated by it goes with it, so that streams go on."""
+        with self._host_lock:
+            step = self._host.step()
+            if step:
+                logger.warning("the clock of this machine was set by %+.1f s", step)
+                self.set_clock(step)
+        return time.time()
+
+    def set_clock(self, step: float) -> None:
+        """Take what is dated by this machine's clock to a clock that was set by `step`, s. Where several services share
+        the database, streams are dated by the clocks of others, too, and stay as they are."""
+        if not self.database.shared:
+            offset = case((StreamRow.offset == 0, 0.0), else_=StreamRow.offset + step)
+            with self.database.transaction() as session:
+                session.execute(update(StreamRow).values(offset=offset, received=StreamRow.received + step))
+        for monitor in self._monitors().values():
+            with monitor.lock:
+                monitor.set_clock(step)
+
+    def set_back(self) -> None:
+        """Where the host's clock was set back while no service ran, let streams go on; before the first batch."""
+        with self.database.session() as session:
+            newest = session.scalar(select(func.max(StreamRow.received)))
+        if newest is not None and (step := time.time() - newest) < -LEAP_S and not self.database.shared:
+            logger.warning("the clock of this machine was set by %+.1f s while no service ran", step)
+            self.set_clock(step)
 
     @contextmanager
     def turn(self, monitor: Monitor, model: str) -> Iterator[None]:
@@ -136,7 +172,7 @@ class Intake:
             if new:
                 streams.forget(stream_id)  # one of this name that has made room for others
             verdict = judging.judge(
-                screened, monitor.watch(stream_id, new), held, options, usual, since, served.base.scale
+                screened, monitor.watch(stream_id, new), held, options, usual, batch.received, since, served.base.scale
             )
             if verdict.change is not None and options.on_change == "adapt" and not held:
                 log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
@@ -148,16 +184,17 @@ class Intake:
             event.rows = rows  # without those that had waited, which other batches count
             source = log.stream(session, model, stream_id)
             assert source is not None
-            if verdict.opened is not None and verdict.held:
-                _take_back(session, event)
-            if verdict.change is not None:
-                _alarm(session, served, "waits" if held else options.on_change, verdict, event)
+            _act(session, served, "waits" if held else options.on_change, verdict, event)
+            leap = details.get("leap")
+            if leap is not None and not streams.get(stream_id).leapt:
+                _alarm_of_clock(session, model, stream_id, leap)
             doubted = verdict.held and (verdict.opened is not None or streams.get(stream_id).doubted)
             known: dict[str, Any] = {
                 "gate": verdict.watch.gate,
                 "opening": verdict.watch.opening,
                 "doubted": doubted,
                 "scale": scale,
+                "leapt": leap is not None,
                 "received": batch.received,
             }
             source.record = replace(streams.get(stream_id), **known).to_json()
@@ -169,6 +206,7 @@ class Intake:
                 "sequence": batch.sequence,
                 "rows": rows,
                 "accepted": event.learnt,
+                "effective_samples": _effective(verdict.rows.learnt, batch.received, options.forgetting_s),
                 "duplicate": False,
                 "state": "learnt",
                 "rejected": verdict.rows.rejected(),
@@ -180,7 +218,7 @@ class Intake:
                 "departure": None if verdict.watch.departure is None else verdict.watch.departure.to_json(),
                 "waited": held,
                 "doubted": doubted,
-                "until": screened.until,
+                "until": None if screened.until is None else min(screened.until, batch.received + log.AHEAD_S),
                 **answered,
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
             }
@@ -239,6 +277,14 @@ def _check_kept(session: Session, served: Served) -> None:
     raise ConflictError(f"version {served.version} of model {served.name!r} was deleted meanwhile: send it again")
 
 
+def _act(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
+    """Do what follows from a verdict: one of CONSEQUENCES where it is a change."""
+    if verdict.opened is not None and verdict.held:
+        _take_back(session, event)
+    if verdict.change is not None:
+        _alarm(session, served, follows, verdict, event)
+
+
 def _take_back(session: Session, event: EventRow) -> None:
     """Unlearn what a stream has taught before the batch with which its opening was found not to fit."""
     earlier = select(EventRow).where(
@@ -250,6 +296,22 @@ def _take_back(session: Session, event: EventRow) -> None:
     )
     for each in session.scalars(earlier.order_by(EventRow.number)).all():
         log.unlearn(session, event.model, each, event.received)
+
+
+def _effective(rows: Rows, received: float, forgetting_s: float | None) -> float:
+    """Independent samples that rows count as when they come."""
+    if forgetting_s is None:
+        return float(rows.weight.sum())
+    return float((rows.weight * np.exp(np.minimum(rows.time - received, 0.0) / forgetting_s)).sum())
+
+
+def _alarm_of_clock(session: Session, model: str, stream_id: str, leap: float) -> None:
+    """Raise the alarm of a stream whose times cannot be."""
+    message = (
+        f"the clock of stream {stream_id} has leapt {leap:.0f} s ahead of its rows' arrival. These rows wait: they are "
+        "logged with the code time_jump, and can be replayed. Set the clock back, or go on under another stream_id"
+    )
+    owner.raise_alarm(session, model, "clock", message, {"stream_id": stream_id, "ahead_s": leap})
 
 
 def _alarm(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:

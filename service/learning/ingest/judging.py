@@ -16,6 +16,7 @@ from lipcore.online.departure import Departure
 from lipcore.online.gates import Patience, is_contact
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
+from service.journal.log import AHEAD_S
 from service.learning.ingest.opening import Opening
 from service.learning.ingest.screening import Screened, Trained
 from service.learning.schema import LearningOptions
@@ -151,12 +152,13 @@ def judge(
     held: bool,
     options: LearningOptions,
     usual: Callable[[], Record],
+    received: float = np.inf,
     carried: float | None = None,
     scale: Array | float = 1.0,
 ) -> Verdict:
     """Decide about the rows that were predicted. held: whether learning waits already; usual: the record of before;
-    carried: event time, s, from which on the arm carries something, None where it does not: such rows teach what it
-    carries, and not the arm; scale: of the version's intervals, (n,)."""
+    received: when the rows came, Unix time, s; carried: event time, s, from which on the arm carries something, None
+    where it does not: such rows teach what it carries, and not the arm; scale: of the version's intervals, (n,)."""
     rows = batch.rows.take(batch.predicted)
     if not len(rows):
         return Verdict(batch.rows, None, None, watch, None, held)
@@ -175,7 +177,8 @@ def judge(
         answered = batch.answered or batch
         record = Record.of(rows.tau[counted], answered.mean[counted], answered.std[counted], batch.noise_std)
         surprise = (error**2 / (bare**2 + batch.noise_std**2)).mean(axis=0)
-        detector, change = detector.step(replace(record, standardised=surprise), float(rows.time.max()))
+        at = min(float(rows.time.max()), received + AHEAD_S)  # one stream's clock is not that of all
+        detector, change = detector.step(replace(record, standardised=surprise), at)
         if not held and not watch.gate.open and batch.trained is not None:
             departure = _followed(departure, batch.trained, rows, counted, batch.noise_std)
     if opened is not None and opened.since is not None and not watch.gate.open:

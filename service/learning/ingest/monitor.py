@@ -83,8 +83,14 @@ class Window:
         parts = (bucket[3] for bucket in self._buckets if self._holds(bucket[0], now))
         return reduce(add, parts, HeldIntervals.none(self._n_joints))
 
+    def set_clock(self, step: float) -> None:
+        """Take the buckets with a clock that was set by `step`, s."""
+        moved = round(step / self._length)
+        self._buckets = tuple((bucket[0] + moved, *bucket[1:]) for bucket in self._buckets)
+
     def _holds(self, number: int, now: float) -> bool:
-        return (number + 1) * self._length > now - self.seconds
+        """Whether a bucket is in the window before a Unix time, s; none is that a wrong clock has put behind it."""
+        return -self.seconds < (number + 1) * self._length - now <= 2 * self._length
 
 
 class Monitor:
@@ -125,7 +131,7 @@ class Monitor:
         made.streams.read(session, model)
         made.payloads = Payloads.restored(session, model, made.streams)
         since = now - max(*settings.quality_windows_s, DETECTOR_S)
-        lately = (EventRow.received > since, EventRow.number <= made.number)
+        lately = (EventRow.received > since, EventRow.received <= now, EventRow.number <= made.number)
         events = list(_batches(session, model, *lately)) or list(_batches(session, model, most=1))
         for event in events:  # the last one in any case: how far learning has gone is not forgotten in a quiet hour
             made._remember(event, event.received > now - DETECTOR_S)
@@ -178,6 +184,13 @@ class Monitor:
                 return False
             self._since_due = 0
             return True
+
+    def set_clock(self, step: float) -> None:
+        """Go with a clock of this machine that was set by `step`, s; `lock` is held."""
+        for window in self.windows:
+            window.set_clock(step)
+        self.streams.set_clock(step)
+        self._detector = self._detector.moved(step)
 
     def decided(self) -> None:
         """Learning goes on after it was held; `lock` is held."""

@@ -39,13 +39,14 @@ READ_EVENTS = 20
 def floor(database: Database, model: str, version: int, through: int, n_joints: int) -> Array:
     """Function variance (N·m)², (n,), that a version's latest errors up to event `through` prove: its std is no lower.
 
-    The batches are those of the last SECONDS before the newest one was received, and more until there are FEWEST_ROWS
+    The batches are those of the last SECONDS before the newest one came, and more until there are FEWEST_ROWS
     rows; a stream that did not fit from its first second on, and that nobody has confirmed, says nothing of this robot.
     Like the learnt state, the floor is a function of the log up to that event, whatever was taken back since.
     """
     of_version = (EventRow.kind == "batch", EventRow.version == version)
     upto = (EventRow.model == model, EventRow.number <= through)
-    query = select(EventRow.received, EventRow.record).where(*upto, *of_version).order_by(EventRow.number.desc())
+    clock = func.coalesce(EventRow.clock, EventRow.received)
+    query = select(clock, EventRow.record).where(*upto, *of_version).order_by(EventRow.number.desc())
     records, rows = list[dict[str, Any]](), 0
     newest: float | None = None
     with database.session() as session:
@@ -53,11 +54,11 @@ def floor(database: Database, model: str, version: int, through: int, n_joints: 
         fitting = func.coalesce(EventRow.report["doubted"].as_boolean(), False).is_(False)
         latest = query.where(counts, fitting).limit(MOST_EVENTS)
         events = session.execute(latest.execution_options(yield_per=READ_EVENTS))
-        for received, record in events:
+        for at, record in events:
             if record is None:
                 continue
-            newest = received if newest is None else newest
-            if rows >= FEWEST_ROWS and received < newest - SECONDS:
+            newest = at if newest is None else newest
+            if rows >= FEWEST_ROWS and at < newest - SECONDS:
                 break
             records.append(record)
             rows += record["rows"]

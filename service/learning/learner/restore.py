@@ -30,7 +30,7 @@ from lipcore.online import transfer as state
 from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, Novel, OnlineModel
 from service.journal import log, snapshots
-from service.journal.log import Memory, decode
+from service.journal.log import Memory
 from service.learning.learner import course
 from service.learning.learner.course import RewoundError, Stretch, Taking, batch_of
 from service.storage.database import Database, EventRow
@@ -130,7 +130,7 @@ def advance(
     if part.is_rollback and any(until < part.end for until in _active(known).values()):
         raise RewoundError(known.number)  # a batch was left out for the sake of events that are undone
     events = [each for each in part.events if not _is_left_out(known, each)]
-    arrivals = [Arrival(each, decode(each.payload)) for each in events if each.payload is not None]
+    arrivals = [Arrival(each, log.learning_rows(each)) for each in events if each.payload is not None]
     if watch is not None and arrivals:
         watch(arrivals)
     teaches = any(len(each.rows.learnt) for each in arrivals) or any(each.events for each in part.takings.values())
@@ -183,13 +183,13 @@ def _learn(
     """Take in the events of a page, one after the other. online: one whose sums nobody else has, where any teaches."""
     for event in part.events:
         if event.kind == "batch":
-            online = online.begin(event.received)
+            online = online.begin(event.received if event.clock is None else event.clock)
         if event.number in rows:
             online = online.learn(rows[event.number], own=True, novel=novel)
         elif event.kind == "unlearn":
             online = _take(database, known, online, part.takings[event.number], event.number)
         elif event.kind == "change":
-            online = online.change((event.detail or {})["t"])
+            online = online.change(float(log.learning_time(event, (event.detail or {})["t"])))
         elif event.kind == "settings":
             online = _remembering(online, Memory.from_json(event.detail or {}))
     return online
@@ -208,7 +208,7 @@ def _take(database: Database, known: Restored, online: OnlineModel, taking: Taki
     try:
         if taking.reweighed:
             raise ForgottenError("a time constant has changed since")
-        every = [log.rows_of(each) for each in taking.events]
+        every = [log.learning_rows(each) for each in taking.events]
         for rows in every:
             online.check_unlearn(rows)
         for rows in every:

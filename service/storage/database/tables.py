@@ -241,7 +241,8 @@ class EventRow(Base):
 
     number: 1, 2, 3 … of its model, in the order of commits; kind: "batch", "replay", "unlearn", "rollback", "change" or
     "settings"; sequence, last_sequence: of a batch, and of its last frame; digest: sha256 of what was sent; received:
-    Unix time, s; version, revision: that predicted the rows; rows, learnt: how many came and how many teach; first,
+    Unix time, s; clock: that of the model's own clock, see `service.journal.log.clock`, None where an earlier release
+    has logged it; version, revision: that predicted the rows; rows, learnt: how many came and how many teach; first,
     last: event times, s; void: unlearnt or rolled back; report: what the acknowledgement said; record: prequential
     sums; detail: of the other kinds; payload: the rows.
     """
@@ -262,6 +263,7 @@ class EventRow(Base):
     last_sequence: Mapped[int | None] = mapped_column(BigInteger)
     digest: Mapped[str | None]
     received: Mapped[float]
+    clock: Mapped[float | None]
     version: Mapped[int | None]
     revision: Mapped[int | None]
     rows: Mapped[int] = mapped_column(default=0)

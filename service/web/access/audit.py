@@ -125,8 +125,8 @@ async def cleaned(database: Database, settings: Settings) -> AsyncIterator[None]
 
 async def _clean(database: Database, settings: Settings) -> None:
     while True:
+        await asyncio.sleep(CLEAN_S)  # first: a host that starts with a wrong clock has it set right by then
         try:
             await to_thread.run_sync(clean, database, settings)
         except Exception as error:
             logger.warning("old lines of the audit log cannot be deleted now: %s", error)
-        await asyncio.sleep(CLEAN_S)

@@ -73,7 +73,7 @@ def test_what_reports_and_events_said_of_streams_becomes_their_records(tmp_path)
     batches.note(database, "payload", {"stream_id": "robot-1", "body": None})  # 4
     database.close()
     with closing(sqlite3.connect(tmp_path / FILE)) as connection:
-        for change in ("streams DROP COLUMN record", "learning DROP COLUMN payload"):
+        for change in ("streams DROP COLUMN record", "learning DROP COLUMN payload", "events DROP COLUMN clock"):
             connection.execute(f"ALTER TABLE {change}")
         connection.execute("UPDATE alembic_version SET version_num = '0006'")
         connection.commit()

@@ -1,9 +1,13 @@
 """What a log says, by the definition: one event after the other, from the beginning, on lists in memory."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from lipcore import TorqueModel
+from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, OnlineModel
 from service.journal.log import decode
 from service.storage.database import EventRow
@@ -41,12 +45,12 @@ class Fold:
         if event.kind == "unlearn":
             return self._take(online, number - 1, [event], number, without)
         if event.kind == "change":
-            return online.change(detail["t"])
+            return online.change(event.clock + min(detail["t"] - event.received, 1.0))
         if event.kind == "settings":
             return self._remembering(online, detail)
-        online = online.begin(event.received) if event.kind == "batch" else online
+        online = online.begin(event.clock) if event.kind == "batch" else online
         batch = number if event.kind == "batch" else detail["event"]
-        return online if without.get(batch, 0) >= number else online.learn(decode(event.payload))
+        return online if without.get(batch, 0) >= number else online.learn(_rows(event))
 
     def _take(
         self, online: OnlineModel, through: int, events: Sequence[EventRow], end: int, without: Without
@@ -65,9 +69,9 @@ class Fold:
                 if any(each.kind == "settings" and each.number > rows[0].number for each in live):
                     raise ForgottenError
                 for each in rows:
-                    online.check_unlearn(decode(each.payload))
+                    online.check_unlearn(_rows(each))
                 for each in rows:
-                    online = online.unlearn(decode(each.payload))
+                    online = online.unlearn(_rows(each))
             except ForgottenError:
                 return self.after(end, {**without, **dict.fromkeys(self._left_out(batch, end), end)})
         return online
@@ -104,6 +108,13 @@ class Fold:
     @staticmethod
     def _remembering(online: OnlineModel, detail: Any) -> OnlineModel:
         return online.with_forgetting(detail.get("forgetting_s")).with_walk(detail.get("friction_walk_s"))
+
+
+def _rows(event: EventRow) -> Rows:
+    """The rows of an event by the model's clock."""
+    rows = decode(event.payload)
+    late = np.minimum(rows.time - event.received, 1.0)
+    return rows if event.kind == "replay" else replace(rows, time=event.clock + late)
 
 
 def _event(event: EventRow) -> int:

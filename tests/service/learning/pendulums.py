@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from sqlalchemy import select
+from sqlalchemy.orm import Session
 
 import lipcore
 from lipcore import FitOptions, Samples, TorqueModel
@@ -139,17 +141,22 @@ class Arm:
     def event(self, kind: str, rows: Rows | None = None, **detail: Any) -> int:
         """Log an event of another kind; return its number."""
         with self.database.transaction() as session:
-            return log.append(session, self.model, kind, detail, 0.0, rows).number
+            return log.append(session, self.model, kind, detail, self._now(session), rows).number
 
     def unlearn(self, number: int) -> int:
         """Unlearn the batch that is the event of this number."""
         with self.database.transaction() as session:
-            return log.unlearn(session, self.model, self.find(number), 0.0).number
+            return log.unlearn(session, self.model, self.find(number), self._now(session)).number
 
     def rollback(self, to: int) -> int:
         """Roll back to the event of this number."""
         with self.database.transaction() as session:
-            return log.rollback(session, self.model, to, 0.0).number
+            return log.rollback(session, self.model, to, self._now(session)).number
+
+    def _now(self, session: Session) -> float:
+        """When the last event came."""
+        latest = select(EventRow.received).where(EventRow.model == self.model).order_by(EventRow.number.desc())
+        return session.scalar(latest.limit(1)) or BEGIN
 
     def find(self, number: int) -> EventRow:
         """An event."""

@@ -9,9 +9,9 @@ from sqlalchemy import delete, select
 
 from lipcore import NotPositiveDefiniteError
 from lipcore.vocabulary import CODES
+from service.journal import log
 from service.learning.learner import follower as following
 from service.learning.learner import publication
-from service.learning.learner import restore as restoring
 from service.learning.learner.follower import Follower, Novelty
 from service.learning.learner.publication import Failed, Published
 from service.learning.learner.worker import Learner
@@ -102,7 +102,7 @@ def test_a_state_is_stored_and_taken_up_again(arm, follower, monkeypatch):
     assert stored(arm) == [3]
     arm.batches(3)
     learnt = []
-    monkeypatch.setattr(restoring, "decode", lambda payload, real=restoring.decode: learnt.append(1) or real(payload))
+    monkeypatch.setattr(log, "decode", lambda payload, real=log.decode: learnt.append(1) or real(payload))
     again = caught_up(Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base))
     assert len(learnt) == 1
     same(answering(arm, again.publish()), at_once(range(4)))

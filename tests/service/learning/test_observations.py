@@ -31,6 +31,7 @@ def test_a_batch_is_acknowledged_and_learnt(school, pupil, body):
         "sequence": 5,
         "rows": 12,
         "accepted": 12,
+        "effective_samples": pytest.approx(1.2),
         "duplicate": False,
         "state": "learnt",
         "rejected": {},

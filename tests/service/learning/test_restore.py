@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lipcore.online.learner import OnlineModel
-from service.journal import snapshots
+from service.journal import log, snapshots
 from service.learning.learner import course, learnt
 from service.learning.learner import restore as restoring
 from service.learning.learner.course import RewoundError
@@ -42,8 +42,8 @@ def test_a_snapshot_changes_nothing_but_the_time_it_takes(arm, pages, at, monkey
     """Twelve batches are learnt as one would be."""
     arm.batches(*range(12))
     assert not at or arm.snapshot(at_most=at) == at
-    decoded, decode = [], restoring.decode
-    monkeypatch.setattr(restoring, "decode", lambda payload: decoded.append(1) or decode(payload))
+    decoded, decode = [], log.decode
+    monkeypatch.setattr(log, "decode", lambda payload: decoded.append(1) or decode(payload))
     found = arm.restored()
     assert (found.number, len(decoded)) == (12, 12 - at)
     same(found.online, at_once(range(12)))

@@ -197,7 +197,7 @@ class Alarm(Record, frozen=True, kw_only=True):
     """Something about a learning model that its owner should know."""
 
     id: int
-    kind: Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion"]
+    kind: Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock"]
     at: str
     message: str
     evidence: dict[str, Any]

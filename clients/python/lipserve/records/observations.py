@@ -35,12 +35,15 @@ class ObservationResponse(Record, frozen=True, kw_only=True):
     revision: Answers of this version with this `revision` or a later one contain the batch
     rows: Rows that came
     accepted: Rows to be learnt
+    effective_samples: Independent samples that these count as now: rows of a fast stream tell nearly the same, and with
+        `forgetting_s` late rows count less; null for a batch that an earlier release has logged
     duplicate: Whether the batch had come before: then this is what was said the first time
     state: What has become of the batch since
     rejected: Rows that are kept but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`,
         `stationary`, `contact`, `change` (a changed robot, or a stream that did not fit, and its owner has not
         decided), `payload` (the arm carries something, of which the row teaches instead), `edge` (acceleration not
-        derivable; where the stream goes on, these are learnt with the next batch)
+        derivable; where the stream goes on, these are learnt with the next batch), `late` (came so late that by
+        `forgetting_s` it counts less than a thousandth)
     gaps: Ranges [first, last] of sequences of the stream that have not come, the latest ones
     derived: What was derived because it was not sent
     held: Whether learning stands still until the model's owner has decided about a change
@@ -53,6 +56,7 @@ class ObservationResponse(Record, frozen=True, kw_only=True):
     sequence: int
     rows: int
     accepted: int
+    effective_samples: float | None = None
     duplicate: bool
     state: Literal["learnt", "unlearnt", "rolled_back"]
     rejected: dict[str, int]
@@ -124,7 +128,7 @@ class ObservationRows(Record, frozen=True, kw_only=True):
     time: Event time, Unix seconds
     ddq: As sent, or as derived from dq
     code: What became of each: learnt, non_finite, limit, time_jump, saturation, stationary, contact, change, edge,
-        payload
+        payload, late
     """
 
     time: list[float | None]

@@ -1,4 +1,5 @@
-"""What is known of a stream has one place: its row, and no longer what its last batch and events said of it."""
+"""What is known of a stream has one place: its row, and no longer what its last batch and events said of it. Models
+have a clock of their own."""
 
 from __future__ import annotations
 
@@ -24,6 +25,7 @@ STREAMS, LEARNING, EVENTS = (
 def upgrade() -> None:
     """Add the records, made of what earlier releases have logged."""
     op.add_column("streams", sa.Column("record", sa.JSON(), nullable=True))
+    op.add_column("events", sa.Column("clock", sa.Double(), nullable=True))
     op.add_column("learning", sa.Column("payload", sa.JSON(), nullable=True))
     connection = op.get_bind()
     declared = _declared(connection)
@@ -57,6 +59,7 @@ def _record(last: Any, said: list[dict[str, Any]]) -> dict[str, Any]:
         "doubted": bool(report.get("doubted")),
         "scale": None if scale is None else {"state": scale, "version": last.version},
         "payload": payload,
+        "leapt": False,
     }
 
 
