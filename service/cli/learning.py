@@ -34,8 +34,10 @@ def show(model: Model, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
         print_json({"learning": learning, "quality": quality})
         return
     at = learning.status
-    state = "is switched off" if not learning.options.enabled else "is held" if at.held is not None else "goes on"
+    state = "is paused" if not learning.options.enabled else "is held" if at.held is not None else "goes on"
     echo(f"{model} version {at.version}, revision {at.published} of {at.revision}: learning {state}")
+    if at.lag_rows:
+        echo(f"  not learnt yet: {counted(at.lag_rows, 'row')}, the first since {at.lag_s:.1f} s")
     if at.held is not None:
         evidence = at.held.evidence
         echo(f"  since {evidence.get('cause') or evidence.get('kind', 'a change')}: {', '.join(evidence['joints'])}")
@@ -43,9 +45,10 @@ def show(model: Model, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     if at.failure is not None:
         echo(f"  fails: {at.failure}")
     if at.streams:
-        table = Table("stream", "sends", "last sequence", "missing", title="streams")
+        table = Table("stream", "sends", "last sequence", "last at", "missing", title="streams")
         for each in at.streams:
-            table.add_row(escape(each.stream_id), each.kind, str(each.last), str(each.missing))
+            last_at = "" if each.last_at is None else each.last_at[:19].replace("T", " ")
+            table.add_row(escape(each.stream_id), each.kind, str(each.last), last_at, str(each.missing))
         out.print(table)
     _print_quality(quality)
 
@@ -149,6 +152,15 @@ def unlearn(
     with connected(url) as client:
         done = client.unlearn(model, stream, sequence)
     print_result(done, as_json, f"batch {sequence} of {stream} is unlearnt: revision {done.revision}")
+
+
+@app.command()
+def forget(model: Model, stream: StreamId, yes: Yes = False, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
+    """Delete a stream: its payload, its clock, and how wide its intervals are. What it has taught stays learnt."""
+    confirm(f"delete stream {stream} of {model}?", yes)
+    with connected(url) as client:
+        client.delete_stream(model, stream)
+    print_result({"stream_id": stream}, as_json, f"stream {stream} of {model} is deleted")
 
 
 @app.command()

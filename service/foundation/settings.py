@@ -170,6 +170,9 @@ class Settings(BaseSettings):
     max_observation_streams: Count = Field(
         1000, description="Most sources of observations of a model; a new one takes the place of the longest silent."
     )
+    stream_retention_s: float = Field(
+        30 * 86400.0, gt=0, description="Silence in s after which a stream without a payload is deleted."
+    )
     stream_flush_rows: Count = Field(100, description="Frames of a stream that are logged together, at most.")
     stream_flush_s: float = Field(0.1, gt=0, description="Longest wait in s of a frame to learn from for others.")
     max_velocity: float = Field(50.0, ge=0.01, le=1e4, description="Largest |dq| in rad/s or m/s that is learnt from.")

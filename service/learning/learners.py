@@ -6,12 +6,12 @@ import asyncio
 import logging
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from contextvars import copy_context
 from dataclasses import dataclass, replace
+from time import perf_counter
 from typing import Annotated, Any, TypeVar
 
 from fastapi import Depends
@@ -54,15 +54,20 @@ class IngestThreads:
     def __init__(self) -> None:
         self._threads = ThreadPoolExecutor(MOST_THREADS, "ingest")
         self._turns: dict[str, asyncio.Lock] = {}
-        self._waiting: Counter[str] = Counter()
+        self._arrived: dict[str, list[float]] = {}  # of batches that are not logged, by model
 
-    async def run(self, model: str, work: Callable[..., Result], *args: Any) -> Result:
+    def wait_s(self, model: str) -> float:
+        """How long the batch of a model has waited that came first of those that are not logged, s. For any thread."""
+        return max((perf_counter() - each for each in self._arrived.get(model, ())), default=0.0)
+
+    async def run(self, model: str, work: Callable[..., Result], *args: Any, arrived: float | None = None) -> Result:
         """Do work on a model's log in the next free thread, in order of arrival; raise BusyError where too much waits
-        already. For the event loop."""
-        waiting = self._waiting.total() - MOST_THREADS
+        already. arrived: of its first row, time of `perf_counter`, now where None. For the event loop."""
+        waiting = sum(map(len, self._arrived.values())) - MOST_THREADS
         if waiting >= MOST_WAITING:
             raise BusyError(f"{waiting} batches are waiting to be logged, the most that may: try again later")
-        self._waiting[model] += 1
+        arrived = perf_counter() if arrived is None else arrived
+        self._arrived[model] = [*self._arrived.get(model, ()), arrived]
         try:
             async with self._turns.setdefault(model, asyncio.Lock()):
                 # what has begun is done to its end, whether anyone still waits for it or not
@@ -70,9 +75,12 @@ class IngestThreads:
                 done = asyncio.get_running_loop().run_in_executor(self._threads, run, work, *args)
                 return await asyncio.shield(done)
         finally:
-            self._waiting[model] -= 1
-            if not self._waiting[model]:
-                del self._waiting[model], self._turns[model]
+            left = list(self._arrived[model])
+            left.remove(arrived)
+            if left:
+                self._arrived[model] = left
+            else:
+                del self._arrived[model], self._turns[model]
 
     def close(self) -> None:
         """Finish what has begun, and take no more."""
@@ -95,6 +103,15 @@ class Status:
     def failure(self) -> str | None:
         """Why the version does not learn, None while it does."""
         return None if self.failed is None else self.failed.error
+
+
+@dataclass(frozen=True)
+class Lag:
+    """How far answers lag behind what has arrived. rows: that are logged, to be learnt, and not in answers; seconds:
+    since the first of these arrived, or of those that wait to be logged."""
+
+    rows: int
+    seconds: float
 
 
 class Learners:
@@ -219,6 +236,15 @@ class Learners:
                     behind += wait
                     self._revisions[key] = served.revision
         return behind, any(before.get(key) == revision for key, revision in self._revisions.items())
+
+    def lag(self, served: Served) -> Lag:
+        """How far the answers of a version lag behind. Not for the event loop."""
+        model = served.name
+        with self.database.session() as session:
+            contained = log.start_of(session, model, served.version) + served.revision
+            rows, arrived = log.unlearnt(session, model, contained)
+        waited = 0.0 if arrived is None else max(time.time() - arrived, 0.0)
+        return Lag(rows, max(waited, self.threads.wait_s(model)))
 
     def status(self, model: str, version: int) -> Status:
         """The learner process's latest messages about a version."""

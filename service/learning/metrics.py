@@ -31,17 +31,16 @@ SCALE = MetricKind(
     "Factor on the half width of intervals that questions are answered with, 1 as the model itself believes",
     ("model", "joint"),
 )
-PAYLOAD = MetricKind(
+STREAMS = MetricKind("gauge", "lipserve_streams", "Streams that are known", ("model",))
+CARRYING = MetricKind("gauge", "lipserve_streams_with_payload", "Streams of them that carry a payload", ("model",))
+LAG_ROWS = MetricKind(
+    "gauge", "lipserve_learning_lag_rows", "Rows to be learnt that answers do not contain yet", ("model",)
+)
+LAG_S = MetricKind(
     "gauge",
-    "lipserve_payload_mass_kg",
-    "Mass that a stream's arm carries beyond what the model was trained with, 0 where that is nothing",
-    ("model", "stream"),
-)
-PAYLOAD_STD = MetricKind(
-    "gauge", "lipserve_payload_mass_std_kg", "Standard deviation of that mass, 0 for nothing", ("model", "stream")
-)
-LAG = MetricKind(
-    "gauge", "lipserve_learning_lag_events", "Events of the log that answers do not contain yet", ("model",)
+    "lipserve_learning_lag_seconds",
+    "Seconds since the first row arrived that answers do not contain yet",
+    ("model",),
 )
 ROWS = MetricKind(
     "counter",
@@ -50,7 +49,7 @@ ROWS = MetricKind(
     ("model", "outcome"),
 )
 LOADED = MetricKind("gauge", "lipserve_models_loaded", "Model versions in memory")
-KINDS = (*QUALITY.values(), REVISION, NOVEL, SCALE, PAYLOAD, PAYLOAD_STD, LAG, ROWS, LOADED)
+KINDS = (*QUALITY.values(), REVISION, NOVEL, SCALE, STREAMS, CARRYING, LAG_ROWS, LAG_S, ROWS, LOADED)
 
 
 class Learning(Collector):
@@ -66,8 +65,8 @@ class Learning(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield every metric with a sample for each model."""
         gauges = {name: kind.family() for name, kind in QUALITY.items()}
-        revision, novel, scale, lag, rows = (kind.family() for kind in (REVISION, NOVEL, SCALE, LAG, ROWS))
-        payload, payload_std = PAYLOAD.family(), PAYLOAD_STD.family()
+        revision, novel, scale, rows = (kind.family() for kind in (REVISION, NOVEL, SCALE, ROWS))
+        streams, carrying, lag_rows, lag_s = (kind.family() for kind in (STREAMS, CARRYING, LAG_ROWS, LAG_S))
         for model, monitor in self._learners.watched().items():
             _add_quality(gauges, model, monitor)
             for outcome in CODES:
@@ -76,16 +75,16 @@ class Learning(Collector):
                 continue
             for joint, factor in zip(served.model.joint_names, served.scales.asked, strict=True):
                 scale.add_metric([model, joint], factor)
-            for stream_id, mass in served.loads.masses().items():
-                for family, value in zip((payload, payload_std), mass or (0.0, 0.0), strict=True):
-                    family.add_metric([model, stream_id], value)
+            known = served.loads.masses()
+            streams.add_metric([model], len(monitor.streams.all()))
+            carrying.add_metric([model], sum(mass is not None for mass in known.values()))
             revision.add_metric([model, str(served.version)], served.revision)
-            with self._learners.database.session() as session:
-                behind = status.current(session, model, served.version) - served.revision
-            lag.add_metric([model], max(behind, 0))
+            lag = self._learners.lag(served)
+            lag_rows.add_metric([model], lag.rows)
+            lag_s.add_metric([model], lag.seconds)
             if (share := self._learners.status(model, served.version).novel_share) is not None:
                 novel.add_metric([model], share)
-        yield from (*gauges.values(), revision, novel, scale, payload, payload_std, lag, rows)
+        yield from (*gauges.values(), revision, novel, scale, streams, carrying, lag_rows, lag_s, rows)
         yield LOADED.of([((), len(self._learners.loaded.versions()))])
 
 

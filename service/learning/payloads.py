@@ -66,9 +66,9 @@ class Payloads:
         return made
 
     def event(self, stream_id: str) -> int:
-        """Number of the event that says what a stream carries; 0 before the first."""
+        """Number of the event that says what a stream carries, at least that with which it began."""
         record = self._streams.payload(stream_id)
-        return 0 if record is None else record.event
+        return max(self._streams.get(stream_id).begun, 0 if record is None else record.event)
 
     def watch(self, stream_id: str, carrier: Carrier, version: int) -> Watch:
         """What a stream carries, as a version sees it; what was declared for all streams where it is ""."""

@@ -28,7 +28,9 @@ class LearningOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    enabled: bool = Field(True, description="Whether observations are taken at all")
+    enabled: bool = Field(
+        True, description="False: learning is paused. Rows are judged, compared and logged, but not learnt"
+    )
     forgetting_s: float | None = Field(
         None,
         ge=FORGETTING_S[0],
@@ -180,19 +182,13 @@ class ObservationResponse(BaseModel):
         "`stationary`, `contact`, `change` (a changed robot, or a stream that did not fit, and its owner has not "
         "decided), `payload` (the arm carries something, of which the row teaches instead), `edge` (acceleration not "
         "derivable; where the stream goes on, these are learnt with the next batch), `late` (came so late that by "
-        "`forgetting_s` it counts less than a thousandth)"
+        "`forgetting_s` it counts less than a thousandth), `paused` (learning is paused)"
     )
     gaps: list[list[int]] = Field(
         description="Ranges [first, last] of sequences of the stream that have not come, the latest ones"
     )
     derived: Derivation | None = Field(None, description="What was derived because it was not sent")
     held: bool = Field(description="Whether learning stands still until the model's owner has decided about a change")
-
-
-class LearningDisabledError(ServiceError):
-    """The model's owner has switched its learning off."""
-
-    status, code = 409, "learning_disabled"
 
 
 class ExpiredError(ServiceError):

@@ -39,6 +39,11 @@ class PayloadRecord:
     version: int | None = None
     body: Mapping[str, Any] | None = None
 
+    @property
+    def holds(self) -> bool:
+        """Whether something is carried."""
+        return self.body is not None or (self.watch is not None and self.watch["held"] is not None)
+
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON has them; `PayloadRecord(**values)` reads them."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
@@ -51,7 +56,7 @@ class StreamRecord:
     gate: which of its rows are contacts; opening: its first second, None once that is judged; doubted: whether that did
     not fit, and nobody has confirmed the stream since; scale: of its intervals, None where they do not adapt; payload:
     what it carries, None where nothing was said or noticed; leapt: whether its clock has leapt ahead of its rows'
-    arrival; received: when the batch came, Unix time, s.
+    arrival; begun: number of its first batch's event; received: when the last batch came, Unix time, s.
     """
 
     gate: ContactGate
@@ -60,6 +65,7 @@ class StreamRecord:
     scale: ScaleRecord | None = None
     payload: PayloadRecord | None = None
     leapt: bool = False
+    begun: int = 0
     received: float = 0.0
 
     def to_json(self) -> dict[str, Any]:
@@ -72,6 +78,7 @@ class StreamRecord:
             "scale": None if self.scale is None else self.scale.to_json(),
             "payload": None if self.payload is None else self.payload.to_json(),
             "leapt": self.leapt,
+            "begun": self.begun,
         }
 
     def decided(self) -> StreamRecord:
@@ -92,6 +99,7 @@ class StreamRecord:
             None if scale is None else ScaleRecord.from_json(scale),
             None if payload is None else PayloadRecord(**payload),
             values["leapt"],
+            values["begun"],
             received,
         )
 
@@ -173,6 +181,17 @@ class Streams:
         """Forget a stream."""
         with self._lock:
             self._records = {name: record for name, record in self._records.items() if name != stream_id}
+
+    def expire(self, session: Session, model: str, silent_since: float) -> None:
+        """Delete the streams of a model whose last batch came before a Unix time, s, and that carry nothing, which
+        would be lost with them."""
+        silent = StreamRow.model == model, StreamRow.received < silent_since
+        for row in session.scalars(select(StreamRow).where(*silent)):
+            payload = StreamRecord.of(row, self._patience_s).payload
+            if payload is None or not payload.holds:
+                session.delete(row)
+        session.flush()
+        self.keep(session, model)
 
     def keep(self, session: Session, model: str) -> None:
         """Forget the streams that the database no longer has."""

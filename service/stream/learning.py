@@ -131,8 +131,11 @@ class Learning:
         """Log a block; return what there is to say of it."""
         first, through = block[0].sequence, block[-1].sequence
         try:
-            model = block[0].served.name
-            result = await self._learners.threads.run(model, lambda: self._learners.observe_frames(self._frames(block)))
+            result = await self._learners.threads.run(
+                block[0].served.name,
+                lambda: self._learners.observe_frames(self._frames(block)),
+                arrived=block[0].arrived,
+            )
         except ServiceError as error:
             refusal = error
         except Exception as error:  # the next block may be logged

@@ -176,11 +176,11 @@ def test_learning_is_switched_where_it_is_watched(visitor: Visitor, dashboard: D
         page.get_by_role("button", name="Roll back").click()
         page.get_by_role("dialog").get_by_role("button", name="Roll back").click()
         expect(page.get_by_text(re.compile(r"Back at revision 0: \d+ batch"))).to_be_visible()
-    page.get_by_role("button", name="Hold learning").click()
+    page.get_by_role("button", name="Pause learning").click()
     visitor.until(lambda: options(dashboard, model)["enabled"] is False)
-    expect(page.get_by_role("region", name="Learning", exact=True)).to_contain_text("does not learn")
+    expect(page.get_by_role("region", name="Learning", exact=True)).to_contain_text("paused")
     assert audit(page) == []
-    page.get_by_role("button", name="Learn again").click()
+    page.get_by_role("button", name="Resume learning").click()
     visitor.until(lambda: options(dashboard, model)["enabled"] is True)
 
 

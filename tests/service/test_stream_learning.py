@@ -36,7 +36,7 @@ class Learners:
     @property
     def threads(self):
         """Runs what the session hands over in a thread."""
-        return SimpleNamespace(run=lambda _, work: to_thread.run_sync(work))
+        return SimpleNamespace(run=lambda _, work, arrived: to_thread.run_sync(work))
 
     def observe_frames(self, frames):
         self.under_way += 1

@@ -140,6 +140,7 @@ class Calls:
     payload = One(calls.learning.payload)
     declare_payload = One(calls.learning.declare_payload)
     remove_payload = One(calls.learning.remove_payload)
+    delete_stream = One(calls.learning.delete_stream)
     alarms = Listed(calls.learning.alarms)
     live = Followed(calls.learning.live)
 

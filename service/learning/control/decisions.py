@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
-from service.foundation.errors import ConflictError, invalid_request, problem
+from service.foundation.errors import ConflictError, invalid_request, not_found, problem
 from service.journal import log
 from service.learning import owner
 from service.learning.control import schema, status
@@ -65,6 +65,23 @@ def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> sc
         audit.note(session, model, "observations unlearnt", version, before=taken)
     learners.process.wake(model)
     return schema.Unlearnt(**revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=rows, trained=versions)
+
+
+def delete_stream(learners: Learners, model: str, stream_id: str) -> None:
+    """Forget a stream; raise NotFoundError."""
+    served = learners.loaded.get(model, None)
+    monitor = learners.monitor(model)
+    with learners.turn(model):
+        with learners.database.transaction(model) as session:
+            row = log.stream(session, model, stream_id)
+            if row is None:
+                raise not_found("stream", stream_id)
+            session.delete(row)
+            audit.note(session, model, "stream deleted", before={"stream_id": stream_id})
+        monitor.streams.forget(stream_id)
+        if served.carrier is not None:
+            served.loads.take(monitor.payloads.carried(served.carrier, served.version))
+        served.scales.take(monitor.streams.factors(served.version))
 
 
 def rollback(learners: Learners, model: str, request: schema.RollbackRequest) -> schema.RolledBack:

@@ -176,6 +176,15 @@ def remove_payload(
     return payload.remove(learners, model, stream_id)
 
 
+@router.delete(
+    "/{model}/streams/{stream_id}", status_code=204, summary="Delete a stream", responses=responses(ConflictError)
+)
+def delete_stream(learners: LearnersDep, model: str, stream_id: StreamId) -> None:
+    """Forget a stream: its payload, its clock, and how wide its intervals are. What it has taught stays learnt, and its
+    batches stay in the log. `GET …/learning` lists the streams."""
+    decisions.delete_stream(learners, model, stream_id)
+
+
 @router.get("/{model}/alarms", summary="List alarms, newest first")
 def list_alarms(learners: LearnersDep, model: str, page: PageQuery) -> schema.AlarmPage:
     """One page of what the model's owner should know: changes, motion beyond what is known, new versions."""

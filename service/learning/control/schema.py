@@ -14,7 +14,7 @@ from service.learning.owner import AlarmKind
 from service.learning.schema import MOST_SEQUENCE, LearningOptions, State
 from service.models.schema import VersionNumber
 
-REPLAYABLE = tuple(code for code in CODES if code not in (CODES[LEARNT], "non_finite", "edge"))
+REPLAYABLE = tuple(code for code in CODES if code not in (CODES[LEARNT], "non_finite", "edge", "late"))
 """Codes whose rows are complete, so that they can be learnt after all."""
 Nullable = list[float | None]
 
@@ -186,6 +186,7 @@ class Stream(BaseModel):
     stream_id: str
     kind: Literal["batches", "frames"]
     last: int = Field(description="Highest sequence that has come")
+    last_at: str | None = Field(description="When that came; null where an earlier release has logged it")
     offset_s: float = Field(description="Event time (Unix seconds) - the stream's own time")
     gaps: list[list[int]] = Field(description="Ranges [first, last] of sequences that have not come, the latest ones")
     missing: int = Field(description="Sequences that have not come, of all gaps that are kept")
@@ -221,6 +222,8 @@ class LearningStatus(BaseModel):
     revision: int = Field(description="Its revision once all of the log is learnt")
     published: int = Field(description="The revision that answers contain now")
     lag_events: int = Field(description="Events of the log that answers do not contain yet")
+    lag_rows: int = Field(description="Rows to be learnt that answers do not contain yet")
+    lag_s: float = Field(description="Seconds since the first row arrived that answers do not contain yet")
     events: int = Field(description="Number of the newest event of the log")
     novel_share: float | None = Field(
         description="Share of the latest samples that lie beyond the basis; null until some are learnt"
@@ -354,10 +357,12 @@ class LiveStatus(BaseModel):
     version: int = Field(description="The version that serves")
     revision: int = Field(description="The revision that answers contain now")
     lag_events: int = Field(description="Events of the log that answers do not contain yet")
+    lag_rows: int = Field(description="Rows to be learnt that answers do not contain yet")
+    lag_s: float = Field(description="Seconds since the first row arrived that answers do not contain yet")
     joint_names: list[str]
     joint_types: list[JointType] = Field(description="What the torques' units follow from: N·m, prismatic: N")
     torque_convention: str
-    learns: bool = Field(description="Whether observations are taken at all")
+    learns: bool = Field(description="False: learning is paused")
     on_change: str = Field(description="What follows a detected change: hold, adapt or learn")
     contact_threshold: float = Field(description="Standard deviations beyond which a row is taken for a contact")
     held: Held | None = Field(description="Why learning waits for a decision; null where it does not")

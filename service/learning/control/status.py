@@ -35,7 +35,7 @@ def learning(learners: Learners, model: str) -> schema.Learning:
     """Return how a model learns and where that stands; raise NotFoundError. Not for the event loop."""
     served = learners.loaded.get(model, None)
     version = served.version
-    latest = learners.status(model, version)
+    latest, lag = learners.status(model, version), learners.lag(served)
     with learners.database.session() as session:
         start, events = log.start_of(session, model, version), log.newest(session, model)
         status = schema.LearningStatus(
@@ -43,6 +43,8 @@ def learning(learners: Learners, model: str) -> schema.Learning:
             revision=events - start,
             published=served.revision,
             lag_events=max(events - start - served.revision, 0),
+            lag_rows=lag.rows,
+            lag_s=lag.seconds,
             events=events,
             novel_share=latest.novel_share,
             linearisation_error=None if latest.published is None else latest.published.linearisation,
@@ -104,6 +106,7 @@ def _streams(session: Session, model: str) -> list[schema.Stream]:
             stream_id=row.stream_id,
             kind=row.kind,
             last=row.last,
+            last_at=None if row.received is None else _moment(row.received),
             offset_s=row.offset,
             gaps=row.missing["ranges"][-MOST_GAPS:],
             missing=sum(last - first + 1 for first, last in row.missing["ranges"]),

@@ -23,9 +23,10 @@ from service.foundation.settings import Settings
 from service.inference.predicting import QUANTITIES, check_shapes
 from service.journal import log
 from service.journal.log import NewBatch, StreamKind, check_kind
+from service.learning import owner
 from service.learning.ingest import dating, deriving, screening
 from service.learning.ingest.dating import Measured, StreamTime
-from service.learning.ingest.intake import Intake, enabled
+from service.learning.ingest.intake import Intake
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Answered
 from service.learning.schema import Derivation, ExpiredError, ObservationRequest, ObservationResponse, State
@@ -36,7 +37,7 @@ ONCE = "a sequence is used once, so a new run needs a stream_id of its own, or h
 
 
 def observe_batch(intake: Intake, model: str, request: ObservationRequest) -> ObservationResponse:
-    """Take a batch; once this returns it is durable. Raise NotFoundError, LearningDisabledError, InvalidRequestError,
+    """Take a batch; once this returns it is durable. Raise NotFoundError, InvalidRequestError,
     ConflictError, ExpiredError, BusyError or StorageFullError."""
     served, received = intake.loaded.get(model, None), intake.arrival()
     batch = measured(request, served.model, intake.settings)
@@ -60,7 +61,7 @@ def _take(
     """Log a batch that is new, in a turn of its model; one that is in the log is acknowledged again."""
     model, stream_id, sequence = key = served.name, request.stream_id, request.sequence
     with intake.database.session() as session:
-        options, source = enabled(session, model), log.stream(session, model, stream_id)
+        options, source = owner.options(session, model), log.stream(session, model, stream_id)
         check_kind(source, "batches")
         # beyond the last of its stream it is new
         known = source is not None and sequence <= source.last
@@ -212,7 +213,7 @@ class FramesResult:
 
 
 def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
-    """Log frames; once this returns they are durable. All of them or none. Raise LearningDisabledError, ConflictError
+    """Log frames; once this returns they are durable. All of them or none. Raise ConflictError
     for a sequence that was used for something else or does not rise, ExpiredError, BusyError or StorageFullError."""
     for before, sequence in pairwise(frames.sequences.tolist()):
         if sequence <= before:
@@ -221,7 +222,7 @@ def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
     intake.arrival()
     with intake.turn(monitor, frames.model):
         with intake.database.session() as session:
-            options = enabled(session, frames.model)
+            options = owner.options(session, frames.model)
             source = log.stream(session, frames.model, frames.stream_id)
             check_kind(source, "frames")
             last = -1 if source is None else source.last

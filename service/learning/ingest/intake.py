@@ -29,7 +29,7 @@ from service.learning.ingest.judging import Verdict
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
 from service.learning.intervals import ScaleRecord
-from service.learning.schema import LearningDisabledError, LearningOptions
+from service.learning.schema import LearningOptions
 from service.learning.streams import StreamRecord
 from service.learning.weigher.weighing import Weighing
 from service.models import registry
@@ -189,7 +189,8 @@ class Intake:
             if leap is not None and not streams.get(stream_id).leapt:
                 _alarm_of_clock(session, model, stream_id, leap)
             doubted = verdict.held and (verdict.opened is not None or streams.get(stream_id).doubted)
-            known: dict[str, Any] = {
+            known: dict[str, Any] = {"begun": event.number} if new else {}
+            known |= {
                 "gate": verdict.watch.gate,
                 "opening": verdict.watch.opening,
                 "doubted": doubted,
@@ -236,21 +237,16 @@ class Intake:
         return report
 
     def follow_up(self, monitor: Monitor, model: str) -> None:
-        """Wake the learner for a batch that is durable; every RETAIN_EVERY batches, bring the log within its limits."""
+        """Wake the learner for a batch that is durable; every RETAIN_EVERY batches, bring the log within its limits and
+        delete streams that have long been silent."""
         self._wake(model)
         if monitor.due(RETAIN_EVERY):
             try:
                 retain(self.database, self.settings, model, time.time())
+                with self.turn(monitor, model), self.database.transaction(model) as session:
+                    monitor.streams.expire(session, model, time.time() - self.settings.stream_retention_s)
             except Exception as error:  # the batch is logged all the same
                 logger.error("the log of model %s was not brought within its limits", model, exc_info=error)
-
-
-def enabled(session: Session, model: str) -> LearningOptions:
-    """How a model learns; raise LearningDisabledError where it does not."""
-    options = owner.options(session, model)
-    if not options.enabled:
-        raise LearningDisabledError(f"learning of model {model!r} is switched off: nothing is logged")
-    return options
 
 
 def _scaled(

@@ -21,7 +21,7 @@ from service.learning.ingest.opening import Opening
 from service.learning.ingest.screening import Screened, Trained
 from service.learning.schema import LearningOptions
 
-CONTACT, CHANGE, PAYLOAD = (CODES.index(code) for code in ("contact", "change", "payload"))
+CONTACT, CHANGE, PAYLOAD, PAUSED = (CODES.index(code) for code in ("contact", "change", "payload", "paused"))
 MOST_INNOVATIONS = 1000
 """Rows whose innovations are kept to tell friction from a payload."""
 
@@ -203,6 +203,8 @@ def judge(
     learnt = np.where(contact & (not (passing or gate.open)), CONTACT, LEARNT)
     if carried is not None:
         learnt = np.where((learnt == LEARNT) & (rows.time >= carried), PAYLOAD, learnt)
+    if not options.enabled:
+        learnt = np.where(learnt == LEARNT, PAUSED, learnt)
     codes[batch.predicted] = CHANGE if held else learnt
     judged = replace(batch.rows, code=codes)
     following = Watch(gate, detector, watch.innovations.then(rows, batch.mean), departure, opening)

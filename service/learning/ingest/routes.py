@@ -23,7 +23,6 @@ from service.learning.learners import Learners, LearnersDep
 from service.learning.schema import (
     MOST_SEQUENCE,
     ExpiredError,
-    LearningDisabledError,
     ObservationRequest,
     ObservationResponse,
 )
@@ -93,7 +92,6 @@ hot = APIRouter(
         TooLargeError,
         ConflictError,
         ExpiredError,
-        LearningDisabledError,
         BusyError,
     ),
 )

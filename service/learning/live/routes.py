@@ -38,6 +38,7 @@ class LiveLook:
         learners, model = self.learners, self.model
         served, now = learners.loaded.get(model, None), time.time()
         monitor, latest = learners.monitor(model), learners.status(model, served.version)
+        lag = learners.lag(served)
         with learners.database.session() as session:
             events = log.newest(session, model) - log.start_of(session, model, served.version)
             options, held = owner.options(session, model), owner.held(session, model)
@@ -47,6 +48,8 @@ class LiveLook:
             version=served.version,
             revision=served.revision,
             lag_events=max(events - served.revision, 0),
+            lag_rows=lag.rows,
+            lag_s=lag.seconds,
             joint_names=list(served.model.joint_names),
             joint_types=list(served.model.joint_types),
             torque_convention=served.model.torque_convention,

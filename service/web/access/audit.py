@@ -37,6 +37,7 @@ Change = Literal[
     "change decided",
     "candidate dismissed",
     "payload declared",
+    "stream deleted",
 ]
 CHANGES: tuple[str, ...] = get_args(Change)
 SERVICE = "service"

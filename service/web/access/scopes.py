@@ -78,6 +78,7 @@ TABLE: dict[tuple[str, str], str] = {
     ("GET", "/v1/models/{model}/payload"): READ,
     ("PUT", "/v1/models/{model}/payload"): UPDATE,
     ("DELETE", "/v1/models/{model}/payload"): UPDATE,
+    ("DELETE", "/v1/models/{model}/streams/{stream_id}"): UPDATE,
     ("GET", "/v1/models/{model}/alarms"): READ,
     ("GET", "/v1/models/{model}/live"): READ,
     ("POST", "/v1/echo"): PREDICT,

@@ -169,6 +169,12 @@ CHANGING = {
         None,
         {"stream_id": None, "body": None},
     ),
+    (DELETE, MODEL + "/streams/{stream_id}"): (
+        lambda api: good(api.delete("/v1/models/arm/streams/arm")),
+        "stream deleted",
+        {"stream_id": "arm"},
+        None,
+    ),
     (DELETE, MODEL): (lambda api: good(api.delete("/v1/models/other")), "model deleted", [1], None),
 }
 """What each changing route is asked, and what its last line says: the change, from and to."""

@@ -113,6 +113,8 @@ def test_learning_is_shown_set_and_taken_back(asked, refused, server, pupil):
     assert "is unlearnt" in asked("learning", "unlearn", pupil, "arm", 1, "--yes")
     assert "unlearnt" in asked("learning", "batch", pupil, "arm", 1)
     assert "has been unlearnt" in refused("learning", "replay", pupil, "arm", 1)
+    assert "is deleted" in asked("learning", "forget", pupil, "arm", "--yes")
+    assert asked("learning", "show", pupil, "--json")["learning"]["status"]["streams"] == []
 
 
 def test_alarms_are_listed(asked, pupil):

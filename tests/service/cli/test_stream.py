@@ -209,7 +209,7 @@ def test_latency_is_timed_over_stream_and_http(lipserve, streaming):
 
 
 def test_what_is_kept_out_for_one_reason_is_said_once():
-    off, full = ("learning_disabled", "learning is switched off"), ("storage_full", "the disk is full")
+    off, full = ("busy", "too much waits"), ("storage_full", "the disk is full")
     given = [(1, 11, off), (12, 20, off), (21, 22, full), (30, 31, full), (32, 40, off)]
     told = refused_figures([StreamRefusal(first, through, *why, []) for first, through, why in given])
     assert [(each["first"], each["through"], each["code"]) for each in told] == [

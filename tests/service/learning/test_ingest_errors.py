@@ -75,14 +75,17 @@ def test_too_many_rows(pupil, school):
     assert said["detail"] == [{"field": "q", "value": f"{most + 1} rows", "expected": f"at most {most} in one batch"}]
 
 
-def test_models_whose_learning_is_switched_off(school, body):
-    pupil = school.enrol("switched-off")
-    send(pupil, 0, body)
+def test_while_learning_is_paused_rows_are_compared_and_logged_and_can_be_learnt_later(school, body):
+    pupil = school.enrol("paused")
+    before = pupil.settled(0)
     pupil.put("learning", {"enabled": False})
-    for sequence in (0, 1):
-        refused(pupil, batch(sequence, body), 409, "learning_disabled")
+    said = send(pupil, 0, body)
+    assert (said["accepted"], said["effective_samples"], said["rejected"]) == (0, 0.0, {"paused": said["rows"]})
+    assert pupil.get("quality")["windows"][0]["rows"] == said["rows"]
+    assert pupil.settled(1)["tau"] == before["tau"]
     pupil.put("learning", {"enabled": True})
-    assert send(pupil, 1, body)["revision"] == 2
+    assert pupil.post("observations/arm/0/replay", {})["codes"] == {"paused": said["rows"]}
+    assert send(pupil, 1, part(recording(), 20, 24))["accepted"] == 4
 
 
 def test_batches_that_are_no_longer_kept_are_not_taken_for_new(school, body):

@@ -10,9 +10,9 @@ from prometheus_client.parser import text_string_to_metric_families as parse
 
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES
-from service.journal import log
 from service.learning.control import status
 from service.learning.ingest.monitor import Window
+from tests.service.data import eventually
 from tests.service.learning.lessons import lesson
 
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")
@@ -90,7 +90,7 @@ def test_quality_is_that_of_the_other_route(school):
                 key = (f"lipserve_quality_{name}", ("joint", joint), ("window", f"{window['seconds']:g}"))
                 assert samples[key] == pytest.approx(value, rel=1e-12)
     assert samples["lipserve_revision", ("version", "1")] == 2
-    assert samples["lipserve_learning_lag_events",] == 0
+    assert (samples["lipserve_learning_lag_rows",], samples["lipserve_learning_lag_seconds",]) == (0, 0)
     assert samples["lipserve_novel_share",] == pupil.get("learning")["status"]["novel_share"]
 
 
@@ -114,12 +114,18 @@ def test_what_became_of_rows_is_counted_and_what_is_not_known_left_out(school):
 
 
 def test_what_is_not_learnt_yet_is_the_lag(school):
-    school.enrol("lagging").teach(0)
+    pupil = school.enrol("lagging")
+    pupil.teach(0)
     learner = school.service.learners.process.pid
-    os.kill(learner, signal.SIGSTOP)  # it may look once more of itself
+    os.kill(learner, signal.SIGSTOP)
     try:
-        with school.service.database.transaction() as session:  # which the learner is not told of
-            log.append(session, "lagging", "settings", {"forgetting_s": None}, 0.0)
-        assert scraped(school, "lagging")["lipserve_learning_lag_events",] == 1
+        for number in (1, 2):
+            pupil.post("observations", lesson(number))
+        samples, status = scraped(school, "lagging"), pupil.get("learning")["status"]
     finally:
         os.kill(learner, signal.SIGCONT)
+    assert samples["lipserve_learning_lag_rows",] == status["lag_rows"] == 20
+    assert 0 < samples["lipserve_learning_lag_seconds",] <= status["lag_s"]
+    pupil.settled(3)
+    after = eventually(lambda: not (now := pupil.get("learning")["status"])["lag_rows"] and now)
+    assert after["lag_s"] == 0.0

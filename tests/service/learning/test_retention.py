@@ -7,6 +7,7 @@ from service.foundation.errors import BusyError, ConflictError
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.journal.log import Memory, encode
+from service.learning.streams import PayloadRecord, Streams
 from service.storage.database import LearnerRow, ServingRow, SnapshotRow, StreamRow, now
 from tests.choosing import slow
 from tests.service.learning.batches import MODEL, OTHER, batch, everything, note, rows, source, take_back, write
@@ -141,6 +142,24 @@ def test_every_run_has_a_stream_of_its_own_and_the_longest_silent_makes_room(dat
     write(database, batch(1, stream_id="run-0", received=1e5))
     snapshot(database, runs + 1)
     assert retain(database, batches=0) == runs  # also those of streams that nobody knows any more
+
+
+def test_streams_that_are_silent_for_long_are_deleted_unless_they_carry_something(database):
+    body = {"mass": 1.0, "com": [0.0, 0.0, 0.1], "inertia": None}
+    gone, put_down = PayloadRecord(1, 0.0, body=None), PayloadRecord(1, 0.0, {"held": None}, 1)
+    held = (PayloadRecord(1, 0.0, body=body), PayloadRecord(1, 0.0, {"held": {}}, 1))
+    payloads = {"nothing": None, "gone": gone, "put-down": put_down, "declared": held[0], "noticed": held[1]}
+    for received, name in enumerate([*payloads, "young"]):
+        write(database, batch(0, stream_id=name, received=1000.0 + received))
+    with database.transaction() as session:
+        streams = Streams.restored(session, MODEL)
+        for name, payload in payloads.items():
+            log.stream(session, MODEL, name).record = streams.change(name, payload=payload).to_json()
+        session.flush()
+        streams.expire(session, MODEL, 1004.5)
+    assert set(streams.all()) == {"declared", "noticed", "young"}
+    with database.session() as session:
+        assert set(Streams.restored(session, MODEL).all()) == set(streams.all())
 
 
 def test_streams_in_use_make_no_room(database):

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lipserve.call import Call, Page, Route, given, page, record, route
+from lipserve.call import Call, Page, Route, given, nothing, page, record, route
 from lipserve.records.jobs import Job
 from lipserve.records.learning import Alarm, Decided, Learning, Quality, RolledBack
 from lipserve.records.observations import Observation, ObservationDetail, ObservationResponse, Replayed, Unlearnt
@@ -138,6 +138,12 @@ def declare_payload(
 def remove_payload(at: Route, model: str, stream_id: str | None = None) -> Call[Payloads]:
     """Answer without a payload from now on, a stream or all of them."""
     return at(record(Payloads), names={"model": model}, params={"stream_id": stream_id})
+
+
+@route("DELETE", "/v1/models/{model}/streams/{stream_id}")
+def delete_stream(at: Route, model: str, stream_id: str) -> Call[None]:
+    """Forget a stream. What it has taught stays learnt."""
+    return at(nothing, names={"model": model, "stream_id": stream_id}, removes=True)
 
 
 @route("GET", "/v1/models/{model}/alarms")

@@ -40,6 +40,7 @@ class AuditEntry(Record, frozen=True, kw_only=True):
         "change decided",
         "candidate dismissed",
         "payload declared",
+        "stream deleted",
     ]
     version: int | None
     alias: str | None

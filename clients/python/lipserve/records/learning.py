@@ -65,7 +65,7 @@ class Quality(Record, frozen=True, kw_only=True):
 class LearningOptions(Record, frozen=True, kw_only=True):
     """How a model learns from observations.
 
-    enabled: Whether observations are taken at all
+    enabled: False: learning is paused. Rows are judged, compared and logged, but not learnt
     forgetting_s: Age in s at which a sample counts 1/e of a new one, in event time; null: nothing is forgotten
     friction_walk_s: Time in s over which friction may change by about 30 %, as that of an arm that warms up does: it is
         followed, and masses and geometry are not opened. 1800 suits most arms; null: friction stays as learnt
@@ -116,6 +116,7 @@ class Stream(Record, frozen=True, kw_only=True):
     """A source of observations.
 
     last: Highest sequence that has come
+    last_at: When that came; null where an earlier release has logged it
     offset_s: Event time (Unix seconds) - the stream's own time
     gaps: Ranges [first, last] of sequences that have not come, the latest ones
     missing: Sequences that have not come, of all gaps that are kept
@@ -125,6 +126,7 @@ class Stream(Record, frozen=True, kw_only=True):
     stream_id: str
     kind: Literal["batches", "frames"]
     last: int
+    last_at: str | None
     offset_s: float
     gaps: list[list[int]]
     missing: int
@@ -145,6 +147,8 @@ class LearningStatus(Record, frozen=True, kw_only=True):
     revision: Its revision once all of the log is learnt
     published: The revision that answers contain now
     lag_events: Events of the log that answers do not contain yet
+    lag_rows: Rows to be learnt that answers do not contain yet
+    lag_s: Seconds since the first row arrived that answers do not contain yet
     events: Number of the newest event of the log
     novel_share: Share of the latest samples that lie beyond the basis; null until some are learnt
     linearisation_error: Error of taking the torque of a learnt arm as linear around the arm as trained, root mean
@@ -159,6 +163,8 @@ class LearningStatus(Record, frozen=True, kw_only=True):
     revision: int
     published: int
     lag_events: int
+    lag_rows: int
+    lag_s: float
     events: int
     novel_share: float | None
     linearisation_error: list[float] | None = None

@@ -65,8 +65,10 @@ class LiveStatus(Record, frozen=True, kw_only=True):
     version: The version that serves
     revision: The revision that answers contain now
     lag_events: Events of the log that answers do not contain yet
+    lag_rows: Rows to be learnt that answers do not contain yet
+    lag_s: Seconds since the first row arrived that answers do not contain yet
     joint_types: What the torques' units follow from: N·m, prismatic: N
-    learns: Whether observations are taken at all
+    learns: False: learning is paused
     on_change: What follows a detected change: hold, adapt or learn
     contact_threshold: Standard deviations beyond which a row is taken for a contact
     held: Why learning waits for a decision; null where it does not
@@ -86,6 +88,8 @@ class LiveStatus(Record, frozen=True, kw_only=True):
     version: int
     revision: int
     lag_events: int
+    lag_rows: int
+    lag_s: float
     joint_names: list[str]
     joint_types: list[Literal["revolute", "prismatic"]]
     torque_convention: str

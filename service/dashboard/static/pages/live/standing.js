@@ -10,11 +10,11 @@ export function learningFacts(status) {
   const [latest] = status.windows;
   const lately = { learnt: latest.accepted, ...latest.rejected };
   const codes = Object.keys(status.counts).filter((code) => !["batches", "duplicates"].includes(code) && (status.counts[code] || lately[code]));
-  const state = status.held ? badge("held", "warn") : status.learns ? badge("learns", "good") : badge("does not learn", "plain");
+  const state = status.held ? badge("held", "warn") : status.learns ? badge("learns", "good") : badge("paused", "warn");
   return [
     facts([
       ["Answers contain", `version ${status.version}, revision ${count(status.revision)}`],
-      ["Not learnt yet", status.lag_events ? counted(status.lag_events, "batch", "batches") : "nothing"],
+      ["Not learnt yet", status.lag_rows ? `${counted(status.lag_rows, "row")}, ${seconds(status.lag_s)}` : "nothing"],
       ["Learning", state],
       ["Beyond what it was trained on", status.novel_share === null ? "not known yet" : `${percent(status.novel_share, 0)} of rows`],
     ]),

@@ -1,4 +1,4 @@
-// Switches of learning where it is watched: hold it, what follows a change, how fast it forgets, and going back.
+// Switches of learning where it is watched: pause it, what follows a change, how fast it forgets, and going back.
 
 import { get, path, post, put } from "../../api.js";
 import { h, refresh } from "../../dom.js";
@@ -23,7 +23,7 @@ export function switches(name, signal) {
     take(await put(`${where}/learning`, { ...now.options, ...changed }, signal));
     notice(said);
   };
-  const hold = button("", () => set({ enabled: !now.options.enabled }, now.options.enabled ? "Learning is held: what streams measure is neither learnt nor compared." : "Learning goes on."));
+  const pause = button("", () => set({ enabled: !now.options.enabled }, now.options.enabled ? "Learning is paused. Rows are still compared with the model." : "Learning has resumed."));
   const change = select(ON_CHANGE, "hold", (value) => attempt(() => set({ on_change: value }, "It is set.")));
   const memory = select([], "", (value) => attempt(() => set({ forgetting_s: value ? Number(value) : null }, value ? `What was learnt ${seconds(Number(value))} ago counts a third of what is learnt now.` : "Nothing is forgotten.")));
   const target = select([], "");
@@ -41,14 +41,14 @@ export function switches(name, signal) {
   function take(found) {
     now = found;
     const { options, status } = found;
-    hold.textContent = options.enabled ? "Hold learning" : "Learn again";
+    pause.textContent = options.enabled ? "Pause learning" : "Resume learning";
     offer(change, ON_CHANGE, options.on_change);
     const memories = [...new Set([...MEMORIES_S, options.forgetting_s].filter((each) => each !== null))].sort((a, b) => a - b);
     offer(memory, [["", "nothing"], ...memories.map((each) => [String(each), `what is older than ${seconds(each)}`])], String(options.forgetting_s ?? ""));
     const reached = (revision) => status.reachable.some(([first, last]) => first <= revision && revision <= last);
     const targets = [...status.snapshots.filter((each) => each.revision > 0 && each.revision < status.revision).map((each) => [String(each.revision), `revision ${count(each.revision)}, ${when(each.created_at)}`]), ["0", "as it was trained"]].filter(([revision]) => reached(Number(revision)));
     offer(target, targets, target.value || targets[0]?.[0]);
-    refresh(element, hold, field("When the robot changes", change), field("Forget", memory), status.revision > 0 && targets.length ? going : null);
+    refresh(element, pause, field("When the robot changes", change), field("Forget", memory), status.revision > 0 && targets.length ? going : null);
   }
   const attempt = (work) => work().catch((error) => error.name === "AbortError" || notice(error.message, "bad"));
   return {

@@ -167,7 +167,7 @@ function keptOut(rows, joint, [low, high]) {
 
 // what is worth a mark and must not make the others too small to see; a robot at rest, changed or with a payload goes on for long
 function odd(row) {
-  return !["learnt", "stationary", "limit", "change", "payload"].includes(row.code);
+  return !["learnt", "stationary", "limit", "change", "payload", "paused"].includes(row.code);
 }
 
 /** What the axis shows: all usual rows and their interval, and of those that were kept out as much again on either side. */

@@ -33,7 +33,7 @@ function status({ options, status: at }, name) {
   if (!at.events) {
     const said = options.enabled
       ? "It has learnt nothing while serving so far. Send measured torque, along a stream or in batches. "
-      : "Learning while it serves is switched off. ";
+      : "Learning is paused. ";
     return empty([said, h("code", {}, `lipserve stream ${name} --simulate panda --learn`), " shows how with a simulated Panda."], live);
   }
   const behind = at.lag_events ? badge(`${counted(at.lag_events, "event")} behind`, "busy") : badge("up to date", "good");

@@ -60,6 +60,7 @@ def _record(last: Any, said: list[dict[str, Any]]) -> dict[str, Any]:
         "scale": None if scale is None else {"state": scale, "version": last.version},
         "payload": payload,
         "leapt": False,
+        "begun": 0,
     }
 
 
