@@ -49,6 +49,8 @@ OFF = 12
 GAP_S = 0.5
 """A longer time between two rows: what came before is not compared with what comes after."""
 
+SETTLED_S = 1.0
+"""A contact, or other friction, is named at once, and something else once rows have shown that for so long, s."""
 BACK_S = 60.0
 """Rows that are older than the latest by more, s, are those of a clock that was set back: they begin anew."""
 
@@ -59,7 +61,8 @@ class Watch:
 
     state: what the last cells show; probabilities: of each hypothesis; since: event time, s, of the last change of
     whether something is held; waiting: rows that are no cell yet; recent: rows of the last cells, and these as they
-    were seen with `around`; off: how many of them, one after the other, a payload does not explain.
+    were seen with `around`; off: how many of them, one after the other, a payload does not explain; unsettled: event
+    time, s, since when they show another state, None where they do not.
     """
 
     n: int
@@ -72,6 +75,7 @@ class Watch:
     cells: tuple[Cell, ...] = ()
     around: Linearised | None = None
     off: int = 0
+    unsettled: float | None = None
 
     def step(self, carrier: Carrier, rows: Rows) -> Watch:
         """Follow rows, in order of event time; those from before the latest are passed over."""
@@ -164,7 +168,7 @@ class Watch:
         """Let rows teach the payload."""
         assert self.held is not None
         held = self.held.more(carrier, Rows.concatenate(parts))
-        watch = replace(self, state="payload", held=held)
+        watch = replace(self, held=held)._named("payload")
         return watch if held.estimate is self.held.estimate else watch._around(carrier)
 
     def _free(self, carrier: Carrier, window: Window, gains: Gains) -> Watch:
@@ -181,7 +185,16 @@ class Watch:
                 window = Window.of(self.around, cells)
                 if (after := taken(window, window.gains(), every=every)) is not None:
                     return self._take_up(carrier, every * after, every)
-        return replace(self, state=state)
+        return self._named(state)
+
+    def _named(self, state: PayloadState) -> Watch:
+        """The same where the last cells show a state."""
+        if state == self.state:
+            return replace(self, unsettled=None)
+        at = float(self.recent[-1].time[-1])
+        if self.state in ("none", "payload") or (self.unsettled is not None and at - self.unsettled >= SETTLED_S):
+            return replace(self, state=state, unsettled=None)
+        return self if self.unsettled is not None else replace(self, unsettled=at)
 
     def _take_up(self, carrier: Carrier, after: int, every: int = 1) -> Watch:
         """Carry what the last cells show, so many. every: of how many cells one was looked at."""
@@ -195,8 +208,10 @@ class Watch:
             vague = PRECISE if estimate.gain - estimate.contact >= BETTER else 0.0
         strange = np.abs((estimate.eta - ANY.centre) / WIDTH).max() > STRANGE
         if strange or np.sqrt(estimate.covariance[0, 0]) > vague * estimate.doubt:
-            return replace(self, state="contact")
-        watch = replace(self, state="payload", since=held.since, held=held, recent=self.recent[-after:], off=0)
+            return self._named("contact")
+        watch = replace(
+            self, state="payload", unsettled=None, since=held.since, held=held, recent=self.recent[-after:], off=0
+        )
         return watch._around(carrier)
 
     def _carry(self, carrier: Carrier, parts: Sequence[Rows], window: Window, gains: Gains) -> Watch:
@@ -221,7 +236,7 @@ class Watch:
             if again.held is not self.held:
                 return again
         state = state_of(gains)
-        return replace(self, state="payload" if state == "none" else state, off=off)
+        return replace(self, off=off)._named("payload" if state == "none" else state)
 
     def _without(self, carrier: Carrier, window: Window, gains: Gains) -> tuple[float, int]:
         """Nats by which the arm without its payload explains the last cells better, and how many of them."""

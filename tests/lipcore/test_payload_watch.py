@@ -217,3 +217,20 @@ def test_what_one_version_has_noticed_another_takes_for_about_there(carrier):
     assert watch.held.estimate.mass[1] < 0.03
     nothing = Watch.of_another(Watch(7).put_down(3.0).to_json(), 7, carrier)
     assert (nothing.held, nothing.since) == (None, 3.0)
+
+
+def test_the_state_changes_at_most_once_a_second_whatever_knocks(carrier):
+    """A knock of 0.15 s on another joint every 0.4 s, none of which a payload explains."""
+    rows = stream(6, first=2.0, last=12.0)
+    knock, tau = (rows.time / 0.4).astype(int), rows.tau.copy()
+    hit = rows.time % 0.4 < 0.15
+    tau[hit, knock[hit] % 7] += np.where(knock[hit] % 2, 20.0, -20.0)
+    knocked = Rows(rows.time, rows.q, rows.dq, rows.ddq, tau, rows.code)
+    watch, states = Watch(7), []
+    for first in range(0, len(knocked), 10):
+        watch = watch.step(carrier, knocked.take(slice(first, first + 10)))
+        states.append(watch.state)
+    changes = [0.1 * place for place in range(1, len(states)) if states[place] != states[place - 1]]
+    assert "contact" in states
+    assert watch.held is None
+    assert min(np.diff(changes), default=1.0) >= 0.99
