@@ -16,16 +16,14 @@ from sqlalchemy import case, func, select, update
 from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
-from lipserve.wording import percent
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
 from service.journal.log import NewBatch
 from service.journal.snapshots import retain
 from service.learning import intervals, owner
-from service.learning.ingest import judging
+from service.learning.ingest import alarms, judging
 from service.learning.ingest.dating import LEAP_S
 from service.learning.ingest.host_clock import HostClock
-from service.learning.ingest.judging import Verdict
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
 from service.learning.intervals import ScaleRecord
@@ -34,8 +32,7 @@ from service.learning.streams import StreamRecord
 from service.learning.weigher.weighing import Weighing
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
-from service.storage.database import EventRow, ModelRow, StreamRow
-from service.web.access import audit
+from service.storage.database import ModelRow, StreamRow
 
 logger = logging.getLogger(__name__)
 
@@ -45,12 +42,6 @@ ROW_NUMBERS, NUMBER_BYTES = 6, 8
 """What a row takes of the disk, for each joint: motion and torque, and half as much again for times and indices."""
 MOST_GAPS = 100
 """Gaps that an acknowledgement names."""
-CONSEQUENCES = {
-    "hold": "nothing is learnt until its owner has decided",
-    "waits": "learning is held already, and none of this is learnt until its owner has decided",
-    "adapt": "a new regime begins, in which what was learnt before counts less",
-    "learn": "learning goes on as before",
-}
 
 
 class Judged(NamedTuple):
@@ -184,10 +175,10 @@ class Intake:
             event.rows = rows  # without those that had waited, which other batches count
             source = log.stream(session, model, stream_id)
             assert source is not None
-            _act(session, served, "waits" if held else options.on_change, verdict, event)
+            alarms.act(session, served, "waits" if held else options.on_change, verdict, event)
             leap = details.get("leap")
             if leap is not None and not streams.get(stream_id).leapt:
-                _alarm_of_clock(session, model, stream_id, leap)
+                alarms.alarm_of_clock(session, model, stream_id, leap)
             doubted = verdict.held and (verdict.opened is not None or streams.get(stream_id).doubted)
             known: dict[str, Any] = {"begun": event.number} if new else {}
             known |= {
@@ -273,68 +264,8 @@ def _check_kept(session: Session, served: Served) -> None:
     raise ConflictError(f"version {served.version} of model {served.name!r} was deleted meanwhile: send it again")
 
 
-def _act(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
-    """Do what follows from a verdict: one of CONSEQUENCES where it is a change."""
-    if verdict.opened is not None and verdict.held:
-        _take_back(session, event)
-    if verdict.change is not None:
-        _alarm(session, served, follows, verdict, event)
-
-
-def _take_back(session: Session, event: EventRow) -> None:
-    """Unlearn what a stream has taught before the batch with which its opening was found not to fit."""
-    earlier = select(EventRow).where(
-        EventRow.model == event.model,
-        EventRow.stream_id == event.stream_id,
-        EventRow.kind == "batch",
-        EventRow.number < event.number,
-        EventRow.void.is_(False),
-    )
-    for each in session.scalars(earlier.order_by(EventRow.number)).all():
-        log.unlearn(session, event.model, each, event.received)
-
-
 def _effective(rows: Rows, received: float, forgetting_s: float | None) -> float:
     """Independent samples that rows count as when they come."""
     if forgetting_s is None:
         return float(rows.weight.sum())
     return float((rows.weight * np.exp(np.minimum(rows.time - received, 0.0) / forgetting_s)).sum())
-
-
-def _alarm_of_clock(session: Session, model: str, stream_id: str, leap: float) -> None:
-    """Raise the alarm of a stream whose times cannot be."""
-    message = (
-        f"the clock of stream {stream_id} has leapt {leap:.0f} s ahead of its rows' arrival. These rows wait: they are "
-        "logged with the code time_jump, and can be replayed. Set the clock back, or go on under another stream_id"
-    )
-    owner.raise_alarm(session, model, "clock", message, {"stream_id": stream_id, "ahead_s": leap})
-
-
-def _alarm(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
-    """Raise the alarm of a change, and hold learning where the owner is to decide about it.
-
-    follows: one of CONSEQUENCES.
-    """
-    change, names = verdict.change, served.model.joint_names
-    assert change is not None
-    evidence = verdict.evidence(names) | {"stream_id": event.stream_id, "sequence": event.sequence}
-    joints = ", ".join(names[joint] for joint in change.joints)
-    finding = f"does not fit what was learnt any more: {evidence['suspect']}?"
-    if verdict.departed is not None:
-        finding = (
-            f"has left what version {verdict.departed.version} was trained on, step by step ({evidence['cause']}):"
-        )
-    message = f"the torque of {joints} {finding} {CONSEQUENCES[follows]}"
-    if verdict.opened is not None:
-        share = percent(verdict.opened.coverage.mean())
-        message = (
-            f"stream {event.stream_id} does not fit the model: {share} of its first second lies within the 95 % band; "
-            f"is it this robot, with the friction and the payload that were learnt? {CONSEQUENCES[follows]}"
-        )
-    owner.raise_alarm(session, served.name, "change", message, evidence)
-    known = {"at": change.at, "event": event.number}
-    if follows == "hold":
-        owner.hold(session, served.name, known | {"evidence": evidence})
-        audit.note(session, served.name, "learning held", served.version, after=known)
-    elif follows == "adapt":
-        audit.note(session, served.name, "change decided", served.version, before=known, after={"decision": "adapt"})

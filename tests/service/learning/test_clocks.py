@@ -35,7 +35,7 @@ def width(answer):
 
 
 def test_a_stream_whose_clock_leaps_waits_and_nothing_is_forgotten_for_it(school):
-    pupil, steady = (school.enrol(name, **FORGETFUL) for name in ("leap", "steady"))
+    pupil, steady = (school.enrol(name, **FORGETFUL) for name in ("clock-leap", "clock-even"))
     for each in (steady, pupil):
         each.teach(0, 1)
     steady.teach(*range(4), stream_id="other")
@@ -54,7 +54,7 @@ def test_a_stream_whose_clock_leaps_waits_and_nothing_is_forgotten_for_it(school
 
 
 def test_a_recording_may_be_sent_faster_than_it_was_measured(school):
-    pupil = school.enrol("fast", **FORGETFUL)
+    pupil = school.enrol("clock-fast", **FORGETFUL)
     for number in range(30):
         body = lesson(number)
         said = pupil.post("observations", body | {"t": (np.arange(10) + 10 * number).tolist()})
@@ -63,7 +63,7 @@ def test_a_recording_may_be_sent_faster_than_it_was_measured(school):
 
 
 def test_rows_that_come_so_late_that_they_would_teach_nothing_are_not_accepted(school):
-    pupil = school.enrol("late", **FORGETFUL)
+    pupil = school.enrol("clock-late", **FORGETFUL)
     pupil.teach(0)
     said = pupil.post("observations", leapt(0, by=-5000.0) | {"sequence": 1})
     assert said["rejected"] == {"time_jump": 10}  # back: the next batch is of a clock that was set
@@ -80,7 +80,7 @@ def test_rows_that_come_so_late_that_they_would_teach_nothing_are_not_accepted(s
 @pytest.mark.parametrize("off", [YEAR, -YEAR])
 def test_a_host_whose_clock_is_set_right_goes_on_as_if_it_had_been_right(school, host, off):
     host.off = off
-    pupil = school.enrol(f"host-{off > 0}", **FORGETFUL)
+    pupil = school.enrol(f"clock-host-{off > 0}", **FORGETFUL)
     pupil.teach(*range(4))
     known = width(pupil.predict())
     host.off = 0.0

@@ -76,7 +76,7 @@ def test_too_many_rows(pupil, school):
 
 
 def test_while_learning_is_paused_rows_are_compared_and_logged_and_can_be_learnt_later(school, body):
-    pupil = school.enrol("paused")
+    pupil = school.enrol("paused-ingest")
     before = pupil.settled(0)
     pupil.put("learning", {"enabled": False})
     said = send(pupil, 0, body)

@@ -1,0 +1,81 @@
+"""What follows from a batch that does not fit: alarms, learning held, and what a stream has taught taken back."""
+
+from __future__ import annotations
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from lipserve.wording import percent
+from service.journal import log
+from service.learning import owner
+from service.learning.ingest.judging import Verdict
+from service.models.loaded import Served
+from service.storage.database import EventRow
+from service.web.access import audit
+
+CONSEQUENCES = {
+    "hold": "nothing is learnt until its owner has decided",
+    "waits": "learning is held already, and none of this is learnt until its owner has decided",
+    "adapt": "a new regime begins, in which what was learnt before counts less",
+    "learn": "learning goes on as before",
+}
+
+
+def act(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
+    """Do what follows from a verdict: one of CONSEQUENCES where it is a change."""
+    if verdict.opened is not None and verdict.held:
+        _take_back(session, event)
+    if verdict.change is not None:
+        _alarm(session, served, follows, verdict, event)
+
+
+def _take_back(session: Session, event: EventRow) -> None:
+    """Unlearn what a stream has taught before the batch with which its opening was found not to fit."""
+    earlier = select(EventRow).where(
+        EventRow.model == event.model,
+        EventRow.stream_id == event.stream_id,
+        EventRow.kind == "batch",
+        EventRow.number < event.number,
+        EventRow.void.is_(False),
+    )
+    for each in session.scalars(earlier.order_by(EventRow.number)).all():
+        log.unlearn(session, event.model, each, event.received)
+
+
+def alarm_of_clock(session: Session, model: str, stream_id: str, leap: float) -> None:
+    """Raise the alarm of a stream whose times cannot be."""
+    message = (
+        f"the clock of stream {stream_id} has leapt {leap:.0f} s ahead of its rows' arrival. These rows wait: they are "
+        "logged with the code time_jump, and can be replayed. Set the clock back, or go on under another stream_id"
+    )
+    owner.raise_alarm(session, model, "clock", message, {"stream_id": stream_id, "ahead_s": leap})
+
+
+def _alarm(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
+    """Raise the alarm of a change, and hold learning where the owner is to decide about it.
+
+    follows: one of CONSEQUENCES.
+    """
+    change, names = verdict.change, served.model.joint_names
+    assert change is not None
+    evidence = verdict.evidence(names) | {"stream_id": event.stream_id, "sequence": event.sequence}
+    joints = ", ".join(names[joint] for joint in change.joints)
+    finding = f"does not fit what was learnt any more: {evidence['suspect']}?"
+    if verdict.departed is not None:
+        finding = (
+            f"has left what version {verdict.departed.version} was trained on, step by step ({evidence['cause']}):"
+        )
+    message = f"the torque of {joints} {finding} {CONSEQUENCES[follows]}"
+    if verdict.opened is not None:
+        share = percent(verdict.opened.coverage.mean())
+        message = (
+            f"stream {event.stream_id} does not fit the model: {share} of its first second lies within the 95 % band; "
+            f"is it this robot, with the friction and the payload that were learnt? {CONSEQUENCES[follows]}"
+        )
+    owner.raise_alarm(session, served.name, "change", message, evidence)
+    known = {"at": change.at, "event": event.number}
+    if follows == "hold":
+        owner.hold(session, served.name, known | {"evidence": evidence})
+        audit.note(session, served.name, "learning held", served.version, after=known)
+    elif follows == "adapt":
+        audit.note(session, served.name, "change decided", served.version, before=known, after={"decision": "adapt"})
