@@ -134,7 +134,7 @@ class Monitor:
         lately = (EventRow.received > since, EventRow.received <= now, EventRow.number <= made.number)
         events = list(_batches(session, model, *lately)) or list(_batches(session, model, most=1))
         for event in events:  # the last one in any case: how far learning has gone is not forgotten in a quiet hour
-            made._remember(event, event.received > now - DETECTOR_S)
+            made._remember(event, now - DETECTOR_S < event.received <= now)
         return made
 
     def follow(self, session: Session, model: str) -> None:
