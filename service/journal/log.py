@@ -290,7 +290,7 @@ def learning_rows(event: EventRow) -> Rows:
     return rows if event.kind == "replay" else replace(rows, time=learning_time(event, rows.time))
 
 
-def unlearnt(session: Session, model: str, after: int) -> tuple[int, float | None]:
+def pending(session: Session, model: str, after: int) -> tuple[int, float | None]:
     """Rows to be learnt after event `after`, and when the first of them arrived, Unix time, s; None without any."""
     later = EventRow.model == model, EventRow.number > after, EventRow.learnt > 0, EventRow.void.is_(False)
     rows, arrived = session.execute(select(func.sum(EventRow.learnt), func.min(EventRow.received)).where(*later)).one()

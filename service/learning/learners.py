@@ -139,7 +139,7 @@ class Learners:
         loaded.when_deleted.append(self.forget)
         self.live = Feed(settings)
         self._intake = Intake(loaded, self._monitor, self.monitors, self.process.wake, self.live.note)
-        self._intake.set_back()
+        self._intake.check_clock_at_start()
         self.weighing = self._intake.weighing
 
     def close(self) -> None:
@@ -242,7 +242,7 @@ class Learners:
         model = served.name
         with self.database.session() as session:
             contained = log.start_of(session, model, served.version) + served.revision
-            rows, arrived = log.unlearnt(session, model, contained)
+            rows, arrived = log.pending(session, model, contained)
         waited = 0.0 if arrived is None else max(time.time() - arrived, 0.0)
         return Lag(rows, max(waited, self.threads.wait_s(model)))
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import select
-from sqlalchemy.orm import Session
+from sqlalchemy.orm import Session, undefer
 
 from service.learning.ingest.judging import ContactGate
 from service.learning.ingest.opening import Opening
@@ -26,11 +26,11 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class PayloadRecord:
-    """What a stream carries, as it was said or noticed last.
+    """The latest known payload of a stream, declared or noticed.
 
-    event: number of the event that has said or noticed it; received: Unix time, s, of the latest rows that tell of it.
-    watch: see `Watch.to_json`, as `version` has seen it; body: what the owner has declared, None for nothing. One of
-    the two is given: it is a declaration where there is no `watch`.
+    event: number of the event that declared or noticed it; received: Unix time of the latest rows that show it, s.
+    watch: the estimate of `version`, see `Watch.to_json`; None for a declaration. body: the declared body, None for
+    no payload.
     """
 
     event: int
@@ -125,7 +125,7 @@ class Streams:
 
     def read(self, session: Session, model: str, stream_ids: Collection[str] | None = None) -> None:
         """Read what other services have written: of these streams, of all where None."""
-        query = select(StreamRow).where(StreamRow.model == model)
+        query = select(StreamRow).where(StreamRow.model == model).options(undefer(StreamRow.record))
         if stream_ids is not None:
             query = query.where(StreamRow.stream_id.in_(stream_ids))
         rows = {row.stream_id: StreamRecord.of(row, self._patience_s) for row in session.scalars(query)}
@@ -143,7 +143,7 @@ class Streams:
         return self._records.get(stream_id) or StreamRecord(ContactGate.start(self._patience_s))
 
     def payload(self, stream_id: str) -> PayloadRecord | None:
-        """What a stream carries: what was said last, of it or of all streams. Of "": what was declared for all."""
+        """Return the newest payload record of a stream, its own or that of all streams; of "" that of all streams."""
         own = self.get(stream_id).payload
         if own is None or (self.default is not None and self.default.event > own.event):
             return self.default
@@ -158,7 +158,7 @@ class Streams:
         }
 
     def change(self, stream_id: str, **fields: Any) -> StreamRecord:
-        """Put fields of a record in the place of those that are known, and return it."""
+        """Replace fields of a record, and return it."""
         with self._lock:
             record = replace(self.get(stream_id), **fields)
             self._records = {**self._records, stream_id: record}
@@ -186,7 +186,7 @@ class Streams:
         """Delete the streams of a model whose last batch came before a Unix time, s, and that carry nothing, which
         would be lost with them."""
         silent = StreamRow.model == model, StreamRow.received < silent_since
-        for row in session.scalars(select(StreamRow).where(*silent)):
+        for row in session.scalars(select(StreamRow).where(*silent).options(undefer(StreamRow.record))):
             payload = StreamRecord.of(row, self._patience_s).payload
             if payload is None or not payload.holds:
                 session.delete(row)

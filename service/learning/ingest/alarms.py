@@ -21,7 +21,7 @@ CONSEQUENCES = {
 }
 
 
-def act(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
+def apply_verdict(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
     """Do what follows from a verdict: one of CONSEQUENCES where it is a change."""
     if verdict.opened is not None and verdict.held:
         _take_back(session, event)
@@ -42,8 +42,8 @@ def _take_back(session: Session, event: EventRow) -> None:
         log.unlearn(session, event.model, each, event.received)
 
 
-def alarm_of_clock(session: Session, model: str, stream_id: str, leap: float) -> None:
-    """Raise the alarm of a stream whose times cannot be."""
+def raise_clock_alarm(session: Session, model: str, stream_id: str, leap: float) -> None:
+    """Raise the alarm of a stream whose clock is ahead of its rows' arrival."""
     message = (
         f"the clock of stream {stream_id} has leapt {leap:.0f} s ahead of its rows' arrival. These rows wait: they are "
         "logged with the code time_jump, and can be replayed. Set the clock back, or go on under another stream_id"

@@ -77,8 +77,8 @@ class Intake:
         self._host, self._host_lock = HostClock(), threading.Lock()
 
     def arrival(self) -> float:
-        """When a batch that is here now arrived: Unix time, s. Where the host's clock was set meanwhile, all that is
-        dated by it goes with it, so that streams go on."""
+        """Return the time of a batch that arrives now, Unix time, s. If the host's clock was set, first move what is
+        dated by it."""
         with self._host_lock:
             step = self._host.step()
             if step:
@@ -97,8 +97,8 @@ class Intake:
             with monitor.lock:
                 monitor.set_clock(step)
 
-    def set_back(self) -> None:
-        """Where the host's clock was set back while no service ran, let streams go on; before the first batch."""
+    def check_clock_at_start(self) -> None:
+        """Move streams to the host's clock if it was set back while no service ran; before the first batch."""
         with self.database.session() as session:
             newest = session.scalar(select(func.max(StreamRow.received)))
         if newest is not None and (step := time.time() - newest) < -LEAP_S and not self.database.shared:
@@ -175,10 +175,10 @@ class Intake:
             event.rows = rows  # without those that had waited, which other batches count
             source = log.stream(session, model, stream_id)
             assert source is not None
-            alarms.act(session, served, "waits" if held else options.on_change, verdict, event)
+            alarms.apply_verdict(session, served, "waits" if held else options.on_change, verdict, event)
             leap = details.get("leap")
             if leap is not None and not streams.get(stream_id).leapt:
-                alarms.alarm_of_clock(session, model, stream_id, leap)
+                alarms.raise_clock_alarm(session, model, stream_id, leap)
             doubted = verdict.held and (verdict.opened is not None or streams.get(stream_id).doubted)
             known: dict[str, Any] = {"begun": event.number} if new else {}
             known |= {
@@ -243,7 +243,7 @@ class Intake:
 def _scaled(
     monitor: Monitor, served: Served, options: LearningOptions, stream_id: str, screened: Screened
 ) -> tuple[ScaleRecord | None, dict[str, Any]]:
-    """The scale of a stream's intervals after a batch, None where it does not adapt, and what the report says of it."""
+    """Return the scale of a stream's intervals after a batch, None if not adaptive, and its part of the report."""
     seen = screened.seen
     if not options.adaptive_intervals or seen is None:
         return None, {}

@@ -233,7 +233,7 @@ class StreamRow(Base):
     forgotten: Mapped[int | None] = mapped_column(BigInteger)
     created_at: Mapped[str]
     received: Mapped[float | None]
-    record: Mapped[dict[str, Any] | None]
+    record: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)  # written with each batch, but rarely read
 
 
 class EventRow(Base):
