@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Hashable, Iterable, Sequence
 from math import isfinite, nan
 from typing import Annotated, Any
 
@@ -58,10 +58,19 @@ def rows_of_numbers(nullable: bool = False) -> Callable[[Any, ValidationInfo], N
 
 def each_once(names: list[Any]) -> list[Any]:
     """The names of components; raise InvalidRequestError where one is there twice."""
-    for index, name in enumerate(names):
-        if name in names[:index]:
-            raise invalid_request(f"components[{index}]", name, "each component once")
+    if (index := first_repeat(names)) is not None:
+        raise invalid_request(f"components[{index}]", names[index], "each component once")
     return names
+
+
+def first_repeat(values: Iterable[Hashable]) -> int | None:
+    """The place of the first value that came before, None where there is none; in linear time."""
+    seen = set()
+    for index, value in enumerate(values):
+        if value in seen:
+            return index
+        seen.add(value)
+    return None
 
 
 def finite(values: Sequence[float] | NDArray[np.float64]) -> list[float | None]:

@@ -16,6 +16,7 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.data.splits import GUARD_S, Kind, Mask, Numbers, Parts, Split, SplitError, choose, split
 from service.foundation.errors import invalid_request
+from service.foundation.fields import first_repeat
 from service.models.schema import HeldOutSet, Holdout, HoldoutLineage
 from service.storage.database import DatasetRow
 
@@ -96,9 +97,10 @@ class Divided:
 def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
     """Raise InvalidRequestError where reports tell already that the data sets cannot be split as asked for."""
     _check_stretches(rows, asked)
-    for index, row in enumerate(rows):
-        if row.sha256 in [each.sha256 for each in rows[:index]]:
-            raise invalid_request(f"datasets[{index}]", row.id, "other samples than those of the data sets before it")
+    if (index := first_repeat(row.sha256 for row in rows)) is not None:
+        expected = "other samples than those of the data sets before it"
+        raise invalid_request(f"datasets[{index}]", rows[index].id, expected)
+    for row in rows:
         if asked.guard_s is not None and not _is_timed(row):
             raise invalid_request("holdout.guard_s", asked.guard_s, f"none, as data set {row.id} has no times")
     if asked.kind == "episodes" and len(rows) == 1 and rows[0].report["episodes"] < 2:

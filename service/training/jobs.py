@@ -27,6 +27,7 @@ from service.foundation.errors import (
     not_found,
     problem,
 )
+from service.foundation.fields import first_repeat
 from service.foundation.settings import Settings
 from service.journal import log
 from service.models import registry
@@ -203,9 +204,9 @@ def cancel(queue: JobQueue, job: str) -> Job:
 
 def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
     first = rows[0]
+    if (twice := first_repeat(row.id for row in rows)) is not None:
+        raise invalid_request(f"datasets[{twice}]", request.datasets[twice], "every data set once")
     for index, row in enumerate(rows):
-        if row.id in [each.id for each in rows[:index]]:
-            raise invalid_request(f"datasets[{index}]", request.datasets[index], "every data set once")
         for what in ("joint_names", "torque_convention"):
             if getattr(row, what) != getattr(first, what):
                 expected = f"the {what} of datasets[0], {getattr(first, what)}"

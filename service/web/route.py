@@ -15,6 +15,7 @@ from fastapi.routing import APIRoute
 from starlette.types import Message, Receive, Scope, Send
 
 from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
+from service.foundation.fields import first_repeat
 
 JSON, OCTETS = b"application/json", b"application/octet-stream"
 _ANY_JSON = re.compile(rb"application/([^;/]+\+)?json\s*(;.*)?", re.IGNORECASE | re.DOTALL)
@@ -117,9 +118,9 @@ class _JsonRequest(Request):
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     value = dict(pairs)
     if len(value) < len(pairs):
-        names = [name for name, _ in pairs]
-        twice = next(name for index, name in enumerate(names) if name in names[:index])
-        item = problem(twice, "given twice", "each field once")
+        index = first_repeat(name for name, _ in pairs)
+        assert index is not None
+        item = problem(pairs[index][0], "given twice", "each field once")
         raise InvalidRequestError(sentence(item), [item])
     return value
 

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.foundation.errors import InvalidRequestError, problem, readable
+from service.foundation.fields import first_repeat
 from service.web.route import Route, each_once, read_json
 from tests.service.data import error, service_of
 
@@ -51,6 +52,21 @@ def test_a_field_that_comes_twice_is_named(value, data):
         with pytest.raises(InvalidRequestError) as raised:
             read_json(wrong.encode())
         assert raised.value.detail == [problem(name, "given twice", "each field once")]
+
+
+def test_what_comes_twice_is_found_in_linear_time():
+    class Name(str):
+        compared = 0
+        __hash__ = str.__hash__
+
+        def __eq__(self, other):
+            Name.compared += 1
+            return super().__eq__(other)
+
+    names = [Name(f"field {number}") for number in range(2000)]
+    assert first_repeat(names) is None
+    assert first_repeat([*names, Name("field 1000"), Name("field 1")]) == 2000
+    assert Name.compared < 100  # a look at each of the others would be four million
 
 
 def test_fields_are_counted_once():

@@ -10,6 +10,7 @@ from lipcore.profiles import Profile
 from service.datasets.mapping.recognition import JOINT, Family, Key
 from service.datasets.options import UploadOptions
 from service.foundation.errors import InvalidDataError, invalid_data, invalid_request
+from service.foundation.fields import first_repeat
 
 MAX_NAME = 100
 _NUMBER = re.compile(r"\d{1,9}")
@@ -97,8 +98,8 @@ def check_names(names: tuple[str, ...]) -> None:
     for index, name in enumerate(names):
         if not name or len(name) > MAX_NAME or not name.isprintable():
             raise invalid_data(f"joint_names[{index}]", name, f"1 to {MAX_NAME} printable characters")
-        if name in names[:index]:
-            raise invalid_data(f"joint_names[{index}]", name, "names that differ")
+    if (twice := first_repeat(names)) is not None:
+        raise invalid_data(f"joint_names[{twice}]", names[twice], "names that differ")
 
 
 def _check_numbers(positions: Family) -> None:
