@@ -42,6 +42,8 @@ numbers, so that the posterior is nowhere wider than its prior, as the evaluator
 
 CERTAIN = 1e-12
 """Variance of a payload's parameter that is known."""
+OPEN_RAD = 0.1
+"""A last axis whose direction is known no better is open, standard deviation in rad."""
 LEAST = 1e-14
 """Smallest variance of whitened variables, of prior variance one."""
 
@@ -147,6 +149,13 @@ class Carrier:
         """Places of the geometry's steps among the variables."""
         first, steps = self.rows.start, self.term.steps
         return slice(first + steps.start, first + steps.stop)
+
+    @property
+    def open_tip(self) -> bool:
+        """Whether the training leaves open how the last axis lies, which bears next to nothing."""
+        arm = self.term.arm
+        turns = self.covariance.diagonal()[self.steps] * arm.widths**2 * arm.geometry.turns
+        return bool((turns[-arm.geometry.screws[-1] :] > OPEN_RAD**2).any())
 
     @property
     def step(self) -> Array:

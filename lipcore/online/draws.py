@@ -6,14 +6,15 @@ Those of the training alone are made once; rows with a payload move them on (`pa
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from lipcore.arm.right_angles import DIRECTIONS, laid_out
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm import ArmKernel
@@ -54,28 +55,43 @@ class Place:
 
     def shifted(self, carrier: Carrier, by: Array, eta: Array) -> Place:
         """The place where w is larger by (M,), its geometry moved as far, and η by (10,)."""
-        steps, arm = carrier.steps, carrier.term.arm
-        w, geometry = self.w + by, self.geometry.moved(carrier.root[steps] * by[steps])
-        w[steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[steps]
-        return Place(w, geometry, self.eta + eta)
+        geometry = self.geometry.moved(carrier.root[carrier.steps] * by[carrier.steps])
+        return Place(self.w + by, geometry, self.eta + eta).there(carrier, geometry)
+
+    def there(self, carrier: Carrier, geometry: Geometry) -> Place:
+        """The place with another geometry."""
+        w, arm = self.w.copy(), carrier.term.arm
+        w[carrier.steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[carrier.steps]
+        return Place(w, geometry, self.eta)
 
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """A draw from the posterior: the place of least energy for other noise. noise: of what is known beforehand."""
+    """A draw from the posterior: the place of least energy for other noise. noise: of what is known beforehand; None
+    for the bottom of a valley, where nothing is drawn."""
 
     place: Place
-    noise: Array
+    noise: Array | None
+
+    def usable(self, size: int) -> bool:
+        """Whether its noise is of so many numbers, as of the same revision."""
+        return self.noise is None or len(self.noise) == size
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """The energy of a place. residual, derivative: of it, by whitened steps; misfit: mean square of the rows' part."""
+    """The energy of a place. residual: of it; misfit: mean square of the rows' part; differentiate: gives the
+    residual's derivative by whitened steps, of which most places are not asked."""
 
     place: Place
     residual: Array
-    derivative: Array
     misfit: float
+    differentiate: Callable[[], Array]
+
+    @cached_property
+    def derivative(self) -> Array:
+        """Of the residual, by whitened steps."""
+        return self.differentiate()
 
     @property
     def energy(self) -> float:
@@ -96,6 +112,16 @@ class Energy(Protocol):
 
 def minimum(problem: Energy, at: Point, rounds: int, shift: Array | float = 0.0) -> Point:
     """Where the energy is least, or what is reached in so many steps; shift: what the residuals should be."""
+    steps = descent(problem, at, rounds, shift)
+    while True:
+        try:
+            next(steps)
+        except StopIteration as done:
+            return cast(Point, done.value)
+
+
+def descent(problem: Energy, at: Point, rounds: int, shift: Array | float = 0.0) -> Generator[None, None, Point]:
+    """The same; it yields after each step."""
     damping, carrier = DAMPING, problem.carrier
     for _ in range(rounds):
         off = at.residual - shift
@@ -103,6 +129,8 @@ def minimum(problem: Energy, at: Point, rounds: int, shift: Array | float = 0.0)
         curvature, gradient = at.derivative.T @ at.derivative, at.derivative.T @ off
         while damping < WORST:
             step = np.asarray(np.linalg.solve(curvature + damping * np.diag(np.diagonal(curvature)), -gradient))
+            if damping <= DAMPING and -0.5 * float(gradient @ step) < STILL:  # what it gains where torque is linear
+                return at
             trial = problem.at(at.place.moved(carrier, step))
             left = trial.residual - shift
             gained = energy - 0.5 * float(left @ left)
@@ -114,6 +142,7 @@ def minimum(problem: Energy, at: Point, rounds: int, shift: Array | float = 0.0)
         at, damping = trial, max(LESS * damping, LEAST_DAMPING)
         if gained < STILL:
             break
+        yield
     return at
 
 
@@ -134,22 +163,32 @@ class Training:
         """The energy of a place, whose payload is left as it is."""
         memory, size = self.carrier.memory, len(place.w)
         features, torque = rows_of(linearised_around(self.carrier, place, np.zeros(PARAMETERS)), *self.virtual)
-        by_arm = memory.derivative(features[:size])
-        derivative = np.zeros((len(by_arm) + PARAMETERS, size + PARAMETERS))
-        derivative[: len(by_arm), :size] = by_arm
-        derivative[len(by_arm) :, size:] = np.eye(PARAMETERS)
-        residual = np.concatenate([memory.residual(place.w, torque), np.zeros(PARAMETERS)])
-        return Point(place, residual, derivative, 0.0)
 
-    def drawn(self, draw: np.random.Generator) -> Draw:
-        """One of the arms that the training allows, with any payload."""
+        def derivative() -> Array:
+            by_arm = memory.derivative(features[:size])
+            out = np.zeros((len(by_arm) + PARAMETERS, size + PARAMETERS))
+            out[: len(by_arm), :size] = by_arm
+            out[len(by_arm) :, size:] = np.eye(PARAMETERS)
+            return out
+
+        residual = np.concatenate([memory.residual(place.w, torque), np.zeros(PARAMETERS)])
+        return Point(place, residual, 0.0, derivative)
+
+    def begun(self, number: int, draw: np.random.Generator) -> Generator[None, None, Draw]:
+        """One of the arms that the training allows, with any payload; it yields after each step. Where the last axis is
+        open, it points in one of six directions, and a valley is sought from there."""
         carrier = self.carrier
-        learnt = Place(carrier.mean, carrier.term.arm.geometry.moved(carrier.step), ANY.centre)
+        geometry = carrier.term.arm.geometry.moved(carrier.step)
+        learnt = Place(carrier.mean, geometry, ANY.centre)
+        if carrier.open_tip:
+            layout = (*[None] * (geometry.n_joints - 1), number % len(DIRECTIONS))
+            return Draw(learnt.there(carrier, laid_out(geometry, layout)), None)
         by = draw.uniform(*WIDE) * carrier.memory.root @ draw.standard_normal(len(carrier.mean))
         at = self.at(learnt.shifted(carrier, by, np.zeros(PARAMETERS)))
         noise = draw.standard_normal(len(at.residual))
         still = np.concatenate([noise[:-PARAMETERS], np.zeros(PARAMETERS)])
-        return Draw(minimum(self, at, RELAXED, still).place, noise)
+        at = yield from descent(self, at, RELAXED, still)
+        return Draw(at.place, noise)
 
     @cached_property
     def alone(self) -> float:
@@ -166,16 +205,15 @@ def linearised_around(carrier: Carrier, place: Place, payload: Array) -> Lineari
 
 
 def arms(carrier: Carrier) -> Generator[None, None, tuple[Draw, ...]]:
-    """Draws from what the training alone says, with any payload; made once a version, by the revision that asks first,
-    and again where another has learnt more directions. It yields after each."""
+    """Where draws begin: what the training alone says, with any payload; made once a version, by the revision that asks
+    first, and again where another has learnt more directions. It yields after each step."""
     size = len(carrier.memory.slope) + len(carrier.memory.outside) + len(carrier.mean) + PARAMETERS
     known = _ARMS.get(carrier.term, ())
-    if not known or len(known[0].noise) != size:
+    if not all(each.usable(size) for each in known) or not known:
         training, draw = Training.of(carrier), np.random.default_rng(SEED)
         found = []
-        for _ in range(DRAWS):
-            found.append(training.drawn(draw))
-            yield
+        for number in range(len(DIRECTIONS) if carrier.open_tip else DRAWS):
+            found.append((yield from training.begun(number, draw)))
         known = _ARMS[carrier.term] = tuple(found)
     return known
 

@@ -118,29 +118,34 @@ class Held:
         if len(kept) > MOST_ROWS:
             kept, every = kept.take(slice(0, None, 2)), 2 * every
         held = replace(self, rows=kept, every=every, count=count)
-        if count < self.due or self.estimate.draws:  # which only draws from more rows can follow
+        if count < self.due or (self.estimate.draws and carrier.open_tip):  # its valleys are followed by refining alone
             return held
-        moved = estimate(carrier, kept, self.before, self.prior, self.estimate)
+        moved = replace(estimate(carrier, kept, self.before, self.prior, self.estimate), draws=self.estimate.draws)
         if self.declared and np.abs((moved.eta - self.prior.centre) / DECLARED).max() > WRONG:
             held, moved = replace(held, declared=False, prior=ANY), estimate(carrier, kept, self.before)
         return replace(held, due=GROWTH * count, estimate=moved)
 
     def refinement(self, carrier: Carrier) -> Generator[None, None, Held] | None:
         """The same with a refined estimate, step by step; None where that would tell nothing new."""
-        # with more rows, what was as good as linear stays so for long
-        growth = GROWTH if self.estimate.draws else ANEW
-        if not carrier.bends or self.declared or not len(self.rows) or self.count < growth * self.refined:
+        if not carrier.bends or self.declared or not len(self.rows):
             return None
-        return self._refined(carrier)
+        # with more rows, what was as good as linear stays so for long
+        if self.count >= (GROWTH if self.estimate.draws else ANEW) * self.refined:
+            return self._refined(carrier, anew=False)
+        if self.estimate.draws and self.count >= ANEW * self.begun:
+            return self._refined(carrier, anew=True)
+        return None
 
-    def _refined(self, carrier: Carrier) -> Generator[None, None, Held]:
-        anew = self.count >= ANEW * self.begun
+    def _refined(self, carrier: Carrier, anew: bool) -> Generator[None, None, Held]:
         found = yield from refine(carrier, self.rows, self.before, self.prior, self.estimate, anew)
         begun = self.count if anew else self.begun
         return replace(self, estimate=found, refined=self.count, begun=begun, due=GROWTH * self.count)
 
     def with_refined(self, refined: Held) -> Held:
         """The same, refined from fewer rows while these came."""
+        if self.due > GROWTH * refined.due:  # it was estimated again, from many more rows
+            newer = replace(self.estimate, draws=refined.estimate.draws)
+            return replace(self, estimate=newer, refined=refined.refined, begun=refined.begun)
         return replace(self, estimate=refined.estimate, refined=refined.refined, begun=refined.begun, due=refined.due)
 
 

@@ -26,24 +26,25 @@ from lipcore.kernels.arm_prior import Alternative
 from lipcore.model.payload import Carrier, Load
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, Known, body, inverse
-from lipcore.online.draws import SEED, Draw, Place, Point, Training, arms, linearised_around, minimum
+from lipcore.online.draws import SEED, Draw, Place, Point, Training, arms, descent, linearised_around, minimum
 from lipcore.online.errors import correlation_roots, whitened
 from lipcore.online.estimate import Estimate, Seen, alone, rows_of
 from lipcore.online.linear import linear
 from lipcore.robots.urdf import PARAMETERS
 
-FIRST, NEXT, ROUNDS, FEW = 30, 2, 8, 4
+FIRST, NEXT, ROUNDS, FEW = 30, 2, 8, 2
 """Steps at most of an estimate from nothing and of one that begins at another; of a refined one, and of a draw from its
 posterior."""
-LINEAR, SOFT, FAR = 2.0, 3.0, 10.0
-"""The mean square, in deviations of the linear posterior, up to which it is as good; and the energies above the least,
-for each number that is unknown, nats, over which a draw counts e times less, as it has not come far enough yet, and
-from which on rows have ruled it out."""
+LINEAR, HOT, FAR = 2.0, 30.0, 100.0
+"""The mean square, in deviations of the linear posterior, up to which it is as good; and the energies, nats, by which a
+draw counts e times less, as what the training is taken to say of arms far away is off by as much, and from which on
+rows have ruled it out."""
 DOUBT = 5.0
-"""Times by which an estimate without draws takes its rows and the arm's training for less exact than they are:
-linear posteriors of bent valleys are too narrow. Chosen on simulated arms (seed 1 of `benchmarks.online.arms`): after
-10, 30 and 100 rows 95 % intervals hold 98, 96 and 80 % of an unseen motion's torques on the worst of three arms (with
-1: 89, 77 and 57); those of the next rows are 1.8 to 2.3, 1.5 to 1.7 and 1.2 to 1.3 times as wide."""
+"""Times by which an estimate takes its rows and the arm's training for less exact than they are, without draws and
+where the last axis is open: linear posteriors of bent valleys are too narrow, and draws come into few valleys. Chosen
+on simulated arms (seed 1 of `benchmarks.online.arms`): after 10, 30 and 100 rows 95 % intervals hold 98, 96 and 80 %
+of an unseen motion's torques on the worst of three arms (with 1: 89, 77 and 57); those of the next rows are 1.8 to 2.3,
+1.5 to 1.7 and 1.2 to 1.3 times as wide."""
 MEDIAN = 0.6745
 """Of the absolute value of what has a normal distribution, standard deviations."""
 
@@ -69,37 +70,53 @@ def refine(
     start: Estimate | None = None,
     anew: bool = False,
 ) -> Generator[None, None, Estimate]:
-    """The same estimate with draws from the posterior, for an arm that bends; it yields after each of them, so that
+    """The same estimate with draws from the posterior, for an arm that bends; it yields after each step, so that
     something else can be done meanwhile. anew: whether draws that rows have ruled out begin again."""
-    problem, draw = _Problem.of(carrier, rows, before, prior), np.random.default_rng([SEED, len(rows)])
+    problem = _Problem.of(carrier, rows, before, prior)
     start = problem.usable(start)
-    at = minimum(problem, problem.at(problem.begin(start)), FIRST if start is None else ROUNDS)
-    yield
+    at = yield from descent(problem, problem.at(problem.begin(start)), FIRST if start is None else ROUNDS)
     known = () if start is None else start.draws
     # another revision of the training may know more, or less
-    known = tuple(each for each in known if len(each.noise) == len(at.residual) - problem.tau.size)
+    known = tuple(each for each in known if each.usable(len(at.residual) - problem.tau.size))
     if not known:
-        drawn = yield from arms(carrier)
-        known = tuple(_carrying(each, at) for each in drawn)
-    points = []
-    for each in known:
-        points.append((problem.sought(each, draw), each.noise))
-        yield
+        begun = yield from arms(carrier)
+        known = tuple(_carrying(each, at) for each in begun)
+    found = []
+    for number, each in enumerate(known):
+        point = yield from problem.sought(each, number, FEW)
+        found.append(Found(point, each.noise))
+    at = min([at, *(each.point for each in found)], key=_energy)
     if anew:
-        out = _ruled_out(min([at, *(point for point, _ in points)], key=lambda each: each.energy))
-        for place, (point, _) in enumerate(points):
-            if point.energy > out:
-                again = _carrying(problem.training.drawn(draw), at)
-                points[place] = problem.sought(again, draw, FIRST), again.noise
-                yield
-    # each of them is the minimum for other noise
-    other = minimum(problem, min([point for point, _ in points], key=lambda each: each.energy), ROUNDS)
-    return problem.estimate(min([at, other], key=lambda each: each.energy), points)
+        for number in [number for number, each in enumerate(found) if each.excess(at) > FAR]:
+            draw = np.random.default_rng([SEED, number, len(rows)])
+            again = _carrying((yield from problem.training.begun(number, draw)), at)
+            point = yield from problem.sought(again, number, FIRST)
+            found[number] = min(found[number], Found(point, again.noise), key=lambda each: each.point.energy)
+    # each draw is the minimum for other noise
+    other = yield from descent(problem, min((each.point for each in found), key=_energy), ROUNDS)
+    return problem.estimate(min(at, other, key=_energy), found)
+
+
+def _energy(at: Point) -> float:
+    return at.energy
 
 
 def _carrying(arm: Draw, at: Point) -> Draw:
     """An arm that carries what is most likely."""
     return replace(arm, place=replace(arm.place, eta=at.place.eta))
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A draw where it has come to. noise: see `Draw`."""
+
+    point: Point
+    noise: Array | None
+
+    def excess(self, least: Point) -> float:
+        """Energy above what a draw has on average, which is half a nat for each number that is unknown."""
+        usual = 0.0 if self.noise is None else 0.5 * least.derivative.shape[1]
+        return self.point.energy - least.energy - usual
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,26 +172,38 @@ class _Problem:
             others, torque_free = rows_of(linearised_around(self.carrier, place, np.zeros(PARAMETERS)), *self.free)
             others[-PARAMETERS:] = 0.0
             features, torque = np.concatenate([others, features], axis=1), np.concatenate([torque_free, torque])
-        features, off = whitened(self.roots, features, torque - self.tau)
         root = np.linalg.cholesky(self.prior.precision).T
-        by_rows = np.hstack([features[:size].T @ self.carrier.memory.root, features[size:].T @ slope])
-        derivative = np.concatenate([trained.derivative, by_rows])
-        derivative[len(trained.derivative) - PARAMETERS : len(trained.derivative), size:] = root
+        _, off = whitened(self.roots, features[:0], torque - self.tau)
+        first = len(trained.residual) - PARAMETERS
+
+        def derivative() -> Array:
+            along, _ = whitened(self.roots, features, torque - self.tau)
+            by_rows = np.hstack([along[:size].T @ self.carrier.memory.root, along[size:].T @ slope])
+            out = np.concatenate([trained.derivative, by_rows])
+            out[first : len(trained.residual), size:] = root
+            return out
+
         residual = np.concatenate([trained.residual, off])
-        residual[len(trained.residual) - PARAMETERS : len(trained.residual)] = root @ (place.eta - self.prior.centre)
-        return Point(place, residual, derivative, float((off**2).mean()))
+        residual[first : len(trained.residual)] = root @ (place.eta - self.prior.centre)
+        return Point(place, residual, float((off**2).mean()), derivative)
 
-    def sought(self, begin: Draw, draw: np.random.Generator, rounds: int = FEW) -> Point:
+    def sought(self, begin: Draw, number: int, rounds: int) -> Generator[None, None, Point]:
         """A draw from the posterior: the minimum for other noise of the training, of what is known of payloads and of
-        the rows (randomised maximum likelihood, Kitanidis 1995, Oliver et al. 1996)."""
-        noise = np.append(begin.noise, draw.standard_normal(self.tau.size))
-        return minimum(self, self.at(begin.place), rounds, noise)
+        the rows (randomised maximum likelihood, Kitanidis 1995, Oliver et al. 1996). number: of the draw, which has the
+        same noise of the same rows each time, and is near where it was."""
+        of_rows, noise = np.random.default_rng([SEED, number]).standard_normal(self.tau.size), begin.noise
+        yield
+        return (
+            yield from descent(self, self.at(begin.place), rounds, 0.0 if noise is None else np.append(noise, of_rows))
+        )
 
-    def estimate(self, at: Point, points: Sequence[tuple[Point, Array]] = ()) -> Estimate:
-        """What is known with the most likely place, and draws with their noise."""
+    def estimate(self, at: Point, found: Sequence[Found] = ()) -> Estimate:
+        """What is known with the most likely place, and draws."""
         carrier, size = self.carrier, len(self.carrier.mean)
-        derivative, doubt, first = at.derivative, np.full(len(at.derivative), DOUBT), len(at.residual) - self.tau.size
-        if not points:
+        derivative, first = at.derivative, len(at.residual) - self.tau.size
+        sure = bool(found) and not carrier.open_tip
+        if not sure:
+            doubt = np.full(len(derivative), DOUBT)
             doubt[:size] = doubt[first - PARAMETERS : first] = 1.0  # what was expected before anything was seen
             derivative = derivative / doubt[:, None]
         # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
@@ -185,14 +214,14 @@ class _Problem:
         outward[:size, :size], outward[size:, size:] = carrier.memory.root, slope
         outward = outward @ root
         room = PARAMETERS * np.diagonal(slope @ inverse(self.prior.precision) @ slope.T)
-        others, bent = _others(carrier, at, root, [point for point, _ in points])
-        draws = tuple(Draw(point.place, noise) for point, noise in points) if bent else ()
+        others, bent = _others(carrier, at, root, found)
+        draws = tuple(Draw(each.point.place, each.noise) for each in found) if bent else ()
         load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry, others)
         of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
         if others:
-            wider = _wider(np.sqrt(np.diagonal(of_eta)), [point.place.eta - eta for point, _ in points])
+            wider = _wider(np.sqrt(np.diagonal(of_eta)), [each.point.place.eta - eta for each in found])
             of_eta *= np.outer(wider, wider)
-        return Estimate(eta, of_eta, load, *self.gains(at), draws, 1.0 if points else DOUBT)
+        return Estimate(eta, of_eta, load, *self.gains(at), draws, 1.0 if sure else DOUBT)
 
     def gains(self, at: Point) -> tuple[float, float]:
         """Nats by which a payload, and a contact of constant torque, explain the rows better than the arm does without
@@ -208,29 +237,23 @@ def _wider(std: Array, off: Sequence[Array]) -> Array:
     return np.maximum(1.0, np.median(np.abs(off), axis=0) / (MEDIAN * std))
 
 
-def _ruled_out(least: Point) -> float:
-    """Energy from which on a draw is ruled out, nats."""
-    return least.energy + FAR * len(least.derivative.T)
-
-
-def _others(carrier: Carrier, at: Point, root: Array, points: Sequence[Point]) -> tuple[tuple[Alternative, ...], bool]:
+def _others(carrier: Carrier, at: Point, root: Array, found: Sequence[Found]) -> tuple[tuple[Alternative, ...], bool]:
     """Arms all over the posterior where it is far from linear, the most likely one first; and whether it is.
 
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
     linear posterior is tangent to it at one place.
     """
-    reached = [each for each in points if each.energy < _ruled_out(at)]
-    known = [each.place for each in reached]
+    reached = [each for each in found if each.excess(at) < FAR and each.point is not at]
+    known = [each.point.place for each in reached]
     if not known:
-        return (), bool(points)
+        return (), bool(found)
     off = [np.zeros(len(root))]
     for each in known:
         w = solve_triangular(carrier.memory.root, each.w - at.place.w, lower=True, check_finite=False)
         off.append(solve_triangular(root, np.append(w, each.eta - at.place.eta), check_finite=False))
-    if np.square(off[1:]).mean() < LINEAR:
+    if np.square(off[1:]).mean() < LINEAR and not carrier.open_tip:
         return (), False
-    excess = np.array([each.energy - at.energy for each in (at, *reached)])
-    shares = np.exp(-excess / (SOFT * len(root)))
+    shares = np.exp(-np.array([0.0, *(max(0.0, each.excess(at)) for each in reached)]) / HOT)
     return tuple(
         carrier.alternative(each.w, each.geometry, body(each.eta)[0], share)
         for each, share in zip((at.place, *known), shares / shares.sum(), strict=True)

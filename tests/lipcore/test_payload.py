@@ -12,6 +12,7 @@ from lipcore.model.body import Body
 from lipcore.model.payload import Carrier, Linearised, Load, NoArmError
 from lipcore.online.batch import Rows
 from lipcore.online.bodies import ANY, body, eta_of
+from lipcore.online.draws import arms
 from lipcore.online.estimate import known
 from lipcore.online.payload import estimate, refine
 from lipcore.robots.library import load_robot, pinocchio
@@ -183,6 +184,19 @@ def test_what_training_says_of_an_arm_of_another_geometry_is_what_its_samples_sa
     assert np.median(exact) > 5 * np.median(linear)
 
 
+def test_draws_begin_with_an_open_last_axis_in_each_direction(open_arm):
+    def axes(geometry):
+        turns, _ = geometry.placements(np.zeros(geometry.n_joints))
+        return (turns @ geometry.axis[..., None])[..., 0]
+
+    _, wrist = open_arm
+    begun = [axes(each.place.geometry) for each in finished(arms(wrist))]
+    for each in begun:
+        np.testing.assert_allclose(each[:-1], axes(wrist.term.arm.geometry.moved(wrist.step))[:-1], atol=1e-9)
+    tips = np.array([each[-1] for each in begun])
+    np.testing.assert_allclose(np.sort((tips @ tips.T).ravel()), [-1] * 6 + [0] * 24 + [1] * 6, atol=1e-9)
+
+
 def test_a_payload_shows_where_an_open_geometry_lies_and_its_intervals_hold(open_arm):
     _, carrier = open_arm
     robot, found = load_robot("ur10"), None
@@ -192,7 +206,7 @@ def test_a_payload_shows_where_an_open_geometry_lies_and_its_intervals_hold(open
     for count in (10, 20, 30, 40, 50, 70, 90, 120, 150, 190, 240, 300):
         found = refined(carrier, rows.take(slice(0, count, max(1, count // 100))), start=found)
     mass, std = found.mass
-    assert abs(mass - 1.0) < 4 * std < 0.05
+    assert abs(mass - 1.0) < 4 * std < 0.1
     turned = np.abs(carrier.term.arm.geometry.towards(found.load.geometry)[carrier.term.arm.geometry.turns])
     assert turned.max() > 0.1  # further than anything is linear
     answer = carrier.carrying(found.load).predict(other.q, other.dq, other.ddq)

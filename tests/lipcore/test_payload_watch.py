@@ -175,9 +175,14 @@ def test_what_is_refined_stays_until_more_rows_are_refined(carrier):
     second = first.step(carrier, later).refined(found)
     assert second.held.estimate is found.estimate
     assert second.held.count == first.held.count + len(later)
-    assert second.refinement() is None
-    last = second.step(carrier, rows.take(rows.time >= UP + 0.25))
-    assert (last.held.estimate is found.estimate) == bool(found.estimate.draws)
+    explored = second.refined(refined(second))  # draws that rows have ruled out begin again
+    assert explored.refinement() is None
+    last = explored.step(carrier, rows.take(rows.time >= UP + 0.25))
+    assert last.held.estimate is not explored.held.estimate  # it is estimated again meanwhile
+    assert last.held.estimate.draws is explored.held.estimate.draws
+    late = last.refined(found).held.estimate  # from many fewer rows
+    assert late.load is last.held.estimate.load
+    assert late.draws is found.estimate.draws
     assert refined(last).estimate.mass[0] == pytest.approx(1.0, abs=0.02)
     assert last.put_down(30.0)._around(carrier).refined(found).held is None
     other = last.declare(carrier, Body(1.0, np.array([0.0, 0.04, 0.08])), UP)._around(carrier)

@@ -27,7 +27,8 @@ from service.storage.database import EventRow
 logger = logging.getLogger(__name__)
 
 ALARM_S = 60.0
-"""A robot that picks and places does so all day: of a model, payloads raise no more than one alarm in so long, s."""
+"""A robot that picks and places does so all day: of a model, payloads raise no more than one alarm in so long, s; and
+a machine that is too slow is told of as often."""
 
 
 class Weighing:
@@ -46,6 +47,7 @@ class Weighing:
         self._monitor, self._turn = monitor, turn
         self.process = WeigherProcess(loaded.storage.settings, self.take)
         self._lock = threading.Lock()
+        self._behind_at = -ALARM_S  # Unix time, s, when it was last said that the process is behind
         self._knows: dict[Stream, tuple[int, int]] = {}  # which process, and up to which declaration
         self._revisions: dict[tuple[str, int], tuple[int, int]] = {}  # which process, and which revision
 
@@ -83,6 +85,10 @@ class Weighing:
             revised = Revised(posterior.weights, posterior.root)
         if self.process.give(stream, Unweighed(rows, batch.received, said, revised, known), most=MOST_WAITING):
             self._ask(stream)  # what was dropped may have said what was not known
+            if batch.received - self._behind_at >= ALARM_S:
+                self._behind_at = batch.received
+                text = "rows come faster than payloads are weighed: the oldest are passed over, now of %r of %s"
+                logger.warning(text, batch.stream_id, served.name)
 
     def forget(self, model: str) -> None:
         """Keep nothing of a model that has been deleted."""

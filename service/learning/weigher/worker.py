@@ -28,7 +28,7 @@ from service.storage.files import Files
 
 logger = logging.getLogger(__name__)
 
-REFINING_SHARE, REFINING_S = 0.15, 1.0
+REFINING_SHARE, REFINING_S = 0.15, 2.0
 """CPU time that refining may take, s a second, and at most at once: what was just taken up is refined first of all."""
 
 
