@@ -166,6 +166,7 @@ def _add_middleware(
         others=settings.max_request_bytes,
         seconds=settings.body_s,
         bytes_per_s=settings.body_bytes_per_s,
+        at_once=max(1, settings.max_requests // 4),
     )
     if settings.max_requests_per_s is not None:
         app.add_middleware(RateLimit, per_s=settings.max_requests_per_s, burst=settings.max_request_burst)

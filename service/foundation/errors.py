@@ -300,7 +300,7 @@ async def _cut_off(request: Request, error: Exception) -> JSONResponse:
 
 async def _http_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
-    codes = {404: "not_found", 405: "method_not_allowed", 408: "request_timeout", 413: "too_large"}
+    codes = {404: "not_found", 405: "method_not_allowed", 408: "request_timeout", 413: "too_large", 429: "busy"}
     message = str(error.detail)
     if error.status_code in (404, 405):
         message = f"no route {request.method} {readable(request.url.path[:200])}: /docs lists all"

@@ -13,7 +13,8 @@ from pydantic import AfterValidator, Field, ValidationInfo
 
 from service.foundation.errors import invalid_request
 
-LONGEST = 200
+LONGEST, MOST_NAMED = 200, 1000
+"""Characters of a name; and what a list of names, or of one number a joint, may hold, whatever the settings."""
 
 
 def for_people(field: str, name: str) -> str:
@@ -35,6 +36,8 @@ NameForPeople = Annotated[str, Field(min_length=1, max_length=LONGEST), AfterVal
 
 def numbers(name: str, row: list[Any], nullable: bool = False) -> list[float]:
     """Finite numbers of a JSON list; nullable: any numbers, and null as NaN. Raise InvalidRequestError."""
+    if set(map(type, row)) == {float} and (nullable or all(map(isfinite, row))):
+        return row
     out = []
     for index, number in enumerate(row):
         value, expected = None, "a number, or null where none was measured" if nullable else "a finite number"

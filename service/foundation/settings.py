@@ -99,7 +99,7 @@ class Settings(BaseSettings):
         description="Most torques, samples times joints, that an imported version may stand on: reading it takes "
         "memory that grows with the square, 10000 of them 0.8 GB.",
     )
-    max_request_bytes: Count = Field(8 * MiB, description="Largest body of any other request.")
+    max_request_bytes: Count = Field(2 * MiB, description="Largest body of any other request.")
     max_joints: Count = Field(32, description="Most joints of a robot.")
     min_samples: int = Field(30, ge=10, description="Fewest samples of a data set.")
     max_samples: Count = Field(1_000_000, description="Most samples of a data set.")
@@ -138,7 +138,11 @@ class Settings(BaseSettings):
         description="The same of one address, or network of IPv6; trusted proxies and local sockets have as many as "
         "there may be.",
     )
-    max_requests: Count = Field(256, description="Most requests that are answered at a time; more are answered 429.")
+    max_requests: Count = Field(
+        256,
+        description="Most requests that are answered at a time, and four times as many as may wait for the bodies of "
+        "one client; more are answered 429.",
+    )
     max_requests_per_s: float | None = Field(
         None,
         gt=0,

@@ -35,8 +35,8 @@ Vectors = Annotated[
 
 ComponentNames = Annotated[
     list[ComponentName],
+    Field(max_length=len(COMPONENTS), json_schema_extra={"uniqueItems": True}),  # first: a long list is not looked at
     AfterValidator(each_once),
-    Field(max_length=len(COMPONENTS), json_schema_extra={"uniqueItems": True}),
 ]
 Part = Literal["all", "held_out"]
 """Of a data set that a model is compared with."""
@@ -212,7 +212,7 @@ class TraceRequest(EvaluateRequest):
         1000, ge=1, lt=2**31, description="Rows to show; evenly chosen where there are more. At most 2000 by default"
     )
     components: Annotated[
-        list[TraceComponent], AfterValidator(each_once), Field(max_length=4, json_schema_extra={"uniqueItems": True})
+        list[TraceComponent], Field(max_length=4, json_schema_extra={"uniqueItems": True}), AfterValidator(each_once)
     ] = Field([], description="Also answer these parts of the torque, where the estimator offers them, as in `predict`")
 
 

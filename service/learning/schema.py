@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInf
 
 from lipcore.data.outliers import LARGEST_TORQUE
 from service.foundation.errors import ServiceError
-from service.foundation.fields import numbers, rows_of_numbers
+from service.foundation.fields import MOST_NAMED, numbers, rows_of_numbers
 
 CONTACT_THRESHOLD = (3.0, 100.0)
 """Bounds of the gate of contacts. Within three standard deviations lie the errors of an honest model, so that the gate
@@ -53,7 +53,9 @@ class LearningOptions(BaseModel):
         "`learn`: learning goes on as before",
     )
     torque_limits: list[TorqueLimit] | None = Field(
-        None, description="Largest |tau| of each joint's actuator in N·m, to tell saturated samples; null: not known"
+        None,
+        max_length=MOST_NAMED,
+        description="Largest |tau| of each joint's actuator in N·m, to tell saturated samples; null: not known",
     )
     contact_threshold: float = Field(
         8.0,

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from lipserve.states import JobState, PromotionOption
-from service.foundation.fields import LONGEST
+from service.foundation.fields import LONGEST, MOST_NAMED
 from service.models.schema import VERSION, HeldOutQuality, Holdout, ModelName
 
 _DEFAULTS, _HOLDOUT = FitOptions(), Holdout()
@@ -75,7 +75,7 @@ class JobRequest(BaseModel):
     )
 
     model: ModelName = Field(description="Name of the model; a new version of it is made")
-    datasets: list[DatasetName] = Field(min_length=1, description="Ids or names of data sets")
+    datasets: list[DatasetName] = Field(min_length=1, max_length=MOST_NAMED, description="Ids or names of data sets")
     estimator: str = Field(
         DEFAULT_ESTIMATOR,
         max_length=40,
@@ -83,7 +83,9 @@ class JobRequest(BaseModel):
         "the simplest unless another one is surely better",
     )
     joint_types: list[JointType] | None = Field(
-        None, description="One a joint; by default those of the robot that a data set was uploaded with, else revolute"
+        None,
+        max_length=MOST_NAMED,
+        description="One a joint; by default those of the robot that a data set was uploaded with, else revolute",
     )
     robot: str | None = Field(
         None,
@@ -116,7 +118,9 @@ class JobDraft(JobRequest):
     """What somebody means to train on what, maybe on recordings that are not uploaded yet."""
 
     datasets: list[DatasetName] = Field(
-        [], description="Those that are there already; without any, what depends on the data is not checked"
+        [],
+        max_length=MOST_NAMED,
+        description="Those that are there already; without any, what depends on the data is not checked",
     )
 
 

@@ -19,8 +19,8 @@ from service.foundation.fields import first_repeat
 
 JSON, OCTETS = b"application/json", b"application/octet-stream"
 _ANY_JSON = re.compile(rb"application/([^;/]+\+)?json\s*(;.*)?", re.IGNORECASE | re.DOTALL)
-MOST_PARAMETERS = 100
-"""Query parameters that are read at all."""
+MOST_PARAMETERS, MOST_FIELDS = 100, 1000
+"""Query parameters, and fields of a JSON object, that are read at all."""
 
 
 class Route(APIRoute):
@@ -116,6 +116,8 @@ class _JsonRequest(Request):
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    if len(pairs) > MOST_FIELDS:
+        raise invalid_request("body", f"an object of {len(pairs)} fields", f"at most {MOST_FIELDS}")
     value = dict(pairs)
     if len(value) < len(pairs):
         index = first_repeat(name for name, _ in pairs)

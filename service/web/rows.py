@@ -19,6 +19,7 @@ from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, invalid_request, problem
 from service.storage.database import AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow
+from service.web.observability.logs import KEY_ID, asked
 
 USUAL = 50
 Row = TypeVar("Row", AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow)
@@ -79,21 +80,25 @@ KeyHeader = Annotated[
 
 @dataclass(frozen=True)
 class Identity:
-    """A request as its client names it, and the digest of what it says."""
+    """A request as its client names it, and the digest of what it says. stored: the name among those of all clients."""
 
     key: str
+    stored: str
     digest: str
 
 
 def identity(key: str | None, *content: Any, file: Path | None = None) -> Identity | None:
-    """The identity of a request; None where it has no key. content: JSON of what it asks; file: what it brings."""
+    """The identity of the request that is being answered; None where it has no key. content: JSON of what it asks;
+    file: what it brings. Each API key has names of its own."""
     if key is None:
         return None
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
     if file is not None:
         with file.open("rb") as opened:
             digest.update(hashlib.file_digest(opened, "sha256").digest())
-    return Identity(key, digest.hexdigest())
+    client = (asked.get() or {}).get(KEY_ID)
+    stored = key if client is None else hashlib.sha256(f"{client} {key}".encode()).hexdigest()
+    return Identity(key, stored, digest.hexdigest())
 
 
 def done(session: Session, table: type[Made], named: Identity | None) -> Made | None:
@@ -101,7 +106,7 @@ def done(session: Session, table: type[Made], named: Identity | None) -> Made | 
     key. Inside a transaction nobody else can make one meanwhile."""
     if named is None:
         return None
-    row = session.scalar(select(table).where(table.idempotency_key == named.key))
+    row = session.scalar(select(table).where(table.idempotency_key == named.stored))
     if row is not None and row.request_digest != named.digest:
         raise ConflictError(
             f"{HEADER} is {named.key}, the key of another request, which made {row.id}: give every request its own",
@@ -113,4 +118,4 @@ def done(session: Session, table: type[Made], named: Identity | None) -> Made | 
 def mark(row: DatasetRow | JobRow, named: Identity | None) -> None:
     """Write the identity of the request into the row that it makes."""
     if named is not None:
-        row.idempotency_key, row.request_digest = named.key, named.digest
+        row.idempotency_key, row.request_digest = named.stored, named.digest

@@ -75,8 +75,16 @@ export function colours(n) {
 // without its bar of buttons: they cannot be reached by keys in what is a picture, and one would send the plot to another host
 const CONFIG = { responsive: true, displayModeBar: false };
 
+/** A text that Plotly shows as it is: it takes some HTML for markup, and names of joints are anybody's. */
+export function literal(text) {
+  return String(text).replaceAll("&", "&amp;").replaceAll("<", "&lt;");
+}
+
 function painted(traces) {
-  return traces.flat().map(({ colour, filled, ...trace }) => {
+  return traces.flat().map(({ colour, filled, ...given }) => {
+    const trace = { ...given };
+    if (trace.name !== undefined) trace.name = literal(trace.name);
+    if (trace.text !== undefined) trace.text = Array.isArray(trace.text) ? trace.text.map(literal) : literal(trace.text);
     if (colour === undefined) return trace;
     const found = typeof colour === "number" ? jointColour(colour) : css(colour) || colour;
     const made = { ...trace, line: { color: found, ...trace.line } };
@@ -88,13 +96,13 @@ function painted(traces) {
 
 function themed({ title = "", x = "", y = "", height = 300, ...rest }) {
   const axis = { gridcolor: css("line"), zerolinecolor: css("line-strong"), linecolor: css("line-strong"), automargin: true };
-  const own = (name, text) => ({ ...axis, ...rest[name], title: { text, standoff: 8, ...rest[name]?.title } });
+  const own = (name, text) => ({ ...axis, ...rest[name], title: { text: literal(text), standoff: 8, ...rest[name]?.title } });
   return {
     margin: { l: 56, r: 16, t: title ? 40 : 16, b: 44 },
     legend: { orientation: "h", y: -0.22, yanchor: "top" },
     hovermode: "x unified",
     ...rest,
-    title: title ? { text: title, x: 0, xanchor: "left", font: { size: 15 } } : undefined,
+    title: title ? { text: literal(title), x: 0, xanchor: "left", font: { size: 15 } } : undefined,
     height,
     autosize: true,
     paper_bgcolor: "rgba(0,0,0,0)",

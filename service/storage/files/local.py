@@ -25,9 +25,9 @@ def check_sha256(path: Path, sha256: str) -> None:
     try:
         digest = sample_file.sha256(path)
     except FileNotFoundError:
-        raise DamagedFileError(f"{path} is missing") from None
+        raise DamagedFileError(f"{path.name} is missing") from None
     if digest != sha256:
-        raise DamagedFileError(f"{path} does not have the sha256 that was kept of it")
+        raise DamagedFileError(f"{path.name} does not have the sha256 that was kept of it")
 
 
 def write_durably(path: Path, write: Callable[[IO[bytes]], Result], draft: Path | None = None) -> Result:

@@ -152,7 +152,7 @@ class Files:
         try:
             return path.read_bytes()
         except FileNotFoundError:
-            raise DamagedFileError(f"{path} is missing") from None
+            raise DamagedFileError(f"{path.name} is missing") from None
 
     def delete_snapshot(self, snapshot: str) -> None:
         """Delete a snapshot; nothing happens where there is none."""
@@ -180,11 +180,11 @@ class Files:
         A copy that is damaged, or was deleted meanwhile, is fetched again, once.
         """
         try:
-            return read(self._place.version(name))
+            return _read_in(self._place.version(name), read)
         except ModelFormatError:
             if not self.shared:
                 raise
-        return read(self._place.version(name, again=True))
+        return _read_in(self._place.version(name, again=True), read)
 
     def load_version(self, name: str, checksums: Mapping[str, str] | None) -> TorqueModel:
         """Load a version, see `lipcore.load`; raise ModelFormatError where it is damaged or missing."""
@@ -242,6 +242,15 @@ class Files:
             path = self._place.file(key, again=True)  # the copy may be damaged, not the object
             local.check_sha256(path, sha256)
         return path
+
+
+def _read_in(folder: Path, read: Callable[[Path], Result]) -> Result:
+    """What `read` makes of a folder. Where that is damaged, the error tells no client where it lies."""
+    try:
+        return read(folder)
+    except ModelFormatError as error:
+        message = str(error).replace(f"{folder}/", "").replace(str(folder), "its folder")
+        raise ModelFormatError(message, error.file) from error
 
 
 @contextmanager

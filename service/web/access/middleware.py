@@ -40,11 +40,8 @@ def secret_of(scope: Scope) -> bytes | None:
 
 
 def subprotocol_of(offered: Iterable[str]) -> str | None:
-    """Return the subprotocol to agree on, of those that a client offers: browsers insist on one of theirs."""
-    offered = list(offered)
-    if SUBPROTOCOL in offered:
-        return SUBPROTOCOL
-    return next((each for each in offered if each.startswith(KEY_SUBPROTOCOL)), None)
+    """Return the subprotocol to agree on, None where only the key is offered: answers repeat no keys."""
+    return SUBPROTOCOL if SUBPROTOCOL in offered else None
 
 
 SAFE = frozenset({"GET", "HEAD", "OPTIONS"})

@@ -4,6 +4,7 @@ may ask, how large a body may be and how long it may take."""
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -28,17 +29,19 @@ class BodyLimit:
     """Refuse to read more of a body than the limit, and to wait for one that comes too slowly.
 
     limits: most bytes by path; others: of all other paths; seconds: longest wait for a body, and one second more for
-    every `bytes_per_s` that came. Only waiting counts, not what the application does between two pieces.
+    every `bytes_per_s` that came. Only waiting counts, not what the application does between two pieces. at_once:
+    bodies of one client that are waited for at a time; more are answered 429.
 
     Not FastAPI's `max_body_size`: to a body whose length is announced, that answers in plain text. Not a timer for
     each request either: 2 µs, where looking at all that wait now and then costs a fifth.
     """
 
     def __init__(
-        self, app: ASGIApp, limits: Mapping[str, int], others: int, seconds: float, bytes_per_s: float
+        self, app: ASGIApp, limits: Mapping[str, int], others: int, seconds: float, bytes_per_s: float, at_once: int
     ) -> None:
         self.app, self.limits, self.others = app, dict(limits), others
-        self.seconds, self.bytes_per_s = seconds, bytes_per_s
+        self.seconds, self.bytes_per_s, self.at_once = seconds, bytes_per_s, at_once
+        self._waited_for: Counter[str] = Counter()  # bodies, by client
         self._due: dict[asyncio.Task[Any], float | None] = {}  # when each ends that waits; None: it is ended
         self._looking: asyncio.AbstractEventLoop | None = None
 
@@ -52,7 +55,7 @@ class BodyLimit:
         for name, value in scope["headers"]:
             if name == b"content-length":
                 refused = value.isdigit() and (len(value) > 18 or int(value) > limit)
-        seen, waited, complete = 0, 0.0, False
+        client, seen, waited, complete = client_of(scope), 0, 0.0, False
 
         async def limited() -> Message:
             nonlocal seen, waited, complete
@@ -60,9 +63,12 @@ class BodyLimit:
                 return await receive()
             if refused:
                 raise _too_large(limit)
+            if self._waited_for[client] >= self.at_once:
+                raise _too_many(client, self.at_once)
             task = asyncio.current_task()
             assert task is not None
             began = monotonic()
+            self._waited_for[client] += 1
             self._due[task] = began - waited + self.seconds + seen / self.bytes_per_s
             if self._looking is not task.get_loop():
                 self._look_later()
@@ -74,6 +80,9 @@ class BodyLimit:
                 raise
             finally:
                 del self._due[task]
+                self._waited_for[client] -= 1
+                if not self._waited_for[client]:
+                    del self._waited_for[client]
             complete = not message.get("more_body", False)
             if not complete:
                 waited += monotonic() - began
@@ -103,6 +112,11 @@ class BodyLimit:
 
 def _too_large(limit: int) -> HTTPException:
     return HTTPException(413, f"the body has more than {limit} bytes, the most that is taken here")
+
+
+def _too_many(client: str, most: int) -> HTTPException:
+    message = f"{most} bodies of {client} are being waited for, the most there may be: send fewer at a time"
+    return HTTPException(429, message, {"Retry-After": "1", "Connection": "close"})
 
 
 def _too_slow(seen: int) -> HTTPException:

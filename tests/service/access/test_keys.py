@@ -17,7 +17,7 @@ from service.web.access import keys as keyring_module
 from service.web.access.keys import Keyring
 from service.web.access.scopes import ADMIN
 from tests.service.access.conftest import REFRESH_S, bearer
-from tests.service.data import error, eventually
+from tests.service.data import arrays, error, eventually, npz, stream
 
 
 @pytest.mark.own_files("reads the file of the database")
@@ -49,6 +49,22 @@ def test_a_key_comes_as_a_bearer_token(guarded):
         assert answer.headers["www-authenticate"] == 'Bearer realm="lipserve"'
     for scheme in ("Bearer", "bearer", "BEARER"):
         assert guarded.api.get("/v1/models", headers={"Authorization": f"{scheme} {key}"}).status_code == 200
+
+
+def test_each_key_has_idempotency_keys_of_its_own(guarded):
+    secrets = [guarded.make("train")[1] for _ in range(2)]
+    eventually(lambda: all(guarded.api.get("/v1/jobs", headers=bearer(each)).status_code != 401 for each in secrets))
+
+    def upload(secret, seed):
+        headers = {**bearer(secret), "content-type": "application/x-npz", "Idempotency-Key": "mine"}
+        return guarded.api.post("/v1/datasets", content=npz(**arrays(stream(seed=seed))), headers=headers)
+
+    one, other = upload(secrets[0], 1), upload(secrets[1], 2)
+    assert (one.status_code, other.status_code) == (201, 201)
+    assert one.json()["id"] != other.json()["id"]
+    assert upload(secrets[0], 1).json() == one.json()
+    refusal = error(upload(secrets[1], 1), 409, "conflict")
+    assert (refusal["detail"][0]["value"], one.json()["id"] in refusal["message"]) == ("mine", False)
 
 
 def test_what_is_not_a_key_is_not_repeated(guarded, caplog):

@@ -13,13 +13,13 @@ SOON = 0.05
 LONG = 60.0
 
 
-def limit(app, seconds=LONG, bytes_per_s=1e9, most=100):
-    return BodyLimit(app, {"/large": 1000}, most, seconds, bytes_per_s)
+def limit(app, seconds=LONG, bytes_per_s=1e9, most=100, at_once=100):
+    return BodyLimit(app, {"/large": 1000}, most, seconds, bytes_per_s, at_once)
 
 
-def scope(path="/", length=None):
+def scope(path="/", length=None, client="192.0.2.1"):
     headers = [] if length is None else [(b"content-length", str(length).encode())]
-    return {"type": "http", "path": path, "headers": headers}
+    return {"type": "http", "path": path, "headers": headers, "client": (client, 1)}
 
 
 def coming(*pieces, more=False):
@@ -129,3 +129,26 @@ def test_streams_and_the_start_pass(kind):
     app = AsyncMock()
     served(limit(app), {"type": kind}, None)
     app.assert_awaited_once_with({"type": kind}, None, None)
+
+
+def test_of_one_client_so_many_bodies_are_waited_for_at_a_time():
+    middleware, sent = limit(reads, at_once=2), asyncio.Event()
+
+    async def slow():
+        await sent.wait()
+        return {"type": "http.request", "body": b"x", "more_body": False}
+
+    async def run():
+        waiting = [asyncio.ensure_future(middleware(scope(), slow, None)) for _ in range(2)]
+        await asyncio.sleep(0)
+        with pytest.raises(HTTPException) as refused:
+            await middleware(scope(), coming(b"x"), None)
+        await middleware(scope(client="192.0.2.2"), coming(b"x"), None)  # another one's is taken
+        sent.set()
+        await asyncio.gather(*waiting)
+        await middleware(scope(), coming(b"x"), None)
+        return refused.value
+
+    refusal = asyncio.run(run())
+    assert (refusal.status_code, refusal.headers["Retry-After"]) == (429, "1")
+    assert "2 bodies of 192.0.2.1" in refusal.detail

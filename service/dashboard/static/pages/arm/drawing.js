@@ -2,7 +2,7 @@
 
 import { css, faint, jointColour } from "../../colours.js";
 import { shortNames } from "../../format.js";
-import { plot } from "../../plots.js";
+import { literal, plot } from "../../plots.js";
 import { add, centres, frames, scaled, times, upright } from "./kinematics.js";
 
 const AXIS = 0.12; // half an axis' length, of the arm's size
@@ -80,7 +80,7 @@ class Arm {
       path(links, { name: "links", line: { color: css("muted"), width: 7 }, hoverinfo: "skip" }),
       path(arms, { name: "to the masses", line: { color: css("line-strong"), width: 2 }, hoverinfo: "skip", connectgaps: false }),
       ...turned.map(({ origin, axis }, place) => path([add(origin, scaled(axis, -half)), add(origin, scaled(axis, half))], {
-        name: this.names[place], line: { color: jointColour(place), width: order[place] === this.thick ? THICK : 9 }, hovertemplate: `${this.names[place]}, ${this.geometry.joints[place].type}<extra></extra>`,
+        name: this.names[place], line: { color: jointColour(place), width: order[place] === this.thick ? THICK : 9 }, hovertemplate: `${literal(this.names[place])}, ${this.geometry.joints[place].type}<extra></extra>`,
       })),
       {
         ...points(masses), type: "scatter3d", mode: "markers", name: "masses", showlegend: false,
