@@ -42,8 +42,9 @@ numbers, so that the posterior is nowhere wider than its prior, as the evaluator
 
 CERTAIN = 1e-12
 """Variance of a payload's parameter that is known."""
-OPEN_RAD = 0.1
-"""A last axis whose direction is known no better is open, standard deviation in rad."""
+TURNS, OPEN_RAD = 2, 0.1
+"""Numbers of a joint's geometry that are turns, the first ones; and a last axis of which samples tell the direction no
+better is open, standard deviation in rad."""
 LEAST = 1e-14
 """Smallest variance of whitened variables, of prior variance one."""
 
@@ -152,10 +153,12 @@ class Carrier:
 
     @property
     def open_tip(self) -> bool:
-        """Whether the training leaves open how the last axis lies, which bears next to nothing."""
+        """Whether the training's samples leave open how the last axis lies, which bears next to nothing. It may be
+        expected at a right angle all the same, but then at any."""
         arm = self.term.arm
-        turns = self.covariance.diagonal()[self.steps] * arm.widths**2 * arm.geometry.turns
-        return bool((turns[-arm.geometry.screws[-1] :] > OPEN_RAD**2).any())
+        taught = (1 / self.covariance.diagonal()[self.steps] - 1) / arm.widths**2
+        first = arm.steps - arm.geometry.screws[-1]
+        return bool((taught[first : first + TURNS] < OPEN_RAD**-2).any())
 
     @property
     def step(self) -> Array:

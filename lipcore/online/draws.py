@@ -7,7 +7,7 @@ Those of the training alone are made once; rows with a payload move them on (`pa
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol, cast
 from weakref import WeakKeyDictionary
@@ -55,14 +55,11 @@ class Place:
 
     def shifted(self, carrier: Carrier, by: Array, eta: Array) -> Place:
         """The place where w is larger by (M,), its geometry moved as far, and η by (10,)."""
-        geometry = self.geometry.moved(carrier.root[carrier.steps] * by[carrier.steps])
-        return Place(self.w + by, geometry, self.eta + eta).there(carrier, geometry)
-
-    def there(self, carrier: Carrier, geometry: Geometry) -> Place:
-        """The place with another geometry."""
-        w, arm = self.w.copy(), carrier.term.arm
-        w[carrier.steps] = (arm.geometry.towards(geometry) - arm.expected) / carrier.root[carrier.steps]
-        return Place(w, geometry, self.eta)
+        steps, learnt = carrier.steps, carrier.term.arm.geometry
+        w, geometry = self.w + by, self.geometry.moved(carrier.root[steps] * by[steps])
+        # steps do not add up where they are large
+        w[steps] = self.w[steps] + (learnt.towards(geometry) - learnt.towards(self.geometry)) / carrier.root[steps]
+        return Place(w, geometry, self.eta + eta)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +179,7 @@ class Training:
         learnt = Place(carrier.mean, geometry, ANY.centre)
         if carrier.open_tip:
             layout = (*[None] * (geometry.n_joints - 1), number % len(DIRECTIONS))
-            return Draw(learnt.there(carrier, laid_out(geometry, layout)), None)
+            return Draw(replace(learnt, geometry=laid_out(geometry, layout)), None)  # which is as likely beforehand
         by = draw.uniform(*WIDE) * carrier.memory.root @ draw.standard_normal(len(carrier.mean))
         at = self.at(learnt.shifted(carrier, by, np.zeros(PARAMETERS)))
         noise = draw.standard_normal(len(at.residual))
