@@ -55,11 +55,12 @@ PayloadState = Literal["none", "payload", "contact", "friction"]
 
 CODES = (
     *("learnt", "non_finite", "limit", "time_jump", "saturation", "stationary"),
-    *("contact", "change", "edge", "payload", "late", "paused"),
+    *("contact", "change", "edge", "payload", "late", "paused", "implausible"),
 )
 """What may become of a row. All but the first keep it out of learning: a number that is not finite; a position,
 velocity, acceleration or torque beyond its limit; time that goes backwards or leaps; torque at its actuator's limit; a
 robot at rest, whose stiction hides its torque; a contact; a changed robot whose owner has not decided yet; the edge of
 a recording, where an acceleration cannot be derived; an arm that carries something, of which it teaches instead; a row
-that came so late that by forgetting it no longer counts; one that came while learning was paused."""
+that came so late that by forgetting it no longer counts; one that came while learning was paused; a torque that nobody
+has measured."""
 LEARNT = 0

@@ -108,6 +108,33 @@ def is_contact(tau: Array, mean: Array, std: Array, noise_std: Array, threshold:
     return np.asarray((np.abs(external(tau, mean, std, noise_std).z) > threshold).any(axis=1))
 
 
+SURELY, ECHOED = 5.0, 1e-9
+"""Standard deviations of the noise from which on a torque is surely another one; N·m or N up to which two are one."""
+
+
+def is_implausible(tau: Array, mean: Array, noise_std: Array, gravity: bool) -> Mask:
+    """Rows, (N,) in order of time, whose torque nobody has measured; all of them where most are.
+
+    tau, mean: (N, n), said to be measured, and the model's; noise_std: (n,); gravity: whether torques contain it.
+
+    - Zero at all joints, where gravity makes it surely another one.
+    - The model's own at all joints, of this row or of the one before: a command, or an answer, that is sent back.
+    - The same at all joints from row to row, while the model's surely becomes another one.
+    """
+    found = np.zeros(len(tau), np.bool_)
+    if not len(tau):
+        return found
+    if gravity:
+        found |= (tau == 0).all(axis=1) & (np.abs(mean) > SURELY * noise_std).any(axis=1)
+    found |= (np.abs(tau - mean) < ECHOED).all(axis=1)
+    found[1:] |= (np.abs(tau[1:] - mean[:-1]) < ECHOED).all(axis=1)
+    run = np.concatenate([[0], np.cumsum((tau[1:] != tau[:-1]).any(axis=1))])  # of rows that are the same
+    first = np.searchsorted(run, run)
+    stuck = (np.abs(mean - mean[first]) > SURELY * noise_std).any(axis=1)
+    found |= np.isin(run, run[stuck])
+    return np.ones_like(found) if found.mean() > 0.5 else found
+
+
 LONGEST_SHARE = 0.1
 """Most of the patience that one step of time uses up: a pause in a stream is not time in contact, and a stream of few
 rows a second needs at least ten of them."""

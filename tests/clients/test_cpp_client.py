@@ -224,8 +224,13 @@ def test_a_sequence_used_for_another_motion_is_refused_and_said(driver, server):
 
 def test_the_example_runs(compiler, server, tmp_path):
     program = built(compiler, "example/controller.cpp", tmp_path, "-O1", "-g", *sanitizers(compiler))
+    known = server.client.get("/v1/models/panda-sim/streams").json()
     out = checked(program, "panda-sim", "200", LIPSERVE_URL=server.url, LIPSERVE_API_KEY="")
     assert "200 cycles" in out
+    assert "taught" not in out
+    assert server.client.get("/v1/models/panda-sim/streams").json() == known
+    out = checked(program, "panda-sim", "200", "teach", LIPSERVE_URL=server.url, LIPSERVE_API_KEY="")
+    assert " 0 learnt" in out  # it is no measurement
     assert "0 torques not acknowledged" in out
     ran = subprocess.run(
         [program, "no-such-model"],

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A torque loop of 1 kHz that uses a learnt model where that can be trusted, and its own torque where it cannot, and
-// teaches the model what was measured.
-//     controller MODEL [CYCLES] [STREAM_ID]
+// A torque loop of 1 kHz that uses a learnt model where that can be trusted, and its own torque where it cannot. With
+// `teach` it also teaches the model what was measured.
+//     controller MODEL [CYCLES] [teach]
 //
-// Put your robot in the place of `Rehearsal`. Nothing here stands between a wrong torque and your hardware: keep the
+// Put your robot in the place of `Rehearsal`, and teach nothing but what its sensors measure. Nothing here stands between a wrong torque and your hardware: keep the
 // limits and the emergency stop of your controller. Run it with a real-time priority: chrt -f 80 controller …
 
 #include <sys/mman.h>
@@ -24,7 +24,8 @@ constexpr std::int64_t period_ns = 1'000'000;
 constexpr double budget_s = 0.0005;  // of a cycle for the answer: what comes later is no use to this cycle
 constexpr double most_std = 1.0;     // N·m: a torque that the model knows less well is not used; choose it for your robot
 
-/// Stands in for a robot: it moves on sinusoids, its own torque is zero, and measures what it was told to exert.
+/// Stands in for a robot: it moves on sinusoids, its own torque is zero. It has no sensors: what it was told to exert
+/// stands in for their torque, and a model is not to learn that (the service keeps it out as `implausible`).
 struct Rehearsal {
   double q[joints] = {}, dq[joints] = {}, ddq[joints] = {}, own[joints] = {}, measured[joints] = {};
 
@@ -50,14 +51,15 @@ bool sure(const lipserve::Answer& answer) {
 }  // namespace
 
 int main(int count, char** arguments) {
-  if (count < 2) return std::fputs("usage: controller MODEL [CYCLES] [STREAM_ID]\n", stderr), 2;
+  if (count < 2) return std::fputs("usage: controller MODEL [CYCLES] [teach]\n", stderr), 2;
   const long cycles = count > 2 ? std::atol(arguments[2]) : 5000;
   // a stream_id knows its sequences for good: one a run, unless the last sequence is kept over runs
   const std::string run = "controller-" + std::to_string(std::time(nullptr));
   lipserve::Options options;
   options.model = arguments[1];
   options.joints = joints;
-  options.stream_id = count > 3 ? arguments[3] : run.c_str();
+  const bool teaches = count > 3 && std::string(arguments[3]) == "teach";
+  if (teaches) options.stream_id = run.c_str();
   lipserve::Client client(options);
   if (mlockall(MCL_CURRENT | MCL_FUTURE) != 0) std::fputs("memory is not locked: it may be paged out\n", stderr);
   if (client.connect(Deadline::in(10.0)) != Status::ok) return std::fprintf(stderr, "%s\n", client.error().message), 1;
@@ -68,13 +70,13 @@ int main(int count, char** arguments) {
   std::int64_t due = Deadline::now().ns;
   for (long cycle = 0; cycle < cycles; ++cycle) {
     robot.move(static_cast<double>(cycle) * 1e-3);
-    const lipserve::Query query{robot.q, robot.dq, robot.ddq, robot.measured};
+    const lipserve::Query query{robot.q, robot.dq, robot.ddq, teaches ? robot.measured : nullptr};
     // first the torque that this cycle needs, then what it measured; neither waits for longer than the budget
     const Status status = client.ask(query, answer, Deadline::in(budget_s));
     const bool use = status == Status::ok && sure(answer);
     ++(use ? used : status == Status::ok ? unsure : missed);
     robot.command(use ? answer.tau : robot.own);
-    kept += client.teach(query) == Status::ok;
+    if (teaches) kept += client.teach(query) == Status::ok;
 
     due += period_ns;
     if (due < Deadline::now().ns) due = Deadline::now().ns;  // a cycle that took too long is not made up for
@@ -82,9 +84,10 @@ int main(int count, char** arguments) {
     clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &moment, nullptr);
   }
 
+  std::printf("%ld cycles: %ld answers used, %ld late or unsure, %ld missed\n", cycles, used, unsure, missed);
+  if (!teaches) return 0;
   client.flush(Deadline::in(10.0));
   const lipserve::Learnt& learnt = client.learnt();
-  std::printf("%ld cycles: %ld answers used, %ld late or unsure, %ld missed\n", cycles, used, unsure, missed);
   std::printf("%ld torques taught: %llu learnt, %llu kept out, %llu refused, %zu torques not acknowledged\n", kept,
               static_cast<unsigned long long>(learnt.accepted), static_cast<unsigned long long>(learnt.rejected),
               static_cast<unsigned long long>(learnt.refused), client.unsettled());

@@ -11,13 +11,13 @@ from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.adaptive import scores
 from lipcore.online.batch import Rows
-from lipcore.online.gates import RowLimits
+from lipcore.online.gates import RowLimits, is_implausible
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.settings import Settings
 from service.learning.schema import DerivedAcceleration, LearningOptions
 from service.models.served import Served
 
-LIMIT, STATIONARY = CODES.index("limit"), CODES.index("stationary")
+LIMIT, STATIONARY, IMPLAUSIBLE = (CODES.index(code) for code in ("limit", "stationary", "implausible"))
 
 COMPARED, LEAST_COMPARED = 4.0, 10
 """Rows that are compared with the version as trained, for each effective row, and of a batch at least: neighbours of a
@@ -125,8 +125,9 @@ def predict(
     carrying: TorqueModel | None = None,
 ) -> Screened:
     """Let a version predict the rows that passed, with what it has learnt and as trained; those it has no finite answer
-    for are beyond its limits. answered: of all rows, where a stream has answered them already; carrying: the version
-    with what the arm carries, where it does: it is compared with the version as trained no more."""
+    for are beyond its limits, and those whose torque nobody has measured are implausible. answered: of all rows, where
+    a stream has answered them already; carrying: the version with what the arm carries, where it does: it is compared
+    with the version as trained no more."""
     model = served.model if carrying is None else carrying
     codes, predicted = rows.code.copy(), rows.code == LEARNT
     asked = predicted | ((codes == STATIONARY) & np.isfinite(rows.ddq).all(axis=1))
@@ -141,6 +142,9 @@ def predict(
     if given is None:
         given = Answered(mean, std)
     known = np.asarray(np.isfinite(mean).all(axis=1) & np.isfinite(std).all(axis=1))
+    invented, gravity = np.zeros_like(known), model.torque_convention == "gravity_included"
+    invented[known] = is_implausible(good.tau[known], given.mean[known], model.noise_std, gravity)
+    known &= ~invented
     reached = given.take(known)
     score = scores(good.tau[known] - reached.mean, reached.std, model.noise_std)
     seen = Seen(good.time[known], score, reached.factor)
@@ -148,6 +152,7 @@ def predict(
     answerable[asked] = known
     judged, known = known & predicted[asked], known[predicted[asked]]
     codes[predicted] = np.where(known, LEARNT, LIMIT)
+    codes[np.flatnonzero(asked)[invented]] = IMPLAUSIBLE
     predicted[predicted] = known
     mean, std, bare = mean[judged], std[judged], bare[judged]
     return Screened(

@@ -145,11 +145,29 @@ def test_both_readers_of_json_take_the_same(school, body):
     assert (seen[0]["rows"], seen[0]["accepted"], seen[0]["rejected"]) == (12, 11, {"non_finite": 1})
 
 
+def test_torque_that_nobody_has_measured_leaves_no_trace(school, body):
+    pupil = school.enrol("invented")
+    send(pupil, 0, body)
+    before = pupil.settled(1)
+    for sequence in (1, 2, 3):
+        later = part(recording(), 18 * sequence, 18 * sequence + 18)
+        own = pupil.predict({name: later[name] for name in ("q", "dq", "ddq")})["tau"]
+        tau = {1: np.zeros_like(own).tolist(), 2: own, 3: [later["tau"][0]] * 18}[sequence]
+        said = send(pupil, sequence, later | {"tau": tau})
+        assert (said["accepted"], said["rejected"], said["held"]) == (0, {"implausible": 18}, False)
+    after = pupil.settled(said["revision"])
+    assert [after[name] for name in ("tau", "tau_std", "scale")] == [
+        before[name] for name in ("tau", "tau_std", "scale")
+    ]
+    assert pupil.get("alarms")["items"] == []
+    assert send(pupil, 4, part(recording(), 72, 76))["accepted"] == 4
+
+
 def test_the_python_client_teaches(streaming):
     rng = np.random.default_rng(2)
     q, dq, ddq = rng.uniform(-0.3, 0.3, (3, 5, 7)) + np.array([0, -0.5, 0, -2, 0, 1.5, 0.7])
     with Client(streaming.server.url) as client:
-        tau = np.array(client.predict("panda-sim", q, dq, ddq).tau)
+        tau = np.array(client.predict("panda-sim", q, dq, ddq).tau) + 0.01 * rng.standard_normal((5, 7))
         tau[2, 0] = np.nan
         said = client.observe("panda-sim", "client", 0, q, dq, tau, ddq, t=np.arange(5) / 100)
         assert (said.rows, said.accepted, said.rejected) == (5, 4, {"non_finite": 1})

@@ -153,7 +153,7 @@ def test_what_is_left_is_what_the_other_batches_teach(school):
 
 def test_replayed_rows_go_with_their_batch(school):
     pupil, without = school.enrol("unlearns-replayed", contact_threshold=8.0), school.enrol("not-replayed")
-    pupil.teach(0, tau=[[50.0, 50.0]] * LESSON)
+    pupil.teach(0, tau=[[50.0 + 0.1 * row, 50.0] for row in range(LESSON)])
     pupil.teach(1)
     replayed = pupil.post("observations/arm/0/replay", {"codes": ["contact"]})
     pupil.settled(replayed["revision"])

@@ -43,7 +43,8 @@ class ObservationResponse(Record, frozen=True, kw_only=True):
         `stationary`, `contact`, `change` (a changed robot, or a stream that did not fit, and its owner has not
         decided), `payload` (the arm carries something, of which the row teaches instead), `edge` (acceleration not
         derivable; where the stream goes on, these are learnt with the next batch), `late` (came so late that by
-        `forgetting_s` it counts less than a thousandth), `paused` (learning is paused)
+        `forgetting_s` it counts less than a thousandth), `paused` (learning is paused), `implausible` (a torque that
+        nobody has measured: zero against gravity, the model's own answer, or the same all the time while the arm moves)
     gaps: Ranges [first, last] of sequences of the stream that have not come, the latest ones
     derived: What was derived because it was not sent
     held: Whether learning stands still until the model's owner has decided about a change
@@ -128,7 +129,7 @@ class ObservationRows(Record, frozen=True, kw_only=True):
     time: Event time, Unix seconds
     ddq: As sent, or as derived from dq
     code: What became of each: learnt, non_finite, limit, time_jump, saturation, stationary, contact, change, edge,
-        payload, late, paused
+        payload, late, paused, implausible
     """
 
     time: list[float | None]

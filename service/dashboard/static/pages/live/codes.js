@@ -10,6 +10,7 @@ export const CODES = {
   limit: { words: "beyond a limit", why: "position, speed, acceleration or torque", symbol: "triangle-up-open", colour: "contact" },
   non_finite: { words: "not a number", why: "a value is missing or not finite", symbol: "cross-open", colour: "contact" },
   time_jump: { words: "time jumped", why: "time goes backwards or skips", symbol: "triangle-left-open", colour: "novel" },
+  implausible: { words: "not measured", why: "zero against gravity, the model's own answer, or the same all the time while the arm moves", symbol: "hourglass-open", colour: "bad", lasting: true },
   paused: { words: "learning paused", why: "judged and compared, but not learnt", symbol: "square-x-open", colour: "muted", lasting: true },
   late: { words: "too late", why: "forgotten by the time it came", symbol: "triangle-left", colour: "muted" },
   edge: { words: "acceleration not known yet", why: "used with the next batch", symbol: "line-ew-open", colour: "muted" },
