@@ -1,5 +1,6 @@
 """The controllers' client: of a real service, and of one on a Unix-domain socket that says what a test tells it to."""
 
+import asyncio
 import json
 import socket
 import struct
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from websockets.sync.server import unix_serve
 
-from lipserve import StreamClient, StreamError
+from lipserve import AsyncStreamClient, StreamClient, StreamError
 from lipserve.stream import StreamRefusal
 from tests.service.data import DEADLINE
 from tests.service.server import free_port
@@ -95,9 +96,39 @@ def scripted(tmp_path):
 def test_deadlines_are_reported(streaming):
     with client_of(streaming) as client:
         assert client._socket.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
-        seen = [client.ask(*PAIR, deadline=budget) for budget in (1e-9, 60.0, 1e-9)]
-    assert [(answer.late, answer.late_answers) for answer in seen] == [(True, 1), (False, 1), (True, 2)]
+        with pytest.raises(StreamError, match=r"no answer within") as missed:  # nor has one come before
+            client.ask(*PAIR, deadline=1e-9)
+        assert missed.value.code == "timeout"
+        seen = [client.ask(*PAIR, deadline=budget) for budget in (60.0, 1e-9, 60.0)]
+    assert [(answer.late, answer.late_answers) for answer in seen] == [(False, 1), (True, 2), (False, 2)]
+    assert [answer.sequence for answer in seen] == [2, 2, 4]  # the last that came in time
     assert all(answer.seconds > 0 for answer in seen)
+
+
+def test_deadlines_are_those_of_the_client_that_is_awaited_too(streaming):
+    async def ask():
+        async with AsyncStreamClient("pendulum", streaming.server.url, timeout=DEADLINE) as client:
+            return [await client.ask(*PAIR, deadline=budget) for budget in (60.0, 1e-9, 60.0)]
+
+    seen = asyncio.run(ask())
+    assert [(answer.late, answer.late_answers, answer.sequence) for answer in seen] == [
+        (False, 0, 1),
+        (True, 1, 1),
+        (False, 1, 3),
+    ]
+
+
+def test_an_answer_that_was_on_its_way_for_too_long_is_late_though_the_service_was_quick(scripted):
+    with scripted([answer(1)], [], [answer(2), answer(3)]) as server, server.client() as client:
+        first = client.ask(*MOTION, deadline=DEADLINE)
+        held = client.ask(*MOTION, deadline=0.01)
+        last = client.ask(*MOTION, deadline=DEADLINE)
+    assert [(each.sequence, each.late, each.late_answers) for each in (first, held, last)] == [
+        (1, False, 0),
+        (1, True, 1),
+        (3, False, 1),
+    ]
+    assert (held.tau.tolist(), last.tau.tolist()) == ([1.0], [3.0])
 
 
 def test_what_is_refused_names_the_field_and_the_next_is_answered(streaming):

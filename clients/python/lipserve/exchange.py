@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from collections import Counter, deque
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
+from time import monotonic
 from typing import Any, NamedTuple
 from urllib.parse import quote, urlencode, urlsplit
 
@@ -86,9 +87,10 @@ class StreamPayload(NamedTuple):
 class StreamAnswer:
     """Torque at one motion, N·m.
 
-    tau: (n,) mean; tau_std: (n,) standard deviation of the function, where asked for; late: whether `seconds` is
-    more than the deadline; late_answers: how many of this connection have been late, this one included; seconds: from
-    the arrival of the frame in the service to the departure of the answer; scale: (n,) factor on the half width of
+    tau: (n,) mean; tau_std: (n,) standard deviation of the function, where asked for; late: whether more than the
+    deadline has passed from sending the query to having its answer, by this client's clock; late_answers: how many of
+    this connection have been late, this one included; seconds: from the arrival of the frame in the service to the
+    departure of the answer; scale: (n,) factor on the half width of
     intervals that hold measurements, external: torque that is not explained, payload: what the arm carries, where
     asked for; fallback: whether some joint's torque went back to gravity, offset and friction, or to the training's
     mean, because the training does not determine it at this motion.
@@ -218,6 +220,8 @@ class Exchange:
         self.unsettled: deque[int] = deque()
         self.learnt = StreamLearnt(first_sequence - 1)
         self.refusals: deque[StreamRefusal] = deque(maxlen=_REFUSALS)
+        self.late_answers = 0
+        self._due: dict[int, float] = {}  # by this client's clock, of queries with a deadline that have no answer
 
     def frame(
         self,
@@ -247,13 +251,15 @@ class Exchange:
         self._sequence = (self._sequence + 1) % SEQUENCES
         if learn:
             self.unsettled.append(self._sequence)
+        if deadline:
+            self._due[self._sequence] = monotonic() + deadline
         header = REQUEST.pack(self._sequence, flags, n, deadline)
         return self._sequence, b"".join((header, *(part.tobytes() for part in parts)))
 
     def take(self, data: str | bytes) -> None:
         """Keep what the service said; raise StreamError where it speaks another layout."""
         if isinstance(data, bytes):
-            answer = read_answer(data)
+            answer = self._timed(read_answer(data))
             self.answers.append(answer)
             if isinstance(answer, StreamError) and answer.sequence is not None:
                 with suppress(ValueError):  # a frame without torque
@@ -271,6 +277,20 @@ class Exchange:
             self._settle(refused["through"])
         else:
             self.hello = read_hello(message)
+
+    def _timed(self, answer: StreamAnswer | StreamError) -> StreamAnswer | StreamError:
+        """The answer, late or not by this client's clock."""
+        due = None if answer.sequence is None else self._due.pop(answer.sequence, None)
+        if due is None or isinstance(answer, StreamError):
+            return answer
+        late = monotonic() > due
+        self.late_answers += late
+        return replace(answer, late=late, late_answers=self.late_answers)
+
+    def given_up(self, sequence: int) -> None:
+        """Count an answer as late that has not come; it is not counted again where it comes after all."""
+        if self._due.pop(sequence, None) is not None:
+            self.late_answers += 1
 
     def answer(self) -> StreamAnswer:
         """Take the oldest answer; raise what is in its place where the query was refused."""

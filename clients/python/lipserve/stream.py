@@ -6,6 +6,7 @@ import asyncio
 import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 from typing import Any, Self
@@ -44,6 +45,10 @@ __all__ = [
 ]
 
 
+PATIENCE_S = 10.0
+"""Longest wait for a connection, and for acknowledgements, in s."""
+
+
 class _Stream(StreamSide):
     """What both clients do alike; arguments: see `StreamClient`."""
 
@@ -53,7 +58,7 @@ class _Stream(StreamSide):
         url: str | None = None,
         unix: Path | str | None = None,
         version: int | None = None,
-        timeout: float = 10.0,
+        timeout: float = 1.0,
         stream_id: str | None = None,
         first_sequence: int = 1,
         alias: str | None = None,
@@ -71,11 +76,16 @@ class _Stream(StreamSide):
         self._destination = destination(address.base, model, **asked)
         self._options: dict[str, Any] = {
             "compression": None,
-            "open_timeout": timeout,
+            "open_timeout": self._patience,
             "close_timeout": 1.0,
             "additional_headers": headers,
         }
         self._begin()
+
+    @property
+    def _patience(self) -> float:
+        """Longest wait in s for what no control loop waits for."""
+        return max(PATIENCE_S, self.timeout)
 
     def _begin(self) -> None:
         """Open the stream where making a client does so."""
@@ -89,6 +99,32 @@ class _Stream(StreamSide):
             raise refused(error.response.status_code, error.response.body) from error
         except (OSError, InvalidHandshake) as error:
             raise StreamError(f"no service answers at {self._unix or self._url}: {error}", "unreachable") from error
+
+    _last: StreamAnswer | None = None  # that came in time
+
+    def _until(self, deadline: float) -> float:
+        """Until when an answer is waited for, by `monotonic`."""
+        return monotonic() + (deadline or self.timeout)
+
+    def _in_time(self, answer: StreamAnswer) -> StreamAnswer:
+        """The answer, or the last one that came in time."""
+        if not answer.late:
+            self._last = answer
+            return answer
+        return answer if self._last is None else self._held()
+
+    def _late(self, sequence: int, deadline: float, error: StreamError) -> StreamAnswer:
+        """What is answered in the place of an answer that has not come by its deadline."""
+        if error.code != "timeout":
+            raise error
+        self._exchange.given_up(sequence)
+        if not deadline or self._last is None:
+            raise unanswered(deadline or self.timeout) from error
+        return self._held()
+
+    def _held(self) -> StreamAnswer:
+        assert self._last is not None
+        return replace(self._last, late=True, late_answers=self._exchange.late_answers)
 
     def _answer_to(self, sequence: int) -> StreamAnswer | None:
         """The answer to a query if it has come, those before it dropped; raise StreamError where it was refused."""
@@ -109,7 +145,7 @@ class StreamClient(_Stream):
 
     model: its name; url, key: as of `Client`; unix: path of the service's Unix-domain socket, instead of host and port
     of the address; version: pins one, alias: follows what that points to, else the version that serves answers;
-    timeout: longest wait for the connection, and for one answer, in s; stream_id: name of the source of the torques
+    timeout: longest wait for an answer without a deadline, in s; stream_id: name of the source of the torques
     that are sent to learn from, None where only answers are wanted; first_sequence: of the first frame: to send frames
     again after a lost connection, take the first of them above `learnt.through`; scale, payload: whether answers carry
     the factor on the half width of their intervals, and what the arm carries.
@@ -120,9 +156,9 @@ class StreamClient(_Stream):
         self._stack = ExitStack()
         address, host, port = self._destination
         with self._opening():
-            made = _connect(host, port, self._unix, self.timeout)
+            made = _connect(host, port, self._unix, self._patience)
             self._socket = self._stack.enter_context(connect(address, sock=made, **self._options))
-        self._take(self.timeout)
+        self._take(self._patience)
 
     def __enter__(self) -> Self:
         return self
@@ -147,16 +183,21 @@ class StreamClient(_Stream):
     ) -> StreamAnswer:
         """Return the torque at one motion: q, dq, ddq of shape (n,) in SI units.
 
-        deadline: seconds that the service may take before it counts the answer as late; 0 for none; tau: (n,) N·m, the
-        torque measured there, to be learnt from after the answer where the client has a stream_id, unless learn is
-        false; external: whether to answer how much of tau the model does not explain.
-        Raise StreamError where the service refuses the motion (the stream goes on), is gone, or does not answer in
-        time: an answer that comes after all is dropped by the next call.
+        deadline: seconds from this call on after which it returns the last answer that came in time, with its own
+        sequence, as `late`; 0 for none, then it waits for `timeout`. tau: (n,) N·m, the torque measured there, to be
+        learnt from after the answer where the client has a stream_id, unless learn is false; external: whether to
+        answer how much of tau the model does not explain.
+        Raise StreamError where the service refuses the motion (the stream goes on), is gone, or does not answer in time
+        (code `timeout`) and no answer has come in time before. One that comes after all is dropped by the next call.
         """
+        end = self._until(deadline)
         sequence = self.send(q, dq, ddq, std, deadline, tau, external, learn)
         while (answer := self._answer_to(sequence)) is None:
-            self._take(self.timeout)
-        return answer
+            try:
+                self._take(max(0.0, end - monotonic()))
+            except StreamError as error:
+                return self._late(sequence, deadline, error)
+        return self._in_time(answer)
 
     def send(
         self,
@@ -186,10 +227,10 @@ class StreamClient(_Stream):
     def flush(self, timeout: float | None = None) -> StreamLearnt:
         """Wait until every torque sent is acknowledged or refused, and return what has become of them.
 
-        timeout: longest wait in s, the client's own where None. Answers that come meanwhile wait for `receive`.
+        timeout: longest wait in s, 10 where None. Answers that come meanwhile wait for `receive`.
         Raise StreamError where it takes longer, or the service is gone.
         """
-        timeout = self.timeout if timeout is None else timeout
+        timeout = self._patience if timeout is None else timeout
         end = monotonic() + timeout
         while self._exchange.unsettled:
             try:
@@ -232,7 +273,7 @@ class AsyncStreamClient(_Stream):
             else:
                 self._connection = await awaited.unix_connect(str(self._unix), address, **self._options)
         try:
-            await self._take(self.timeout)
+            await self._take(self._patience)
         except BaseException:
             await self.close()
             raise
@@ -259,10 +300,14 @@ class AsyncStreamClient(_Stream):
     ) -> StreamAnswer:
         """Return the torque at one motion; see `StreamClient.ask`. Where the task is cancelled meanwhile, the answer is
         dropped by the next call."""
+        end = self._until(deadline)
         sequence = await self.send(q, dq, ddq, std, deadline, tau, external, learn)
         while (answer := self._answer_to(sequence)) is None:
-            await self._take(self.timeout)
-        return answer
+            try:
+                await self._take(max(0.0, end - monotonic()))
+            except StreamError as error:
+                return self._late(sequence, deadline, error)
+        return self._in_time(answer)
 
     async def send(
         self,
@@ -291,7 +336,7 @@ class AsyncStreamClient(_Stream):
 
     async def flush(self, timeout: float | None = None) -> StreamLearnt:
         """Wait until every torque sent is acknowledged or refused; see `StreamClient.flush`."""
-        timeout = self.timeout if timeout is None else timeout
+        timeout = self._patience if timeout is None else timeout
         try:
             async with asyncio.timeout(timeout):
                 while self._exchange.unsettled:
