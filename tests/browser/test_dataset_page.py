@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -161,3 +162,12 @@ def test_what_is_dragged_is_held_out_of_the_training(visitor: Visitor, dashboard
 def test_who_holds_nothing_out_by_hand_is_not_offered_it(visitor: Visitor, dataset: str) -> None:
     page = visitor.open(f"#/train?datasets={dataset}")
     expect(page.get_by_label("Which part").locator("option[value=stretches]")).to_have_count(0)
+
+
+def test_names_of_joints_are_no_markup(visitor: Visitor, dashboard: Dashboard) -> None:
+    names = ("<a href='https://elsewhere.example'>one</a>", "<b>two</b>")
+    given = replace(stream(samples=120, rate=20.0, seed=33), joint_names=names)
+    page = visitor.open(f"#/data/{upload(dashboard.client, given, name='markup')['id']}")
+    drawn(page)
+    expect(page.locator(".strip").get_by_text("<b>two</b>").first).to_be_visible()
+    expect(page.locator("a[href*='elsewhere']")).to_have_count(0)
