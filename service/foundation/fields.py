@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Hashable, Iterable, Sequence
+from contextlib import suppress
 from math import isfinite, nan
 from typing import Annotated, Any
 
@@ -36,8 +37,11 @@ NameForPeople = Annotated[str, Field(min_length=1, max_length=LONGEST), AfterVal
 
 def numbers(name: str, row: list[Any], nullable: bool = False) -> list[float]:
     """Finite numbers of a JSON list; nullable: any numbers, and null as NaN. Raise InvalidRequestError."""
-    if set(map(type, row)) == {float} and (nullable or all(map(isfinite, row))):
-        return row
+    if set(map(type, row)) <= {int, float}:
+        with suppress(OverflowError):
+            values = list(map(float, row))
+            if nullable or all(map(isfinite, values)):
+                return values
     out = []
     for index, number in enumerate(row):
         value, expected = None, "a number, or null where none was measured" if nullable else "a finite number"

@@ -198,7 +198,7 @@ def decode(body: bytes) -> PredictBody | None:
     """Decode a query, or return None where anything in it is not as it should be."""
     try:
         query = _decoder.decode(body)
-    except msgspec.MsgspecError:
+    except (msgspec.MsgspecError, RecursionError):
         return None
     if query.alias is not None and query.version is not None:
         return None

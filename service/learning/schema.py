@@ -185,8 +185,8 @@ class ObservationResponse(BaseModel):
         "decided), `payload` (the arm carries something, of which the row teaches instead), `edge` (acceleration not "
         "derivable; where the stream goes on, these are learnt with the next batch), `late` (came so late that by "
         "`forgetting_s` it counts less than a thousandth), `paused` (learning is paused), "
-        "`implausible` (a torque that nobody has measured: zero against gravity, the model's own answer, or the same all "
-        "the time while the arm moves)"
+        "`implausible` (a torque that nobody has measured: zero against gravity, the model's own answer, or the same "
+        "all the time while the arm moves)"
     )
     gaps: list[list[int]] = Field(
         description="Ranges [first, last] of sequences of the stream that have not come, the latest ones"

@@ -100,6 +100,13 @@ def test_many_wrong_fields_and_long_names_give_a_short_answer(api):
     assert max(len(each["field"]) for each in problems) < 500
 
 
+def test_json_that_is_nested_too_deep_is_refused(api):
+    body = b'{"q": ' + b"[" * 50_000 + b"]" * 50_000 + b"}"
+    for path in ("predict", "observations", "evaluate"):
+        answer = api.post(f"/v1/models/panda-sim/{path}", content=body, headers={"content-type": "application/json"})
+        assert "nested too deep" in error(answer, 422, "invalid_request")["message"]
+
+
 def test_objects_and_lists_that_hold_too_much_are_not_looked_at(api):
     fields = error(api.post("/v1/jobs", json=dict.fromkeys(map(str, range(5000)), 0)), 422, "invalid_request")
     assert fields["detail"] == [{"field": "body", "value": "an object of 5000 fields", "expected": "at most 1000"}]

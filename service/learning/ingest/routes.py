@@ -75,7 +75,7 @@ def decode(body: bytes) -> ObservationRequest | None:
     """Decode a batch, or return None where anything in it is not as it should be."""
     try:
         batch = _decoder.decode(body)
-    except msgspec.MsgspecError:
+    except (msgspec.MsgspecError, RecursionError):
         return None
     # what is there has two quotes for its name, and strings have two more: no other quotes, no field twice
     quotes = 2 * (batch.names() + 1 + len(batch.joint_names or ()))
