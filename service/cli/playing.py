@@ -54,7 +54,7 @@ class Tally:
         """
         error = tau - answer.tau
         self.rows += 1
-        self.late += answer.late
+        self.late += answer.seconds > deadline
         self.received_late += seconds > deadline
         self.behind_s = max(self.behind_s, behind_s)
         self._trips.append(seconds)
@@ -273,7 +273,8 @@ def play(
             sent = time.perf_counter()
         tau = motion.tau[row] if learn else None
         try:
-            answer = stream.ask(motion.q[row], motion.dq[row], motion.ddq[row], deadline=deadline, tau=tau)
+            stream.send(motion.q[row], motion.dq[row], motion.ddq[row], deadline=deadline, tau=tau)
+            answer = stream.receive()  # its own, however late
         except StreamError as error:
             if error.sequence is None:
                 total.merge(part)

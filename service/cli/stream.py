@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     from service.cli.playing import Motion, Tally
 
 app = alone()
-SECONDS = 60.0
+SECONDS, ANSWER_S = 60.0, 10.0
+"""Of motion; and longest wait for an answer, which is counted as late long before."""
 
 
 @app.command()
@@ -121,7 +122,7 @@ def stream(
     with (
         Stop().listening() as stop,
         connected(url) as client,
-        client.stream(model, version=version, alias=alias, stream_id=source, scale=True) as opened,
+        client.stream(model, version=version, alias=alias, stream_id=source, scale=True, timeout=ANSWER_S) as opened,
     ):
         played = _fitting(played, opened)
         step = played.step if deadline is None else deadline / 1e3

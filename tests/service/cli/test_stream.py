@@ -126,15 +126,15 @@ def test_a_recording_is_played(asked, refused, arm, recording):
 
 
 def test_ctrl_c_ends_a_stream_with_its_figures(lipserve, arm, server, monkeypatch):
-    asked, ask = [], StreamClient.ask
+    asked, send = [], StreamClient.send
 
     def ask_and_press(self, *arguments, **options):
         asked.append(arguments)
         if len(asked) == 5:
             signal.raise_signal(signal.SIGINT)
-        return ask(self, *arguments, **options)
+        return send(self, *arguments, **options)
 
-    monkeypatch.setattr(StreamClient, "ask", ask_and_press)
+    monkeypatch.setattr(StreamClient, "send", ask_and_press)
     before = signal.getsignal(signal.SIGINT)
     code, out, _ = lipserve("stream", arm[0], "--simulate", "double-pendulum", "--url", server.url, "--json")
     assert (code, len(asked)) == (130, 5)
@@ -143,15 +143,15 @@ def test_ctrl_c_ends_a_stream_with_its_figures(lipserve, arm, server, monkeypatc
 
 
 def test_a_stream_that_the_service_closes_ends_with_its_figures(lipserve, arm, server, monkeypatch):
-    asked, ask = [], StreamClient.ask
+    asked, send = [], StreamClient.send
 
     def ask_or_end(self, *arguments, **options):
         asked.append(arguments)
         if len(asked) == 5:
             raise StreamError("the service closed the stream: the service stops", "closed")
-        return ask(self, *arguments, **options)
+        return send(self, *arguments, **options)
 
-    monkeypatch.setattr(StreamClient, "ask", ask_or_end)
+    monkeypatch.setattr(StreamClient, "send", ask_or_end)
     code, out, err = lipserve("stream", arm[0], "--simulate", "double-pendulum", "--url", server.url, "--json")
     assert (code, lines(out)[-1]["summary"]["rows"]) == (1, 4)
     assert "error: the service closed the stream: the service stops (closed)" in err
