@@ -178,7 +178,7 @@ def test_figures_are_those_of_all_rows():
     for first in (0, 25):
         part = Tally(noise)
         for row in range(first, 25 if first == 0 else 40):
-            answer = StreamAnswer(row, mean[row], std[row], 1, 0, row % 10 == 0, 0, 0.0)
+            answer = StreamAnswer(row, mean[row], std[row], 1, 0, False, 0, 0.03 if row % 10 == 0 else 0.0)
             part.add(answer, tau[row], seconds=row / 1e3, behind_s=row / 1e2, deadline=0.0295)
         tally.merge(part)
     figures, error = tally.figures(), tau - mean
