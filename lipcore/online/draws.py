@@ -64,8 +64,10 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """A draw from the posterior: the place of least energy for other noise. noise: of what is known beforehand; None
-    for the bottom of a valley, where nothing is drawn."""
+    """A draw from the posterior: the minimum of the energy whose residuals are shifted by noise.
+
+    noise: of the training and of the payload's prior; None: no noise, so that it is a minimum of the energy itself.
+    """
 
     place: Place
     noise: Array | None
@@ -206,7 +208,7 @@ def arms(carrier: Carrier) -> Generator[None, None, tuple[Draw, ...]]:
     first, and again where another has learnt more directions. It yields after each step."""
     size = len(carrier.memory.slope) + len(carrier.memory.outside) + len(carrier.mean) + PARAMETERS
     known = _ARMS.get(carrier.term, ())
-    if not all(each.usable(size) for each in known) or not known:
+    if not known or not all(each.usable(size) for each in known):
         training, draw = Training.of(carrier), np.random.default_rng(SEED)
         found = []
         for number in range(len(DIRECTIONS) if carrier.open_tip else DRAWS):

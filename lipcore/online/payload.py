@@ -84,14 +84,14 @@ def refine(
     found = []
     for number, each in enumerate(known):
         point = yield from problem.sought(each, number, FEW)
-        found.append(Found(point, each.noise))
+        found.append(_Found(point, each.noise))
     at = min([at, *(each.point for each in found)], key=_energy)
     if anew:
         for number in [number for number, each in enumerate(found) if each.excess(at) > FAR]:
             draw = np.random.default_rng([SEED, number, len(rows)])
             again = _carrying((yield from problem.training.begun(number, draw)), at)
             point = yield from problem.sought(again, number, FIRST)
-            found[number] = min(found[number], Found(point, again.noise), key=lambda each: each.point.energy)
+            found[number] = min(found[number], _Found(point, again.noise), key=lambda each: each.point.energy)
     # each draw is the minimum for other noise
     other = yield from descent(problem, min((each.point for each in found), key=_energy), ROUNDS)
     return problem.estimate(min(at, other, key=_energy), found)
@@ -107,14 +107,14 @@ def _carrying(arm: Draw, at: Point) -> Draw:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """A draw where it has come to. noise: see `Draw`."""
+class _Found:
+    """The point that a draw has reached. noise: see `Draw`."""
 
     point: Point
     noise: Array | None
 
     def excess(self, least: Point) -> float:
-        """Energy above what a draw has on average, which is half a nat for each number that is unknown."""
+        """Energy above the usual one of a draw, nats: that exceeds the least by half the number of unknowns."""
         usual = 0.0 if self.noise is None else 0.5 * least.derivative.shape[1]
         return self.point.energy - least.energy - usual
 
@@ -197,7 +197,7 @@ class _Problem:
             yield from descent(self, self.at(begin.place), rounds, 0.0 if noise is None else np.append(noise, of_rows))
         )
 
-    def estimate(self, at: Point, found: Sequence[Found] = ()) -> Estimate:
+    def estimate(self, at: Point, found: Sequence[_Found] = ()) -> Estimate:
         """What is known with the most likely place, and draws."""
         carrier, size = self.carrier, len(self.carrier.mean)
         derivative, first = at.derivative, len(at.residual) - self.tau.size
@@ -237,7 +237,7 @@ def _wider(std: Array, off: Sequence[Array]) -> Array:
     return np.maximum(1.0, np.median(np.abs(off), axis=0) / (MEDIAN * std))
 
 
-def _others(carrier: Carrier, at: Point, root: Array, found: Sequence[Found]) -> tuple[tuple[Alternative, ...], bool]:
+def _others(carrier: Carrier, at: Point, root: Array, found: Sequence[_Found]) -> tuple[tuple[Alternative, ...], bool]:
     """Arms all over the posterior where it is far from linear, the most likely one first; and whether it is.
 
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the

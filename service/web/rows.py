@@ -80,7 +80,7 @@ KeyHeader = Annotated[
 
 @dataclass(frozen=True)
 class Identity:
-    """A request as its client names it, and the digest of what it says. stored: the name among those of all clients."""
+    """A request as its client names it, and the digest of what it says. stored: the name as the database has it."""
 
     key: str
     stored: str

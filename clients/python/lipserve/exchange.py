@@ -90,10 +90,10 @@ class StreamAnswer:
     tau: (n,) mean; tau_std: (n,) standard deviation of the function, where asked for; late: whether more than the
     deadline has passed from sending the query to having its answer, by this client's clock; late_answers: how many of
     this connection have been late, this one included; seconds: from the arrival of the frame in the service to the
-    departure of the answer; scale: (n,) factor on the half width of
-    intervals that hold measurements, external: torque that is not explained, payload: what the arm carries, where
-    asked for; fallback: whether some joint's torque went back to gravity, offset and friction, or to the training's
-    mean, because the training does not determine it at this motion.
+    departure of the answer; scale: (n,) factor on the half width of intervals that hold measurements, external: torque
+    that is not explained, payload: what the arm carries, where asked for; fallback: whether some joint's torque went
+    back to gravity, offset and friction, or to the training's mean, because the training does not determine it at this
+    motion.
     """
 
     sequence: int

@@ -46,7 +46,7 @@ __all__ = [
 
 
 PATIENCE_S = 10.0
-"""Longest wait for a connection, and for acknowledgements, in s."""
+"""Shortest that this wait may be, s: a control loop's `timeout` may be shorter."""
 
 
 class _Stream(StreamSide):
@@ -84,7 +84,7 @@ class _Stream(StreamSide):
 
     @property
     def _patience(self) -> float:
-        """Longest wait in s for what no control loop waits for."""
+        """Longest wait for a connection and for acknowledgements, in s."""
         return max(PATIENCE_S, self.timeout)
 
     def _begin(self) -> None:
