@@ -50,7 +50,8 @@ namespace lipserve {
 
 enum class Status : std::uint8_t {
   ok,
-  timeout,      // connected, but no answer by the deadline; one that comes after all is dropped and counted as stale
+  timeout,      // connected, but no answer by the deadline: the last one that came is answered, `late`, if there is one;
+                // one that comes after all is dropped and counted as stale
   unreachable,  // no connection now; it is had again as soon as there is a service
   refused,      // the service said no, to this query or to the connection
   full,         // more is taught and not acknowledged than `Options::backlog` holds; this one is not kept
@@ -98,7 +99,7 @@ struct Answer {
   std::uint32_t sequence = 0;
   std::uint32_t version = 0;
   std::uint64_t revision = 0;      // online updates that it contains
-  bool late = false;               // it left the service after its budget
+  bool late = false;               // after the deadline, or it left the service after its budget
   std::uint32_t late_answers = 0;  // of this connection
   double seconds = 0.0;            // that the service took
   const double* tau = nullptr;
@@ -1072,10 +1073,14 @@ inline Status Client::ask(const Query& query, Answer& answer, Deadline until) {
   Status status = run(until, false, [this] { return answered_; });
   if (answered_) {
     status = outcome_;
-    if (status == Status::ok) answer = answer_, ++counters_.answered;
+    if (status == Status::ok) {
+      answer_.late |= Deadline::now().ns > until.ns;  // this thread was not let run in time
+      answer = answer_, ++counters_.answered;
+    }
   } else if (status == Status::timeout) {
     say(error_, status, "timeout", "no answer by the deadline");
     error_.sequence = asked_;
+    answer = answer_, answer.late = true;  // the last one that came
   }
   asking_ = ask_unsent_ = answered_ = false;
   return status;
