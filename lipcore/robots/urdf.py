@@ -149,14 +149,47 @@ class RigidBody:
         return mean if mean > MIN_LENGTH else DEFAULT_LENGTH
 
 
+MAX_DENSITY = 25_000.0
+"""kg/m³, more than osmium's."""
+TRIANGLE = 1.05
+"""How far numbers that were rounded may miss the inequality of principal moments."""
+MIN_REACH, MIN_RADIUS = 1.0, 1e-6
+"""A shorter robot counts as this long, m; an inertia of a smaller radius of gyration, m, as none."""
+
+
 def describe(urdf: str) -> Description:
     """Read what a URDF holds and check that Pinocchio takes it; raise UrdfError."""
     text = read(urdf)
     joints = tuple(joint for joint in text.joints if joint.kind in MOVABLE and joint.mimics is None)
     if not joints:
         raise UrdfError("the URDF has no joint that moves, expected revolute, continuous or prismatic joints")
-    _parse(text.plain)
+    _check_bodies(_parse(text.plain))
     return Description(text.robot, joints)
+
+
+def _check_bodies(model: Any) -> None:
+    """Raise UrdfError where no body of its mass and size can have an inertia; zero inertia counts as not given.
+
+    Of principal moments I₁ ≤ I₂ ≤ I₃ about the centre of mass, I₃ ≤ I₁ + I₂; the radius of gyration √(I₃/m) is within
+    the robot's reach; and no matter is denser than MAX_DENSITY: of all bodies of one mass and density a ball has the
+    smallest I₁ + I₂ + I₃ = 6/5 m r².
+    """
+    reach = max(MIN_REACH, sum(float(np.linalg.norm(place.translation)) for place in tuple(model.jointPlacements)))
+    for name, inertia in tuple(zip(tuple(model.names), tuple(model.inertias), strict=True))[1:]:  # what is fixed first
+        mass, moments = float(inertia.mass), np.linalg.eigvalsh(inertia.inertia)
+        if mass <= 0 or moments[2] <= mass * MIN_RADIUS**2:
+            continue
+        body, about = f"the body that joint {name!r} moves has", "expected kg·m² about its centre of mass"
+        radius, ball = float(np.sqrt(moments[2] / mass)), float(np.sqrt(5 / 6 * moments.sum() / mass))
+        if moments[2] > TRIANGLE * (moments[0] + moments[1]):
+            listed = ", ".join(f"{each:.3g}" for each in moments)
+            raise UrdfError(f"{body} principal moments of inertia {listed}, expected none above the sum of the others")
+        if radius > reach:
+            raise UrdfError(f"{body} a radius of gyration of {radius:.3g} m for a robot of {reach:.3g} m, {about}")
+        if mass / (4 / 3 * np.pi * ball**3) > MAX_DENSITY:
+            raise UrdfError(
+                f"{body} {mass:.3g} kg within {1e3 * ball:.2g} mm, denser than any metal; {about}, mass in kg"
+            )
 
 
 def _mismatch(robot: str, movable: Sequence[str], data: Sequence[str], listed: str = "") -> JointMismatchError:

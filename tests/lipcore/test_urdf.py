@@ -130,6 +130,12 @@ def test_a_list_that_does_not_fit_is_shown(listed: tuple[str, ...]) -> None:
         (robot(link("a"), link("b"), joint("j", "a", "b", "spherical")), "'j' is of type 'spherical'"),
         (robot(link("a"), link("b", -1), joint("j", "a", "b")), "'j' moves has mass -1 kg"),
         (
+            ARM.replace('"0.1"', '"1e5"'),
+            "'j1' moves has a radius of gyration of 316 m for a robot of 1 m, expected kg·m²",
+        ),
+        (ARM.replace('izz="0.1"', 'izz="0.3"'), "has principal moments of inertia 0.1, 0.1, 0.3, expected none above"),
+        (robot(link("a"), link("b", 5e4), joint("j", "a", "b")), "has 5e\\+04 kg within 2.2 mm, denser than any metal"),
+        (
             robot(link("r"), link("a"), link("b"), *(joint(f"j{p}{c}", p, c) for p, c in ("ra", "ab", "ba"))),
             "link 'a' is the child of two joints, 'jra' and 'jba': a closed loop",
         ),
@@ -142,6 +148,11 @@ def test_a_list_that_does_not_fit_is_shown(listed: tuple[str, ...]) -> None:
 def test_text_that_cannot_be_used_is_refused_with_the_reason(text: str, message: str) -> None:
     with pytest.raises(UrdfError, match=message):
         describe(text)
+
+
+def test_inertia_that_is_not_given_and_of_a_fixed_link_is_taken() -> None:
+    describe(ARM.replace('"0.1"', '"0"'))
+    describe(robot(link("base").replace('"0.1"', '"1e5"'), link("a"), joint("j", "base", "a")))
 
 
 def test_what_is_uploaded_is_never_written_to_stderr(capfd: pytest.CaptureFixture[str]) -> None:
