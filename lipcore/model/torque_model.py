@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from lipcore.data.metrics import Answer
 from lipcore.data.motion import Motion, motion_arrays
@@ -142,6 +142,16 @@ class TorqueModel:
         """What is known of the rigid bodies, of an estimator that has them."""
         term = self.estimator.terms.get("rigid_body")
         return term.arm if isinstance(term, ArmKernel) else None
+
+    def position_limits(self, largest: float) -> Array:
+        """Largest |q| of each joint that can be in SI units, (n,) rad (m): `largest`, and any of joints that turn on,
+        which are the revolute ones that were recorded over more than a turn."""
+        return np.where(self._turns, np.inf, largest)
+
+    @cached_property
+    def _turns(self) -> NDArray[np.bool_]:
+        span = np.subtract(self.training_range["q"]["max"], self.training_range["q"]["min"])
+        return np.asarray((span > 2 * np.pi) & (np.array(self.joint_types) == "revolute"))
 
     @property
     def noise_std(self) -> Array:

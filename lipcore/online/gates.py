@@ -21,14 +21,15 @@ Mask = NDArray[np.bool_]
 class RowLimits:
     """What a row may hold.
 
-    position, velocity, acceleration: largest |q|, |dq|, |ddq| of any joint, SI. torque: (n,) largest |tau| of each
-    joint, N·m or N, or None where not known. max_gap_s: longest step of time within rows that accelerations are derived
-    from, s; None: any. stationary_speed: a robot whose every |dq| lies below it stands; 0: never. saturation_share:
-    share of its limit from which on a torque is taken for cut off, below the limit since a drive's measured torque
-    wavers about it: 0.98 leaves 2 %, four standard deviations of a noise of half a per cent of the limit.
+    position: largest |q|, of each joint (n,) or of all; velocity, acceleration: largest |dq|, |ddq| of any joint, SI.
+    torque: (n,) largest |tau| of each joint, N·m or N, or None where not known. max_gap_s: longest step of time within
+    rows that accelerations are derived from, s; None: any. stationary_speed: a robot whose every |dq| lies below it
+    stands; 0: never. saturation_share: share of its limit from which on a torque is taken for cut off, below the limit
+    since a drive's measured torque wavers about it: 0.98 leaves 2 %, four standard deviations of a noise of half a per
+    cent of the limit.
     """
 
-    position: float
+    position: Array | float
     velocity: float
     acceleration: float
     torque: Array | None

@@ -38,17 +38,17 @@ class Query(NamedTuple):
     values: Array
     single: bool
 
-    def check(self, max_position: float, expected: Callable[[str], str] = lambda _: "a finite number") -> None:
-        """Raise InvalidRequestError where a number is not finite or a position beyond ±`max_position`, rad (m).
+    def check(self, limits: Array, expected: Callable[[str], str] = lambda _: "a finite number") -> None:
+        """Raise InvalidRequestError where a number is not finite or a position beyond ±`limits`, (n,) rad (m).
         expected: says what a number of q, dq, ddq or tau has to be."""
         if not np.isfinite(self.values).all():
             part, row, joint = np.argwhere(~np.isfinite(self.values))[0]
             number = f"{self.values[part, row, joint]:g}"
             raise invalid_request(self._name(QUANTITIES[part], row, joint), number, expected(QUANTITIES[part]))
-        size = np.abs(self.values[0])
-        if size.max() > max_position:
-            row, joint = np.unravel_index(size.argmax(), size.shape)
-            within = f"radians (or metres) within ±{max_position:g}: are these degrees?"
+        beyond = np.abs(self.values[0]) - limits
+        if beyond.max() > 0:
+            row, joint = np.unravel_index(beyond.argmax(), beyond.shape)
+            within = f"radians (or metres) within ±{limits[joint]:g}: are these degrees?"
             raise invalid_request(self._name("q", row, joint), f"{self.values[0, row, joint]:g}", within)
 
     def components(self, model: TorqueModel, names: Sequence[ComponentName]) -> dict[str, Estimate]:
@@ -222,7 +222,9 @@ def at_once(served: Served, motion: Array, max_position: float, payload: Payload
     """Torque at one motion (3, n), for the event loop; None where the motion or the answer is not as it should be, or
     what answers with a payload has to be made first."""
     model = served.asked if payload is None else served.declared.known(payload.numbers)
-    if model is None or motion.shape[1] != model.n_joints or abs(motion[0]).max() > max_position:
+    if model is None or motion.shape[1] != model.n_joints:
+        return None
+    if (abs(motion[0]) > served.model.position_limits(max_position)).any():
         return None
     answer = model.answer_fully(motion)
     assert answer.tau_std is not None  # it is, unless declined
@@ -246,7 +248,7 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
     query = Query(np.stack([np.atleast_2d(values) for values in parts]), single)
     if (count := query.values.shape[1]) > settings.max_batch:
         raise invalid_request("q", f"{count} queries", f"at most {settings.max_batch} in one request")
-    query.check(settings.max_position)
+    query.check(served.model.position_limits(settings.max_position))
 
     known = carrying(served, request.payload)
     q, dq, ddq, *_ = query.values

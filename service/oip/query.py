@@ -112,7 +112,7 @@ def read(message: Message, model: TorqueModel, settings: Settings) -> Question:
         values[places[tensor.name]] = _as_read(message.numbers(place, dtype), dtype).reshape(rows, -1)
     query = Query(values, single)
     datatypes = {tensor.name: tensor.datatype for tensor in request.inputs}
-    query.check(settings.max_position, lambda name: f"a finite number of {datatypes[name]}")
+    query.check(model.position_limits(settings.max_position), lambda name: f"a finite number of {datatypes[name]}")
     return Question(query, outputs)
 
 

@@ -140,8 +140,8 @@ _FLAGS = (
 class FrameReader:
     """Reads frames of one robot into a single buffer, which the next frame overwrites."""
 
-    def __init__(self, joint_names: tuple[str, ...], max_position: float) -> None:
-        self.joint_names, self.n_joints, self.max_position = joint_names, len(joint_names), max_position
+    def __init__(self, joint_names: tuple[str, ...], position_limits: Array) -> None:
+        self.joint_names, self.n_joints, self._limits = joint_names, len(joint_names), position_limits
         self.motion: Array = np.zeros((3, self.n_joints))
         self._numbers, self._query = self.motion.reshape(-1), Query(self.motion[:, None], single=True)
         self._lengths = {torque: frames.request_bytes(self.n_joints, torque) for torque in (False, True)}
@@ -161,7 +161,7 @@ class FrameReader:
             raise invalid_request("deadline", budget, "seconds, or 0 for none")
         # a copy, because the model takes aligned and writable memory, and the message is neither for certain
         self._numbers[:] = np.frombuffer(data, frames.NUMBER, 3 * n, frames.REQUEST.size)
-        self._query.check(self.max_position)
+        self._query.check(self._limits)
         return self.motion
 
     def torque(self, data: bytes) -> Array:
@@ -366,7 +366,8 @@ class Session(Conversation):
     def _take(self, served: Served) -> None:
         self._served, self._loads, self._noise_std = served, served.loads, np.array(served.noise_std)
         self._carry()
-        self._reader = FrameReader(served.model.joint_names, self.settings.max_position)
+        limits = served.model.position_limits(self.settings.max_position)
+        self._reader = FrameReader(served.model.joint_names, limits)
 
     def _carry(self) -> None:
         """Answer with what the arm carries, as far as that is known by now."""

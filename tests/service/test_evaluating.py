@@ -77,14 +77,6 @@ def test_the_shipped_model_is_good_and_honest(strict, panda):
     assert min(answer["coverage"]) > 0.8
 
 
-def test_a_joint_whose_torque_does_not_vary_has_no_nmse(api, trained):
-    still = replace(stream(seed=7), tau=stream(seed=7).tau * [1, 0])
-    answer = ask(api, trained.name, upload(api, still)["id"]).json()
-    assert answer["nmse"][0] > 0
-    assert answer["nmse"][1] is None
-    assert np.isfinite(answer["rmse"]).all()
-
-
 @pytest.mark.parametrize(
     ("robot", "convention", "words"),
     [

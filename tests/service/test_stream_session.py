@@ -24,6 +24,9 @@ class Model:
     def __init__(self, factor=1.0):
         self.factor = factor
 
+    def position_limits(self, largest):
+        return np.full(len(self.joint_names), largest)
+
     def answer(self, motion, std=True):
         return self.factor * motion[0], np.full_like(motion[0], self.factor) if std else None
 

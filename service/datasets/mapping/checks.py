@@ -15,6 +15,8 @@ CONSTANT = 1e-6
 """A joint whose positions span less than this (rad, m) has not moved."""
 MOVED = 0.01
 """One that was left out and whose positions span more than this (rad, m) has moved."""
+JUMP = 1.0
+"""Between two rows a position that jumps by a turn, but for so many rad, has been wrapped."""
 LARGEST = 1e12
 """No time, motion or torque in SI units is larger; beyond it, squares and differences overflow."""
 SLOWEST = 1.0
@@ -60,6 +62,43 @@ class Seen:
     def span(self) -> float:
         """Largest less smallest value; 0 where there are none."""
         return max(0.0, self.high - self.low)
+
+
+class Turns:
+    """Takes jumps of a whole turn out of a joint's positions, block after block, as sensors wrap them at ±π or 2π.
+
+    count: jumps so far; first: row of the first one, counted from 1.
+    """
+
+    def __init__(self) -> None:
+        self.count, self.first = 0, 0
+        self._last: tuple[float, float] | None = None
+        self._turned = 0.0
+
+    def unwrap(self, q: Array, episode: Array | None, rows: Rows) -> Array:
+        """More positions (M,), rad, NaN where missing, of these rows, without jumps; each episode begins where it is
+        recorded."""
+        known = np.flatnonzero(~np.isnan(q))
+        if len(known) == 0:
+            return q
+        values = q[known]
+        numbers = np.zeros(len(known)) if episode is None else episode[known]
+        last = self._last or (float(values[0]), float(numbers[0]))
+        step, other = np.diff(values, prepend=last[0]), np.diff(numbers, prepend=last[1]) != 0
+        jumps = np.where((np.abs(np.abs(step) - TURN) < JUMP) & ~other, -np.sign(step), 0.0)
+        self._last = float(values[-1]), float(numbers[-1])
+        if jumps.any():
+            self.first = self.first or int(rows[known[jumps.argmax() if jumps.max() > 0 else jumps.argmin()]])
+            self.count += int(np.count_nonzero(jumps))
+        elif not self._turned:
+            return q
+        turned = np.cumsum(jumps)
+        begun = np.maximum.accumulate(np.where(other, np.arange(len(jumps)), -1))
+        turned = np.where(begun < 0, turned + self._turned, turned - turned[np.maximum(begun, 0)])
+        self._turned = float(turned[-1])
+        out = q.copy()
+        out[known] += TURN * turned
+        return out
 
 
 class Clockwork:
@@ -123,15 +162,16 @@ def check_rows(rows: int, missing: int, repeated: int, least: int, seen: list[Se
         raise invalid_data("rows", usable, f"at least {least} samples{left_out}")
 
 
-def check_positions(seen: list[tuple[str, Seen]], max_position: float, unit_given: bool) -> None:
-    """Raise InvalidDataError where positions are too large for SI units, or a joint has not moved."""
+def check_positions(seen: list[tuple[str, Seen]], max_position: float, certain: bool) -> None:
+    """Raise InvalidDataError where positions are too large for SI units, unless these are certain, or a joint has not
+    moved."""
     farthest = max((each for _, each in seen), key=lambda each: abs(each.far))
-    if abs(farthest.far) > max_position:
-        hint = "" if unit_given else ' Then say units={"q": "deg"}'
+    if abs(farthest.far) > max_position and not certain:
         raise invalid_data(
             f"{farthest.name}, row {farthest.far_row}",
             f"{farthest.far:g}",
-            f"radians (or metres) within ±{max_position:g}: are these degrees?{hint}",
+            f'radians (or metres) within ±{max_position:g}: are these degrees? Then say units={{"q": "deg"}}, or '
+            'units={"q": "rad"} if joints turn on',
         )
     for joint, each in seen:
         if each.span < CONSTANT:
@@ -140,6 +180,14 @@ def check_positions(seen: list[tuple[str, Seen]], max_position: float, unit_give
                 f"constant at {each.low:g}",
                 f"a joint that moves: leave out locked joints, drop_joints={joint}",
             )
+
+
+def check_torques(seen: list[tuple[str, Seen]]) -> None:
+    """Raise InvalidDataError where a torque is the same in all rows: nobody has measured it."""
+    constant = [(joint, each) for joint, each in seen if each.span == 0]
+    for joint, each in constant:
+        hint = "" if len(constant) == len(seen) else f"; without any, leave it out: drop_joints={joint}"
+        raise invalid_data(each.name, f"constant at {each.low:g}", f"torque measured while the joint moved{hint}")
 
 
 def epoch_unit(t: Array, rows: Rows, name: str) -> None:

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.profiles import Profile
 from lipcore.vocabulary import TorqueConvention
+from lipserve.wording import counted
 from service.datasets.formats.table import Table
 from service.datasets.mapping import checks
-from service.datasets.mapping.checks import Clockwork, Rows, Seen
+from service.datasets.mapping.checks import Clockwork, Rows, Seen, Turns
 from service.datasets.mapping.choice import MOTION
 from service.datasets.mapping.mapping import ColumnMap, Source, resolve
 from service.datasets.options import UploadOptions
@@ -74,6 +75,7 @@ def read(
         "torque_constants": None if mapped.torque.constants is None else list(mapped.torque.constants),
         "torque_factors": None if mapped.torque.factors is None else list(mapped.torque.factors),
         "rows_read": reader.rows,
+        "turns": {name: each.count for name, each in zip(mapped.joints, reader.turns, strict=True) if each.count},
         "repeated_stamps": reader.clockwork.repeated,
         "first_repeated_row": reader.clockwork.first_repeated or None,
         "missing_rows": int(reader.staged.missing().sum()),
@@ -91,6 +93,7 @@ class _Reader:
         self.time_has_unit = any(each.unit is not None for each in mapped.t)
         self.clockwork = Clockwork(mapped.t[0].name if mapped.t else TIME)
         self.seen = {quantity: [Seen(each.name) for each in row] for quantity, row in mapped.quantities.items()}
+        self.turns = [Turns() for _ in mapped.joints]
         self.left_out = {name: Seen(each.name) for name, each in mapped.dropped.items()}
         self.absent = {quantity for quantity in MOTION if quantity in mapped.quantities}
         """Those of which there was no value yet: perhaps there is none at all."""
@@ -122,11 +125,18 @@ class _Reader:
         joints = list(zip(self.mapped.joints, self.seen["q"], strict=True))
         unit = all(each.unit is not None for each in self.mapped.quantities["q"])
         checks.check_positions(joints, self.settings.max_position, unit)
+        checks.check_torques(list(zip(self.mapped.joints, self.seen["tau"], strict=True)))
         self._check_slopes(missing)
 
     def notes(self) -> list[str]:
         """What of the file is not used after all."""
         out = [f"{quantity} has no values and is taken as not given" for quantity in MOTION if quantity in self.absent]
+        for name, turns in zip(self.mapped.joints, self.turns, strict=True):
+            if turns.count:
+                out.append(
+                    f"the position of {name} jumps by whole turns, {counted(turns.count, 'time')}, first in row "
+                    f"{turns.first}: these were taken out"
+                )
         for name, each in self.left_out.items():
             if each.span > checks.MOVED:
                 out.append(
@@ -167,6 +177,8 @@ class _Reader:
                 if all(np.isnan(each).all() for each in values):
                     continue
                 self._begin(quantity)
+            if quantity == "q":
+                values = [turns.unwrap(each, episode, rows) for turns, each in zip(self.turns, values, strict=True)]
             for joint, each in enumerate(values):
                 columns[column(quantity, joint)] = each
         for name, source in self.mapped.dropped.items():

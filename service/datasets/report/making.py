@@ -72,11 +72,6 @@ def make_report(
     known = profile if best is None else profiles.profile(best)
     rigid = _rigid_bodies(known, limits_of(known, names), prepared, samples, gravity)
     excitation = _excitation(samples, rigid)
-    constant = [
-        f"tau{joint + 1} is constant: nothing can be learnt about this joint's torque"
-        for joint, (low, high) in enumerate(samples.ranges["tau"])
-        if low == high
-    ]
     reading = [note for note in noted if not note.startswith(WARNING)]
     warned = [note.removeprefix(WARNING) for note in noted if note.startswith(WARNING)]
     if profile is not None and limits is None:
@@ -106,7 +101,6 @@ def make_report(
         },
         torque_noise_estimate=samples.noise,
         warnings=warned
-        + constant
         + [each.text for each in remedies]
         + warnings(clock.timing, recorded.saturation, recorded.limits, samples.lags, raw.rows),
         reading=reading,

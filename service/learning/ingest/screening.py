@@ -107,7 +107,7 @@ def limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> 
         if (effort > 0).all():
             torque = effort
     return RowLimits(
-        settings.max_position,
+        model.position_limits(settings.max_position),
         settings.max_velocity,
         settings.max_acceleration,
         torque,

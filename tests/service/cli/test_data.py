@@ -116,7 +116,7 @@ def test_refusals_of_an_upload_speak_as_the_shell_does(refused, recording, tmp_p
     turned = replace(samples, q=np.degrees(samples.q) * 50)
     write_recording(path, turned)
     message = refused("data", "add", path)
-    assert "are these degrees? Then say --unit q=deg (invalid_data" in message
+    assert "are these degrees? Then say --unit q=deg, or --unit q=rad if joints turn on (invalid_data" in message
     hint = refused("train", path, "--model", "never").splitlines()[-1]
     assert f"`lipserve data add {path}` takes options that say how to read it" in hint
     write_recording(path, replace(samples, q=samples.q * [1.0, 0.0]))

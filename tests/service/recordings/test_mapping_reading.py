@@ -157,6 +157,7 @@ def with_column(**columns):
 BACK = "expected more than 0.38, the time before it"
 LOCKED = "constant at 0.25, expected a joint that moves: leave out locked joints, drop_joints=joint2"
 DEGREES = "radians (or metres) within ±12.6: are these degrees?"
+UNMEASURED = "constant at 0, expected torque measured while the joint moved; without any, leave it out"
 NO_TIME = "199 whose time was there before"
 
 
@@ -171,6 +172,8 @@ NO_TIME = "199 whose time was there before"
         pytest.param(with_column(t=np.full(200, 3.0)), "rows", NO_TIME, id="no time"),
         pytest.param(with_column(episode=np.full(200, 0.5)), "episode, row 1", "a whole number", id="half"),
         pytest.param(with_column(q2=np.full(200, 0.25)), "q2", LOCKED, id="locked"),
+        pytest.param(with_column(tau1=np.zeros(200)), "tau1", UNMEASURED, id="no torque"),
+        pytest.param(with_column(tau1=np.full(200, -3.5)), "tau1", "constant at -3.5, expected", id="constant torque"),
         pytest.param(with_column(t=np.arange(200) * 10.0), "t", 'units={"t": "ms"}', id="milliseconds"),
         pytest.param(with_column(t=1.7e18 + np.arange(200) * 1e7), "t, row 1", 'units={"t": "ns"}', id="ns since 1970"),
     ],
@@ -179,6 +182,40 @@ def test_what_cannot_be_used_is_refused_with_its_row(reading, columns, field, me
     reply = refused(reading, columns)
     assert reply.detail[0].field == field
     assert message in reply.message
+
+
+def wrapped(q, lowest=-np.pi):
+    """Positions as a sensor tells them that begins again after each turn."""
+    return (q - lowest) % (2 * np.pi) + lowest
+
+
+@pytest.mark.parametrize("lowest", [-np.pi, 0.0])
+def test_turns_that_a_sensor_has_wrapped_are_put_together_again(reading, lowest):
+    data = motion()
+    data["q"][:, 0] = 40.0 * data["t"] + data["q"][:, 0]
+    result = reading(canonical(data | {"q": wrapped(data["q"], lowest)}), block=33)
+    turns = (result.staged.table("q") - data["q"]) / (2 * np.pi)
+    np.testing.assert_allclose(turns, np.round(turns[:1]) * np.ones((200, 1)), atol=1e-12)
+    count = int((np.diff(wrapped(data["q"], lowest)[:, 0]) < -5).sum())
+    assert result.facts["turns"]["joint1"] == count > 5
+    assert f"the position of joint1 jumps by whole turns, {count} times, first in row" in " ".join(result.noted)
+
+
+def test_every_episode_begins_where_it_was_recorded(reading):
+    data = motion()
+    data["q"][:, 0] = 10.0 * data["t"]
+    columns = canonical(data | {"q": wrapped(data["q"])}) | {"episode": np.repeat([0.0, 1.0], 100)}
+    columns["q1"][50] = np.nan
+    q = reading(columns).staged.table("q")[:, 0]
+    assert q[100] == columns["q1"][100]
+    assert np.nanmax(np.abs(np.delete(np.diff(q), 99))) < 0.3
+
+
+def test_joints_that_turn_on_have_no_limit_once_their_unit_is_said(reading):
+    data = motion()
+    data["q"][:, 0] += 30.0
+    assert 'units={"q": "rad"} if joints turn on' in refused(reading, canonical(data)).message
+    np.testing.assert_array_equal(reading(canonical(data), options(units={"q": "rad"})).staged.table("q"), data["q"])
 
 
 def test_a_full_disk_stops_the_reading(tmp_path):
