@@ -195,7 +195,7 @@ def _memory(subject: Subject, engines: Engines, query: Samples) -> dict[str, flo
     before = resident(pid)
     names = [f"copy-{number}" for number in range(COPIES)]
     for name in names:
-        client.import_model(archive, name)
+        client.import_model(archive, name, "always")
         client.put_learning(name, LEARNING)
         client.predict(name, query.q[0], query.dq[0], query.ddq[0])
     loaded = resident(pid)

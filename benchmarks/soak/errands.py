@@ -184,7 +184,7 @@ def archive(desk: Desk, turn: int) -> None:
     """Export what was learnt, signed, import it as another model, and delete that; the same of a URDF."""
     content = desk.ask("GET", f"/v1/models/{ARM}/export")
     kind = {"content-type": "application/x-tar"}
-    desk.ask("POST", "/v1/models/import?name=copy", 201, content=content, headers=kind)
+    desk.ask("POST", "/v1/models/import?name=copy&promotion=always", 201, content=content, headers=kind)
     desk.ask("DELETE", "/v1/models/copy", 204)
     desk.ask("GET", f"/v1/models/{ARM}/export?format=c")
     desk.ask("GET", f"/v1/models/{ARM}/urdf")

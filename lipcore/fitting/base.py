@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 from lipcore.fitting.options import FitOptions
 from lipcore.vocabulary import AUTO, CHAINED_ARM, ROBOT_ESTIMATORS
@@ -28,6 +29,21 @@ class RobotKind:
     joint_types: tuple[str, ...]
     torque_convention: str
 
+    @classmethod
+    def of_manifest(cls, manifest: Mapping[str, Any]) -> RobotKind:
+        """The robot of a saved model."""
+        names, types = tuple(manifest["joint_names"]), tuple(manifest["joint_types"])
+        return cls(names, types, manifest["torque_convention"])
+
+    def difference(self, other: RobotKind) -> tuple[str, str, str] | None:
+        """Return a field in which another robot differs, its text here and there; None where there is none."""
+        for name in (each.name for each in fields(RobotKind)):
+            own, others = getattr(self, name), getattr(other, name)
+            if own != others:
+                own, others = (part if isinstance(part, str) else ", ".join(part) for part in (own, others))
+                return name, own, others
+        return None
+
 
 def check_base(
     name: str,
@@ -48,11 +64,9 @@ def check_base(
         raise BaseMismatchError("base", name, f"a version whose estimator has an arm, {' or '.join(ROBOT_ESTIMATORS)}")
     if estimator not in robots:
         raise BaseMismatchError("estimator", estimator, f"one of {', '.join(robots)} with a base")
-    for each in fields(RobotKind):
-        own, others = getattr(data, each.name), getattr(base, each.name)
-        if own != others:
-            own, others = (part if isinstance(part, str) else ", ".join(part) for part in (own, others))
-            raise BaseMismatchError("base", name, f"a version with the {each.name} of the data, {own}; it has {others}")
+    if (found := data.difference(base)) is not None:
+        field, own, others = found
+        raise BaseMismatchError("base", name, f"a version with the {field} of the data, {own}; it has {others}")
     if estimator == CHAINED_ARM and list(order) != list(range(len(order))):
         raise BaseMismatchError("estimator", estimator, f"{' or '.join(robots[:2])}: the base's joints go another way")
     if robot is not None:

@@ -157,7 +157,8 @@ def latency(
     import numpy as np  # noqa: PLC0415 - takes long to import; help needs none
 
     with connected(url) as client:
-        version = client.version(model, client.model(model).serving_version)
+        served = client.model(model)
+        version = client.version(model, served.serving_version or served.latest_version)
         low, high = (
             np.array([version.training_range[name][side] for name in ("q", "dq", "ddq")]) for side in ("min", "max")
         )

@@ -75,7 +75,11 @@ Names = list[str | tuple[str, str]]
 
 def models(context: typer.Context) -> Names:
     """Names of models."""
-    return _listed(context, "/v1/models?limit=100", lambda each: (each["name"], f"version {each['serving_version']}"))
+    return _listed(
+        context,
+        "/v1/models?limit=100",
+        lambda each: (each["name"], f"version {each['serving_version'] or 'none'} answers"),
+    )
 
 
 def datasets(context: typer.Context) -> Names:

@@ -18,7 +18,7 @@ from service.cli import connecting
 from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
 from service.cli.models import print_held_out, print_promotion, print_selection
-from service.cli.options import HELD_OUT_BY, PROMOTION, JobId, Json, Limit, Url, alone, group, names, pairs, value
+from service.cli.options import HELD_OUT_BY, JobId, Json, Limit, Promotion, Url, alone, group, names, pairs, value
 
 if TYPE_CHECKING:
     from lipserve.records.jobs import Job
@@ -168,14 +168,7 @@ def train(
             help="Never learn what is held out. By default the version is judged without it, then trained on all rows.",
         ),
     ] = False,
-    promotion: Annotated[
-        str | None,
-        typer.Option(
-            help="Whether the version answers: `ask`, if it does well on what was held out, or `always`; by default as "
-            "the service is set.",
-            autocompletion=lambda: PROMOTION,
-        ),
-    ] = None,
+    promotion: Promotion = None,
     patience: Patience = PATIENCE,
     wait: Annotated[bool, typer.Option(help="Wait for the job's end; --no-wait leaves it to `lipserve jobs`.")] = True,
     as_json: Json = False,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from rich.markup import escape
@@ -16,12 +16,13 @@ from lipserve.wording import counted
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result, print_warnings
-from service.cli.options import Alias, Data, Json, Limit, Model, Url, Version, Yes, confirm, group
+from service.cli.options import Alias, Data, Json, Limit, Model, Promotion, Url, Version, Yes, confirm, group
 
 if TYPE_CHECKING:
     from lipserve.records.models import Alias as AliasRecord
     from lipserve.records.models import Selection
     from lipserve.results.arm import Version as VersionRecord
+    from lipserve.states import PromotionOption
 
 app = group("Models: list, show, promote, roll back, compare, export, import and delete them.")
 SERVING = "serving"
@@ -48,7 +49,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
         aliases = ", ".join(f"{name} → {at}" for name, at in model.aliases.items()) or "-"
         table.add_row(
             escape(model.name),
-            str(model.serving_version),
+            str(model.serving_version or "none"),
             *judged(None if serving is None else serving.quality),
             str(len(model.versions)),
             "-" if serving is None else serving.estimator,
@@ -66,7 +67,7 @@ def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json:
 
     with connected(url) as client:
         record = client.model(model)
-        detail = client.version(model, version or record.serving_version)
+        detail = client.version(model, version or record.serving_version or record.latest_version)
         try:
             learning = client.learning(model).status
         except ApiError:  # the version that serves cannot be read: the others can be shown all the same
@@ -74,7 +75,8 @@ def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json:
     if as_json:
         print_json({"model": record, "version": detail, "learning": learning})
         return
-    echo(f"{record.name}: version {record.serving_version} serves, {record.latest_version} is the newest")
+    serving = "no version" if record.serving_version is None else f"version {record.serving_version}"
+    echo(f"{record.name}: {serving} serves, {record.latest_version} is the newest")
     if learning is not None:
         held = ", held until you decide" if learning.held is not None else ""
         echo(f"  revision {learning.published} of {learning.revision} answers, learnt since it was trained{held}")
@@ -99,7 +101,10 @@ def promote(
     """Let a version answer where none is named; with --alias, point that alias to it instead."""
     with connected(url) as client:
         moved = client.set_alias(model, alias, _which(version))
+        judged = client.version(model, moved.version).promotion
     _moved(model, moved, as_json)
+    if not as_json and judged is not None and not judged.passed:
+        print_warnings([f"version {moved.version} would not answer by itself: {judged.reason}"])
 
 
 @app.command()
@@ -233,14 +238,20 @@ def urdf(
 def import_(
     path: Annotated[Path, typer.Argument(help="Archive that was exported.", exists=True, dir_okay=False)],
     name: Annotated[str | None, typer.Option(help="Of the model; that of the archive by default.")] = None,
+    promotion: Promotion = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Make a new version of an exported archive. It answers where the model had none before."""
+    """Make a new version of an exported archive. It answers if the model had none before, and if it does well on what
+    its training held out."""
     with connected(url) as client:
-        made = client.import_model(path, name)
-    promote = f"`lipserve models promote {made.model} {made.version}`"
-    print_result(made, as_json, f"{made.model} version {made.version} is imported: {promote}")
+        made = client.import_model(path, name, cast("PromotionOption | None", promotion))
+    what, judged = f"{made.model} version {made.version} is imported", made.promotion
+    assert judged is not None
+    promote = f"`lipserve models promote {made.model} {made.version}` lets it answer"
+    print_result(
+        made, as_json, f"{what} and answers" if judged.answers else f"{what} and waits: {judged.reason}; {promote}"
+    )
 
 
 @app.command()
@@ -294,9 +305,9 @@ def print_held_out(version: VersionRecord) -> None:
 
 
 def print_promotion(version: VersionRecord) -> None:
-    """Print why a version answers by itself, or does not; nothing where it was not judged."""
+    """Print why a version answers by itself, or does not; nothing of one that was refreshed or shipped."""
     judged = version.promotion
-    if judged is None or judged.passed is None:
+    if judged is None:
         return
     if judged.passed:
         echo(f"  it answers by itself: {judged.reason}")

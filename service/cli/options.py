@@ -19,7 +19,14 @@ ROBOTS = [
     *("asr-twodof", "finger-edu"),
 ]
 HELD_OUT_BY = ["auto", "last", "episodes", "blocks"]
-PROMOTION = ["ask", "always"]
+Promotion = Annotated[
+    str | None,
+    typer.Option(
+        help="Whether the version answers: `ask`, if it does well on what was held out, or `always`; by default as the "
+        "service is set.",
+        autocompletion=lambda: ["ask", "always"],
+    ),
+]
 
 
 Url = Annotated[

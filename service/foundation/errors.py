@@ -89,6 +89,12 @@ class ConflictError(ServiceError):
     status, code = 409, "conflict"
 
 
+class NoServingVersionError(ServiceError):
+    """All versions of the model wait as candidates: none answers by itself."""
+
+    status, code = 409, "no_serving_version"
+
+
 class TooLargeError(ServiceError):
     """The body exceeds a limit."""
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from lipcore.fitting.base import RobotKind
 from service.foundation.errors import ConflictError, invalid_request, not_found
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.models.registry import SERVING
 from service.models.schema import Alias, AliasList, AliasMove, AliasRequest
-from service.storage.database import AliasMoveRow, AliasRow, ModelRow, VersionRow, now
+from service.storage.database import AliasMoveRow, AliasRow, ModelRow, ServingRow, VersionRow, now
 
 
 def page(loaded: LoadedModels, model: str) -> AliasList:
@@ -18,7 +19,8 @@ def page(loaded: LoadedModels, model: str) -> AliasList:
     # nothing is listed here that does not answer yet; and other services move and remove aliases meanwhile
     with loaded.moving, loaded.database.moment() as session:
         _check_model(session, model)
-        return AliasList(items=[_show(loaded, session, model, name) for name in (SERVING, *names(session, model))])
+        serving = [] if registry.answering(session, model) is None else [SERVING]
+        return AliasList(items=[_show(loaded, session, model, name) for name in (*serving, *names(session, model))])
 
 
 def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> Alias:
@@ -26,7 +28,8 @@ def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> 
 
     The version is in memory and warm before the alias moves: queries follow by one assignment, those in flight keep
     what answered them. Raise InvalidRequestError where not exactly one of version and alias is named, NotFoundError,
-    ConflictError beyond `max_aliases`, UnreadableVersionError. Not for the event loop.
+    ConflictError beyond `max_aliases` and for a version of another robot, UnreadableVersionError. Not for the event
+    loop.
     """
     if (request.version is None) == (request.alias is None):
         given = "neither" if request.version is None else "both"
@@ -68,7 +71,10 @@ def _move(loaded: LoadedModels, model: str, alias: str, version: int, taken_back
             _check_model(session, model)
             if not registry.exists(session, model, version):  # deleted since it was found
                 raise not_found("version", version)
-            if taken_back is not None and _last(session, model, alias).seq != number:
+            if taken_back is None:
+                manifest = session.get_one(VersionRow, (model, version)).manifest
+                registry.check_robot(session, model, RobotKind.of_manifest(manifest))
+            elif _last(session, model, alias).seq != number:
                 raise ConflictError(f"the alias {alias!r} of model {model!r} was moved meanwhile: look, and try again")
             if alias == SERVING:
                 registry.serve(session, model, version, number)
@@ -153,7 +159,7 @@ def _check_room(loaded: LoadedModels, session: Session, model: str, alias: str) 
 def _show(loaded: LoadedModels, session: Session, model: str, alias: str) -> Alias:
     past = _history(session, model, alias, loaded.storage.settings.max_alias_moves)
     if alias == SERVING:
-        version = registry.answering(session, model)
+        version = session.get_one(ServingRow, model).version
         changed_at = past[0].at if past else session.get_one(VersionRow, (model, version)).created_at
     else:
         row = session.get_one(AliasRow, (model, alias))

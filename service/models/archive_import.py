@@ -9,26 +9,32 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
+from sqlalchemy import select
 
 from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, ModelFormatError, read_manifest_bytes
 from lipcore.files.probing import probe
+from lipcore.fitting.base import RobotKind
+from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings
+from lipserve.states import PromotionOption
 from service.compute import cage
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
 from service.models import archive_reading, registry
 from service.models.archive_fields import FIELDS
 from service.models.archive_reading import check_texts, invalid_member, invalid_model, limits_of
+from service.models.lineage import held_out_figures
 from service.models.loaded import LoadedModels
-from service.models.schema import Version
-from service.storage.database import LearnerRow, ServingRow, now
+from service.models.schema import Promotion, Version
+from service.storage.database import LearnerRow, VersionRow, now
 from service.storage.files import new_id
 from service.web.storage_errors import undecided
 
 logger = logging.getLogger(__name__)
 
+OTHERS = Acceptance(unknown=("it was imported beside other versions",))
 OPTION_LIMITS = {
     "hyperparameter_samples": "max_hyperparameter_samples",
     "posterior_samples": "max_posterior_samples",
@@ -37,11 +43,13 @@ OPTION_LIMITS = {
 """Options of a fit, and the settings that limit them: a refresh trains with those of the version."""
 
 
-def add(loaded: LoadedModels, upload: Path, name: str | None) -> Version:
+def add(loaded: LoadedModels, upload: Path, name: str | None, promotion: PromotionOption | None = None) -> Version:
     """Make a new version of what an archive holds; return it. Not for the event loop.
 
-    name: of the model, that of the archive by default. The version answers only where it is the model's first one: any
-    other has to be chosen. Raise InvalidDataError naming the member that is wrong and what is wrong with it.
+    name: of the model, that of the archive by default; promotion: whether it answers, as the settings say where None.
+    If asked, it answers only where it is the model's first one, and the figures in its lineage say that it may. Raise
+    InvalidDataError naming the member that is wrong and what is wrong with it, ConflictError for a model of another
+    robot.
     """
     settings = loaded.storage.settings
     cage.run("service.models.archive_reading:try_out", type(None), upload, settings, settings=settings, field="archive")
@@ -59,7 +67,7 @@ def add(loaded: LoadedModels, upload: Path, name: str | None) -> Version:
     with loaded.files.new_version(folder) as target:
         persistence.write(target, files)
     try:
-        version, serves = _publish(loaded, model, folder, manifest)
+        version, serves = _publish(loaded, model, folder, manifest, promotion or settings.promotion)
     except BaseException as error:
         if not undecided(error):
             with suppress(OSError):  # what cannot be deleted now is swept
@@ -71,15 +79,27 @@ def add(loaded: LoadedModels, upload: Path, name: str | None) -> Version:
     return registry.show_version(loaded.database, model, version)
 
 
-def _publish(loaded: LoadedModels, model: str, folder: str, manifest: dict[str, Any]) -> tuple[int, bool]:
+def _publish(
+    loaded: LoadedModels, model: str, folder: str, manifest: dict[str, Any], option: PromotionOption
+) -> tuple[int, bool]:
     """Add the version; return its number, and whether it answers where none is named."""
     with loaded.database.transaction() as session:
-        version = registry.publish(session, model, folder, manifest, None, candidate=True)
-        serving = session.get(ServingRow, model)
-        serves = serving is not None and serving.version == version
-        if not serves:  # it is nobody's rival: who imports it says what becomes of it
+        registry.check_robot(session, model, RobotKind.of_manifest(manifest))
+        first = session.scalar(select(VersionRow.version).where(VersionRow.model == model).limit(1)) is None
+        judged = Promotion.of(_accepted(manifest) if first else OTHERS, registry.answering(session, model), option)
+        waits = not judged.answers
+        version = registry.publish(session, model, folder, manifest, None, candidate=waits, promotion=judged)
+        if waits:  # it is nobody's rival: who imports it says what becomes of it
             session.get_one(LearnerRow, (model, version)).role = "dismissed"
-    return version, serves
+    return version, judged.answers
+
+
+def _accepted(manifest: Mapping[str, Any]) -> Acceptance:
+    """What the figures say that come with a version."""
+    try:
+        return accept(held_out_figures(tuple(manifest["joint_names"]), manifest["lineage"]["holdout"]))
+    except (KeyError, TypeError, ValueError):
+        return Acceptance(unknown=("its archive does not say how it does on what its training held out",))
 
 
 def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:

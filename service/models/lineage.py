@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from lipcore.data.coverage import coverage_interval
 from lipcore.data.metrics import Answer
 from lipcore.data.samples import Samples
 from lipcore.files.manifest import FORMAT_VERSION
+from lipcore.model.acceptance import HeldOutFigures
 from lipcore.model.torque_model import TorqueModel
 from service import __version__
 from service.foundation.fields import finite
@@ -81,6 +83,19 @@ def figures(model: TorqueModel, samples: Samples, most: int, of: int) -> dict[st
     per_joint = {name: finite(getattr(compared, name)) for name in ("nmse", "rmse", "coverage", "nlpd")}
     width = {"interval_width": compared.width.tolist()}
     return {"samples": len(used), "of": of, **per_joint, **width, **known(coverage_interval(used, answer))}
+
+
+def held_out_figures(joint_names: tuple[str, ...], holdout: Mapping[str, Any]) -> HeldOutFigures:
+    """Figures of a fit on what was held out, as a lineage has them; raise KeyError, TypeError or ValueError where there
+    are none, or others."""
+    found = {
+        each.name: np.array(holdout[each.name], np.float64)
+        for each in fields(HeldOutFigures)
+        if each.name != "joint_names"
+    }
+    if any(each.shape != (len(joint_names),) for each in found.values()):
+        raise ValueError("figures are not those of the joints")
+    return HeldOutFigures(joint_names, **found)
 
 
 def answer_of(model: TorqueModel, samples: Samples) -> Answer:

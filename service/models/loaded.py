@@ -143,8 +143,7 @@ class LoadedModels:
             return (None, None) if serving is None else (serving.version, serving)
         number = self.newest(model, alias)
         if number is None:
-            registry.find(self.database, model, None)  # that there is no such model is said first
-            raise not_found("alias", alias)
+            raise registry.no_alias(self.database, model, alias)
         return number, None
 
     def point(self, model: str, alias: str, version: int | None) -> None:

@@ -13,7 +13,8 @@ from sqlalchemy.orm import Session
 
 import lipcore
 from lipcore.files.persistence import checksums, read_manifest
-from service.foundation.errors import NotFoundError, not_found
+from lipcore.fitting.base import RobotKind
+from service.foundation.errors import ConflictError, NoServingVersionError, NotFoundError, not_found
 from service.foundation.settings import shipped_models
 from service.models.schema import HeldOutQuality, Model, ModelPage, Promotion, Version, VersionSummary
 from service.storage.database import (
@@ -73,13 +74,11 @@ def publish(
 ) -> int:
     """Add a version whose files are complete; it is visible once the session commits. Return its number.
 
-    It answers from then on, unless it is a candidate for that of a model that has a version. start: number of the last
-    event of the model that it contains by training, the newest where None; promotion: why it answers, or does not.
+    It answers from then on, unless it is a candidate. start: number of the last event of the model that it contains by
+    training, the newest where None; promotion: why it answers, or does not.
     """
-    row, latest = _row(session, model), _newest(session, model)
-    if latest and session.get(ServingRow, model) is None:  # of a home from before there were candidates
-        serve(session, model, latest)
-    row.last_version = version = max(row.last_version, latest) + 1
+    row = _row(session, model)
+    row.last_version = version = row.last_version + 1
     audit.note(session, model, "version added", version, after=_origin(manifest, job))
     session.add(
         VersionRow(
@@ -95,7 +94,7 @@ def publish(
     if start is None:
         start = session.scalar(select(func.max(EventRow.number)).where(EventRow.model == model)) or 0
     session.add(LearnerRow(model=model, version=version, start=start, role="candidate"))
-    if not candidate or not latest:
+    if not candidate:
         serve(session, model, version)
     return version
 
@@ -118,28 +117,44 @@ def _row(session: Session, model: str) -> ModelRow:
     return row
 
 
-def _newest(session: Session, model: str) -> int:
-    """The highest number among the versions that there are, 0 where there are none."""
-    return session.scalar(select(func.max(VersionRow.version)).where(VersionRow.model == model)) or 0
+def check_robot(session: Session, model: str, kind: RobotKind) -> None:
+    """Raise ConflictError where a model's first version is of another robot than one that is to answer for it."""
+    query = select(VersionRow).where(VersionRow.model == model).order_by(VersionRow.version).limit(1)
+    first = session.scalar(query)
+    found = None if first is None else RobotKind.of_manifest(first.manifest).difference(kind)
+    if first is not None and found is not None:
+        field, own, others = found
+        raise ConflictError(
+            f"model {model!r} is of another robot: the {field} of its version {first.version}: {own}; of this one: "
+            f"{others}. Choose another name"
+        )
 
 
-def answering(session: Session, model: str) -> int:
-    """The version that answers where none is named, 0 where there is none."""
+def answering(session: Session, model: str) -> int | None:
+    """The version that answers where none is named, None where there is none."""
     chosen = session.get(ServingRow, model)
-    return _newest(session, model) if chosen is None else chosen.version
+    return None if chosen is None else chosen.version
 
 
 def learning(session: Session, model: str) -> list[int]:
     """Versions that learn: candidates for the place of the one that serves, and last that one."""
     candidates = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == "candidate")
     serves = answering(session, model)
-    return [*(each for each in session.scalars(candidates) if each != serves), *([serves] if serves else [])]
+    return [*(each for each in session.scalars(candidates) if each != serves), *([] if serves is None else [serves])]
 
 
-def missing(session: Session, model: str, version: int | None) -> NotFoundError:
-    """The error for a version that there is not: of its model, where that is none either."""
-    known = session.scalar(select(ModelRow.name).where(ModelRow.name == model))
-    return not_found("model", model) if known is None else not_found("version", version)
+def missing(session: Session, model: str, version: int | None) -> NotFoundError | NoServingVersionError:
+    """The error for a version that there is not: of its model, where that is none either. version: None for the one
+    that serves."""
+    if session.scalar(select(ModelRow.name).where(ModelRow.name == model)) is None:
+        return not_found("model", model)
+    if version is not None:
+        return not_found("version", version)
+    newest = session.scalar(select(func.max(VersionRow.version)).where(VersionRow.model == model))
+    return NoServingVersionError(
+        f"no version of model {model!r} serves, all wait as candidates: `lipserve models show {model}` says why, and "
+        f"`lipserve models promote {model} {newest}` lets the newest answer"
+    )
 
 
 def exists(session: Session, model: str, version: int) -> bool:
@@ -195,18 +210,9 @@ def pointers(database: Database, models: Collection[str] | None = None) -> dict[
 
 def serving(database: Database, models: Collection[str]) -> dict[str, Serving]:
     """Which version of each of these models answers; those that have none are left out."""
-    newest = (
-        select(VersionRow.model, func.max(VersionRow.version), ServingRow.version, ServingRow.change)
-        .outerjoin(ServingRow, ServingRow.model == VersionRow.model)
-        .where(VersionRow.model.in_(models))
-        .group_by(VersionRow.model, ServingRow.version, ServingRow.change)
-    )
+    query = select(ServingRow.model, ServingRow.version, ServingRow.change).where(ServingRow.model.in_(models))
     with database.session() as session:
-        rows = session.execute(newest).all()
-    return {
-        model: Serving(latest, 0) if chosen is None else Serving(chosen, change)
-        for model, latest, chosen, change in rows
-    }
+        return {model: Serving(version, change) for model, version, change in session.execute(query)}
 
 
 def install_shipped(database: Database, files: Files) -> None:
@@ -248,28 +254,32 @@ def _is_missing(session: Session, source: Path) -> bool:
 
 
 def find(database: Database, model: str, version: int | None) -> VersionRow:
-    """Return a version, the one that answers where None; raise NotFoundError."""
-    if version is None:
-        chosen = serving(database, [model]).get(model)
-        version = None if chosen is None else chosen.version
+    """Return a version, the one that answers where None; raise NotFoundError or NoServingVersionError."""
     with database.session() as session:
-        row = None if version is None else session.get(VersionRow, (model, version))
+        number = answering(session, model) if version is None else version
+        row = None if number is None else session.get(VersionRow, (model, number))
         if row is None:
             raise missing(session, model, version)
     return row
 
 
 def named(database: Database, text: str) -> VersionRow:
-    """The version that a text of the pattern `schema.VERSION` names; raise NotFoundError."""
+    """The version that a text of the pattern `schema.VERSION` names; raise NotFoundError or NoServingVersionError."""
     name, _, alias = text.partition("@")
     model, _, number = name.partition(":")
     if alias in ("", SERVING):
         return find(database, model, int(number) if number else None)
     version = pointers(database, [model]).get((model, alias))
     if version is None:
-        find(database, model, None)  # that there is no such model is said first
-        raise not_found("alias", alias)
+        raise no_alias(database, model, alias)
     return find(database, model, version)
+
+
+def no_alias(database: Database, model: str, alias: str) -> NotFoundError:
+    """The error for an alias that there is not: of its model, where that is none either."""
+    with database.session() as session:
+        known = session.scalar(select(ModelRow.name).where(ModelRow.name == model))
+    return not_found("model", model) if known is None else not_found("alias", alias)
 
 
 def recent(database: Database, count: int) -> list[str]:
@@ -345,12 +355,12 @@ def rows_of(session: Session, keys: Collection[tuple[str, int]]) -> dict[tuple[s
 def lost(
     database: Database, files: Files, held: Collection[tuple[str, int]], damaged: Collection[tuple[str, int]]
 ) -> tuple[int, int]:
-    """How many models have a version that serves and cannot be read, and how many there are. held: versions in memory,
-    which answer whatever their files are; damaged: those whose files could not be read."""
+    """How many models have a version that serves and cannot be read, and how many have one that serves. held: versions
+    in memory, which answer whatever their files are; damaged: those whose files could not be read."""
     with database.session() as session:
         names = list(session.scalars(select(ModelRow.name)))
         rows = session.execute(select(VersionRow.model, VersionRow.version, VersionRow.folder))
         folders = {(model, version): folder for model, version, folder in rows}
     serves = {(model, each.version) for model, each in serving(database, names).items()}
     gone = [key for key in serves - set(held) if key in damaged or not files.has_version(folders.get(key, ""))]
-    return len(gone), len(names)
+    return len(gone), len(serves)

@@ -8,6 +8,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Path, Query, Request, Response, status
 from fastapi.responses import StreamingResponse
 
+from lipserve.states import PromotionOption
 from service.foundation.errors import (
     ConflictError,
     InvalidDataError,
@@ -52,12 +53,19 @@ async def import_version(
     name: Annotated[
         schema.ModelName | None, Query(description="Name of the model; that of the archive by default")
     ] = None,
+    promotion: Annotated[
+        PromotionOption | None,
+        Query(
+            description="Whether it answers: `ask`, if the model had no version and the figures that come with it say "
+            "that it does well on what its training held out; `always`, in any case. LIPSERVE_PROMOTION by default"
+        ),
+    ] = None,
 ) -> schema.Version:
-    """Check an archive and make a new version of it, which answers where the model had none."""
+    """Check an archive and make a new version of it."""
     path = loaded.files.upload()
     try:
         await receive_to(request, path, ARCHIVES, loaded.storage.disk)
-        version = await to_thread.run_sync(archive_import.add, loaded, path, name, limiter=turns)
+        version = await to_thread.run_sync(archive_import.add, loaded, path, name, promotion, limiter=turns)
     finally:
         path.unlink(missing_ok=True)
     response.headers["Location"] = f"/v1/models/{version.model}/versions/{version.version}"

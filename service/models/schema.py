@@ -7,7 +7,9 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StringConstraints, model_validator
 
 from lipcore.data.splits import Kind, Split
+from lipcore.model.acceptance import Acceptance
 from lipcore.vocabulary import JointType, TorqueConvention
+from lipserve.states import PromotionOption
 
 ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
 """Lower-case letters, digits, dots, underscores and hyphens: safe in URLs and never a path."""
@@ -64,11 +66,19 @@ class Promotion(BaseModel):
 
     answers: bool = Field(description="Whether it answered once it was trained; else it waits under alias `candidate`")
     passed: bool | None = Field(
-        description="Whether its intervals hold 90 % on every joint, as far as can be told, and it is not worse than "
-        "the version that serves; null where it was not judged"
+        description="Whether its error is below that of the mean torque on every joint, its intervals hold 90 %, and "
+        "it is not worse than the version that serves; null where that cannot be told"
     )
-    serving: int | None = Field(description="The version that answered until then; null where it is the first")
+    serving: int | None = Field(description="The version that answered until then; null where none did")
     reason: str
+
+    @classmethod
+    def of(cls, found: Acceptance, serving: int | None, option: PromotionOption = "ask") -> Promotion:
+        """What becomes of a version: it answers if it has passed, or if its owner wants that in any case."""
+        passed, reason = found.passed, found.reason
+        if not passed and option == "always":
+            reason += "; it answers as was asked for"
+        return cls(answers=passed is True or option == "always", passed=passed, serving=serving, reason=reason)
 
 
 class HeldOutQuality(BaseModel):
@@ -124,7 +134,7 @@ class Version(BaseModel):
         "version where it comes from (`imported`)"
     )
     promotion: Promotion | None = Field(
-        None, description="Whether it answers by itself; null for one that was refreshed, imported or shipped"
+        None, description="Whether it answers by itself; null for one that was refreshed or shipped"
     )
     selection: Selection | None = Field(
         None, description="How the estimator was chosen; null where it was named when the training was asked for"
@@ -148,7 +158,7 @@ class VersionSummary(BaseModel):
         None, description="On what its training held out; null where that was nothing"
     )
     promotion: Promotion | None = Field(
-        None, description="Whether it answers by itself, and why; null for one that was refreshed, imported or shipped"
+        None, description="Whether it answers by itself, and why; null for one that was refreshed or shipped"
     )
 
 
@@ -158,9 +168,8 @@ class Model(BaseModel):
     name: str
     created_at: str
     latest_version: int = Field(description="The newest version")
-    serving_version: int = Field(
-        description="The version that answers where none is named: the newest, unless that waits as candidate, or an "
-        "earlier one was chosen"
+    serving_version: int | None = Field(
+        description="The version that answers where none is named; null where all wait as candidates"
     )
     aliases: dict[str, int] = Field(description="Names that were given to versions, `serving` aside")
     versions: list[VersionSummary]

@@ -98,6 +98,9 @@ def _checked(queue: JobQueue, request: JobRequest) -> tuple[list[DatasetRow], li
         raise invalid_request("datasets", len(request.datasets), f"at most {queue.settings.max_job_datasets}")
     rows = [store.find(queue.database, dataset) for dataset in request.datasets]
     joint_types = _check_joints(request, rows)
+    kind = RobotKind(tuple(rows[0].joint_names), tuple(joint_types), rows[0].torque_convention)
+    with queue.database.session() as session:
+        registry.check_robot(session, request.model, kind)
     if request.holdout is not None:
         holding_out.check(rows, request.holdout, queue.settings.min_samples)
     if queue.settings.cluster is None:  # else its workers have what it takes, or say so
@@ -243,7 +246,7 @@ def _check_extra(request: JobRequest) -> None:
 def _check_base(base: VersionRow, request: JobRequest, data: DatasetRow, joint_types: list[str]) -> None:
     """Check that the training can start from a version."""
     manifest = base.manifest
-    of_base = RobotKind(tuple(manifest["joint_names"]), tuple(manifest["joint_types"]), manifest["torque_convention"])
+    of_base = RobotKind.of_manifest(manifest)
     of_data = RobotKind(tuple(data.joint_names), tuple(joint_types), data.torque_convention)
     order = manifest["parameters"].get("geometry", {}).get("order")
     options, name = FitOptions(**request.options.model_dump()), f"{base.model}:{base.version}"

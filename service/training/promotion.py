@@ -1,10 +1,9 @@
 """Whether a version that was trained answers by itself: judged by what its training held out, before its last fit.
 
-It waits where the 95 % intervals of a joint hold less than LEAST_COVERAGE of that, by the upper end of the confidence
-interval, as 85 % of ten errors tell nothing; and where it is worse than the version that serves, by paired differences.
-Both are compared as they were trained; a version that has learnt the rows held out is compared by its judged fit, whose
-scores its lineage keeps. Of versions that are as good 1 to 7 % wait (simulated: 5 to 60 s held out, errors that stay
-alike for 0.1 to 3 s).
+It waits unless `lipcore.model.acceptance` accepts it, and where it is worse than the version that serves, by paired
+differences. Both are compared as they were trained; a version that has learnt the rows held out is compared by its
+judged fit, whose scores its lineage keeps. Of versions that are as good 1 to 7 % wait (simulated: 5 to 60 s held out,
+errors that stay alike for 0.1 to 3 s).
 """
 
 from __future__ import annotations
@@ -17,15 +16,16 @@ from sqlalchemy.orm import Session
 from lipcore.data.metrics import BlockScores, Difference
 from lipcore.data.samples import Samples
 from lipcore.files.manifest import ModelFormatError
+from lipcore.fitting.base import RobotKind
+from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.torque_model import TorqueModel
 from lipserve.states import PromotionOption
 from service.models import aliases, registry
-from service.models.lineage import answer_of, learnt_from
+from service.models.lineage import answer_of, held_out_figures, learnt_from
 from service.models.schema import HoldoutLineage, Promotion
 from service.storage.database import Database, LearnerRow, VersionRow
 from service.storage.files import Files
 
-LEAST_COVERAGE = 0.9
 CANDIDATE = "candidate"
 """Alias of the version that waits."""
 
@@ -43,22 +43,14 @@ def judge(
     version, with the figures on these samples."""
     with database.session() as session:
         number = registry.answering(session, model)
-        serving = session.get(VersionRow, (model, number))
-    before = None if serving is None else number
+        serving = None if number is None else session.get_one(VersionRow, (model, number))
     if held_out is None:
-        return Promotion(answers=True, passed=None, serving=before, reason="not judged, as nothing was held out")
-    problems, passes = _coverage(trained.joint_names, lineage["holdout"])
-    if serving is not None:
-        problem, note = _against(files, serving, trained, held_out, lineage)
-        problems, passes = problems + problem, passes + note
-    reason = "; ".join(problems + passes)
-    if not problems:
-        return Promotion(answers=True, passed=True, serving=before, reason=reason)
-    if serving is None:
-        return Promotion(answers=True, passed=False, serving=None, reason=f"{reason}; no other version could answer")
-    if option == "always":
-        return Promotion(answers=True, passed=False, serving=before, reason=f"{reason}; it answers as was asked for")
-    return Promotion(answers=False, passed=False, serving=before, reason=reason)
+        found = Acceptance(unknown=("not judged, as nothing was held out",))
+    else:
+        found = accept(held_out_figures(trained.joint_names, lineage["holdout"]))
+        if serving is not None:
+            found += _against(files, serving, trained, held_out, lineage)
+    return Promotion.of(found, number, option)
 
 
 def compare_refreshed(
@@ -72,14 +64,13 @@ def compare_refreshed(
         refreshed = session.get(VersionRow, (model, version))
     if refreshed is None:
         return None
-    problems, passes = _against(files, refreshed, trained, held_out, lineage)
-    return "; ".join(problems + passes)
+    return _against(files, refreshed, trained, held_out, lineage).reason
 
 
 def settle(session: Session, model: str, judged: Promotion, option: PromotionOption) -> Promotion:
     """The same as of the moment when the version is added: it waits where another one answers by now."""
-    serving = registry.answering(session, model) or None
-    if serving in (None, judged.serving) or judged.passed is None or option == "always":
+    serving = registry.answering(session, model)
+    if serving in (None, judged.serving) or not judged.answers or option == "always":
         return judged
     reason = f"version {serving} answers since it was judged, and was not compared with it"
     return Promotion(answers=False, passed=False, serving=serving, reason=reason)
@@ -94,37 +85,23 @@ def wait(session: Session, model: str, version: int, most_aliases: int) -> None:
         aliases.point(session, model, CANDIDATE, version)
 
 
-def _coverage(joint_names: tuple[str, ...], figures: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """What is wrong with the coverage, and what is right."""
-    by_joint = zip(joint_names, *(figures[name] for name in ("coverage", "coverage_high", "independent")), strict=True)
-    narrow = [
-        f"{joint} {100 * share:.0f} % (at most {100 * high:.0f} %, from {count:.0f} independent errors)"
-        for joint, share, high, count in by_joint
-        if high < LEAST_COVERAGE
-    ]
-    least = f"{100 * LEAST_COVERAGE:.0f} %"
-    if narrow:
-        return [f"the 95 % intervals hold less than {least} of what was held out: {', '.join(narrow)}"], []
-    return [], [f"its 95 % intervals hold {least} of what was held out, as far as that can tell"]
-
-
 def _against(
     files: Files, serving: VersionRow, trained: TorqueModel, held_out: Samples, lineage: dict[str, Any]
-) -> tuple[list[str], list[str]]:
+) -> Acceptance:
     """How the version is worse than the one that serves, or why that is not said."""
     name, manifest = f"version {serving.version}", serving.manifest
-    kind = tuple(manifest["joint_names"]), manifest["torque_convention"]
-    if kind != (trained.joint_names, trained.torque_convention):
-        return [f"{name} has other joints or another torque convention"], []
+    kind = RobotKind(trained.joint_names, trained.joint_types, trained.torque_convention)
+    if RobotKind.of_manifest(manifest).difference(kind) is not None:
+        return Acceptance(against=(f"{name} is of another robot",))
     scores = BlockScores.of(held_out, answer_of(trained, held_out))
     try:
         before = _scores(files, serving, held_out, lineage["holdout"])
     except ModelFormatError:
-        return [], [f"not compared with {name}, which cannot be read"]
+        return Acceptance(speaks_for=(f"not compared with {name}, which cannot be read",))
     if before is None or not np.array_equal(before.rows, scores.rows):
-        return [], [f"not compared with {name}, which was trained on what was held out"]
+        return Acceptance(speaks_for=(f"not compared with {name}, which was trained on what was held out",))
     if len(scores.rows) < 2:
-        return [], [f"what was held out is too short to compare it with {name}"]
+        return Acceptance(speaks_for=(f"what was held out is too short to compare it with {name}",))
     return _verdict(scores.less(before), name)
 
 
@@ -145,17 +122,19 @@ def _scores(files: Files, serving: VersionRow, held_out: Samples, holdout: dict[
     return BlockScores(np.array(blocks.rows, np.int64), np.array([blocks.nlpd, nmse]).T)
 
 
-def _verdict(total: Difference, name: str) -> tuple[list[str], list[str]]:
+def _verdict(total: Difference, name: str) -> Acceptance:
     """Worse by the log predictive density, or by the errors where it is not better by the former."""
     (density, nmse), (clear, larger) = total.mean.tolist(), total.significant.tolist()
     half, half_nmse = total.half_width.tolist()
     amount = f"{density:+.3g} ± {half:.2g} nats a sample"
     if clear and density > 0:
-        return [f"it predicts what was held out worse than {name}: negative log density {amount}"], []
+        worse = f"it predicts what was held out worse than {name}: negative log density {amount}"
+        return Acceptance(against=(worse,))
     if larger and nmse > 0 and not clear:
-        return [f"its errors are larger than those of {name}: mean nMSE {nmse:+.2g} ± {half_nmse:.1g}"], []
+        larger_than = f"its errors are larger than those of {name}: mean nMSE {nmse:+.2g} ± {half_nmse:.1g}"
+        return Acceptance(against=(larger_than,))
     how = "better" if clear else "no worse"
-    return [], [f"it predicts what was held out {how} than {name}: negative log density {amount}"]
+    return Acceptance(speaks_for=(f"it predicts what was held out {how} than {name}: negative log density {amount}",))
 
 
 def _is_new_to(earlier: dict[str, Any], holdout: dict[str, Any]) -> bool:

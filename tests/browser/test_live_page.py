@@ -55,7 +55,9 @@ def copies(dashboard: Dashboard) -> Any:
 
     def copied(name: str) -> str:
         headers = {"content-type": "application/x-tar"}
-        answer = dashboard.client.post("/v1/models/import", content=archive, headers=headers, params={"name": name})
+        answer = dashboard.client.post(
+            "/v1/models/import", content=archive, headers=headers, params={"name": name, "promotion": "always"}
+        )
         assert answer.status_code == 201, answer.text
         return name
 

@@ -112,7 +112,9 @@ def test_an_arm_is_drawn_where_one_was_learnt_and_said_to_be_unknown_elsewhere(
 def test_a_robot_that_streams_is_live_and_its_last_hour_is_drawn(visitor: Visitor, dashboard: Dashboard) -> None:
     archive = dashboard.client.get(f"/v1/models/{dashboard.model}/export").content
     headers = {"content-type": "application/x-tar"}
-    answer = dashboard.client.post("/v1/models/import", content=archive, headers=headers, params={"name": "glanced"})
+    answer = dashboard.client.post(
+        "/v1/models/import", content=archive, headers=headers, params={"name": "glanced", "promotion": "always"}
+    )
     assert answer.status_code == 201, answer.text
     page = visitor.open("#/")
     place = card(page, "glanced")

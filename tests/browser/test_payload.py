@@ -47,7 +47,9 @@ def robot(dashboard: Dashboard) -> str:
     """A model of the arm that streams, the shipped one under a name of its own."""
     archive = dashboard.client.get("/v1/models/panda-sim/export").content
     headers = {"content-type": "application/x-tar"}
-    answer = dashboard.client.post("/v1/models/import", content=archive, headers=headers, params={"name": MODEL})
+    answer = dashboard.client.post(
+        "/v1/models/import", content=archive, headers=headers, params={"name": MODEL, "promotion": "always"}
+    )
     assert answer.status_code == 201, answer.text
     return MODEL
 

@@ -131,7 +131,10 @@ def arm(dashboard: Dashboard) -> str:
     """A model that streams may teach: a copy of the shared one."""
     archive = dashboard.client.get(f"/v1/models/{dashboard.model}/export").content
     answer = dashboard.client.post(
-        "/v1/models/import", content=archive, headers={"content-type": "application/x-tar"}, params={"name": "live-arm"}
+        "/v1/models/import",
+        content=archive,
+        headers={"content-type": "application/x-tar"},
+        params={"name": "live-arm", "promotion": "always"},
     )
     assert answer.status_code == 201, answer.text
     return "live-arm"

@@ -76,7 +76,9 @@ def test_what_one_service_stores_another_reads_and_deletes(shared):
         assert two.get(f"/v1/datasets/{dataset['id']}/preview").status_code == 200
         archive = two.get("/v1/models/panda-sim/export").content
         kind = {"content-type": MEDIA_TYPE}
-        made = one.post("/v1/models/import", content=archive, headers=kind, params={"name": "moved"})
+        made = one.post(
+            "/v1/models/import", content=archive, headers=kind, params={"name": "moved", "promotion": "always"}
+        )
         assert made.status_code == 201, made.text
         same = [api.post("/v1/models/moved/predict", json=QUERY).json() for api in (one, two)]
         assert same[0] == same[1]

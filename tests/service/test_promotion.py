@@ -11,9 +11,10 @@ from service.models.registry import answering
 from service.models.schema import HeldOutBlocks, Promotion
 from service.storage.database import LearnerRow
 from service.training.promotion import settle
-from tests.service.data import ended, error, queue, service_of, stream, train, upload
+from tests.service.data import QUICK, ended, error, queue, service_of, stream, train, upload
 
 ROWS, HELD = 120, {"share": 0.3}
+QUERY = {"q": [0.1, 0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
 CUT = 84
 """Rows of a recording that are learnt from."""
 
@@ -42,7 +43,7 @@ def judged(api):
     learnt, as of 4, which was to answer in any case; 3 has learnt from noise, and is as unsure as it should be."""
     narrow, noisy = recording(api, 32, slice(CUT, None)), recording(api, 34, slice(0, CUT - 10), 20.0)
     train(api, "judged", recording(api, 31))
-    jobs = [train(api, "judged", each, holdout=HELD) for each in (narrow, noisy)]
+    jobs = [train(api, "judged", each, holdout=HELD, promotion="ask") for each in (narrow, noisy)]
     jobs.append(train(api, "judged", narrow, holdout=HELD, promotion="always"))
     return jobs
 
@@ -52,9 +53,12 @@ def outcome(api, number):
     return found["answers"], found["passed"], found["serving"]
 
 
-def test_without_a_held_out_part_a_version_answers_and_is_not_judged(api, judged):
+def test_without_a_held_out_part_a_version_is_not_judged_and_answers_only_where_that_is_asked_for(api, judged):
     assert outcome(api, 1) == (True, None, None)
-    assert reason(api, "judged", 1) == "not judged, as nothing was held out"
+    assert reason(api, "judged", 1) == "not judged, as nothing was held out; it answers as was asked for"
+    train(api, "unjudged", recording(api, 31), promotion="ask")
+    found = version(api, "unjudged", 1)["promotion"]
+    assert (found["answers"], found["passed"], found["reason"]) == (False, None, "not judged, as nothing was held out")
 
 
 def test_a_version_whose_intervals_are_too_narrow_waits(api, judged):
@@ -80,28 +84,65 @@ def test_a_version_answers_where_that_is_asked_for(api, judged):
 def test_the_newest_that_waits_has_the_alias_candidate_and_answers_once_it_is_let(api, judged):
     model = api.get("/v1/models/judged").json()
     assert (model["serving_version"], model["aliases"]) == (4, {"candidate": 3})
-    query = {"q": [0.1, 0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
     for asked, answers in (({}, 4), ({"alias": "candidate"}, 3)):
-        assert api.post("/v1/models/judged/predict", json=query | asked).json()["version"] == answers
+        assert api.post("/v1/models/judged/predict", json=QUERY | asked).json()["version"] == answers
     with service_of(api).database.session() as session:
         roles = [session.get_one(LearnerRow, ("judged", number)).role for number in (2, 3)]
     assert roles == ["dismissed"] * 2  # in no contest
 
     moved = api.put("/v1/models/judged/aliases/serving", json={"alias": "candidate"})
     assert moved.status_code == 200, moved.text
-    assert api.post("/v1/models/judged/predict", json=query).json()["version"] == 3
+    assert api.post("/v1/models/judged/predict", json=QUERY).json()["version"] == 3
     assert outcome(api, 3) == (False, False, 1)  # as it was once it was trained
     problem = error(api.delete("/v1/models/judged/versions/3"), 409, "conflict")
     assert "'candidate'" in problem["message"]
     assert api.delete("/v1/models/judged/versions/2").status_code == 204
 
 
-def test_the_first_version_answers_whatever_it_is_like_and_is_said_to_have_failed(api):
-    train(api, "first-bad", recording(api, 35, slice(CUT, None)), holdout=HELD)
+def test_a_first_version_that_fails_waits_and_its_model_has_no_answer_until_it_is_promoted(api):
+    train(api, "first-bad", recording(api, 35, slice(CUT, None)), holdout=HELD, promotion="ask")
     found = version(api, "first-bad", 1)["promotion"]
-    assert (found["answers"], found["passed"], found["serving"]) == (True, False, None)
-    assert found["reason"].endswith("no other version could answer")
-    assert api.get("/v1/models/first-bad").json()["aliases"] == {}
+    assert (found["answers"], found["passed"], found["serving"]) == (False, False, None)
+    model = api.get("/v1/models/first-bad").json()
+    assert (model["serving_version"], model["aliases"]) == (None, {"candidate": 1})
+    assert [each["alias"] for each in api.get("/v1/models/first-bad/aliases").json()["items"]] == ["candidate"]
+    shown = next(each for each in api.get("/v1/overview").json()["items"] if each["name"] == "first-bad")
+    assert (shown["serving_version"], shown["candidate"]) == (None, 1)
+
+    where = "/v1/models/first-bad"
+    rows = {"t": [0.0], "q": [[0.1, 0.2]], "dq": [[0.0, 0.0]], "ddq": [[0.0, 0.0]], "tau": [[0.0, 0.0]]}
+    for refused in (
+        api.post(f"{where}/predict", json=QUERY),
+        api.post(f"{where}/observations", json={"stream_id": "s", "sequence": 0, **rows}),
+        api.get(f"{where}/export"),
+        api.post(f"{where}/aliases/serving/rollback", json={}),
+    ):
+        code = "conflict" if "rollback" in str(refused.request.url) else "no_serving_version"
+        said = error(refused, 409, code)["message"]
+        assert code == "conflict" or "`lipserve models promote first-bad 1`" in said
+    answer = api.post("/v2/models/first-bad/infer", json={"inputs": []})
+    assert answer.status_code == 409
+    assert "`lipserve models promote first-bad 1`" in answer.json()["error"]
+
+    assert api.put(f"{where}/aliases/serving", json={"version": 1}).status_code == 200
+    assert api.post(f"{where}/predict", json=QUERY).json()["version"] == 1
+
+
+def test_what_is_no_motion_of_this_torque_does_not_answer(api):
+    samples = stream(samples=ROWS, rate=10.0, seed=33)
+    others = replace(samples, tau=stream(samples=ROWS, rate=10.0, seed=36).tau)
+    train(api, "others", upload(api, others)["id"], holdout=HELD, promotion="ask")
+    assert "its error is not below that of the mean torque: joint1" in reason(api, "others", 1)
+
+
+def test_models_keep_their_robot(api):
+    train(api, "kept", recording(api, 41))
+    other = stream(samples=ROWS, rate=10.0, seed=31)
+    other = upload(api, replace(other, joint_names=("elbow", "wrist")))["id"]
+    body = {"model": "kept", "datasets": [other], "estimator": "lip-chain", "options": QUICK}
+    for path in ("/v1/jobs", "/v1/jobs/check"):
+        said = error(api.post(path, json=body), 409, "conflict")["message"]
+        assert "joint_names of its version 1: joint1, joint2; of this one: elbow, wrist" in said
 
 
 def test_versions_that_learnt_the_same_held_out_rows_are_compared_as_they_were_judged(api):
@@ -123,7 +164,7 @@ def test_versions_that_learnt_the_same_held_out_rows_are_compared_as_they_were_j
 def test_a_retrained_version_that_is_worse_waits_though_the_serving_one_has_learnt_what_is_held_out(api):
     dataset = recording(api, 40)
     train(api, "worse", dataset, holdout=HELD)
-    train(api, "worse", dataset, holdout=HELD, joint_types=["prismatic"] * 2)
+    train(api, "worse", dataset, holdout=HELD, estimator="se", promotion="ask")
     assert "it predicts what was held out worse than version 1" in reason(api, "worse", 2)
     assert api.get("/v1/models/worse").json()["serving_version"] == 1
 

@@ -106,6 +106,16 @@ def test_nothing_is_compressed(streaming):
         agrees(ask(connection, frame()), streaming.model, MOTION)
 
 
+def test_a_model_whose_versions_all_wait_is_refused(streaming):
+    train(streaming.server.client, "waiting", streaming.dataset, promotion="ask")
+    with pytest.raises(InvalidStatus) as refused, dial(streaming.server, "/v1/models/waiting/stream"):
+        pass
+    assert refused.value.response.status_code == 409
+    problem = json.loads(refused.value.response.body)["error"]
+    assert problem["code"] == "no_serving_version"
+    assert "`lipserve models promote waiting 1`" in problem["message"]
+
+
 def test_the_echo_sends_back_what_comes(streaming):
     with dial(streaming.server, ECHO) as connection:
         for message in (frame(), b"", "text"):

@@ -44,11 +44,11 @@ def page(learners: Learners, part: Page) -> OverviewPage:
     serving = {name: each.version for name, each in registry.serving(learners.database, names).items()}
     pointers = registry.pointers(learners.database, names)
     with learners.database.session() as session:
-        versions = registry.rows_of(session, serving.items()) if serving else {}
+        versions = registry.rows_of(session, [(row.name, serving.get(row.name, row.last_version)) for row in rows])
     monitors = learners.watched()
     items = []
     for row in rows:
-        key = (row.name, serving.get(row.name, 0))
+        key = (row.name, serving.get(row.name, row.last_version))
         if (version := versions.get(key)) is None:  # deleted a moment ago
             continue
         manifest = version.manifest
@@ -56,7 +56,7 @@ def page(learners: Learners, part: Page) -> OverviewPage:
         items.append(
             ModelOverview(
                 name=row.name,
-                serving_version=key[1],
+                serving_version=serving.get(row.name),
                 latest_version=row.last_version,
                 estimator=manifest["estimator"],
                 created_at=version.created_at,

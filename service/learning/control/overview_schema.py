@@ -58,9 +58,9 @@ class ModelOverview(BaseModel):
     """A model at a glance."""
 
     name: str
-    serving_version: int
+    serving_version: int | None = Field(description="null where all versions wait as candidates")
     latest_version: int
-    estimator: str = Field(description="Of the version that serves, as all that follows")
+    estimator: str = Field(description="Of the version that serves, else of the newest, as all that follows")
     created_at: str = Field(description="When that version was made")
     joint_names: list[str]
     joint_types: list[JointType]

@@ -23,7 +23,7 @@ from service.learning.streams import Streams
 from service.models.loads import Carried
 from service.models.scales import Factor
 from service.models.served import Learnt
-from service.storage.database import Database, EventRow, LearnerRow, ServingRow
+from service.storage.database import Database, EventRow, LearnerRow
 from service.storage.files import Files
 
 MOST_ROWS = 500
@@ -150,7 +150,4 @@ def _restored(
 
 def _learns(session: Session, model: str, version: int) -> bool:
     row = session.get(LearnerRow, (model, version))
-    if row is not None:
-        return row.role in ("serving", "candidate")
-    serving = session.get(ServingRow, model)
-    return serving is None or serving.version == version
+    return row is not None and row.role in ("serving", "candidate")

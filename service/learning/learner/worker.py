@@ -17,7 +17,7 @@ from service.learning.learner.contest import Duels
 from service.learning.learner.follower import Follower
 from service.learning.learner.publication import Failed, Message
 from service.models import registry
-from service.storage.database import Database, LearnerRow
+from service.storage.database import Database
 from service.storage.files import Files
 
 logger = logging.getLogger(__name__)
@@ -138,12 +138,7 @@ class Learner:
     def _learning(self, model: str) -> list[int]:
         """Versions of a model that learn; the one that serves last, so that it is the last to be dropped."""
         with self.database.session() as session:
-            versions = registry.learning(session, model)
-            known = session.get(LearnerRow, (model, versions[-1])) if versions else None
-        if versions and known is None:  # trained before there was a log
-            with self.database.transaction() as session:
-                registry.serve(session, model, versions[-1])
-        return versions
+            return registry.learning(session, model)
 
     def _follow(self, key: Key) -> Follower:
         while len(self.followers) >= self.settings.max_learning_models:

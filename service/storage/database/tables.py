@@ -174,9 +174,10 @@ class AliasMoveRow(Base):
 
 
 class ServingRow(Base):
-    """Which version of a model answers where none is named: the last that was trained, promoted or rolled back to.
+    """Which version of a model answers where none is named: the last that was trained, promoted or rolled back to. None
+    does of a model without such a row: all of its versions are candidates.
 
-    change: goes up by one whenever that changes. A model without such a row is answered by its newest version.
+    change: goes up by one whenever that changes.
     """
 
     __tablename__ = "serving"

@@ -89,7 +89,13 @@ def good(answer):
 
 
 def import_(api):
-    good(api.post("/v1/models/import?name=other", content=exported(api, "arm", version=1, learnt=False), headers=TAR))
+    good(
+        api.post(
+            "/v1/models/import?name=other&promotion=always",
+            content=exported(api, "arm", version=1, learnt=False),
+            headers=TAR,
+        )
+    )
 
 
 def remove_version(api):

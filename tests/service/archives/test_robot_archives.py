@@ -37,11 +37,11 @@ def with_urdf(files, urdf):
 
 def test_model_with_its_robot_goes_in_and_out(api, files, model):
     assert send(api, pack(files), name="with-robot").status_code == 201
-    out = unpack(exported(api, "with-robot"))
+    out = unpack(exported(api, "with-robot", version=1))
     assert out[ROBOT] == files[ROBOT]
     samples = stream(seed=12, samples=10)
     body = {name: getattr(samples, name).tolist() for name in ("q", "dq", "ddq")}
-    answer = api.post("/v1/models/with-robot/predict", json=body).json()
+    answer = api.post("/v1/models/with-robot/predict", json=body | {"version": 1}).json()
     assert np.array_equal(answer["tau"], model.predict(samples.q, samples.dq, samples.ddq).tau)
 
 

@@ -44,7 +44,7 @@ def test_imported_version_answers_alike_to_the_last_bit(api, trained, archive):
     answer = send(api, archive, name="taken-in")
     assert answer.status_code == 201, answer.text
     assert answer.headers["location"] == "/v1/models/taken-in/versions/1"
-    before, after = ask(api, trained.name, version=1), ask(api, "taken-in")
+    before, after = ask(api, trained.name, version=1), ask(api, "taken-in", version=1)
     for name in ("tau", "tau_std", "noise_std", "covariance"):
         assert before[name] == after[name]
 
@@ -58,7 +58,7 @@ def test_imported_version_tells_where_it_comes_from(api, trained, archive):
     assert version["job"] is None
     for name in ("joint_names", "noise_std", "options", "fit", "compact", "calibration", "training_range"):
         assert version[name] == original[name]
-    again = send(api, exported(api, "told"), name="told").json()
+    again = send(api, exported(api, "told", version=1), name="told").json()
     assert [each["model"] for each in again["lineage"]["imported"]] == [trained.name, "told"]
     assert again["version"] == 2
 

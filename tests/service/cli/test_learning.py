@@ -78,7 +78,9 @@ def pupil(server, arm):
     name, _ = arm
     archive = server.client.get(f"/v1/models/{name}/export").content
     headers = {"content-type": "application/x-tar"}
-    made = server.client.post("/v1/models/import", content=archive, headers=headers, params={"name": "cli-pupil"})
+    made = server.client.post(
+        "/v1/models/import", content=archive, headers=headers, params={"name": "cli-pupil", "promotion": "always"}
+    )
     assert made.status_code == 201, made.text
     for number in range(2):
         answer = server.client.post("/v1/models/cli-pupil/observations", json=lesson(number))
@@ -124,7 +126,7 @@ def test_alarms_are_listed(asked, pupil):
 
 def test_quality_stands_in_every_list(asked, server, recording):
     path = recording(21, samples=120, rate=10.0)
-    asked("train", path, "--model", "cli-listed", *QUICKLY)
+    asked("train", path, "--model", "cli-listed", *QUICKLY, "--promotion", "always")
     quality = server.client.get("/v1/models/cli-listed").json()["versions"][0]["quality"]
     error = f"{sum(quality['nmse']) / 2:.2e}"
     inside = percent(sum(quality["coverage"]) / 2)

@@ -88,7 +88,7 @@ def test_from_files_to_torques(streaming, tmp_path):
         ended = await client.wait(job)
         assert (ended.state, states[-1]) == ("succeeded", "succeeded")
         path = await client.export("awaited", tmp_path / "awaited.tar")
-        assert (await client.import_model(path, "awaited-copy")).version == 1
+        assert (await client.import_model(path, "awaited-copy", "always")).version == 1
         assert (await client.set_learning("awaited-copy", contact_threshold=8.0)).options.contact_threshold == 8.0
         return await client.predict("awaited", *MOTION), await client.evaluate("awaited", dataset.id)
 

@@ -107,7 +107,7 @@ def message(names, t, q, dq, tau):
 
 def test_the_bridge_teaches_what_it_hears(server, bridge, monkeypatch, tmp_path):
     with Client(server.url) as client:
-        client.import_model(client.export("panda-sim", tmp_path / "m.tar"), "bridged")
+        client.import_model(client.export("panda-sim", tmp_path / "m.tar"), "bridged", "always")
         monkeypatch.setattr(Node, "given", {"model": "bridged", "url": server.url, "rows": 30})
         node = bridge.Bridge()
         joints = client.version("bridged", 1).joint_names

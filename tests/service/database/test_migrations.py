@@ -12,7 +12,17 @@ from sqlalchemy import inspect, select
 
 from service.learning.ingest.judging import ContactGate
 from service.learning.streams import Streams
-from service.storage.database import Base, Database, JobRow, ModelRow, SnapshotRow, VersionRow, migrations
+from service.storage.database import (
+    Base,
+    Database,
+    JobRow,
+    LearnerRow,
+    ModelRow,
+    ServingRow,
+    SnapshotRow,
+    VersionRow,
+    migrations,
+)
 from service.storage.database.migrations import HEAD
 from tests.service.database.starting import check_starts_together
 from tests.service.learning import batches
@@ -53,6 +63,9 @@ def test_what_an_earlier_release_stored_is_kept(earlier):
         [job] = session.scalars(select(JobRow))
         assert (job.id, job.state, job.history, job.retry_of) == ("job_1", "queued", [], None)
         assert session.scalars(select(SnapshotRow.sha256)).all() == [None]
+        [serving], [learner] = session.scalars(select(ServingRow)), session.scalars(select(LearnerRow))
+        assert (serving.model, serving.version) == (learner.model, learner.version) == ("arm", 3)
+        assert learner.role == "serving"
     database.close()
 
 

@@ -11,7 +11,7 @@ from lipcore.vocabulary import CODES
 from service.foundation.settings import Settings
 from service.journal import log
 from service.journal.log import NewBatch
-from service.storage.database import Database, EventRow, ModelRow, StreamRow, VersionRow, now
+from service.storage.database import Database, EventRow, ModelRow, ServingRow, StreamRow, VersionRow, now
 
 MODEL, OTHER = "arm", "other"
 
@@ -23,6 +23,7 @@ def opened(home: Path) -> Database:
         session.add_all(ModelRow(name=name, created_at=now()) for name in (MODEL, OTHER))
         session.flush()
         for name in (MODEL, OTHER):
+            session.add(ServingRow(model=name, version=1, change=1))
             session.add(VersionRow(model=name, version=1, folder=f"mv_{name}", created_at=now(), job=None, manifest={}))
     return database
 

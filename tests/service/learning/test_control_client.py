@@ -82,7 +82,7 @@ def test_imported_version_answers_as_the_one_that_has_learnt(school, pupil):
     assert (about["learnt"], about["revision"]) == (True, pupil.predict()["revision"])
     version = send(school.client, archive, name="arrived").json()
     assert version["lineage"]["learnt"]["revision"] == about["revision"]
-    answer = answered(school.client.post("/v1/models/arrived/predict", json=QUERIES))
+    answer = answered(school.client.post("/v1/models/arrived/predict", json=QUERIES | {"version": 1}))
     assert answer["revision"] == 0
     close(answer, pupil.predict())
 
@@ -92,7 +92,7 @@ def test_version_as_trained_is_exported_where_asked(school, pupil):
     about = json.loads(unpack(archive)["export.json"])
     assert (about["learnt"], about["revision"]) == (False, 0)
     assert send(school.client, archive, name="untaught").status_code == 201
-    answer = answered(school.client.post("/v1/models/untaught/predict", json=QUERIES))
+    answer = answered(school.client.post("/v1/models/untaught/predict", json=QUERIES | {"version": 1}))
     fresh = school.enrol("fresh").predict()
     close(answer, fresh)
     assert np.abs(np.array(fresh["tau"]) - np.array(pupil.predict()["tau"])).max() > 1e-6

@@ -5,7 +5,7 @@ from math import inf
 
 import numpy as np
 import pytest
-from sqlalchemy import delete, select
+from sqlalchemy import select
 
 from lipcore import NotPositiveDefiniteError
 from lipcore.vocabulary import CODES
@@ -15,7 +15,7 @@ from service.learning.learner import publication
 from service.learning.learner.follower import Follower, Novelty
 from service.learning.learner.publication import Failed, Published
 from service.learning.learner.worker import Learner
-from service.storage.database import LearnerRow, ServingRow, SnapshotRow
+from service.storage.database import SnapshotRow
 from tests.service.learning.pendulums import ARM, QUERIES, Arm, at_once, rows, same, trained
 
 
@@ -239,17 +239,6 @@ def test_no_more_versions_are_kept_than_may_be_and_none_is_lost(arm, learner):
     assert turns(learner, "nobody") == []
     learner.close()
     assert stored(arm) == [1, 1, 2, 3]  # all of all at the end
-
-
-def test_a_home_of_an_earlier_release_learns(arm, learner):
-    with arm.database.transaction() as session:
-        session.execute(delete(ServingRow))
-        session.execute(delete(LearnerRow))
-    arm.batches(0)
-    (message,) = turns(learner, ARM)
-    assert message.revision == 1
-    with arm.database.session() as session:
-        assert session.get(LearnerRow, (ARM, 1)).role == "serving"
 
 
 def test_snapshots_are_taken_now_and_then(home):

@@ -75,7 +75,7 @@ def test_what_is_in_no_snapshot_stays(database):
 def test_what_any_learning_version_needs_stays(database):
     write(database, *(batch(k) for k in range(10)))
     with database.transaction() as session:
-        session.add(ServingRow(model=MODEL, version=2, change=2))
+        session.get_one(ServingRow, MODEL).version = 2
     learner(database, 2, 0, "serving")
     snapshot(database, 9, version=2)
     learner(database, 3, 2, "candidate")  # trained on 1 and 2, no snapshot yet

@@ -3,16 +3,16 @@
 from dataclasses import replace
 
 import pytest
-from sqlalchemy import delete, select
+from sqlalchemy import select
 
-from service.foundation.errors import NotFoundError
+from service.foundation.errors import NoServingVersionError, NotFoundError
 from service.learning import refresh
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learner.publication import Contested
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.models.registry import Serving
-from service.storage.database import JobRow, LearnerRow, ServingRow, VersionRow, now
+from service.storage.database import JobRow, LearnerRow, VersionRow, now
 from tests.service.learning.lessons import answered
 from tests.service.learning.pendulums import ARM
 
@@ -38,13 +38,6 @@ def roles(arm):
     return {row.version: (row.start, row.role) for row in rows if row is not None}
 
 
-def earlier_release(arm):
-    """Make the home one of a release that knew neither candidates nor learning."""
-    with arm.database.transaction() as session:
-        session.execute(delete(ServingRow))
-        session.execute(delete(LearnerRow))
-
-
 def test_a_candidate_does_not_serve_until_it_is_promoted(arm):
     arm.batches(0, 1, 2)
     assert arm.publish(candidate=True, start=1) == 2
@@ -59,9 +52,12 @@ def test_a_candidate_does_not_serve_until_it_is_promoted(arm):
     assert registry.show(arm.database, ARM).serving_version == 2
 
 
-def test_the_first_version_serves_though_it_was_meant_as_a_candidate(arm):
+def test_a_first_version_that_is_a_candidate_does_not_serve(arm):
     arm.publish("fresh", candidate=True)
-    assert registry.serving(arm.database, ["fresh"]) == {"fresh": Serving(1, 1)}
+    assert registry.serving(arm.database, ["fresh"]) == {}
+    with pytest.raises(NoServingVersionError, match="`lipserve models promote fresh 1`"):
+        registry.find(arm.database, "fresh", None)
+    assert registry.show(arm.database, "fresh").serving_version is None
 
 
 def test_what_serves_or_is_not_there_cannot_be_chosen(arm):
@@ -69,17 +65,6 @@ def test_what_serves_or_is_not_there_cannot_be_chosen(arm):
     with pytest.raises(NotFoundError, match="no version '7'"):
         serve(arm, 7)
     assert serving(arm) == Serving(1, 1)
-
-
-def test_a_home_of_an_earlier_release_is_served_by_its_newest_versions(arm):
-    arm.publish()
-    earlier_release(arm)
-    assert serving(arm) == Serving(2, 0)
-    assert registry.find(arm.database, ARM, None).version == 2
-    assert registry.show(arm.database, ARM).serving_version == 2
-    arm.publish(candidate=True)
-    assert serving(arm) == Serving(2, 1)
-    assert serve(arm, 3) == 2
 
 
 def test_the_models_that_changed_last_are_loaded_first(arm):

@@ -218,11 +218,10 @@ class Story:
         return version
 
     def publish(self, model: str, version: int) -> None:
-        """Import a version as the next one of a model."""
+        """Import a version as the next one of a model: it waits, as nothing was held out of its training."""
         with self.client.stream("GET", f"/v1/models/{ARM}/export", params={"version": 1, "learnt": False}) as answer:
             archive = answer.read()
-        serves = {f"alias/{model}/serving": 1} if version == 1 else {}
-        with self.asking("publication", **{f"version/{model}/{version}": ANY}, **serves) as told:
+        with self.asking("publication", **{f"version/{model}/{version}": ANY}) as told:
             answer = self._post("/v1/models/import", MEDIA_TYPE, archive, name=model)
             assert answer["version"] == version
             told[f"version/{model}/{version}"] = answer["created_at"]
@@ -234,8 +233,7 @@ class Story:
 
     def delete_model(self, model: str, version: int) -> None:
         """Delete a model, of one version."""
-        gone = {f"version/{model}/{version}": None, f"alias/{model}/serving": None}
-        with self.asking("publication", **gone):
+        with self.asking("publication", **{f"version/{model}/{version}": None}):
             self._done(self.client.delete(f"/v1/models/{model}"))
 
     def make_key(self, name: str) -> None:

@@ -230,14 +230,22 @@ def urdf(at: Route, model: str, version: int | None = None, alias: str | None = 
 
 
 @route("POST", "/v1/models/import")
-def import_model(at: Route, path: Path | str, name: str | None = None) -> Call[Version]:
+def import_model(
+    at: Route, path: Path | str, name: str | None = None, promotion: PromotionOption | None = None
+) -> Call[Version]:
     """Make a new version of an archive that a service has exported; raise ApiError where it is refused.
 
-    name: of the model, that of the archive by default. The version answers where the model had none before.
+    name: of the model, that of the archive by default; promotion: `ask`, so that it answers if the model had no version
+    and it does well on what its training held out, or `always`.
     """
     headers = {"content-type": "application/x-tar"}
     return at(
-        record(Version), names={}, params=given(name=name), headers=headers, file=Path(path), timeout=ARCHIVE_TIMEOUT
+        record(Version),
+        names={},
+        params=given(name=name, promotion=promotion),
+        headers=headers,
+        file=Path(path),
+        timeout=ARCHIVE_TIMEOUT,
     )
 
 

@@ -30,9 +30,9 @@ class Promotion(Record, frozen=True, kw_only=True):
     """Whether a version that was trained answers by itself, and why: judged by what its training held out.
 
     answers: Whether it answered once it was trained; else it waits under alias `candidate`
-    passed: Whether its intervals hold 90 % on every joint, as far as can be told, and it is not worse than the version
-        that serves; null where it was not judged
-    serving: The version that answered until then; null where it is the first
+    passed: Whether its error is below that of the mean torque on every joint, its intervals hold 90 %, and it is not
+        worse than the version that serves; null where that cannot be told
+    serving: The version that answered until then; null where none did
     """
 
     answers: bool
@@ -45,7 +45,7 @@ class VersionSummary(Record, frozen=True, kw_only=True):
     """A version in the list of its model.
 
     quality: On what its training held out; null where that was nothing
-    promotion: Whether it answers by itself, and why; null for one that was refreshed, imported or shipped
+    promotion: Whether it answers by itself, and why; null for one that was refreshed or shipped
     """
 
     version: int
@@ -59,15 +59,14 @@ class Model(Record, frozen=True, kw_only=True):
     """A named model. Queries are answered by the version that serves unless they name another.
 
     latest_version: The newest version
-    serving_version: The version that answers where none is named: the newest, unless that waits as candidate, or an
-        earlier one was chosen
+    serving_version: The version that answers where none is named; null where all wait as candidates
     aliases: Names that were given to versions, `serving` aside
     """
 
     name: str
     created_at: str
     latest_version: int
-    serving_version: int
+    serving_version: int | None
     aliases: dict[str, int]
     versions: list[VersionSummary]
 
@@ -143,7 +142,7 @@ class Version(Record, frozen=True, kw_only=True):
     lineage: Data sets with their hashes, when and with which `software` it was trained, and how well it fits them
         (`training_metrics`); also the version of another unit that it started from (`base`), and of an imported version
         where it comes from (`imported`)
-    promotion: Whether it answers by itself; null for one that was refreshed, imported or shipped
+    promotion: Whether it answers by itself; null for one that was refreshed or shipped
     selection: How the estimator was chosen; null where it was named when the training was asked for
     robot: The URDF of an estimator with rigid bodies, and its prior
     parameters: `friction`; of rigid bodies also `inertia`, `rotor` and `geometry`, with standard deviations and with

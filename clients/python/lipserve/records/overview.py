@@ -70,7 +70,8 @@ class RecentQuality(Record, frozen=True, kw_only=True):
 class ModelOverview(Record, frozen=True, kw_only=True):
     """A model at a glance.
 
-    estimator: Of the version that serves, as all that follows
+    serving_version: null where all versions wait as candidates
+    estimator: Of the version that serves, else of the newest, as all that follows
     created_at: When that version was made
     quality: On what its training held out; null where that was nothing
     candidate: A version that waits under the alias `candidate`
@@ -85,7 +86,7 @@ class ModelOverview(Record, frozen=True, kw_only=True):
     """
 
     name: str
-    serving_version: int
+    serving_version: int | None
     latest_version: int
     estimator: str
     created_at: str

@@ -33,7 +33,7 @@ export async function render(view, { name, query }, { signal, title }) {
   const where = path`/v1/models/${name}`;
   const [model, datasets] = await Promise.all([get(where, {}, signal), pages("/v1/datasets", 200, {}, signal)]);
   const asked = Number(query.get("version"));
-  const number = model.versions.some((each) => each.version === asked) ? asked : model.serving_version;
+  const number = model.versions.some((each) => each.version === asked) ? asked : shownFirst(model);
   const version = await get(`${where}/versions/${number}`, {}, signal);
   const state = { name, where, model, version, datasets, ...firstChoice(version, datasets, query) };
   state.tab = TABS.some(([tab]) => tab === query.get("tab")) ? query.get("tab") : "accuracy";
@@ -72,7 +72,7 @@ export async function render(view, { name, query }, { signal, title }) {
   /** Read the model again, after something about it was changed here. */
   const reload = async () => {
     state.model = await get(where, {}, signal);
-    if (!state.model.versions.some((each) => each.version === state.version.version)) await select(state.model.serving_version);
+    if (!state.model.versions.some((each) => each.version === state.version.version)) await select(shownFirst(state.model));
     else await show();
   };
 
@@ -84,6 +84,11 @@ export async function render(view, { name, query }, { signal, title }) {
   }, state.tab);
   list.setAttribute("aria-label", `Model ${name}`);
   replace(view, top, choice, list, panel);
+}
+
+/** The version that a page shows where none is named. */
+function shownFirst(model) {
+  return model.serving_version ?? model.latest_version;
 }
 
 /** What stands above all tabs: what can be done, and what is looked at. Returns its element, and what brings it up to date. */
@@ -107,7 +112,8 @@ function header(state, reload) {
     const { word, kind, why } = mayAnswer(version);
     promote.title = `${why}.`;
     refresh(actions, shown === serving ? badge("serving") : [badge(word, kind), promote], follow, train);
-    const answers = shown === serving ? `Version ${shown} answers` : `You look at version ${shown}, version ${serving} answers`;
+    const other = serving === null ? "no version answers" : `version ${serving} answers`;
+    const answers = shown === serving ? `Version ${shown} answers` : `You look at version ${shown}, ${other}`;
     refresh(about, h("p", { class: "muted" }, [answers, version.estimator, `made ${when(version.created_at)}`, ...names].join(" · ")), shown === serving || promoted(version)?.matches(".banner") ? promoted(version) : h("p", { class: "hint" }, `${why}.`), warned(version.warnings));
   };
   return [h("div", {}, heading(name, actions), about), update];

@@ -23,7 +23,7 @@ export async function render(view, _params, { signal, title }) {
   const columns = [
     { label: "Model", value: (model) => model.name, cell: (model) => link(model.name, address(model.name)) },
     ...qualityColumns((model) => ({ quality: serving(model)?.quality, joints: null })),
-    { label: "Answers", value: (model) => model.serving_version, cell: (model) => link(`version ${model.serving_version}`, `${address(model.name)}?tab=versions`) },
+    { label: "Answers", value: (model) => model.serving_version, cell: (model) => link(model.serving_version === null ? "none yet" : `version ${model.serving_version}`, `${address(model.name)}?tab=versions`) },
     { label: "Estimator", value: (model) => serving(model)?.estimator, cell: (model) => serving(model)?.estimator ?? "–" },
     { label: "Made", value: (model) => serving(model)?.created_at, first: "descending", cell: (model) => (serving(model) ? time(serving(model).created_at) : "–") },
     { label: "Versions", numeric: true, value: (model) => model.versions.length, first: "descending", cell: (model) => count(model.versions.length) },

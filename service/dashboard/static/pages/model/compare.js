@@ -21,7 +21,7 @@ export function compareForm(state, signal) {
   const newest = [...model.versions].reverse();
   const other = newest.find((each) => each.version !== model.serving_version).version;
   const boxes = newest.map((each) => {
-    const checked = [model.serving_version, other].includes(each.version);
+    const checked = [model.serving_version ?? model.versions[0].version, other].includes(each.version);
     const box = h("input", { type: "checkbox", name: "versions", value: String(each.version), checked, onchange: () => limit() });
     return [each, box];
   });

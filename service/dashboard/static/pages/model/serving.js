@@ -7,7 +7,7 @@ import { mayAnswer } from "./promotion.js";
 export function confirmServing(name, version, serving) {
   const { word, why } = mayAnswer(version);
   return confirm(
-    `Serve version ${version.version} of ${name} instead of version ${serving}? It answers every query that names no version. You can undo this under “Versions”. Judged: ${word}. ${why}.`,
+    `Serve version ${version.version} of ${name}${serving === null ? "" : ` instead of version ${serving}`}? It answers every query that names no version. You can undo this under “Versions”. Judged: ${word}. ${why}.`,
     `Serve version ${version.version}`,
     "primary",
   );

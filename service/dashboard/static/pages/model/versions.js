@@ -108,7 +108,7 @@ function aliasTable({ name, where }, aliases, reload) {
 
 function aliasForm({ where, model, name }, reload) {
   const alias = h("input", { type: "text", required: true, pattern: "[a-z][a-z0-9._\\-]{0,63}", placeholder: "production", autocomplete: "off", spellcheck: "false" });
-  const version = select([...model.versions].reverse().map((each) => [String(each.version), `version ${each.version}`]), String(model.serving_version));
+  const version = select([...model.versions].reverse().map((each) => [String(each.version), `version ${each.version}`]), String(model.serving_version ?? model.latest_version));
   const set = button("Set alias", async () => {
     if (!alias.reportValidity()) return;
     const chosen = alias.value.trim(), number = Number(version.value);

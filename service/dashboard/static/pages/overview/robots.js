@@ -58,7 +58,7 @@ function robotCard(first) {
   const update = (model, live) => {
     const names = shortNames(model.joint_names);
     refresh(state, standing(model, live));
-    refresh(about, `Version ${model.serving_version}, ${model.estimator}, made ${ago(model.created_at)}.`, model.candidate ? ` Version ${model.candidate} waits.` : "");
+    refresh(about, model.serving_version === null ? "No version answers: all wait as candidates." : `Version ${model.serving_version}, ${model.estimator}, made ${ago(model.created_at)}.`, model.candidate ? ` Version ${model.candidate} waits.` : "");
     if (drawn !== model.serving_version) {
       drawn = model.serving_version;
       posture = JSON.stringify(model.position);
