@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from service.app import create_app
+from service.foundation.settings import Settings
 from service.guide.routes import anchor
 from service.web.access.scopes import TABLE
+from service.web.limits.requests import body_limit, body_limits
 from service.web.openapi import METHODS
 
 TARGET = Path(__file__).parent / "reference/api.md"
@@ -69,7 +71,9 @@ def _route(method: str, path: str, operation: Document) -> Iterator[str]:
             yield f"| `{each['name']}` | {each['in']}{needed} | {_type(each['schema'])} | {_said(each)} |"
         yield ""
     if body := operation.get("requestBody"):
-        yield f"Body: {_kinds(body['content'])}\n"
+        most = body_limit(body_limits(Settings()), path)
+        size = f"{most >> 20} MiB" if most >= 1 << 20 else f"{most >> 10} KiB"
+        yield f"Body, at most {size}: {_kinds(body['content'])}\n"
     for status, answer in operation["responses"].items():
         if int(status) < 400:
             yield f"Answer: {status} {_kinds(answer.get('content', {})) or '(nothing)'}\n"

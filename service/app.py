@@ -47,7 +47,7 @@ from service.web import openapi, storage_errors
 from service.web.access import audit, audit_routes
 from service.web.access.keys import Keyring
 from service.web.access.middleware import KeyAccess, LocalAccess
-from service.web.limits.requests import BodyLimit, Gate, RateLimit, Turns
+from service.web.limits.requests import BodyLimit, Gate, RateLimit, Turns, body_limits
 from service.web.observability import metrics, readiness, requests
 from service.web.observability.meters import Meters
 from service.web.observability.metrics import System, Traffic
@@ -158,12 +158,7 @@ def _add_middleware(
     """Add what every request passes, from the inside out."""
     app.add_middleware(
         BodyLimit,
-        limits={
-            "/v1/datasets": settings.max_upload_bytes,
-            "/v1/robots": settings.max_urdf_bytes,
-            "/v1/models/import": settings.max_archive_bytes,
-        },
-        others=settings.max_request_bytes,
+        limits=body_limits(settings),
         seconds=settings.body_s,
         bytes_per_s=settings.body_bytes_per_s,
         at_once=max(1, settings.max_requests // 4),

@@ -99,7 +99,7 @@ class Settings(BaseSettings):
         description="Most torques, samples times joints, that an imported version may stand on: reading it takes "
         "memory that grows with the square, 10000 of them 0.8 GB.",
     )
-    max_request_bytes: Count = Field(2 * MiB, description="Largest body of any other request.")
+    max_request_bytes: Count = Field(2 * MiB, description="Largest body with motions: of predictions and observations.")
     max_joints: Count = Field(32, description="Most joints of a robot.")
     min_samples: int = Field(30, ge=10, description="Fewest samples of a data set.")
     max_samples: Count = Field(1_000_000, description="Most samples of a data set.")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
 from lipcore.online.adaptive import Adaptive, outside
@@ -15,19 +16,36 @@ from service.learning.ingest.screening import Seen
 
 @dataclass(frozen=True)
 class ScaleRecord:
-    """The scale of a stream's intervals after its last batch, which a version predicted."""
+    """The scale of a stream's intervals after its last batch, which a version predicted: `state` of all measurements,
+    `accepted` of those that were not kept out, which is what others are answered with."""
 
     state: Adaptive
+    accepted: Adaptive
     version: int
+
+    @classmethod
+    def start(cls, own: Array, version: int) -> ScaleRecord:
+        """Before the first row, from the version's `own` scale, (n,)."""
+        return cls(Adaptive.start(own), Adaptive.start(own), version)
+
+    def step(self, seen: Seen, accepted: NDArray[np.bool_]) -> ScaleRecord:
+        """Follow measurements (M, n). accepted: (M,), of rows that were not kept out."""
+        factors = factor(self.state, seen)
+        given = seen.score[accepted], None if seen.factor is None else seen.factor[accepted]
+        state = self.state.step(seen.time, seen.score, factors)
+        return replace(self, state=state, accepted=self.accepted.step(seen.time[accepted], *given))
 
     def to_json(self) -> dict[str, Any]:
         """As the stream's record has it."""
-        return {"state": self.state.to_json(), "version": self.version}
+        return {"state": self.state.to_json(), "accepted": self.accepted.to_json(), "version": self.version}
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> ScaleRecord:
-        """Read what `to_json` wrote."""
-        return ScaleRecord(Adaptive.from_json(values["state"]), values["version"])
+        """Read what `to_json` wrote, or an earlier release, which knew one state."""
+        state, accepted = (
+            Adaptive.from_json(each) for each in (values["state"], values.get("accepted") or values["state"])
+        )
+        return ScaleRecord(state, accepted, values["version"])
 
 
 @dataclass(frozen=True)

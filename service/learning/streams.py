@@ -14,11 +14,13 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session, undefer
 
+from lipcore.data.samples import Array
+from lipcore.online.adaptive import Adaptive
 from service.learning.ingest.judging import ContactGate
 from service.learning.ingest.opening import Opening
 from service.learning.intervals import ScaleRecord
 from service.models.scales import Factor
-from service.storage.database import LearningRow, StreamRow
+from service.storage.database import EventRow, LearningRow, StreamRow
 
 FORMAT = 1
 """Of a record's JSON; a later release that changes it reads this one, too."""
@@ -152,7 +154,7 @@ class Streams:
     def factors(self, version: int) -> dict[str, Factor]:
         """The factors on the widths of a version's intervals, of streams whose last batch it predicted."""
         return {
-            name: Factor(record.scale.state.factor, record.received, record.doubted)
+            name: Factor(record.scale.state.factor, record.scale.accepted.factor, record.received, record.doubted)
             for name, record in self._records.items()
             if record.scale is not None and record.scale.version == version
         }
@@ -163,6 +165,23 @@ class Streams:
             record = replace(self.get(stream_id), **fields)
             self._records = {**self._records, stream_id: record}
         return record
+
+    def take_back(self, session: Session, model: str, version: int, own: Array) -> None:
+        """Answer others with the scales that streams had after the last of their batches that still counts, of a
+        version with an `own` scale, (n,). Batches of earlier releases do not say it."""
+        counts = (EventRow.model == model, EventRow.version == version, EventRow.void.is_(False))
+        for stream_id, record in self._records.items():
+            if record.scale is None or record.scale.version != version:
+                continue
+            of_stream = select(EventRow.report).where(
+                *counts, EventRow.stream_id == stream_id, EventRow.kind == "batch"
+            )
+            report = session.scalar(of_stream.order_by(EventRow.number.desc()).limit(1))
+            accepted = Adaptive.start(own) if report is None else record.scale.accepted
+            if report is not None and "accepted_scale" in report:
+                accepted = Adaptive.from_json(report["accepted_scale"])
+            self.change(stream_id, scale=replace(record.scale, accepted=accepted))
+        self.change_all(session, model, lambda record: record)
 
     def set_clock(self, step: float) -> None:
         """Go with a clock of this machine that was set by `step`, s, as the database does."""

@@ -14,10 +14,12 @@ RECENT_S = 60.0
 
 @dataclass(frozen=True)
 class Factor:
-    """Of a stream: values (n,), and when the batch came that made them, Unix time, s. doubted: whether the stream did
-    not fit from its first second on, and nobody has confirmed it: its own answers have them, and no others."""
+    """Of a stream: values (n,) for its own answers, and `others` (n,), of what was not kept out of it; received: when
+    the batch came that made them, Unix time, s. doubted: whether the stream did not fit from its first second on, and
+    nobody has confirmed it: no others are answered with its factors."""
 
     values: Array
+    others: Array
     received: float
     doubted: bool = False
 
@@ -49,7 +51,7 @@ class Scales:
         """Answer with these from now on."""
         trusted = [each for each in streams.values() if not each.doubted]
         latest = max((each.received for each in trusted), default=0.0)
-        recent = [each.values for each in trusted if each.received >= latest - RECENT_S]
+        recent = [each.others for each in trusted if each.received >= latest - RECENT_S]
         self._widest = widest(recent, self._own)
         self.asked = self._widest.tolist()
         self._streams = streams

@@ -113,12 +113,15 @@ def test_an_answer_carries_the_scale_of_its_stream_as_it_is_then():
     talk, _ = session(loaded, 1, stream_id="arm", scale=True)
     asking, _ = session(loaded, 1, scale=True)
     assert reply(talk).scale.tolist() == [1.0, 1.0]
-    factors = {"arm": Factor(np.array([0.5, 3.0]), 100.0), "other": Factor(np.array([0.7, 2.0]), 101.0)}
+    factors = {
+        "arm": Factor(np.array([0.5, 3.0]), np.array([0.5, 3.0]), 100.0),
+        "other": Factor(np.array([9.0, 2.0]), np.array([0.7, 2.0]), 101.0),
+    }
     loaded.memory[1].scales.take(factors)
     seen = reply(talk)
     assert (seen.tau.tolist(), seen.scale.tolist()) == ([1.0, 2.0], [0.5, 3.0])
     assert reply(asking).scale.tolist() == [1.0, 3.0]
-    factors["other"] = Factor(np.array([0.7, 2.0]), 200.0)  # by then the first is of long ago
+    factors["other"] = Factor(np.array([0.7, 2.0]), np.array([0.7, 2.0]), 200.0)  # by then the first is of long ago
     loaded.memory[1].scales.take(factors)
     assert reply(asking).scale.tolist() == [1.0, 2.0]
     assert reply(talk).scale.tolist() == [0.5, 3.0]
@@ -126,7 +129,7 @@ def test_an_answer_carries_the_scale_of_its_stream_as_it_is_then():
 
 def test_external_torque_is_judged_by_the_scale_of_its_stream():
     loaded = Loaded(v1=Model(2.0))
-    loaded.memory[1].scales.take({"arm": Factor(np.array([0.5, 3.0]), 100.0)})
+    loaded.memory[1].scales.take({"arm": Factor(np.array([0.5, 3.0]), np.array([0.5, 3.0]), 100.0)})
     request = frame([[1.0, 2.0], [0, 0], [0, 0]], flags=ASK_EXTERNAL, tau=[3.0, 1.0], learn=False)
     for options, scale in (({"stream_id": "arm"}, [0.5, 3.0]), ({}, [1.0, 3.0]), ({"stream_id": "new"}, [1.0, 1.0])):
         talk, _ = session(loaded, 1, scale=True, **options)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from lipcore.fitting.base import RobotKind
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import ConflictError, invalid_request, not_found, problem
@@ -23,7 +24,7 @@ from service.learning.ingest.batches import state
 from service.learning.learners import Learners
 from service.learning.schema import LearningOptions
 from service.models import registry
-from service.storage.database import Database, EventRow, LearnerRow
+from service.storage.database import Database, EventRow, LearnerRow, VersionRow
 from service.web.access import audit
 from service.web.rows import Page
 
@@ -101,7 +102,8 @@ def rollback(learners: Learners, model: str, request: schema.RollbackRequest) ->
 
 def _to_revision(learners: Learners, model: str, revision: int) -> schema.RolledBack:
     version = serving(learners.database, model)
-    with learners.database.turn(model), learners.database.transaction(model) as session:
+    served, monitor = learners.loaded.get(model, version), learners.monitor(model)
+    with learners.turn(model), learners.database.transaction(model) as session:
         newest = status.current(session, model, version)
         if revision >= newest:
             raise invalid_request("revision", revision, f"one below {newest}, the newest of version {version}")
@@ -115,8 +117,11 @@ def _to_revision(learners: Learners, model: str, revision: int) -> schema.Rolled
         )
         count = session.scalar(undone) or 0
         log.rollback(session, model, to, time.time())
+        session.flush()
+        monitor.streams.take_back(session, model, version, served.base.scale)
         revised = revised_now(session, model, version)
         audit.note(session, model, "learning rolled back", version, before=newest, after=revision)
+    served.scales.take(monitor.streams.factors(version))
     learners.process.wake(model)
     return schema.RolledBack(**revised.model_dump(), undone=count, complete=True)
 
@@ -139,6 +144,8 @@ def _to_version(learners: Learners, model: str, version: int) -> schema.RolledBa
         raise ConflictError(f"version {version} of model {model!r} serves already")
     learners.loaded.get(model, version)  # so that the change costs no query anything, or fails before it is made
     with learners.database.transaction() as session:
+        manifest = session.get_one(VersionRow, (model, version)).manifest
+        registry.check_robot(session, model, RobotKind.of_manifest(manifest))
         registry.serve(session, model, version)
         revised = revised_now(session, model, version)
         complete = status.is_reached(revised.revision, status.reachable(session, model, version))

@@ -16,6 +16,7 @@ from sqlalchemy import case, func, select, update
 from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
+from lipcore.vocabulary import CODES
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
 from service.journal.log import NewBatch
@@ -24,6 +25,7 @@ from service.learning import intervals, owner
 from service.learning.ingest import alarms, judging
 from service.learning.ingest.dating import LEAP_S
 from service.learning.ingest.host_clock import HostClock
+from service.learning.ingest.judging import Verdict
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
 from service.learning.intervals import ScaleRecord
@@ -35,6 +37,9 @@ from service.models.loaded import LoadedModels, Served
 from service.storage.database import ModelRow, StreamRow
 
 logger = logging.getLogger(__name__)
+
+ACCEPTED = tuple(CODES.index(code) for code in ("learnt", "stationary", "payload"))
+"""Codes of rows whose errors are those of the arm as it is known, and of what it is known to carry."""
 
 RETAIN_EVERY = 200
 """Batches of a model after which its log is brought within its limits."""
@@ -167,7 +172,7 @@ class Intake:
             )
             if verdict.change is not None and options.on_change == "adapt" and not held:
                 log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
-            scale, answered = _scaled(monitor, served, options, stream_id, screened)
+            scale, answered = _scaled(monitor, served, options, stream_id, screened, verdict)
             record = None if verdict.record is None else verdict.record.to_json()
             judged = replace(batch, rows=verdict.rows, record=record)
             start = log.start_of(session, model, served.version)
@@ -210,6 +215,7 @@ class Intake:
                 "departure": None if verdict.watch.departure is None else verdict.watch.departure.to_json(),
                 "waited": held,
                 "doubted": doubted,
+                "aside": verdict.held or not options.enabled,
                 "until": None if screened.until is None else min(screened.until, batch.received + log.AHEAD_S),
                 **answered,
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
@@ -241,18 +247,18 @@ class Intake:
 
 
 def _scaled(
-    monitor: Monitor, served: Served, options: LearningOptions, stream_id: str, screened: Screened
+    monitor: Monitor, served: Served, options: LearningOptions, stream_id: str, screened: Screened, verdict: Verdict
 ) -> tuple[ScaleRecord | None, dict[str, Any]]:
     """Return the scale of a stream's intervals after a batch, None if not adaptive, and its part of the report."""
     seen = screened.seen
     if not options.adaptive_intervals or seen is None:
         return None, {}
-    state = monitor.scale(stream_id, served.version, served.base.scale)
-    report = {"answered": intervals.inside(state, seen)}
+    scale = monitor.scale(stream_id, served.version, served.base.scale)
+    report = {"answered": intervals.inside(scale.state, seen)}
     # other errors were of the arm without what it carries, or with what it no longer does
     if screened.answered is None:
-        state = state.step(seen.time, seen.score, intervals.factor(state, seen))
-    return ScaleRecord(state, served.version), report
+        scale = scale.step(seen, np.isin(verdict.rows.code[screened.asked], ACCEPTED))
+    return scale, {**report, "accepted_scale": scale.accepted.to_json()}
 
 
 def _check_kept(session: Session, served: Served) -> None:

@@ -15,7 +15,6 @@ from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
 from lipcore.data.samples import Array
-from lipcore.online.adaptive import Adaptive
 from lipcore.online.change import ChangeDetector
 from lipcore.online.departure import Departure
 from lipcore.online.record import Record
@@ -25,7 +24,7 @@ from service.journal import log
 from service.learning import intervals
 from service.learning.ingest.judging import Innovations, Watch
 from service.learning.ingest.opening import Opening
-from service.learning.intervals import HeldIntervals
+from service.learning.intervals import HeldIntervals, ScaleRecord
 from service.learning.payloads import Payloads
 from service.learning.streams import Streams
 from service.storage.database import EventRow
@@ -160,11 +159,11 @@ class Monitor:
         opening = Opening.start(len(self.joint_names)) if new else known.opening
         return Watch(known.gate, self._detector, self._innovations, self._departure, opening)
 
-    def scale(self, stream_id: str, version: int, own: Array) -> Adaptive:
+    def scale(self, stream_id: str, version: int, own: Array) -> ScaleRecord:
         """The scale of a stream's intervals before its next rows, which a version predicts: another one begins anew,
         from its `own`, (n,)."""
         known = self.streams.get(stream_id).scale
-        return Adaptive.start(own) if known is None or known.version != version else known.state
+        return ScaleRecord.start(own, version) if known is None or known.version != version else known
 
     def usual(self, now: float) -> Record:
         """Record of the shortest window before a Unix time, s."""

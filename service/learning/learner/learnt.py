@@ -40,7 +40,8 @@ def floor(database: Database, model: str, version: int, through: int, n_joints: 
     """Function variance (N·m)², (n,), that a version's latest errors up to event `through` prove: its std is no lower.
 
     The batches are those of the last SECONDS before the newest one came, and more until there are FEWEST_ROWS
-    rows; a stream that did not fit from its first second on, and that nobody has confirmed, says nothing of this robot.
+    rows. A stream that did not fit from its first second on, and that nobody has confirmed, says nothing of this robot;
+    nor does what waits for its owner's decision, or came while learning was paused.
     Like the learnt state, the floor is a function of the log up to that event, whatever was taken back since.
     """
     of_version = (EventRow.kind == "batch", EventRow.version == version)
@@ -51,8 +52,8 @@ def floor(database: Database, model: str, version: int, through: int, n_joints: 
     newest: float | None = None
     with database.session() as session:
         counts = EventRow.void.is_(False) | EventRow.number.in_(_undone_later(session, model, through))
-        fitting = func.coalesce(EventRow.report["doubted"].as_boolean(), False).is_(False)
-        latest = query.where(counts, fitting).limit(MOST_EVENTS)
+        kept_out = (func.coalesce(EventRow.report[why].as_boolean(), False) for why in ("doubted", "aside"))
+        latest = query.where(counts, *(each.is_(False) for each in kept_out)).limit(MOST_EVENTS)
         events = session.execute(latest.execution_options(yield_per=READ_EVENTS))
         for at, record in events:
             if record is None:

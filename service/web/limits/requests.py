@@ -19,16 +19,35 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.foundation.errors import BusyError, RateLimitedError, refuse
+from service.foundation.settings import Settings
 from service.web.observability.logs import KEY_ID
 
+OTHER_BYTES = 256 * 1024
+"""Largest body where neither motions nor files are sent: a list of a thousand names, each as long as may be."""
 LOOK_S = 0.5
 """Longest time in s between two looks at the bodies that are waited for."""
+
+
+def body_limits(settings: Settings) -> dict[str, int]:
+    """Most bytes of a body, by path or by what a path ends in; `*`: of all others: a few settings or names."""
+    return {
+        "/v1/datasets": settings.max_upload_bytes,
+        "/v1/robots": settings.max_urdf_bytes,
+        "/v1/models/import": settings.max_archive_bytes,
+        **dict.fromkeys(("predict", "observations", "infer", "echo"), settings.max_request_bytes),
+        "*": min(OTHER_BYTES, settings.max_request_bytes),
+    }
+
+
+def body_limit(limits: Mapping[str, int], path: str) -> int:
+    """The limit that a path has."""
+    return limits.get(path) or limits.get(path.rpartition("/")[2]) or limits["*"]
 
 
 class BodyLimit:
     """Refuse to read more of a body than the limit, and to wait for one that comes too slowly.
 
-    limits: most bytes by path; others: of all other paths; seconds: longest wait for a body, and one second more for
+    limits: see `body_limits`; seconds: longest wait for a body, and one second more for
     every `bytes_per_s` that came. Only waiting counts, not what the application does between two pieces. at_once:
     bodies of one client that are waited for at a time; more are answered 429.
 
@@ -37,9 +56,9 @@ class BodyLimit:
     """
 
     def __init__(
-        self, app: ASGIApp, limits: Mapping[str, int], others: int, seconds: float, bytes_per_s: float, at_once: int
+        self, app: ASGIApp, limits: Mapping[str, int], seconds: float, bytes_per_s: float, at_once: int
     ) -> None:
-        self.app, self.limits, self.others = app, dict(limits), others
+        self.app, self.limits = app, dict(limits)
         self.seconds, self.bytes_per_s, self.at_once = seconds, bytes_per_s, at_once
         self._waited_for: Counter[str] = Counter()  # bodies, by client
         self._due: dict[asyncio.Task[Any], float | None] = {}  # when each ends that waits; None: it is ended
@@ -50,7 +69,7 @@ class BodyLimit:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        limit = self.limits.get(scope["path"], self.others)
+        limit = body_limit(self.limits, scope["path"])
         refused = False
         for name, value in scope["headers"]:
             if name == b"content-length":

@@ -101,6 +101,33 @@ def test_the_owner_is_told_with_the_evidence(loaded):
     assert line["what"] == "POST /v1/models/{model}/observations"
 
 
+def test_what_is_kept_out_ignored_or_taken_back_leaves_no_trace_in_answers_to_the_bit(school):
+    """A change whose rows the owner leaves out, a pause, and rows that were learnt and rolled back."""
+    pupil = school.enrol("untouched", **WATCHFUL, on_change="hold")
+    drive(pupil, range(10))
+    answers = {name: value for name, value in pupil.settled(10).items() if name != "revision"}
+
+    def unchanged(revision):
+        seen = pupil.settled(revision)
+        return {name: value for name, value in seen.items() if name != "revision"} == answers
+
+    doubted = drive(pupil, range(10, 16), push=PUSH)
+    assert doubted[-1]["held"]
+    assert unchanged(doubted[-1]["revision"])
+    pupil.post("learning/change", {"decision": "ignore"})
+    assert unchanged(doubted[-1]["revision"])
+    options = pupil.get("learning")["options"]
+    pupil.put("learning", {**options, "enabled": False})
+    paused = drive(pupil, range(16, 18))
+    pupil.put("learning", {**options, "enabled": True})
+    assert unchanged(paused[-1]["revision"])
+    learnt = drive(pupil, range(18, 20))[-1]
+    assert learnt["accepted"] == BATCH
+    assert not unchanged(learnt["revision"])
+    back = pupil.post("rollback", {"revision": paused[-1]["revision"]})
+    assert unchanged(back["revision"])
+
+
 @pytest.mark.slow
 def test_after_a_decision_the_changed_robot_is_learnt(school):
     pupil = school.enrol("decided", **WATCHFUL, on_change="hold")

@@ -44,7 +44,7 @@ def state(school, pupil, stream_id="arm"):
         return scale and scale["state"]
 
 
-def test_one_batch_widens_what_does_not_hold_and_the_belief_stays(school, pupil):
+def test_one_batch_widens_what_its_stream_is_answered_and_what_was_kept_out_nobody_elses(school, pupil):
     body = off(0)
     motion = {name: body[name] for name in KEYS}
     before = pupil.predict(motion)
@@ -56,11 +56,17 @@ def test_one_batch_widens_what_does_not_hold_and_the_belief_stays(school, pupil)
     )  # rows are contacts: nothing is learnt of them
     said = pupil.post("observations", body)
     assert said["rejected"] == {"contact": 10}
+    scale = school.service.loaded.get(pupil.model, None).scales.of("arm").tolist()
+    assert scale[0] < 2.0
+    assert scale[1] > 10.0
     after = pupil.predict(motion)
-    assert after["scale"][0] < 2.0
-    assert after["scale"][1] > 10.0
-    assert not outside(body, after)[:, 1].any()
-    assert (after["tau"], after["tau_std"]) == (before["tau"], before["tau_std"])
+    assert not outside(body, after | {"scale": scale})[:, 1].any()
+    assert [after[name] for name in ("tau", "tau_std", "scale")] == [
+        before[name] for name in ("tau", "tau_std", "scale")
+    ]
+    pupil.put("learning", {"on_change": "learn", "contact_threshold": 100})
+    pupil.post("observations", off(1))
+    assert pupil.predict(motion)["scale"][1] > 10.0
 
 
 def test_the_record_is_the_models_own_and_what_was_answered_stands_beside_it(school, pupil):
@@ -83,8 +89,9 @@ def test_the_record_is_the_models_own_and_what_was_answered_stands_beside_it(sch
 
 
 def test_questions_get_the_widest_of_the_streams_and_streams_their_own(school, pupil):
-    pupil.put("learning", CAREFUL)
+    pupil.put("learning", {"on_change": "learn", "contact_threshold": 100})
     pupil.post("observations", off(0, "sick"))
+    pupil.put("learning", CAREFUL)
     for number in range(40):
         pupil.post("observations", lesson(number, "well"))
     scales = school.service.loaded.get(pupil.model, None).scales

@@ -14,7 +14,7 @@ LONG = 60.0
 
 
 def limit(app, seconds=LONG, bytes_per_s=1e9, most=100, at_once=100):
-    return BodyLimit(app, {"/large": 1000}, most, seconds, bytes_per_s, at_once)
+    return BodyLimit(app, {"/large": 1000, "*": most}, seconds, bytes_per_s, at_once)
 
 
 def scope(path="/", length=None, client="192.0.2.1"):
