@@ -88,7 +88,7 @@ class Turns:
         jumps = np.where((np.abs(np.abs(step) - TURN) < JUMP) & ~other, -np.sign(step), 0.0)
         self._last = float(values[-1]), float(numbers[-1])
         if jumps.any():
-            self.first = self.first or int(rows[known[jumps.argmax() if jumps.max() > 0 else jumps.argmin()]])
+            self.first = self.first or int(rows[known[np.flatnonzero(jumps)[0]]])
             self.count += int(np.count_nonzero(jumps))
         elif not self._turned:
             return q

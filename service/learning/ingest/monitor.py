@@ -139,18 +139,19 @@ class Monitor:
     def follow(self, session: Session, model: str) -> None:
         """Take in what other services have logged since `number`; `lock` is held."""
         decided, streams = False, set[str]()
-        since = EventRow.model == model, EventRow.kind == "payload", EventRow.number > self.number
-        payloads = session.execute(select(EventRow.stream_id, EventRow.number).where(*since)).all()
+        since = EventRow.model == model, EventRow.kind.in_(("payload", "rollback")), EventRow.number > self.number
+        others = session.execute(select(EventRow.stream_id, EventRow.number, EventRow.kind).where(*since)).all()
         for event in _batches(session, model, EventRow.number > self.number):
             held = self.held
             self._remember(event, True)
             decided |= held and not (event.report or {}).get("waited", True)
             self.number = event.number
             streams.add(event.stream_id or "")
-        for stream_id, number in payloads:
+        for stream_id, number, kind in others:
             self.number = max(self.number, number)
             streams.add(stream_id or "")
-        if streams:  # a decision is in the records of all
+            decided |= kind == "rollback"
+        if streams:  # a decision, and a rollback, is in the records of all
             self.streams.read(session, model, None if decided else streams)
 
     def watch(self, stream_id: str, new: bool = False) -> Watch:
