@@ -9,9 +9,11 @@ from pydantic import ValidationError
 
 from service.models.registry import answering
 from service.models.schema import HeldOutBlocks, Promotion
-from service.storage.database import LearnerRow
+from service.storage.database import LearnerRow, VersionRow
 from service.training.promotion import settle
+from tests.service.archives.packing import TAR, exported
 from tests.service.data import QUICK, ended, error, queue, service_of, stream, train, upload
+from tests.service.learning.lessons import publish
 
 ROWS, HELD = 120, {"share": 0.3}
 QUERY = {"q": [0.1, 0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
@@ -143,6 +145,22 @@ def test_models_keep_their_robot(api):
     for path in ("/v1/jobs", "/v1/jobs/check"):
         said = error(api.post(path, json=body), 409, "conflict")["message"]
         assert "joint_names of its version 1: joint1, joint2; of this one: elbow, wrist" in said
+
+    train(api, "of-other", other)
+    archive = exported(api, "of-other")
+    said = error(api.post("/v1/models/import?name=kept", content=archive, headers=TAR), 409, "conflict")["message"]
+    assert "of this one: elbow, wrist" in said
+    service = service_of(api)
+    with service.database.session() as session:
+        folder = service.files.version_folder(session.get_one(VersionRow, ("of-other", 1)).folder)
+    publish(service.database, service.files, folder, "kept", candidate=True)  # as an earlier release has let it in
+    for move in (
+        api.put("/v1/models/kept/aliases/serving", json={"version": 2}),
+        api.put("/v1/models/kept/aliases/spare", json={"version": 2}),
+        api.post("/v1/models/kept/rollback", json={"version": 2}),
+    ):
+        assert "of this one: elbow, wrist" in error(move, 409, "conflict")["message"]
+    assert api.get("/v1/models/kept").json()["serving_version"] == 1
 
 
 def test_versions_that_learnt_the_same_held_out_rows_are_compared_as_they_were_judged(api):
