@@ -17,6 +17,7 @@ from sqlalchemy.exc import DBAPIError
 from service.app import create_app
 from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
+from service.learning.weigher.weighing import Weighing
 from service.storage.database import Database
 from service.storage.database.engine import FILE
 from service.storage.files import Files
@@ -235,8 +236,9 @@ def test_a_service_says_why_it_cannot_start(tmp_path):
 
 @pytest.mark.own_files("the home of a service that others share holds next to nothing")
 @pytest.mark.parametrize("gone", ["the home", "all but the database"])
-def test_a_home_that_is_deleted_is_storage_that_fails(tmp_path, gone):
+def test_a_home_that_is_deleted_is_storage_that_fails(tmp_path, monkeypatch, gone):
     home = tmp_path / "home"
+    monkeypatch.setattr(Weighing, "expect", lambda self: None)  # a process that starts makes its folders
     with TestClient(create_app(Settings(home=home)), ADDRESS, raise_server_exceptions=False) as api:
         dataset = upload(api, stream())["id"]
         assert api.post("/v1/models/panda-sim/predict", json=ZERO).status_code == 200
