@@ -6,7 +6,7 @@ import logging
 from collections.abc import Collection
 from contextlib import suppress
 
-from sqlalchemy import delete, select
+from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
 from lipserve.states import ACTIVE
@@ -41,8 +41,8 @@ OF_MODEL = (AliasMoveRow, AliasRow, ServingRow, LearnerRow, LearningRow, StreamR
 def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
     """Delete a version for good; its number is not given again. Not for the event loop.
 
-    Raise NotFoundError; ConflictError, naming the reason, while an alias points to it, it serves, it is compared with
-    the one that serves, or a job trains it anew or starts from it.
+    Raise NotFoundError; ConflictError, naming the reason, while an alias points to it, it serves, it is the only
+    one, it is compared with the one that serves, or a job trains it anew or starts from it.
     """
     with loaded.moving:
         with loaded.database.transaction() as session:
@@ -116,6 +116,8 @@ def _check_unused(session: Session, model: str, version: int) -> None:
         raise ConflictError(f"{name} has the alias {', '.join(map(repr, pointing))}: move or remove it first")
     if registry.answering(session, model) == version:
         raise ConflictError(f"{name} serves: let another version serve first, or delete the model")
+    if session.scalar(select(func.count()).select_from(VersionRow).where(VersionRow.model == model)) == 1:
+        raise ConflictError(f"{name} is its only one: delete the model")
     learner = session.get(LearnerRow, (model, version))
     if learner is not None and learner.role == "candidate":
         raise ConflictError(f"{name} is compared with the version that serves: wait until that is decided")

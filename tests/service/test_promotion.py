@@ -126,6 +126,8 @@ def test_a_first_version_that_fails_waits_and_its_model_has_no_answer_until_it_i
     assert answer.status_code == 409
     assert "`lipserve models promote first-bad 1`" in answer.json()["error"]
 
+    assert api.delete(f"{where}/aliases/candidate").status_code == 204
+    assert "only one" in error(api.delete(f"{where}/versions/1"), 409, "conflict")["message"]
     assert api.put(f"{where}/aliases/serving", json={"version": 1}).status_code == 200
     assert api.post(f"{where}/predict", json=QUERY).json()["version"] == 1
 
