@@ -30,13 +30,21 @@ SAMPLES = 250
 """Samples that tell the noise: its estimate is then good to about five per cent."""
 
 
-def start(samples: Samples, stretches: Samples | None = None) -> Array:
-    """Noise std that a fit starts from, (n,) N·m: the white noise of the signals, or a share of their spread.
+def white(samples: Samples, stretches: Samples | None = None) -> Array:
+    """White noise of the torque signals, standard deviation (n,) N·m.
 
     stretches: contiguous samples, where `samples` are thinned: their differences would tell of motion.
     """
     signals = samples if stretches is None else stretches
-    level = noise_level([signals.tau[part] for part in signals.episodes()])
+    return noise_level([signals.tau[part] for part in signals.episodes()])
+
+
+def start(samples: Samples, stretches: Samples | None = None) -> Array:
+    """Noise std that a fit starts from, (n,) N·m: the white noise of the signals, or a share of their spread.
+
+    stretches: see `white`.
+    """
+    level = white(samples, stretches)
     return np.asarray(np.maximum.reduce([level, START_SHARE * samples.tau.std(axis=0), floor(samples)]))
 
 

@@ -56,7 +56,7 @@ class Acceptance:
 
     @property
     def passed(self) -> bool | None:
-        """Whether the model may answer by itself, None where that cannot be told."""
+        """Whether the model may answer by itself; None: too little was held out to judge."""
         if self.against:
             return False
         return None if self.unknown else True

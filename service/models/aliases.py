@@ -11,7 +11,7 @@ from service.models import registry
 from service.models.loaded import LoadedModels
 from service.models.registry import SERVING
 from service.models.schema import Alias, AliasList, AliasMove, AliasRequest
-from service.storage.database import AliasMoveRow, AliasRow, ModelRow, ServingRow, VersionRow, now
+from service.storage.database import AliasMoveRow, AliasRow, ServingRow, VersionRow, now
 
 
 def page(loaded: LoadedModels, model: str) -> AliasList:
@@ -141,7 +141,7 @@ def _before(session: Session, move: AliasMoveRow) -> int:
 
 
 def _check_model(session: Session, model: str) -> None:
-    if session.scalar(select(ModelRow.name).where(ModelRow.name == model)) is None:
+    if not registry.has_model(session, model):
         raise not_found("model", model)
 
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from pydantic import ValidationError
-from sqlalchemy import select
 
 from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, ModelFormatError, read_manifest_bytes
@@ -28,7 +27,7 @@ from service.models.archive_reading import check_texts, invalid_member, invalid_
 from service.models.lineage import held_out_figures
 from service.models.loaded import LoadedModels
 from service.models.schema import Promotion, Version
-from service.storage.database import LearnerRow, VersionRow, now
+from service.storage.database import LearnerRow, now
 from service.storage.files import new_id
 from service.web.storage_errors import undecided
 
@@ -85,7 +84,7 @@ def _publish(
     """Add the version; return its number, and whether it answers where none is named."""
     with loaded.database.transaction() as session:
         registry.check_robot(session, model, RobotKind.of_manifest(manifest))
-        first = session.scalar(select(VersionRow.version).where(VersionRow.model == model).limit(1)) is None
+        first = not registry.has_model(session, model)
         judged = Promotion.of(_accepted(manifest) if first else OTHERS, registry.answering(session, model), option)
         waits = not judged.answers
         version = registry.publish(session, model, folder, manifest, None, candidate=waits, promotion=judged)
@@ -95,7 +94,7 @@ def _publish(
 
 
 def _accepted(manifest: Mapping[str, Any]) -> Acceptance:
-    """What the figures say that come with a version."""
+    """Judge a version by the held-out figures in its lineage."""
     try:
         return accept(held_out_figures(tuple(manifest["joint_names"]), manifest["lineage"]["holdout"]))
     except (KeyError, TypeError, ValueError):

@@ -143,10 +143,15 @@ def learning(session: Session, model: str) -> list[int]:
     return [*(each for each in session.scalars(candidates) if each != serves), *([] if serves is None else [serves])]
 
 
+def has_model(session: Session, model: str) -> bool:
+    """Whether there is a model of this name."""
+    return session.scalar(select(ModelRow.name).where(ModelRow.name == model)) is not None
+
+
 def missing(session: Session, model: str, version: int | None) -> NotFoundError | NoServingVersionError:
     """The error for a version that there is not: of its model, where that is none either. version: None for the one
     that serves."""
-    if session.scalar(select(ModelRow.name).where(ModelRow.name == model)) is None:
+    if not has_model(session, model):
         return not_found("model", model)
     if version is not None:
         return not_found("version", version)
@@ -278,8 +283,7 @@ def named(database: Database, text: str) -> VersionRow:
 def no_alias(database: Database, model: str, alias: str) -> NotFoundError:
     """The error for an alias that there is not: of its model, where that is none either."""
     with database.session() as session:
-        known = session.scalar(select(ModelRow.name).where(ModelRow.name == model))
-    return not_found("model", model) if known is None else not_found("alias", alias)
+        return not_found("alias", alias) if has_model(session, model) else not_found("model", model)
 
 
 def recent(database: Database, count: int) -> list[str]:

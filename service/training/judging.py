@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from lipcore.data.metrics import BlockScores
-from lipcore.data.signals import noise_level
+from lipcore.fitting.noise import white
 from lipcore.model.torque_model import TorqueModel
 from service.foundation.fields import finite
 from service.foundation.settings import Settings
@@ -26,9 +26,7 @@ def judged_figures(settings: Settings, model: TorqueModel, material: Material) -
     assert table is not None  # something was held out
     samples = table.thinned(most)
     repeats = repeating.look(material.table.parts, samples, model.joint_types)
-    signals = material.samples if material.stretches is None else material.stretches
-    noise = noise_level([signals.tau[each] for each in signals.episodes()])
-    judged = {"judged_rows": material.rows, "torque_noise": noise.tolist()}
+    judged = {"judged_rows": material.rows, "torque_noise": white(material.samples, material.stretches).tolist()}
     found = {**judged, **figures(model, samples, most, len(table)), **repeats}
     if material.every is None:
         return found

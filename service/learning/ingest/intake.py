@@ -39,7 +39,7 @@ from service.storage.database import ModelRow, StreamRow
 logger = logging.getLogger(__name__)
 
 ACCEPTED = tuple(CODES.index(code) for code in ("learnt", "stationary", "payload"))
-"""Codes of rows whose errors are those of the arm as it is known, and of what it is known to carry."""
+"""Codes of rows that are not kept out: the model, with the payload it knows of, is to explain them."""
 
 RETAIN_EVERY = 200
 """Batches of a model after which its log is brought within its limits."""

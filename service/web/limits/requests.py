@@ -29,7 +29,7 @@ LOOK_S = 0.5
 
 
 def body_limits(settings: Settings) -> dict[str, int]:
-    """Most bytes of a body, by path or by what a path ends in; `*`: of all others: a few settings or names."""
+    """Largest body in bytes, by path or by a path's last part; `*`: of every other path."""
     return {
         "/v1/datasets": settings.max_upload_bytes,
         "/v1/robots": settings.max_urdf_bytes,
