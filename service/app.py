@@ -15,7 +15,6 @@ from threadpoolctl import threadpool_limits
 
 from lipserve.wording import counted
 from service import __version__
-from service.compute.confinement import protections
 from service.dashboard import routes as dashboard
 from service.datasets import routes as datasets
 from service.foundation import errors
@@ -37,6 +36,7 @@ from service.oip import routes as oip
 from service.oip import rpc
 from service.replication import Replication
 from service.robots import routes as robots
+from service.runtime.confinement import protections
 from service.storage.files.store import start_sweeping
 from service.storage.storage import Storage, hold_home, look_database, look_files, look_home
 from service.stream import routes as stream

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from benchmarks.reproduce.experiment import Cell, CellResult, Experiment, run_cell
 from benchmarks.reproduce.results import Results
-from service.compute.process import Place, start_process
+from service.runtime.process import Place, start_process
 
 
 class ReproductionError(RuntimeError):

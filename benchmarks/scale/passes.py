@@ -24,9 +24,9 @@ from benchmarks.scale.part import Part
 from lipcore.data.samples import Samples
 from lipcore.posterior.summing import Summing
 from lipcore.training.conditioning import SHARD, ShardStatistics, sum_samples
-from service.compute import executors
-from service.compute.executors import Processes, summed
 from service.foundation.settings import Settings, shipped_models
+from service.runtime import executors
+from service.runtime.executors import Processes, summed
 
 NAME = "pass"
 MODEL = "panda-sim"

@@ -15,7 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from service import __version__
 from service.cli.consoles import echo, explain, print_error
-from service.compute.remote import imported
+from service.runtime.remote import imported
 
 
 class Entry(NamedTuple):

@@ -10,8 +10,8 @@ import uvicorn
 
 from service.app import create_app
 from service.cli.options import alone, settings_of
-from service.compute.allocator import keep_little
 from service.oip import rpc
+from service.runtime.allocator import keep_little
 from service.storage.storage import HomeError, check_home
 from service.web.observability import logs
 from service.web.server import sockets

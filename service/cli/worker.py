@@ -9,7 +9,7 @@ import typer
 
 from service.cli.consoles import CommandError
 from service.cli.options import alone, settings_of
-from service.compute.process import THREAD_VARIABLES
+from service.runtime.process import THREAD_VARIABLES
 from service.web.observability import logs
 
 app = alone()

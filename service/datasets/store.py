@@ -19,7 +19,6 @@ from lipcore.data.samples import Array, Samples
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
 from lipserve.states import ACTIVE
-from service.compute import cage
 from service.datasets.mapping.reading import Recording
 from service.datasets.options import UploadOptions
 from service.datasets.report.making import make_report
@@ -27,6 +26,7 @@ from service.datasets.schema import MOST_STARTS, Dataset, DatasetPage, Preview, 
 from service.datasets.staging import Staged, column, prepare, staging
 from service.foundation.errors import ConflictError, invalid_request, not_found
 from service.robots.store import profile_of
+from service.runtime import cage
 from service.storage import sample_file
 from service.storage.database import Database, DatasetRow, JobRow, now
 from service.storage.files import Files, new_id

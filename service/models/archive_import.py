@@ -18,7 +18,6 @@ from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings
 from lipserve.states import PromotionOption
-from service.compute import cage
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
 from service.models import archive_reading, registry
@@ -27,6 +26,7 @@ from service.models.archive_reading import check_texts, invalid_member, invalid_
 from service.models.lineage import held_out_figures
 from service.models.loaded import LoadedModels
 from service.models.schema import Promotion, Version
+from service.runtime import cage
 from service.storage.database import LearnerRow, now
 from service.storage.files import new_id
 from service.web.storage_errors import undecided

@@ -1,4 +1,4 @@
-"""Reading a URDF where it can do no harm: `service.compute.cage` calls this in a process of its own."""
+"""Reading a URDF where it can do no harm: `service.runtime.cage` calls this in a process of its own."""
 
 from __future__ import annotations
 

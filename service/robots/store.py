@@ -18,7 +18,6 @@ from lipcore.robots.library import ROBOTS, UnknownRobotError, profile_urdf
 from lipcore.robots.urdf import Description, RigidBody
 from lipcore.robots.urdf_text import MOVABLE, UrdfError
 from lipserve.states import ACTIVE
-from service.compute import cage
 from service.foundation.errors import (
     ConflictError,
     InvalidRequestError,
@@ -29,6 +28,7 @@ from service.foundation.fields import LONGEST, for_people
 from service.foundation.settings import Settings
 from service.robots.caged import invalid_urdf
 from service.robots.schema import ProfileJoint, Robot, RobotPage, RobotProfile
+from service.runtime import cage
 from service.storage.database import Database, JobRow, RobotRow, now
 from service.storage.files import new_id
 from service.web.rows import Page, newest

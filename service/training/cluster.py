@@ -13,10 +13,10 @@ from secrets import token_hex
 
 from lipserve.states import QUEUED
 from service import __version__
-from service.compute import remote
-from service.compute.cluster import Cluster, needs_gpu
-from service.compute.executors import ClusterUnavailableError, lost
-from service.compute.process import Slot
+from service.runtime import remote
+from service.runtime.cluster import Cluster, needs_gpu
+from service.runtime.executors import ClusterUnavailableError, lost
+from service.runtime.process import Slot
 from service.storage.database import JobRow
 from service.training import lifecycle
 from service.training.lifecycle import Ended, Hand

@@ -27,12 +27,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from lipserve.states import ACTIVE, QUEUED, RUNNING
 from service import __version__
-from service.compute import executors
-from service.compute.cluster import GPU, JOB, needs_gpu
-from service.compute.executors import GPU_SHARD, SHARD, placed
-from service.compute.process import Slot, training_place
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
+from service.runtime import executors
+from service.runtime.cluster import GPU, JOB, needs_gpu
+from service.runtime.executors import GPU_SHARD, SHARD, placed
+from service.runtime.process import Slot, training_place
 from service.storage.database import Database, JobRow
 from service.storage.files import Files
 from service.training import lifecycle, worker

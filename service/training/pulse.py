@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from lipcore.fitting.hyperparameters import FitProgress
-from service.compute.progress import Progress
+from service.runtime.progress import Progress
 from service.storage.database import Database, JobRow, now
 
 SEARCH = "hyperparameters"

@@ -21,10 +21,10 @@ from fastapi import Depends
 from sqlalchemy import select
 
 from lipserve.states import ACTIVE, QUEUED, RUNNING
-from service.compute.cluster import Cluster
-from service.compute.process import Slot, training_place
 from service.foundation.fields import of_app
 from service.foundation.settings import Settings
+from service.runtime.cluster import Cluster
+from service.runtime.process import Slot, training_place
 from service.storage.database import JobRow
 from service.storage.replicas import Replicas
 from service.storage.storage import Storage

@@ -26,8 +26,8 @@ from lipcore.posterior.statistics import empty
 from lipcore.posterior.summing import Summing
 from lipcore.training.conditioning import ShardStatistics, sum_samples, with_statistics
 from lipcore.vocabulary import Place
-from service.compute.executors import placed, sent, shard_executor, summed
 from service.foundation.settings import Settings
+from service.runtime.executors import placed, sent, shard_executor, summed
 from service.storage.files import PATIENCE_S, Files
 from service.storage.sample_file import Reader
 from service.training.table import Shard, Table

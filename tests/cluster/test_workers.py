@@ -5,10 +5,10 @@ from functools import partial
 import pytest
 
 from lipcore.fitting.hyperparameters import FitCancelledError
-from service.compute.executors import ClusterUnavailableError, lost, sent, shard_executor, summed
 from service.foundation.settings import Settings
+from service.runtime.executors import ClusterUnavailableError, lost, sent, shard_executor, summed
 from tests.cluster.workers import cluster
-from tests.service.compute.work import dying, home, numbers
+from tests.service.runtime.work import dying, home, numbers
 from tests.service.data import ended, job, queue, running, stream, upload
 from tests.service.server import Server
 

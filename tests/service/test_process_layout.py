@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from service.compute.process import THREAD_VARIABLES, Place, training_cpus, training_place
 from service.foundation.settings import Settings
+from service.runtime.process import THREAD_VARIABLES, Place, training_cpus, training_place
 from tests.service.data import ENDLESS, queue, running, stream, upload
 from tests.service.server import Server
 

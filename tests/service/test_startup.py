@@ -53,7 +53,7 @@ def test_a_controller_that_loads_a_model_imports_neither_fitting_nor_service():
     assert result.isdisjoint((*FITTING, *SERVING, "pinocchio", "matplotlib"))
 
 
-@pytest.mark.parametrize("module", ["service.__main__", "service.compute.process"])
+@pytest.mark.parametrize("module", ["service.__main__", "service.runtime.process"])
 def test_a_training_process_takes_its_place_before_numerics_start_their_threads(module):
     """A spawned process imports its parent's main module, then what its initializer needs, then the job."""
     result = imported(f"import {module}")

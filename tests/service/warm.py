@@ -30,7 +30,7 @@ PRELOADED = [
     "service.learning.weigher.worker",
     __name__,
 ]
-STARTERS = ("service.compute.process", "service.compute.companion")
+STARTERS = ("service.runtime.process", "service.runtime.companion")
 """Modules that start processes of the service."""
 
 
@@ -90,7 +90,7 @@ def warm_processes() -> Iterator[None]:
     with (
         patch.multiple(STARTERS[0], multiprocessing=_shim()),
         patch.multiple(STARTERS[1], multiprocessing=_shim()),
-        patch("service.compute.cage.start", _start),
+        patch("service.runtime.cage.start", _start),
     ):
         yield
 
@@ -104,7 +104,7 @@ def _start(control: socket.socket) -> ForkServerProcess:
 
 
 def _serve_calls(control: socket.socket) -> None:
-    from service.compute import cage, reader_process
+    from service.runtime import cage, reader_process
 
     os.environ.clear()
     os.environ.update(cage.ENVIRONMENT)
@@ -158,7 +158,7 @@ def _serve(arguments: list[str], environment: dict[str, str], log: Path, address
     forkserver._forkserver.ensure_running = lambda: None  # type: ignore[attr-defined]
     for module in STARTERS:
         import_module(module).multiprocessing = _shim()  # type: ignore[attr-defined]
-    import_module("service.compute.cage").start = _start  # type: ignore[attr-defined]
+    import_module("service.runtime.cage").start = _start  # type: ignore[attr-defined]
     current_process().name = "MainProcess"  # as logs have it
     sys.argv = ["lipserve", *arguments]
     from service.__main__ import main

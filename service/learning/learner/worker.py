@@ -9,7 +9,6 @@ from contextlib import suppress
 from math import inf
 from multiprocessing.connection import Connection
 
-from service.compute.companion import BEAT, BEAT_S, received
 from service.foundation.settings import Settings
 from service.journal import snapshots
 from service.learning.learner import publication
@@ -17,6 +16,7 @@ from service.learning.learner.contest import Duels
 from service.learning.learner.follower import Follower
 from service.learning.learner.publication import Failed, Message
 from service.models import registry
+from service.runtime.companion import BEAT, BEAT_S, received
 from service.storage.database import Database
 from service.storage.files import Files
 

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from service.compute.companion import Companion
-from service.compute.process import Place, training_place
 from service.foundation.settings import Settings
+from service.runtime.companion import Companion
+from service.runtime.process import Place, training_place
 
 if TYPE_CHECKING:  # numerics
     from service.learning.weigher.messages import Message

@@ -19,10 +19,10 @@ from lipcore.online.draws import arms
 from lipcore.online.held import Held
 from lipcore.online.holding import Watch
 from lipcore.online.payload import estimate
-from service.compute.companion import BEAT, BEAT_S, received
 from service.foundation.settings import Settings
 from service.learning.weigher.messages import MOST_STREAMS, Asked, Message, Revised, Stream, Unweighed, Weighed
 from service.models import registry
+from service.runtime.companion import BEAT, BEAT_S, received
 from service.storage.database import Database
 from service.storage.files import Files
 

@@ -15,10 +15,10 @@ import pytest
 from fastapi.testclient import TestClient
 
 from service.app import create_app
-from service.compute.confinement import protections
 from service.datasets.staging import Staged
 from service.foundation.errors import InvalidDataError
 from service.foundation.settings import Settings
+from service.runtime.confinement import protections
 from service.storage.disk import Disk
 from tests.service.archives.packing import exported, pack, unpack, with_header
 from tests.service.data import ADDRESS, error
@@ -162,7 +162,7 @@ def test_an_archive_whose_tensors_say_that_they_are_larger_than_they_are(narrow)
 
 def test_a_reader_that_crashes_is_no_failure_of_the_service(narrow, monkeypatch):
     with monkeypatch.context() as patched:
-        patched.setattr("service.datasets.store.READER", "tests.service.compute.inmates:crash_over")
+        patched.setattr("service.datasets.store.READER", "tests.service.runtime.inmates:crash_over")
         message = refused(send(narrow, GOOD, CSV))
     assert "cannot be read: its reader was ended by SIGSEGV" in message
     assert send(narrow, GOOD, CSV).status_code == 201

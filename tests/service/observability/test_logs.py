@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from service.compute.process import Place, start_process
+from service.runtime.process import Place, start_process
 from service.web.observability import logs
 from service.web.observability.logs import LogOptions, job_id, request_id
 

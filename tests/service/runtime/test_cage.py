@@ -12,17 +12,17 @@ from pathlib import Path
 import pytest
 
 from lipcore.extras import MissingExtraError
-from service.compute import cage
-from service.compute.cage import start
-from service.compute.confinement import FORBIDDEN, OF_ITSELF, calls, protections
-from service.compute.reader_messages import ANSWER_BYTES, OUTPUT_BYTES, Failure
 from service.foundation.errors import InvalidDataError, NotReadyError, TooLargeError
 from service.foundation.settings import Settings
+from service.runtime import cage
+from service.runtime.cage import start
+from service.runtime.confinement import FORBIDDEN, OF_ITSELF, calls, protections
+from service.runtime.reader_messages import ANSWER_BYTES, OUTPUT_BYTES, Failure
 from tests.service.data import eventually
 from tests.service.server import children
 
 MiB = 1024 * 1024
-HERE = "tests.service.compute.inmates"
+HERE = "tests.service.runtime.inmates"
 memory_is_limited = pytest.mark.skipif(not protections()["memory"], reason="this system does not limit memory")
 landlocked = pytest.mark.skipif(not protections()["landlock"], reason="a kernel without Landlock")
 filtered = pytest.mark.skipif(not protections()["seccomp"], reason="a system without seccomp, or an unknown processor")
@@ -78,7 +78,7 @@ def test_errors_that_a_reader_may_raise_come_back_as_they_are(settings):
 def test_an_error_of_ours_is_none_of_the_file_and_is_logged_with_what_was_written(settings, caplog):
     with pytest.raises(cage.UnexpectedReaderError, match="KeyError: 'a bug'"):
         call("bug", object, settings=settings)
-    (record,) = [each for each in caplog.records if each.name == "service.compute.cage"]
+    (record,) = [each for each in caplog.records if each.name == "service.runtime.cage"]
     assert "noise\\n\\x1b[31m of a library" in record.fields["output"]
     assert "in bug" in record.fields["output"]
 
@@ -318,7 +318,7 @@ class Outer(msgspec.Struct):
 
 @pytest.mark.parametrize(
     ("maker", "encoder"),
-    [("service.compute.cage:_decoder", "msgspec.msgpack"), ("lipserve.call:decoder", "msgspec.json")],
+    [("service.runtime.cage:_decoder", "msgspec.msgpack"), ("lipserve.call:decoder", "msgspec.json")],
 )
 def test_threads_that_are_the_first_to_read_a_type_at_once_all_read_it(maker, encoder):
     """msgspec makes what it knows of a type in steps, without a lock: a second thread ends the process (SIGSEGV)."""

@@ -7,13 +7,13 @@ import sys
 
 import pytest
 
-from service.compute.allocator import HEAPS
+from service.runtime.allocator import HEAPS
 
 glibc = pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_info"), reason="another C library")
 THREADS = 8
 SCRIPT = f"""
 import ctypes, threading
-from service.compute.allocator import keep_little
+from service.runtime.allocator import keep_little
 print(keep_little())
 library = ctypes.CDLL(None)
 library.malloc.restype = library.fopen.restype = ctypes.c_void_p
@@ -61,7 +61,7 @@ BLOCKS = 2000
 PINNED = f"""
 import ctypes, os
 from pathlib import Path
-from service.compute.allocator import give_back
+from service.runtime.allocator import give_back
 library = ctypes.CDLL(None)
 library.malloc.restype = ctypes.c_void_p
 library.malloc.argtypes = [ctypes.c_size_t]

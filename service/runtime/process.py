@@ -21,8 +21,8 @@ from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal
 
-from service.compute.remote import imported
 from service.foundation.settings import Settings
+from service.runtime.remote import imported
 from service.web.observability import logs
 from service.web.observability.logs import LogOptions
 

@@ -16,9 +16,9 @@ from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
 
-from service.compute.process import Place, call, start_process
-from service.compute.progress import LOOK_S, Progress
 from service.foundation.settings import Settings
+from service.runtime.process import Place, call, start_process
+from service.runtime.progress import LOOK_S, Progress
 
 logger = logging.getLogger(__name__)
 

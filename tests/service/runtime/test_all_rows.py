@@ -10,8 +10,8 @@ import lipcore
 from lipcore.data import independence
 from lipcore.data.samples import Samples
 from lipcore.training.conditioning import SHARD, condition
-from service.compute.executors import Inline, shard_executor, summed
 from service.foundation.settings import Settings
+from service.runtime.executors import Inline, shard_executor, summed
 from service.storage.database import DatasetRow
 from service.storage.files import Files, new_id
 from service.storage.sample_file import Reader

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lipcore.fitting.hyperparameters import FitCancelledError
-from service.compute import executors
-from service.compute.executors import AHEAD, Inline, ShardFailedError, shard_executor, summed
 from service.foundation.settings import Settings
-from tests.service.compute.work import dying, freezing, numbers
+from service.runtime import executors
+from service.runtime.executors import AHEAD, Inline, ShardFailedError, shard_executor, summed
+from tests.service.runtime.work import dying, freezing, numbers
 
 SHARDS = list(range(37))
 

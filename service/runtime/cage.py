@@ -23,9 +23,11 @@ from typing import Any, TypeVar
 import msgspec
 
 from lipcore.extras import MissingExtraError
-from service.compute.confinement import OPEN_FILES
-from service.compute.progress import LOOK_S, Progress
-from service.compute.reader_messages import (
+from service.foundation.errors import NotReadyError, ServiceError, TooLargeError, invalid_data, problem, readable
+from service.foundation.settings import Settings
+from service.runtime.confinement import OPEN_FILES
+from service.runtime.progress import LOOK_S, Progress
+from service.runtime.reader_messages import (
     ERRORS,
     OUTPUT_BYTES,
     Answer,
@@ -37,8 +39,6 @@ from service.compute.reader_messages import (
     send,
     typed,
 )
-from service.foundation.errors import NotReadyError, ServiceError, TooLargeError, invalid_data, problem, readable
-from service.foundation.settings import Settings
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -218,7 +218,7 @@ def start(control: socket.socket) -> Any:
     """Start a process that serves the calls of a socket, with no descriptor and no variable but what it needs."""
     path = json.dumps([os.path.abspath(each) for each in sys.path])
     code = (
-        "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from service.compute import reader_process as process"
+        "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from service.runtime import reader_process as process"
     )
     return subprocess.Popen(  # noqa: S603 - our own
         [sys.executable, "-I", "-c", f"{code}; process.serve({control.fileno()})", path],

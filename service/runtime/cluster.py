@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import Any
 from urllib.parse import urlsplit
 
-from service.compute.executors import ClusterUnavailableError, connect
+from service.runtime.executors import ClusterUnavailableError, connect
 
 logger = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from math import inf
 
 import pytest
 
-from service.compute.progress import LOOK_S, Progress, main_thread_s
+from service.runtime.progress import LOOK_S, Progress, main_thread_s
 from tests.service.data import eventually
 
 BUSY = "while True: pass"

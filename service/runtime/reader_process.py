@@ -22,8 +22,9 @@ from typing import Any, NoReturn, get_type_hints
 import msgspec
 
 from lipcore.extras import MissingExtraError
-from service.compute.confinement import Bounds, confine, own_files, protections, renounce
-from service.compute.reader_messages import (
+from service.foundation.errors import ServiceError
+from service.runtime.confinement import Bounds, confine, own_files, protections, renounce
+from service.runtime.reader_messages import (
     ANSWER_BYTES,
     ERRORS,
     OUTPUT_BYTES,
@@ -38,8 +39,7 @@ from service.compute.reader_messages import (
     typed,
     with_length,
 )
-from service.compute.remote import imported
-from service.foundation.errors import ServiceError
+from service.runtime.remote import imported
 
 NICENESS = 5
 """Of a confined process: a control loop goes before an upload."""

@@ -25,10 +25,10 @@ from typing import Any, ParamSpec, Protocol, Self, TypeVar
 
 from lipcore.extras import need
 from lipcore.fitting.hyperparameters import FitCancelledError
-from service.compute import remote
-from service.compute.process import Place, start_process
-from service.compute.progress import LOOK_S, Progress
 from service.foundation.settings import Settings
+from service.runtime import remote
+from service.runtime.process import Place, start_process
+from service.runtime.progress import LOOK_S, Progress
 from service.web.observability import logs
 
 P = ParamSpec("P")
