@@ -17,7 +17,6 @@ from lipserve.wording import counted
 from service import __version__
 from service.dashboard import routes as dashboard
 from service.datasets import routes as datasets
-from service.foundation import errors
 from service.foundation.settings import Settings
 from service.guide import routes as guide
 from service.inference import routes
@@ -43,12 +42,12 @@ from service.stream import routes as stream
 from service.training import metrics as jobs_metrics
 from service.training import routes as training
 from service.training.queue import JobQueue, queue_of
-from service.web import openapi, storage_errors
+from service.web import errors, openapi
 from service.web.access import audit, audit_routes
 from service.web.access.keys import Keyring
 from service.web.access.middleware import KeyAccess, LocalAccess
 from service.web.limits.requests import BodyLimit, Gate, RateLimit, Turns, body_limits
-from service.web.observability import metrics, readiness, requests
+from service.web.observability import health, metrics, requests
 from service.web.observability.meters import Meters
 from service.web.observability.metrics import System, Traffic
 from service.web.observability.readiness import Look, Readiness, Stopping
@@ -116,11 +115,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     )
     app.state.stopping, app.state.meters, app.state.confined = stopping, meters, protections()
     errors.install(app)
-    storage_errors.install(app)
     _add_middleware(app, settings, keyring, meters, hot)
     openapi.install(app, settings.keys_needed)
     for router in (
-        readiness.router,
+        health.router,
         metrics.router,
         audit_routes.router,
         datasets.router,

@@ -23,14 +23,14 @@ from service.foundation.errors import (
     TooLargeError,
     UnsupportedMediaTypeError,
     invalid_request,
-    responses,
 )
 from service.foundation.fields import NameForPeople
-from service.storage.storage import StorageDep
+from service.web.dependencies import KeyHeader, PageQuery, StorageDep
+from service.web.errors import responses
 from service.web.limits.requests import UploadsDep
 from service.web.limits.upload import Kinds, receive_to
 from service.web.route import Route
-from service.web.rows import KeyHeader, PageQuery, identity
+from service.web.rows import identity
 
 KINDS = Kinds(MEDIA_TYPES, SUFFIXES)
 

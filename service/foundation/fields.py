@@ -1,14 +1,13 @@
-"""What several rooms take and show: names for people, numbers in lists, and what the application keeps for routes."""
+"""What several rooms take and show: names for people, numbers in lists."""
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from contextlib import suppress
 from math import isfinite, nan
 from typing import Annotated, Any
 
 import numpy as np
-from fastapi import Request
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, ValidationInfo
 
@@ -97,15 +96,6 @@ def _to_array(name: str, value: Any, nullable: bool) -> NDArray[np.float64]:
             raise invalid_request(f"{name}[{index}]", row, f"a list of {width} numbers, as {name}[0] has")
         rows.append(numbers(f"{name}[{index}]", row, nullable))
     return np.array(rows).reshape(len(rows), width)
-
-
-def of_app(name: str) -> Callable[[Request], Awaitable[Any]]:
-    """A dependency of routes: what the running application keeps under this name."""
-
-    async def kept(request: Request) -> Any:
-        return getattr(request.app.state, name)
-
-    return kept
 
 
 BINARY: dict[str, Any] = {"type": "string", "format": "binary"}

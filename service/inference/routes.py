@@ -16,12 +16,12 @@ from service.foundation.errors import (
     RevisionNotReachedError,
     TooLargeError,
     UnreadableVersionError,
-    responses,
 )
 from service.inference import comparison, evaluating, predicting, schema
 from service.inference.predicting import decode, encode
 from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.models.served import Served, reached
+from service.web.errors import responses
 from service.web.limits.requests import PredictionsDep
 from service.web.route import JSON, OCTETS, Reply, Route, hot_route, is_json, media_type
 

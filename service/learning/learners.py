@@ -19,7 +19,6 @@ from sqlalchemy import select
 
 from lipserve.states import PartState
 from service.foundation.errors import BusyError
-from service.foundation.fields import of_app
 from service.journal import log
 from service.learning.ingest.batches import Frames, FramesResult, observe_batch, observe_frames
 from service.learning.ingest.intake import Intake
@@ -31,6 +30,7 @@ from service.learning.live.feed import Feed
 from service.learning.schema import ObservationRequest, ObservationResponse
 from service.models.loaded import LoadedModels, Served
 from service.storage.database import StreamRow
+from service.web.dependencies import of_app
 from service.web.observability.readiness import Lasting
 
 logger = logging.getLogger(__name__)

@@ -20,7 +20,6 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.online.transfer import Revision
 from lipserve.states import PartState
 from service.foundation.errors import NotFoundError, UnreadableVersionError, not_found
-from service.foundation.fields import of_app
 from service.models import registry
 from service.models.lineage import learnt_from
 from service.models.loads import Loads
@@ -29,6 +28,7 @@ from service.models.scales import Scales
 from service.models.served import Alias, Key, LearntStates, Served, Waiting
 from service.storage.database import VersionRow
 from service.storage.storage import Storage
+from service.web.dependencies import of_app
 
 logger = logging.getLogger(__name__)
 

@@ -17,15 +17,15 @@ from service.foundation.errors import (
     TooLargeError,
     UnreadableVersionError,
     UnsupportedMediaTypeError,
-    responses,
 )
 from service.foundation.fields import BINARY, upload_body
 from service.models import aliases, archive, archive_import, deletion, registry, schema
 from service.models.loaded import LoadedModelsDep
+from service.web.dependencies import PageQuery
+from service.web.errors import responses
 from service.web.limits.requests import ArchivesDep
 from service.web.limits.upload import Kinds, receive_to
 from service.web.route import Route
-from service.web.rows import PageQuery
 
 ARCHIVES = Kinds({archive.MEDIA_TYPE: "tar"}, {".tar": "tar"})
 _BINARY = {"schema": BINARY}

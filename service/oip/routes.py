@@ -12,8 +12,8 @@ from starlette.types import Scope
 from service import __version__
 from service.models.loaded import LoadedModels
 from service.oip import dataplane, schema, wire
-from service.web.observability import readiness as health
-from service.web.observability.readiness import ReadinessDep
+from service.web.dependencies import ReadinessDep
+from service.web.observability import health
 from service.web.route import Reply, Route, hot_route
 
 _ONE, _VERSIONED = {"parameters": [schema.MODEL]}, {"parameters": [schema.MODEL, schema.VERSION]}

@@ -15,15 +15,14 @@ from service.foundation.errors import (
     NotInstalledError,
     TooLargeError,
     UnsupportedMediaTypeError,
-    responses,
 )
 from service.foundation.fields import NameForPeople
 from service.robots import store
 from service.robots.schema import UPLOAD_BODY, ProfileList, Robot, RobotPage, RobotProfile
-from service.storage.storage import StorageDep
+from service.web.dependencies import PageQuery, StorageDep
+from service.web.errors import responses
 from service.web.limits.upload import Kinds, receive
 from service.web.route import Route
-from service.web.rows import PageQuery
 
 KINDS = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
 

@@ -9,16 +9,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-from fastapi import Depends
 from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
 from lipcore.extras import MissingExtraError
 from lipcore.files.durable import make_folder
 from lipserve.states import PartState
-from service.foundation.fields import of_app
 from service.foundation.settings import Settings
 from service.storage.database.engine import FILE, Database
 from service.storage.database.migrations import DatabaseVersionError
@@ -39,9 +36,6 @@ class Storage:
     def open(cls, settings: Settings) -> Storage:
         """Open, or make, what the settings name."""
         return cls(settings, Database.of(settings, settings.database_timeout_s), Files.of(settings), Disk(settings))
-
-
-StorageDep = Annotated[Storage, Depends(of_app("storage"))]
 
 
 WRITE_S = 2.0

@@ -21,7 +21,6 @@ from fastapi import Depends
 from sqlalchemy import select
 
 from lipserve.states import ACTIVE, QUEUED, RUNNING
-from service.foundation.fields import of_app
 from service.foundation.settings import Settings
 from service.runtime.cluster import Cluster
 from service.runtime.process import Slot, training_place
@@ -31,6 +30,7 @@ from service.storage.storage import Storage
 from service.training import lifecycle, worker
 from service.training.feed import Feed
 from service.training.lifecycle import Ended, Facts, Hand, Settled, Settler, queue_again
+from service.web.dependencies import of_app
 
 logger = logging.getLogger(__name__)
 

@@ -18,16 +18,16 @@ from service.foundation.errors import (
     NotFoundError,
     NotInstalledError,
     TooLargeError,
-    responses,
 )
 from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.storage.database import JobRow
 from service.training import jobs
 from service.training.queue import JobQueue, JobQueueDep
 from service.training.schema import Job, JobDraft, JobPage, JobRequest
-from service.web.observability.readiness import StoppingDep
+from service.web.dependencies import KeyHeader, PageQuery, StoppingDep
+from service.web.errors import responses
 from service.web.route import Route
-from service.web.rows import KeyHeader, PageQuery, identity
+from service.web.rows import identity
 
 
 def _row(queue: JobQueueDep, job: str) -> JobRow:

@@ -18,6 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.foundation import errors
 from service.foundation.errors import ServiceError
 from service.web.access.scopes import OPEN, SCOPES, TABLE
+from service.web.errors import OPEN_INFERENCE
 
 SCHEME = "key"
 DESCRIPTION = "An API key with scopes, `Authorization: Bearer lip_…`:\n\n" + "\n".join(
@@ -144,7 +145,7 @@ def _add(path: str, method: str, operation: dict[str, Any]) -> None:
         kinds += BODY
     if method != "get" and not path.endswith(PURE):
         kinds += WRITING
-    protocol = f"{path}/".startswith(f"{errors.OPEN_INFERENCE}/")
+    protocol = f"{path}/".startswith(f"{OPEN_INFERENCE}/")
     answers = operation["responses"]
     own = set(answers)
     for kind in kinds:

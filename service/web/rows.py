@@ -10,14 +10,13 @@ import hashlib
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
-from fastapi import Depends, Header, Query, Request
 from pydantic import BaseModel
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
-from service.foundation.errors import ConflictError, invalid_request, problem
+from service.foundation.errors import ConflictError, problem
 from service.storage.database import AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow
 from service.web.observability.logs import KEY_ID, asked
 
@@ -44,38 +43,8 @@ def newest(
     return rows[: page.limit], following
 
 
-def _page(
-    request: Request,
-    limit: Annotated[int | None, Query(ge=1, description=f"Most items of this page; {USUAL} by default")] = None,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
-) -> Page:
-    most = request.app.state.storage.settings.max_page
-    if limit is None:
-        limit = min(USUAL, most)
-    if limit > most:
-        raise invalid_request("limit", limit, f"at most {most}")
-    if cursor is not None and not (cursor.isascii() and cursor.isdigit() and len(cursor) < 18):
-        raise invalid_request("cursor", cursor, "the next_cursor of a page")
-    return Page(after=None if cursor is None else int(cursor), limit=limit)
-
-
-PageQuery = Annotated[Page, Depends(_page)]
-
-
 HEADER = "Idempotency-Key"
 Made = TypeVar("Made", DatasetRow, JobRow)
-
-KeyHeader = Annotated[
-    str | None,
-    Header(
-        alias=HEADER,
-        max_length=100,
-        pattern=r"^[!-~]+$",
-        description="A name that the client gives to this request, of printable characters without spaces, so that it "
-        "can send it again when the answer is lost: it is done once, and what it made is answered each time. Another "
-        "request under the same key is a conflict",
-    ),
-]
 
 
 @dataclass(frozen=True)

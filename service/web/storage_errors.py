@@ -8,17 +8,12 @@ sent again, a batch is known by its number, and what has an idempotency key by t
 from __future__ import annotations
 
 import errno
-import logging
 import sqlite3
 
-from fastapi import FastAPI, Request
-from fastapi.responses import JSONResponse
 from sqlalchemy.exc import DBAPIError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
-from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError, answer_of
-
-logger = logging.getLogger(__name__)
+from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
 
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 """Of the operating system: the disk, a quota or the largest file allowed is used up."""
@@ -104,19 +99,3 @@ def _of_postgresql(error: DBAPIError, state: str | None) -> ServiceError | None:
         message = f"the database cannot be used now: SQLSTATE {state}; the service's log says more"
         return StorageUnavailableError(message, headers=RETRY_AFTER)
     return None
-
-
-def install(app: FastAPI) -> None:
-    """Answer requests that fail for the storage's sake with what they can act on."""
-    for kind in (DBAPIError, PoolTimeoutError, OSError):
-        app.add_exception_handler(kind, _answer)
-
-
-async def _answer(request: Request, error: Exception) -> JSONResponse:
-    answer = translated(error)
-    if answer is None and isinstance(error, FileNotFoundError) and not request.app.state.storage.files.in_place():
-        answer = StorageUnavailableError("files cannot be read or written now: the home of the service is gone")
-    if answer is None:
-        raise error  # as unexpected as any other
-    logger.error("%s at %s: %s", answer.code, request.scope["path"], error)
-    return answer_of(request.scope, answer)

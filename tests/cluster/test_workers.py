@@ -8,8 +8,8 @@ from lipcore.fitting.hyperparameters import FitCancelledError
 from service.foundation.settings import Settings
 from service.runtime.executors import ClusterUnavailableError, lost, sent, shard_executor, summed
 from tests.cluster.workers import cluster
-from tests.service.runtime.work import dying, home, numbers
 from tests.service.data import ended, job, queue, running, stream, upload
+from tests.service.runtime.work import dying, home, numbers
 from tests.service.server import Server
 
 SHARDS = range(20)

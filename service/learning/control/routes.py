@@ -14,7 +14,6 @@ from service.foundation.errors import (
     NotFoundError,
     TooLargeError,
     UnreadableVersionError,
-    responses,
 )
 from service.learning.control import decisions, overview, payload, schema, status
 from service.learning.control.overview_schema import OverviewPage
@@ -24,8 +23,9 @@ from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
 from service.training import jobs
 from service.training.queue import JobQueueDep
 from service.training.schema import Job
+from service.web.dependencies import PageQuery
+from service.web.errors import responses
 from service.web.route import Route
-from service.web.rows import PageQuery
 
 Sequence = Annotated[int, Path(ge=0, le=MOST_SEQUENCE)]
 EXAMPLE = {"forgetting_s": 3600.0, "on_change": "hold", "contact_threshold": 8.0}

@@ -10,14 +10,7 @@ from fastapi import APIRouter
 from msgspec import Meta, Struct
 from starlette.types import Scope
 
-from service.foundation.errors import (
-    BusyError,
-    ConflictError,
-    InvalidRequestError,
-    NotFoundError,
-    TooLargeError,
-    responses,
-)
+from service.foundation.errors import BusyError, ConflictError, InvalidRequestError, NotFoundError, TooLargeError
 from service.inference.predicting import QUANTITIES, Array, to_array
 from service.learning.learners import Learners, LearnersDep
 from service.learning.schema import (
@@ -26,6 +19,7 @@ from service.learning.schema import (
     ObservationRequest,
     ObservationResponse,
 )
+from service.web.errors import responses
 from service.web.route import Reply, each_once, hot_route, is_json
 
 Number = float | None

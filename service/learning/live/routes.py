@@ -11,14 +11,15 @@ from fastapi import APIRouter, Depends
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from lipcore.vocabulary import CODES
-from service.foundation.errors import BusyError, InvalidRequestError, NotFoundError, responses
+from service.foundation.errors import BusyError, InvalidRequestError, NotFoundError
 from service.journal import log
 from service.learning import owner
 from service.learning.control import decisions, payload, status
 from service.learning.control.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.learning.learners import Learners, LearnersDep
-from service.web.observability.meters import OTHER, Meters, MetersDep, StreamMeter
-from service.web.observability.readiness import StoppingDep
+from service.web.dependencies import MetersDep, StoppingDep
+from service.web.errors import responses
+from service.web.observability.meters import OTHER, Meters, StreamMeter
 from service.web.route import Route
 from service.web.rows import Page
 

@@ -17,7 +17,7 @@ from service.foundation.errors import NotReadyError, invalid_request
 from service.oip import dataplane, schema
 from service.oip.rpc.definition import SERVICE, message
 from service.oip.rpc.messages import InferRequest, Message, decode, encode
-from service.web.observability import readiness
+from service.web.observability import health
 from service.web.route import Reply
 
 CALL = "lipserve.call"
@@ -59,7 +59,7 @@ async def _server_live(state: State, scope: Scope, body: bytes) -> Reply:
 async def _server_ready(state: State, scope: Scope, body: bytes) -> Reply:
     decode(message("ServerReadyRequest"), body)
     try:
-        await to_thread.run_sync(readiness.ready, state.readiness)
+        await to_thread.run_sync(health.ready, state.readiness)
     except NotReadyError:
         return encode(message("ServerReadyResponse")(ready=False))
     return encode(message("ServerReadyResponse")(ready=True))

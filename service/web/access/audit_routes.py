@@ -7,13 +7,13 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query
 from pydantic import AwareDatetime, BaseModel, Field
 
-from service.foundation.errors import InvalidRequestError, responses
+from service.foundation.errors import InvalidRequestError
 from service.storage.database import AuditRow
-from service.storage.storage import StorageDep
 from service.web.access import audit
 from service.web.access.audit import Change
+from service.web.dependencies import PageQuery, StorageDep
+from service.web.errors import responses
 from service.web.route import Route
-from service.web.rows import PageQuery
 
 router = APIRouter(prefix="/v1", tags=["audit"], responses=responses(InvalidRequestError), route_class=Route)
 

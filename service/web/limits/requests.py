@@ -18,8 +18,9 @@ from fastapi import Depends, Request
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.foundation.errors import BusyError, RateLimitedError, refuse
+from service.foundation.errors import BusyError, RateLimitedError
 from service.foundation.settings import Settings
+from service.web.errors import refuse
 from service.web.observability.logs import KEY_ID
 
 OTHER_BYTES = 256 * 1024

@@ -9,12 +9,9 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-from fastapi import Depends
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
-
-from service.foundation.fields import of_app
 
 BOUNDS = (
     *(0.000_05, 0.000_1, 0.000_25, 0.000_5, 0.001, 0.002, 0.005, 0.01, 0.025),
@@ -116,9 +113,6 @@ class Meters:
     def streams(self) -> Mapping[str, StreamMeter]:
         """Meters of streams by model, as they are now."""
         return dict(self._streams)
-
-
-MetersDep = Annotated[Meters, Depends(of_app("meters"))]
 
 
 _FAMILIES: dict[str, Any] = {

@@ -14,8 +14,8 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from lipcore import extras
-from service.foundation.errors import ERROR_CODE
 from service.foundation.settings import Settings
+from service.web.errors import ERROR_CODE
 from service.web.observability.logs import KEY_ID, REQUEST_ID, asked, given_request_id, new_request_id, request_id
 from service.web.observability.meters import Kind, Meters
 

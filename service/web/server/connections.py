@@ -22,8 +22,9 @@ from uvicorn.server import ServerState
 from websockets.frames import CloseCode
 from websockets.protocol import State
 
-from service.foundation.errors import BusyError, ErrorBody, ErrorResponse, refuse
+from service.foundation.errors import BusyError, ErrorBody, ErrorResponse
 from service.foundation.settings import Settings
+from service.web.errors import refuse
 from service.web.limits.requests import HEALTH
 from service.web.server.room import Room
 

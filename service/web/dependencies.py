@@ -1,0 +1,59 @@
+"""What endpoints ask for in their signatures: parts of the application, pages of lists, the name of a request."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from typing import Annotated, Any
+
+from fastapi import Depends, Header, Query, Request
+
+from service.foundation.errors import invalid_request
+from service.storage.storage import Storage
+from service.web.observability.meters import Meters
+from service.web.observability.readiness import Readiness, Stopping
+from service.web.rows import HEADER, USUAL, Page
+
+
+def of_app(name: str) -> Callable[[Request], Awaitable[Any]]:
+    """A dependency of routes: what the running application keeps under this name."""
+
+    async def kept(request: Request) -> Any:
+        return getattr(request.app.state, name)
+
+    return kept
+
+
+StorageDep = Annotated[Storage, Depends(of_app("storage"))]
+MetersDep = Annotated[Meters, Depends(of_app("meters"))]
+ReadinessDep = Annotated[Readiness, Depends(of_app("readiness"))]
+StoppingDep = Annotated[Stopping, Depends(of_app("stopping"))]
+
+
+def _page(
+    request: Request,
+    limit: Annotated[int | None, Query(ge=1, description=f"Most items of this page; {USUAL} by default")] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
+) -> Page:
+    most = request.app.state.storage.settings.max_page
+    if limit is None:
+        limit = min(USUAL, most)
+    if limit > most:
+        raise invalid_request("limit", limit, f"at most {most}")
+    if cursor is not None and not (cursor.isascii() and cursor.isdigit() and len(cursor) < 18):
+        raise invalid_request("cursor", cursor, "the next_cursor of a page")
+    return Page(after=None if cursor is None else int(cursor), limit=limit)
+
+
+PageQuery = Annotated[Page, Depends(_page)]
+
+KeyHeader = Annotated[
+    str | None,
+    Header(
+        alias=HEADER,
+        max_length=100,
+        pattern=r"^[!-~]+$",
+        description="A name that the client gives to this request, of printable characters without spaces, so that it "
+        "can send it again when the answer is lost: it is done once, and what it made is answered each time. Another "
+        "request under the same key is a conflict",
+    ),
+]
