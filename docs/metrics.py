@@ -6,9 +6,9 @@ import sys
 from collections.abc import Iterator
 
 from service.learning import metrics as learning
+from service.telemetry.meters import MetricKind
 from service.training import metrics as training
 from service.web.observability import metrics
-from service.web.observability.meters import MetricKind
 
 KINDS: tuple[MetricKind, ...] = (
     *metrics.TRAFFIC_KINDS,

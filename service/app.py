@@ -36,21 +36,22 @@ from service.oip import rpc
 from service.replication import Replication
 from service.robots import routes as robots
 from service.runtime.confinement import protections
+from service.storage import audit
 from service.storage.files.store import start_sweeping
 from service.storage.storage import Storage, hold_home, look_database, look_files, look_home
 from service.stream import routes as stream
+from service.telemetry.meters import Meters
+from service.telemetry.readiness import Look, Readiness, Stopping
 from service.training import metrics as jobs_metrics
 from service.training import routes as training
 from service.training.queue import JobQueue, queue_of
 from service.web import errors, openapi
-from service.web.access import audit, audit_routes
+from service.web.access import audit_routes
 from service.web.access.keys import Keyring
 from service.web.access.middleware import KeyAccess, LocalAccess
 from service.web.limits.requests import BodyLimit, Gate, RateLimit, Turns, body_limits
 from service.web.observability import health, metrics, requests
-from service.web.observability.meters import Meters
 from service.web.observability.metrics import System, Traffic
-from service.web.observability.readiness import Look, Readiness, Stopping
 from service.web.observability.requests import RequestContext, RequestLog
 
 logger = logging.getLogger(__name__)

@@ -26,9 +26,9 @@ from service.learning.control import schema as learning
 from service.models import schema as models
 from service.oip import schema as oip
 from service.robots import schema as robots
+from service.telemetry import readiness
 from service.training import schema as training
 from service.web.access import audit_routes
-from service.web.observability import readiness
 
 TARGET = Path(__file__).parent / "lipserve/records"
 WIDTH = 120

@@ -13,7 +13,7 @@ from service.cli.options import alone, settings_of
 from service.oip import rpc
 from service.runtime.allocator import keep_little
 from service.storage.storage import HomeError, check_home
-from service.web.observability import logs
+from service.telemetry import logs
 from service.web.server import sockets
 from service.web.server.connections import StreamProtocol, guarded
 

@@ -10,7 +10,7 @@ import typer
 from service.cli.consoles import CommandError
 from service.cli.options import alone, settings_of
 from service.runtime.process import THREAD_VARIABLES
-from service.web.observability import logs
+from service.telemetry import logs
 
 app = alone()
 

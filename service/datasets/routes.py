@@ -25,12 +25,12 @@ from service.foundation.errors import (
     invalid_request,
 )
 from service.foundation.fields import NameForPeople
+from service.storage.rows import identity
 from service.web.dependencies import KeyHeader, PageQuery, StorageDep
 from service.web.errors import responses
 from service.web.limits.requests import UploadsDep
 from service.web.limits.upload import Kinds, receive_to
 from service.web.route import Route
-from service.web.rows import identity
 
 KINDS = Kinds(MEDIA_TYPES, SUFFIXES)
 

@@ -29,11 +29,11 @@ from service.robots.store import profile_of
 from service.runtime import cage
 from service.storage import sample_file
 from service.storage.database import Database, DatasetRow, JobRow, now
+from service.storage.errors import undecided
 from service.storage.files import Files, new_id
+from service.storage.rows import Identity, Page, done, mark, newest
 from service.storage.sample_file import PartOf
 from service.storage.storage import Storage
-from service.web.rows import Identity, Page, done, mark, newest
-from service.web.storage_errors import undecided
 
 READER = "service.datasets.caged:read_upload"
 MOST_NAMED = 5

@@ -22,8 +22,8 @@ from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import BusyError, ConflictError
 from service.storage.database import EventRow, LearnerRow, LearningRow, SnapshotRow, StreamRow, fetch, now
-from service.web.rows import Page
-from service.web.rows import newest as newest_rows
+from service.storage.rows import Page
+from service.storage.rows import newest as newest_rows
 
 StreamKind = Literal["batches", "frames"]
 EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings", "payload"]

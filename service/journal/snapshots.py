@@ -14,8 +14,8 @@ from service.foundation.settings import Settings
 from service.journal import log
 from service.models import registry
 from service.storage.database import Database, EventRow, SnapshotRow, StreamRow, VersionRow, now
+from service.storage.errors import undecided
 from service.storage.files import Files, new_id
-from service.web.storage_errors import undecided
 
 
 def save(

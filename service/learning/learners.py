@@ -30,8 +30,8 @@ from service.learning.live.feed import Feed
 from service.learning.schema import ObservationRequest, ObservationResponse
 from service.models.loaded import LoadedModels, Served
 from service.storage.database import StreamRow
+from service.telemetry.readiness import Lasting
 from service.web.dependencies import of_app
-from service.web.observability.readiness import Lasting
 
 logger = logging.getLogger(__name__)
 

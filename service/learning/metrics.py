@@ -12,7 +12,7 @@ from lipcore.vocabulary import CODES
 from service.learning.control import status
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
-from service.web.observability.meters import MetricKind
+from service.telemetry.meters import MetricKind
 
 FIGURES = {
     "nmse": "Mean squared error / variance of the measured torque; every row is predicted before it is learnt",

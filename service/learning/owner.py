@@ -10,9 +10,9 @@ from sqlalchemy.orm import Session
 from service.foundation.errors import invalid_request, not_found
 from service.journal import log
 from service.learning.schema import CONTACT_THRESHOLD, FORGETTING_S, FRICTION_WALK_S, TORQUE_LIMIT, LearningOptions
+from service.storage import audit
 from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, fetch, now
-from service.web.access import audit
-from service.web.rows import Page, newest
+from service.storage.rows import Page, newest
 
 AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock"]
 _SET = select(LearningRow.options, LearningRow.held).where(LearningRow.model == bindparam("model"))

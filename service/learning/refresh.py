@@ -26,12 +26,12 @@ from service.learning.learners import Learners
 from service.learning.owner import AlarmKind
 from service.models import deletion, registry
 from service.models.loaded import LoadedModels
+from service.storage import audit
 from service.storage.database import AlarmRow, Database, LearnerRow, ServingRow
 from service.training import jobs
 from service.training import refresh_data as scope
 from service.training.queue import JobQueue
 from service.training.schema import Job
-from service.web.access import audit
 
 logger = logging.getLogger(__name__)
 

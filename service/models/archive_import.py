@@ -28,8 +28,8 @@ from service.models.loaded import LoadedModels
 from service.models.schema import Promotion, Version
 from service.runtime import cage
 from service.storage.database import LearnerRow, now
+from service.storage.errors import undecided
 from service.storage.files import new_id
-from service.web.storage_errors import undecided
 
 logger = logging.getLogger(__name__)
 

@@ -13,6 +13,7 @@ from lipserve.states import ACTIVE
 from service.foundation.errors import ConflictError, NotFoundError, not_found
 from service.models import aliases, registry
 from service.models.loaded import LoadedModels
+from service.storage import audit
 from service.storage.database import (
     AlarmRow,
     AliasMoveRow,
@@ -30,7 +31,6 @@ from service.storage.database import (
     now,
 )
 from service.storage.files import Files
-from service.web.access import audit
 
 logger = logging.getLogger(__name__)
 

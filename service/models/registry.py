@@ -17,6 +17,7 @@ from lipcore.fitting.base import RobotKind
 from service.foundation.errors import ConflictError, NoServingVersionError, NotFoundError, not_found
 from service.foundation.settings import shipped_models
 from service.models.schema import HeldOutQuality, Model, ModelPage, Promotion, Version, VersionSummary
+from service.storage import audit
 from service.storage.database import (
     AliasMoveRow,
     AliasRow,
@@ -31,8 +32,7 @@ from service.storage.database import (
     now,
 )
 from service.storage.files import Files, new_id
-from service.web.access import audit
-from service.web.rows import Page, newest
+from service.storage.rows import Page, newest
 
 logger = logging.getLogger(__name__)
 

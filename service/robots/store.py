@@ -31,7 +31,7 @@ from service.robots.schema import ProfileJoint, Robot, RobotPage, RobotProfile
 from service.runtime import cage
 from service.storage.database import Database, JobRow, RobotRow, now
 from service.storage.files import new_id
-from service.web.rows import Page, newest
+from service.storage.rows import Page, newest
 
 
 def add(database: Database, content: bytes, name: str | None, settings: Settings) -> Robot:

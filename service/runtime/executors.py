@@ -29,7 +29,7 @@ from service.foundation.settings import Settings
 from service.runtime import remote
 from service.runtime.process import Place, start_process
 from service.runtime.progress import LOOK_S, Progress
-from service.web.observability import logs
+from service.telemetry import logs
 
 P = ParamSpec("P")
 T = TypeVar("T")

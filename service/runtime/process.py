@@ -23,8 +23,8 @@ from typing import Any, Literal
 
 from service.foundation.settings import Settings
 from service.runtime.remote import imported
-from service.web.observability import logs
-from service.web.observability.logs import LogOptions
+from service.telemetry import logs
+from service.telemetry.logs import LogOptions
 
 logger = logging.getLogger(__name__)
 

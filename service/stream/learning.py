@@ -21,7 +21,7 @@ from service.learning.ingest.batches import Frames
 from service.learning.ingest.host_clock import SET_S
 from service.learning.learners import Learners
 from service.models.loaded import Served
-from service.web.storage_errors import translated
+from service.storage.errors import translated
 
 logger = logging.getLogger(__name__)
 

@@ -26,8 +26,8 @@ from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.models.registry import SERVING
 from service.stream.learning import Learning, Taught
+from service.telemetry.meters import StreamMeter
 from service.web.access.middleware import subprotocol_of
-from service.web.observability.meters import StreamMeter
 from service.web.server.connections import StreamProtocol
 
 if TYPE_CHECKING:

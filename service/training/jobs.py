@@ -35,11 +35,11 @@ from service.models.loaded import LoadedModels
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, JobRow, RobotRow, VersionRow, now
 from service.storage.files import new_id
+from service.storage.rows import Identity, Page, done, mark, newest
+from service.telemetry.logs import KEY_ID, asked, request_id
 from service.training import holding_out, lifecycle, refresh_data
 from service.training.queue import JobQueue
 from service.training.schema import Job, JobDraft, JobPage, JobRequest, Options
-from service.web.observability.logs import KEY_ID, asked, request_id
-from service.web.rows import Identity, Page, done, mark, newest
 
 USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
 """Seconds after which who finds the queue full may try again: where nothing is known of the jobs that run, and most."""

@@ -13,9 +13,9 @@ from sqlalchemy.orm import Session
 from lipserve.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, PartState
 from lipserve.wording import counted
 from service.storage.database import Database, JobRow
+from service.telemetry.meters import Durations, MetricKind
+from service.telemetry.readiness import Lasting
 from service.training.queue import JobQueue
-from service.web.observability.meters import Durations, MetricKind
-from service.web.observability.readiness import Lasting
 
 JOBS = MetricKind("gauge", "lipserve_jobs", "Training jobs that wait or run now", ("state",))
 FINISHED = MetricKind("counter", "lipserve_jobs_finished_total", "Training jobs that have ended, ever", ("outcome",))

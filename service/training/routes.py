@@ -21,13 +21,13 @@ from service.foundation.errors import (
 )
 from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.storage.database import JobRow
+from service.storage.rows import identity
 from service.training import jobs
 from service.training.queue import JobQueue, JobQueueDep
 from service.training.schema import Job, JobDraft, JobPage, JobRequest
 from service.web.dependencies import KeyHeader, PageQuery, StoppingDep
 from service.web.errors import responses
 from service.web.route import Route
-from service.web.rows import identity
 
 
 def _row(queue: JobQueueDep, job: str) -> JobRow:

@@ -24,16 +24,16 @@ from service.models.lineage import MOST_SAMPLES, figures, software
 from service.models.schema import Promotion
 from service.runtime.allocator import give_back
 from service.runtime.executors import ClusterUnavailableError
+from service.storage import errors as storage_errors
 from service.storage.database import Database, JobRow, LearnerRow, now
 from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
+from service.telemetry.logs import job_id
 from service.training import judging, lifecycle, promotion, refresh_data
 from service.training.holding_out import CannotHoldOutError
 from service.training.material import Material, observed, recorded
 from service.training.planned_fit import PlannedFit
 from service.training.pulse import Pulse, SupersededError
-from service.web import storage_errors
-from service.web.observability.logs import job_id
 
 logger = logging.getLogger(__name__)
 

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 from fastapi import Depends, Header, Query, Request
 
 from service.foundation.errors import invalid_request
+from service.storage.rows import HEADER, USUAL, Page
 from service.storage.storage import Storage
-from service.web.observability.meters import Meters
-from service.web.observability.readiness import Readiness, Stopping
-from service.web.rows import HEADER, USUAL, Page
+from service.telemetry.meters import Meters
+from service.telemetry.readiness import Readiness, Stopping
 
 
 def of_app(name: str) -> Callable[[Request], Awaitable[Any]]:

@@ -29,7 +29,7 @@ from service.foundation.errors import (
     readable,
     sentence,
 )
-from service.web import storage_errors
+from service.storage import errors as storage_errors
 
 logger = logging.getLogger(__name__)
 

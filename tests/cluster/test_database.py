@@ -16,8 +16,8 @@ from service import cli
 from service.foundation.errors import StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.storage.database import Base, Database, LearningRow, ModelRow, now
+from service.storage.errors import translated
 from service.storage.storage import HomeError, check_home
-from service.web.storage_errors import translated
 from tests.histories.proxy import Proxy
 from tests.service.database.starting import check_starts_together
 from tests.service.server import free_port

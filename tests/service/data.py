@@ -15,8 +15,8 @@ from lipserve.states import ACTIVE
 from service.learning.learners import Learners
 from service.models.loaded import LoadedModels
 from service.storage.storage import Storage
+from service.telemetry.readiness import Readiness
 from service.training.queue import JobQueue
-from service.web.observability.readiness import Readiness
 
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations": 4}
 """Options of a fit that takes a fraction of a second."""

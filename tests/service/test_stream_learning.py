@@ -16,7 +16,7 @@ from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
 from service.learning.ingest.batches import FramesResult
 from service.stream.session import Session
-from service.web.observability.meters import Meters
+from service.telemetry.meters import Meters
 from tests.service.data import DEADLINE
 from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, MOTION, STD, TAU, frame, read
 from tests.service.test_stream_session import Model, served

@@ -11,7 +11,7 @@ from service.foundation.settings import Settings
 from service.models.loads import Carried, Loads
 from service.models.scales import Factor, Scales
 from service.stream.session import Echo, Session
-from service.web.observability.meters import Meters
+from service.telemetry.meters import Meters
 from tests.service.data import DEADLINE
 from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, FALLBACK, SCALE, STD, frame, read
 

@@ -24,9 +24,9 @@ from service.learning.ingest.batches import state
 from service.learning.learners import Learners
 from service.learning.schema import LearningOptions
 from service.models import registry
+from service.storage import audit
 from service.storage.database import Database, EventRow, LearnerRow, VersionRow
-from service.web.access import audit
-from service.web.rows import Page
+from service.storage.rows import Page
 
 WORDS = {"unlearnt": "has been unlearnt", "rolled_back": "was undone by a rollback"}
 

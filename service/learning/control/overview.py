@@ -25,8 +25,8 @@ from service.learning.learners import Learners
 from service.models import registry
 from service.models.loaded import Served
 from service.storage.database import AlarmRow, EventRow, LearningRow, ModelRow
+from service.storage.rows import Page, newest
 from service.training.promotion import CANDIDATE
-from service.web.rows import Page, newest
 
 HOUR_S = 3600.0
 DECIMALS = 3

@@ -33,7 +33,7 @@ from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
 from service.learning.streams import PayloadRecord
 from service.models.served import Served
-from service.web.access import audit
+from service.storage import audit
 
 DRAWS = 500
 """Of a payload's parameters, for the spread of its inertia."""

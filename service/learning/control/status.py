@@ -24,7 +24,7 @@ from service.learning.learners import Learners
 from service.learning.schema import ObservationResponse
 from service.models import registry
 from service.storage.database import EventRow, LearnerRow, StreamRow
-from service.web.rows import Page
+from service.storage.rows import Page
 
 Range = tuple[int, int]
 MOST_GAPS = 20

@@ -10,8 +10,8 @@ from service.journal import log
 from service.learning import owner
 from service.learning.ingest.judging import Verdict
 from service.models.loaded import Served
+from service.storage import audit
 from service.storage.database import EventRow
-from service.web.access import audit
 
 CONSEQUENCES = {
     "hold": "nothing is learnt until its owner has decided",

@@ -27,8 +27,8 @@ from service.learning.learner.publication import Published
 from service.learning.learner.restore import Arrival, advance, restore
 from service.storage.database import Database
 from service.storage.disk import Disk
+from service.storage.errors import translated
 from service.storage.files import Files
-from service.web.storage_errors import translated
 
 logger = logging.getLogger(__name__)
 

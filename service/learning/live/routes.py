@@ -17,11 +17,11 @@ from service.learning import owner
 from service.learning.control import decisions, payload, status
 from service.learning.control.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.learning.learners import Learners, LearnersDep
+from service.storage.rows import Page
+from service.telemetry.meters import OTHER, Meters, StreamMeter
 from service.web.dependencies import MetersDep, StoppingDep
 from service.web.errors import responses
-from service.web.observability.meters import OTHER, Meters, StreamMeter
 from service.web.route import Route
-from service.web.rows import Page
 
 MOST_ALARMS = 5
 COUNTS = (*CODES, "batches", "duplicates")

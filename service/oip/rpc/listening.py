@@ -20,7 +20,7 @@ from service.oip.rpc import taken
 from service.oip.rpc.definition import SERVICE
 from service.oip.rpc.messages import PROTOBUF
 from service.oip.rpc.methods import CALL, METHODS
-from service.web.observability.readiness import Stopping
+from service.telemetry.readiness import Stopping
 
 logger = logging.getLogger(__name__)
 

@@ -30,7 +30,7 @@ class Base(DeclarativeBase):
 class DatasetRow(Base):
     """An uploaded data set; its samples lie in the file store under the same id.
 
-    idempotency_key, request_digest: see `service.web.rows`; None where the client has given none.
+    idempotency_key, request_digest: see `service.storage.rows`; None where the client has given none.
     """
 
     __tablename__ = "datasets"
@@ -68,7 +68,7 @@ class JobRow(Base):
 
     history: what happened to it, oldest first, each {at, state, message}; retry_of: id of the job that it repeats;
     request_id: of the request that queued it; owner: id of the service that has it run, None where none does yet;
-    idempotency_key, request_digest: see `service.web.rows`; key: id of the API key that queued it, None without keys.
+    idempotency_key, request_digest: `service.storage.rows`; key: id of the API key that queued it, None without keys.
     """
 
     __tablename__ = "jobs"
@@ -328,7 +328,7 @@ class ApiKeyRow(Base):
 
 
 class AuditRow(Base):
-    """One change of a model, see `service.web.access.audit`. No line refers to a model's row: it outlives that.
+    """One change of a model, see `service.storage.audit`. No line refers to a model's row: it outlives that.
 
     key, key_name: API key of who did it, None without keys; what: method and route, or `job` and its id, or `service`;
     before, after: what was and what is, as JSON. The database refuses to change a line.

@@ -8,9 +8,9 @@ from fastapi import APIRouter, Query
 from pydantic import AwareDatetime, BaseModel, Field
 
 from service.foundation.errors import InvalidRequestError
+from service.storage import audit
+from service.storage.audit import Change
 from service.storage.database import AuditRow
-from service.web.access import audit
-from service.web.access.audit import Change
 from service.web.dependencies import PageQuery, StorageDep
 from service.web.errors import responses
 from service.web.route import Route

@@ -14,11 +14,11 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.foundation.errors import ForbiddenError, NotFoundError, ServiceError, problem, readable
 from service.foundation.settings import is_loopback
+from service.telemetry.logs import KEY_ID
 from service.web.access.keys import CHALLENGE, Key, Keyring, refusal
 from service.web.access.scopes import ADMIN, WEBSOCKET, rule_of, scopes_of_stream
 from service.web.errors import refuse
 from service.web.limits.requests import COUNTED
-from service.web.observability.logs import KEY_ID
 from service.web.server.connections import CONNECTION, StreamProtocol
 
 SUBPROTOCOL = "lipserve"

@@ -20,8 +20,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.foundation.errors import BusyError, RateLimitedError
 from service.foundation.settings import Settings
+from service.telemetry.logs import KEY_ID
 from service.web.errors import refuse
-from service.web.observability.logs import KEY_ID
 
 OTHER_BYTES = 256 * 1024
 """Largest body where neither motions nor files are sent: a list of a thousand names, each as long as may be."""

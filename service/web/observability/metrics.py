@@ -17,8 +17,8 @@ from prometheus_client.registry import Collector
 from service import __version__
 from service.storage.disk import measure
 from service.storage.storage import Storage
-from service.web.observability.meters import Durations, Kind, Meters, MetricKind, merged
-from service.web.observability.readiness import Readiness
+from service.telemetry.meters import Durations, Kind, Meters, MetricKind, merged
+from service.telemetry.readiness import Readiness
 from service.web.route import Route
 
 BUILD = MetricKind("gauge", "lipserve_build_info", "1; the version of LIPServe", ("version",))

@@ -15,9 +15,9 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from lipcore import extras
 from service.foundation.settings import Settings
+from service.telemetry.logs import KEY_ID, REQUEST_ID, asked, given_request_id, new_request_id, request_id
+from service.telemetry.meters import Kind, Meters
 from service.web.errors import ERROR_CODE
-from service.web.observability.logs import KEY_ID, REQUEST_ID, asked, given_request_id, new_request_id, request_id
-from service.web.observability.meters import Kind, Meters
 
 _OF_CALLS = "/inference.GRPCInferenceService/"
 MONITORING = frozenset(

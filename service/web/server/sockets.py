@@ -18,7 +18,7 @@ from typing import Any
 import uvicorn
 from uvicorn.config import STARTUP_FAILURE
 
-from service.web.observability.readiness import Stopping
+from service.telemetry.readiness import Stopping
 
 logger = logging.getLogger(__name__)
 

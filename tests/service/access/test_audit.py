@@ -11,6 +11,7 @@ from sqlalchemy.exc import DBAPIError
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.learning import owner
+from service.storage import audit
 from service.storage.database import (
     AliasMoveRow,
     AliasRow,
@@ -21,7 +22,7 @@ from service.storage.database import (
     ServingRow,
     VersionRow,
 )
-from service.web.access import audit, keys
+from service.web.access import keys
 from tests.service.access.conftest import bearer
 from tests.service.archives.packing import TAR, exported
 from tests.service.data import QUICK, ended, error, eventually, queue, service_of, stream, upload

@@ -20,9 +20,9 @@ from service.foundation.settings import Settings
 from service.learning.weigher.weighing import Weighing
 from service.storage.database import Database
 from service.storage.database.engine import FILE
+from service.storage.errors import translated
 from service.storage.files import Files
 from service.storage.storage import HomeError, check_home
-from service.web.storage_errors import translated
 from tests.service.data import ADDRESS, DEADLINE, arrays, error, npz, service_of, stream, upload
 from tests.service.faults.storage import small_disk
 from tests.service.test_robots import urdf

@@ -10,9 +10,9 @@ import pytest
 
 from service.foundation.errors import StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
+from service.storage import errors as storage_errors
 from service.storage.files import Files, FilesUnreachableError, objects
 from service.storage.storage import HomeError, check_home
-from service.web import storage_errors
 from tests.service.data import stream
 
 

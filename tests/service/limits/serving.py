@@ -14,7 +14,7 @@ from starlette.responses import Response
 from starlette.websockets import WebSocket
 
 from service.foundation.settings import Settings
-from service.web.observability.readiness import Stopping
+from service.telemetry.readiness import Stopping
 from service.web.server.connections import guarded
 from service.web.server.sockets import Server
 from tests.service.data import DEADLINE, eventually

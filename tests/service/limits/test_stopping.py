@@ -20,7 +20,7 @@ GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
 HELD = GET.replace(b"/ ", b"/held ", 1)
 HOLD = """
 import asyncio, sys, uvicorn
-from service.web.observability.readiness import Stopping
+from service.telemetry.readiness import Stopping
 from service.web.server.sockets import serve
 
 async def app(scope, receive, send):

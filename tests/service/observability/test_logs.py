@@ -10,8 +10,8 @@ from concurrent.futures import ProcessPoolExecutor
 import pytest
 
 from service.runtime.process import Place, start_process
-from service.web.observability import logs
-from service.web.observability.logs import LogOptions, job_id, request_id
+from service.telemetry import logs
+from service.telemetry.logs import LogOptions, job_id, request_id
 
 
 def record(message="said %s", *args, **more):

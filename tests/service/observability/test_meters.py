@@ -5,7 +5,7 @@ from time import perf_counter
 import pytest
 
 from service.foundation.settings import Settings
-from service.web.observability.meters import BOUNDS, OTHER, Durations, Kind, Meters, RequestMeter, merged
+from service.telemetry.meters import BOUNDS, OTHER, Durations, Kind, Meters, RequestMeter, merged
 from tests.service.streams import LATE, frame
 from tests.service.test_stream_session import Loaded, Model, reply, session
 

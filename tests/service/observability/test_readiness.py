@@ -12,8 +12,8 @@ from service.learning.learner.process import LearnerProcess
 from service.learning.learners import RESTART_S
 from service.learning.metrics import Learning
 from service.storage import storage
+from service.telemetry.readiness import KEPT_S, Readiness
 from service.training.metrics import START_S
-from service.web.observability.readiness import KEPT_S, Readiness
 from tests.service.data import QUICK, error, queue, service_of, stream, upload
 
 FEW = {**QUICK, "posterior_samples": 40}

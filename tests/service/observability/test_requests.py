@@ -17,9 +17,10 @@ from service.app import create_app
 from service.foundation.settings import Settings
 from service.inference import predicting as inference
 from service.learning.learners import IngestThreads
-from service.web.observability import logs, requests
-from service.web.observability.logs import KEY_ID, given_request_id, new_request_id, request_id
-from service.web.observability.meters import Kind, Meters
+from service.telemetry import logs
+from service.telemetry.logs import KEY_ID, given_request_id, new_request_id, request_id
+from service.telemetry.meters import Kind, Meters
+from service.web.observability import requests
 from service.web.observability.requests import RequestContext, RequestLog
 from tests.service.data import ADDRESS, error, stream, upload
 

@@ -28,7 +28,7 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 from service.storage.database import Database, SnapshotRow, now
 from service.storage.files import Files
-from service.web.storage_errors import undecided
+from service.storage.errors import undecided
 home = Path(sys.argv[1])
 database = Database(home)
 files = Files(home)

@@ -19,8 +19,8 @@ from sqlalchemy.orm import Session
 
 from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, AuditRow, Database, JobRow, now
-from service.web.observability.logs import KEY_ID, asked, job_id, request_id
-from service.web.rows import Page, newest
+from service.storage.rows import Page, newest
+from service.telemetry.logs import KEY_ID, asked, job_id, request_id
 
 logger = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, problem
 from service.storage.database import AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow
-from service.web.observability.logs import KEY_ID, asked
+from service.telemetry.logs import KEY_ID, asked
 
 USUAL = 50
 Row = TypeVar("Row", AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow)

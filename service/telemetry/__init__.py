@@ -1,0 +1,1 @@
+"""What any room may report to: logs, meters, readiness."""
