@@ -19,8 +19,8 @@ from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
 from lipserve import Client
 from service.cli.demo import ServiceProcess
+from service.contract.observations import LearningOptions
 from service.learning.owner import set_options
-from service.learning.schema import LearningOptions
 from service.models import registry
 from service.storage.database import Database
 from service.storage.files import Files, new_id

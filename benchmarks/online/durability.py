@@ -14,7 +14,7 @@ from benchmarks.online.bed import install, train
 from benchmarks.online.trials import BATCHES, LATE, MODEL, ROWS, TWICE, Tally, Trials, Victim
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
-from service.learning.schema import LearningOptions
+from service.contract.observations import LearningOptions
 
 ROBOT, RATE, SPEED = "double-pendulum", 100.0, 5.0
 FIT = {"hyperparameter_samples": 40, "posterior_samples": 100, "max_iterations": 30, "starts": 1}

@@ -18,7 +18,7 @@ from benchmarks.online.carried import Outcome, carried
 from benchmarks.online.pickup_table import Carrying, case_row, rival_row
 from benchmarks.online.rivals import rivals
 from lipcore.model.torque_model import TorqueModel
-from service.learning.schema import LearningOptions
+from service.contract.observations import LearningOptions
 
 PARTS = ("payload", "rivals", "quiet")
 """What can be measured, by name; only where it is asked for."""

@@ -18,7 +18,7 @@ from benchmarks.online.sending import batch_request, send
 from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
 from lipcore.robots.library import Robot, pinocchio
-from service.learning.schema import LearningOptions
+from service.contract.observations import LearningOptions
 
 MODEL, FORGETTING_S = "adapts", 30.0
 PRIOR = 1.0

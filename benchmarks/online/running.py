@@ -26,7 +26,7 @@ from benchmarks.online.scene import Scene, rows_of
 from benchmarks.online.sending import BATCH_ROWS
 from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
-from service.learning.schema import LearningOptions
+from service.contract.observations import LearningOptions
 
 PARTS = ("flow", "cost", "quality", "fleet")
 """What can be measured, by name."""

@@ -30,7 +30,7 @@ from benchmarks.soak.day import ARM, LOOP, Clock, Day, Tally
 from benchmarks.soak.errands import ERRANDS, SLOW, Desk
 from benchmarks.soak.resources import WARMING, Growth, Look, ResourceWatch, growth, series
 from lipcore.warm_up import warm_up
-from service.learning.schema import LearningOptions
+from service.contract.observations import LearningOptions
 from service.models import signing
 from service.storage.database import Database
 from service.web.access import keys

@@ -26,7 +26,7 @@ from benchmarks.soak.resources import ResourceWatch, series
 from benchmarks.timing import Timing
 from lipcore.data.samples import Samples
 from lipcore.model.torque_model import TorqueModel
-from service.learning.schema import LearningOptions
+from service.contract.observations import LearningOptions
 
 KINDS = ("predict", "stream", "observe", "upload")
 QUERIES, UPLOADED = 200, 300

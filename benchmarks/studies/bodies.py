@@ -23,7 +23,7 @@ import httpx
 import lipcore
 from benchmarks.online.bed import Bed, install, serving
 from benchmarks.processes import resident
-from service.learning.schema import LearningOptions
+from service.contract.observations import LearningOptions
 
 MODEL, SIZES = "panda-sim", (1 << 16, 1 << 18, 1 << 20, (1 << 21) - 4096)
 PLACES = {

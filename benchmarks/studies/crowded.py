@@ -24,7 +24,7 @@ from benchmarks.online.sending import Ack, batch_requests, stream
 from lipcore.data.samples import Samples
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
-from service.learning.schema import LearningOptions
+from service.contract.observations import LearningOptions
 
 CROWDED, OTHER = "crowded", "other"
 ROWS, PERIOD_S, ALONE_S, BESIDE_S, LEAD_S = 10, 0.1, 10, 12, 2.0

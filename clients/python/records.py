@@ -18,17 +18,11 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
-from service.datasets import schema as datasets
-from service.learning import schema as observing
-from service.learning.control import overview_schema as overview
-from service.learning.control import payload_schema as payloads
-from service.learning.control import schema as learning
-from service.models import schema as models
+from service.contract import audit, datasets, health, learning, models, overview, robots
+from service.contract import jobs as training
+from service.contract import observations as observing
+from service.contract import payload as payloads
 from service.oip import schema as oip
-from service.robots import schema as robots
-from service.telemetry import readiness
-from service.training import schema as training
-from service.web.access import audit_routes
 
 TARGET = Path(__file__).parent / "lipserve/records"
 WIDTH = 120
@@ -54,13 +48,13 @@ ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
     "payloads": ("What arms carry.", (payloads.Payloads,)),
     "live": ("Events of a model followed live.", (learning.LiveStatus, learning.LiveLost)),
     "overview": ("Models at a glance.", (overview.ModelOverview,)),
-    "audit": ("What changed models.", (audit_routes.AuditEntry,)),
+    "audit": ("What changed models.", (audit.AuditEntry,)),
     "server": (
         "The service, and what the Open Inference Protocol tells of it.",
         (
-            readiness.Health,
-            readiness.Live,
-            readiness.Ready,
+            health.Health,
+            health.Live,
+            health.Ready,
             oip.ServerMetadata,
             oip.ServerLive,
             oip.ServerReady,

@@ -9,9 +9,9 @@ from anyio import to_thread
 from fastapi import APIRouter, Depends, Query, Request, Response, status
 
 from lipserve.asking import MEDIA_TYPES, SUFFIXES
+from service.contract.datasets import Dataset, DatasetPage, Preview
 from service.datasets import store
 from service.datasets.options import UPLOAD_BODY, UploadOptions, upload_options
-from service.datasets.schema import Dataset, DatasetPage, Preview
 from service.datasets.staging import QUANTITIES
 from service.foundation.errors import (
     ConflictError,

@@ -19,10 +19,10 @@ from lipcore.data.samples import Array, Samples
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
 from lipserve.states import ACTIVE
+from service.contract.datasets import MOST_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
 from service.datasets.mapping.reading import Recording
 from service.datasets.options import UploadOptions
 from service.datasets.report.making import make_report
-from service.datasets.schema import MOST_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
 from service.datasets.staging import Staged, column, prepare, staging
 from service.foundation.errors import ConflictError, invalid_request, not_found
 from service.robots.store import profile_of

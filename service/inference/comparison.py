@@ -9,9 +9,9 @@ from lipcore.data import metrics
 from lipcore.data.metrics import Answer, Comparison, Difference, evaluate
 from lipcore.data.samples import Samples
 from lipserve.states import Outcome
+from service.contract import predictions as schema
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
-from service.inference import schema
 from service.inference.evaluating import measured
 from service.models.evaluation import joint_figures
 from service.models.loaded import LoadedModels, Served

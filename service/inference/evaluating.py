@@ -14,14 +14,14 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
 from lipcore.model import dynamics
 from lipcore.profiles import profile, recognise
+from service.contract import predictions as schema
+from service.contract.models import Evaluation, HoldoutLineage
 from service.datasets import store
 from service.foundation.errors import DamagedDataError, invalid_request
-from service.inference import schema
 from service.inference.predicting import check_offered
 from service.models import registry
 from service.models.evaluation import evaluation
 from service.models.loaded import LoadedModels, Served
-from service.models.schema import Evaluation, HoldoutLineage
 from service.storage import sample_file
 from service.storage.database import DatasetRow
 from service.training import holding_out, repeating

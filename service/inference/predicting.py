@@ -17,11 +17,11 @@ from lipcore.model.functionals import Estimate
 from lipcore.model.payload import NoArmError
 from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import ROBOT_ESTIMATORS, ComponentName, TorqueConvention
+from service.contract.models import ALIAS
+from service.contract.payload import Payload
+from service.contract.predictions import PredictRequest
 from service.foundation.errors import invalid_request
-from service.inference.payload import Payload
-from service.inference.schema import PredictRequest
 from service.models.loaded import LoadedModels, Served
-from service.models.schema import ALIAS
 from service.web.route import each_once
 
 Array = NDArray[np.float64]

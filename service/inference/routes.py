@@ -9,6 +9,7 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
+from service.contract import predictions as schema
 from service.foundation.errors import (
     DamagedDataError,
     InvalidRequestError,
@@ -17,7 +18,7 @@ from service.foundation.errors import (
     TooLargeError,
     UnreadableVersionError,
 )
-from service.inference import comparison, evaluating, predicting, schema
+from service.inference import comparison, evaluating, predicting
 from service.inference.predicting import decode, encode
 from service.models.loaded import LoadedModels, LoadedModelsDep
 from service.models.served import Served, reached

@@ -18,6 +18,7 @@ from fastapi import Depends
 from sqlalchemy import select
 
 from lipserve.states import PartState
+from service.contract.observations import ObservationRequest, ObservationResponse
 from service.foundation.errors import BusyError
 from service.journal import log
 from service.learning.ingest.batches import Frames, FramesResult, observe_batch, observe_frames
@@ -27,7 +28,6 @@ from service.learning.learner import publication
 from service.learning.learner.process import LearnerProcess
 from service.learning.learner.publication import Contested, Failed, Message, Published
 from service.learning.live.feed import Feed
-from service.learning.schema import ObservationRequest, ObservationResponse
 from service.models.loaded import LoadedModels, Served
 from service.storage.database import StreamRow
 from service.telemetry.readiness import Lasting

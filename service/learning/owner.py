@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 from sqlalchemy import bindparam, select
 from sqlalchemy.orm import Session
 
+from service.contract.learning import AlarmKind
+from service.contract.observations import (
+    CONTACT_THRESHOLD,
+    FORGETTING_S,
+    FRICTION_WALK_S,
+    TORQUE_LIMIT,
+    LearningOptions,
+)
 from service.foundation.errors import invalid_request, not_found
 from service.journal import log
-from service.learning.schema import CONTACT_THRESHOLD, FORGETTING_S, FRICTION_WALK_S, TORQUE_LIMIT, LearningOptions
 from service.storage import audit
 from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, fetch, now
 from service.storage.rows import Page, newest
 
-AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock"]
 _SET = select(LearningRow.options, LearningRow.held).where(LearningRow.model == bindparam("model"))
 
 

@@ -18,12 +18,13 @@ from sqlalchemy.orm import Session
 
 from lipserve.states import ACTIVE
 from lipserve.wording import percent
+from service.contract.jobs import Job
+from service.contract.learning import AlarmKind
 from service.foundation.errors import BusyError, ConflictError
 from service.foundation.settings import Settings
 from service.learning import owner
 from service.learning.learner.publication import Contested, Published
 from service.learning.learners import Learners
-from service.learning.owner import AlarmKind
 from service.models import deletion, registry
 from service.models.loaded import LoadedModels
 from service.storage import audit
@@ -31,7 +32,6 @@ from service.storage.database import AlarmRow, Database, LearnerRow, ServingRow
 from service.training import jobs
 from service.training import refresh_data as scope
 from service.training.queue import JobQueue
-from service.training.schema import Job
 
 logger = logging.getLogger(__name__)
 

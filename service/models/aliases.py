@@ -6,11 +6,11 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from lipcore.fitting.base import RobotKind
+from service.contract.models import Alias, AliasList, AliasMove, AliasRequest
 from service.foundation.errors import ConflictError, invalid_request, not_found
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.models.registry import SERVING
-from service.models.schema import Alias, AliasList, AliasMove, AliasRequest
 from service.storage.database import AliasMoveRow, AliasRow, ServingRow, VersionRow, now
 
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.files.checks import LARGEST, LARGEST_SQUARE, MAX_NAME
-from service.models.schema import HoldoutLineage
+from service.contract.models import HoldoutLineage
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
 Size = Annotated[float, Field(ge=0, le=LARGEST)]

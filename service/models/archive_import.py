@@ -18,6 +18,7 @@ from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings
 from lipserve.states import PromotionOption
+from service.contract.models import Promotion, Version
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
 from service.models import archive_reading, registry
@@ -25,7 +26,6 @@ from service.models.archive_fields import FIELDS
 from service.models.archive_reading import check_texts, invalid_member, invalid_model, limits_of
 from service.models.lineage import held_out_figures
 from service.models.loaded import LoadedModels
-from service.models.schema import Promotion, Version
 from service.runtime import cage
 from service.storage.database import LearnerRow, now
 from service.storage.errors import undecided

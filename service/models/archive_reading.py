@@ -17,10 +17,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lipcore.files import persistence, strict_json
 from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, Limits, ModelFormatError
+from service.contract.models import ModelName
 from service.foundation.errors import InvalidDataError, invalid_data, problem
 from service.foundation.settings import Settings
 from service.models import signing
-from service.models.schema import ModelName
 from service.models.signing import SIGNATURE, Signature
 
 EXPORT, CHECKSUMS = "export.json", "checksums.json"

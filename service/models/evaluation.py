@@ -11,8 +11,8 @@ from lipcore.data import metrics
 from lipcore.data.coverage import CoverageInterval, coverage_interval
 from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Answer, Metrics
 from lipcore.data.samples import Array, Samples
+from service.contract.models import Interval, Reliability, Stretches
 from service.foundation.fields import finite
-from service.models.schema import Interval, Reliability, Stretches
 
 FEWEST_EPISODES, MOST_EPISODES = 5, 200
 """Episodes stand for stretches where there are so many; fewer make no box plot, more are mostly a few samples long."""

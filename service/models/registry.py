@@ -14,9 +14,9 @@ from sqlalchemy.orm import Session
 import lipcore
 from lipcore.files.persistence import checksums, read_manifest
 from lipcore.fitting.base import RobotKind
+from service.contract.models import HeldOutQuality, Model, ModelPage, Promotion, Version, VersionSummary
 from service.foundation.errors import ConflictError, NoServingVersionError, NotFoundError, not_found
 from service.foundation.settings import shipped_models
-from service.models.schema import HeldOutQuality, Model, ModelPage, Promotion, Version, VersionSummary
 from service.storage import audit
 from service.storage.database import (
     AliasMoveRow,

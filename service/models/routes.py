@@ -9,6 +9,7 @@ from fastapi import APIRouter, Path, Query, Request, Response, status
 from fastapi.responses import StreamingResponse
 
 from lipserve.states import PromotionOption
+from service.contract import models as schema
 from service.foundation.errors import (
     ConflictError,
     InvalidDataError,
@@ -19,7 +20,7 @@ from service.foundation.errors import (
     UnsupportedMediaTypeError,
 )
 from service.foundation.fields import BINARY, upload_body
-from service.models import aliases, archive, archive_import, deletion, registry, schema
+from service.models import aliases, archive, archive_import, deletion, registry
 from service.models.loaded import LoadedModelsDep
 from service.web.dependencies import PageQuery
 from service.web.errors import responses

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from anyio import CapacityLimiter
 
 from lipcore.model.torque_model import TorqueModel
+from service.contract.models import ALIAS
 from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
 from service.models import registry
 from service.models.loaded import LoadedModels, Served
-from service.models.schema import ALIAS
 from service.oip import query, schema
 from service.oip.query import shapes
 from service.oip.tensors import Message

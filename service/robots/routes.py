@@ -7,6 +7,7 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response, status
 
+from service.contract.robots import UPLOAD_BODY, ProfileList, Robot, RobotPage, RobotProfile
 from service.foundation.errors import (
     ConflictError,
     InvalidDataError,
@@ -18,7 +19,6 @@ from service.foundation.errors import (
 )
 from service.foundation.fields import NameForPeople
 from service.robots import store
-from service.robots.schema import UPLOAD_BODY, ProfileList, Robot, RobotPage, RobotProfile
 from service.web.dependencies import PageQuery, StorageDep
 from service.web.errors import responses
 from service.web.limits.upload import Kinds, receive

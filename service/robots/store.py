@@ -18,6 +18,7 @@ from lipcore.robots.library import ROBOTS, UnknownRobotError, profile_urdf
 from lipcore.robots.urdf import Description, RigidBody
 from lipcore.robots.urdf_text import MOVABLE, UrdfError
 from lipserve.states import ACTIVE
+from service.contract.robots import ProfileJoint, Robot, RobotPage, RobotProfile
 from service.foundation.errors import (
     ConflictError,
     InvalidRequestError,
@@ -27,7 +28,6 @@ from service.foundation.errors import (
 from service.foundation.fields import LONGEST, for_people
 from service.foundation.settings import Settings
 from service.robots.caged import invalid_urdf
-from service.robots.schema import ProfileJoint, Robot, RobotPage, RobotProfile
 from service.runtime import cage
 from service.storage.database import Database, JobRow, RobotRow, now
 from service.storage.files import new_id

@@ -11,12 +11,13 @@ import logging
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime, timedelta
-from typing import Any, Literal, get_args
+from typing import Any
 
 from anyio import to_thread
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
+from service.contract.audit import Change
 from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, AuditRow, Database, JobRow, now
 from service.storage.rows import Page, newest
@@ -24,22 +25,6 @@ from service.telemetry.logs import KEY_ID, asked, job_id, request_id
 
 logger = logging.getLogger(__name__)
 
-Change = Literal[
-    "version added",
-    "version deleted",
-    "model deleted",
-    "alias moved",
-    "learning set",
-    "observations unlearnt",
-    "observations replayed",
-    "learning rolled back",
-    "learning held",
-    "change decided",
-    "candidate dismissed",
-    "payload declared",
-    "stream deleted",
-]
-CHANGES: tuple[str, ...] = get_args(Change)
 SERVICE = "service"
 """Stands for a route where nobody asked: a version that comes with LIPServe, or that has proved better."""
 CLEAN_S = 3600.0

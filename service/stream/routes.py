@@ -11,10 +11,10 @@ from fastapi import APIRouter
 from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.utils import ClientDisconnected
 
+from service.contract.models import ALIAS
+from service.contract.predictions import one_choice
 from service.foundation.errors import NotFoundError, NotReadyError, invalid_request
-from service.inference.schema import one_choice
 from service.learning.learners import Learners
-from service.models.schema import ALIAS
 from service.models.served import reached
 from service.stream.session import Conversation, Echo, Session
 from service.web.limits.requests import Counted

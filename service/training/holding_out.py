@@ -15,9 +15,9 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.data.splits import GUARD_S, Kind, Mask, Numbers, Parts, Split, SplitError, choose, split
+from service.contract.models import HeldOutSet, Holdout, HoldoutLineage
 from service.foundation.errors import invalid_request
 from service.foundation.fields import first_repeat
-from service.models.schema import HeldOutSet, Holdout, HoldoutLineage
 from service.storage.database import DatasetRow
 
 UNTIMED_GUARD = 25.0

@@ -17,6 +17,7 @@ from lipcore.fitting.options import FitOptions
 from lipcore.robots.library import ROBOTS
 from lipcore.vocabulary import AUTO, CHOICES, DIFFERENTIATED, ROBOT_ESTIMATORS
 from lipserve.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
+from service.contract.jobs import Job, JobDraft, JobPage, JobRequest, Options
 from service.datasets import store
 from service.foundation.errors import (
     BusyError,
@@ -39,7 +40,6 @@ from service.storage.rows import Identity, Page, done, mark, newest
 from service.telemetry.logs import KEY_ID, asked, request_id
 from service.training import holding_out, lifecycle, refresh_data
 from service.training.queue import JobQueue
-from service.training.schema import Job, JobDraft, JobPage, JobRequest, Options
 
 USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
 """Seconds after which who finds the queue full may try again: where nothing is known of the jobs that run, and most."""

@@ -7,11 +7,11 @@ from typing import Any
 from lipcore.data.metrics import BlockScores
 from lipcore.fitting.noise import white
 from lipcore.model.torque_model import TorqueModel
+from service.contract.models import Evaluation
 from service.foundation.fields import finite
 from service.foundation.settings import Settings
 from service.models.evaluation import evaluation
 from service.models.lineage import answer_of, figures
-from service.models.schema import Evaluation
 from service.training import repeating
 from service.training.material import Material
 from service.training.table import TablePart

@@ -18,11 +18,11 @@ from lipcore.kernels.geometry import Geometry
 from lipcore.model.sibling import arm_as_expected, arm_of_sibling
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
+from service.contract.models import Holdout, HoldoutLineage
 from service.foundation.settings import Settings
 from service.journal import log
 from service.models import registry
 from service.models.lineage import named
-from service.models.schema import Holdout, HoldoutLineage
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, VersionRow
 from service.storage.files import Files

@@ -20,9 +20,9 @@ from lipcore.fitting.base import RobotKind
 from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.torque_model import TorqueModel
 from lipserve.states import PromotionOption
+from service.contract.models import HoldoutLineage, Promotion
 from service.models import aliases, registry
 from service.models.lineage import answer_of, held_out_figures, learnt_from
-from service.models.schema import HoldoutLineage, Promotion
 from service.storage.database import Database, LearnerRow, VersionRow
 from service.storage.files import Files
 

@@ -11,6 +11,7 @@ from fastapi import APIRouter, Depends, Response, status
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from lipserve.states import ACTIVE
+from service.contract.jobs import Job, JobDraft, JobPage, JobRequest
 from service.foundation.errors import (
     BusyError,
     ConflictError,
@@ -24,7 +25,6 @@ from service.storage.database import JobRow
 from service.storage.rows import identity
 from service.training import jobs
 from service.training.queue import JobQueue, JobQueueDep
-from service.training.schema import Job, JobDraft, JobPage, JobRequest
 from service.web.dependencies import KeyHeader, PageQuery, StoppingDep
 from service.web.errors import responses
 from service.web.route import Route

@@ -17,11 +17,11 @@ from lipcore.extras import MissingExtraError
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import REFIT_ERROR
 from lipserve.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState, PromotionOption
+from service.contract.models import Promotion
 from service.foundation.errors import NotInstalledError, ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.models import registry
 from service.models.lineage import MOST_SAMPLES, figures, software
-from service.models.schema import Promotion
 from service.runtime.allocator import give_back
 from service.runtime.executors import ClusterUnavailableError
 from service.storage import errors as storage_errors

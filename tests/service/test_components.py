@@ -8,9 +8,9 @@ import pytest
 from lipcore.data.motion import Motion
 from lipcore.kernels.independent import SquaredExponentialKernel
 from lipcore.model import dynamics
+from service.contract.predictions import PredictRequest
 from service.foundation.settings import Settings
 from service.inference import predicting
-from service.inference.schema import PredictRequest
 from tests.service.data import error, service_of
 
 NAMES = list(dynamics.COMPONENTS)

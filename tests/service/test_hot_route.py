@@ -15,9 +15,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from service.contract.predictions import PredictRequest, PredictResponse
 from service.inference import predicting as inference
 from service.inference.predicting import PredictBody, Prediction
-from service.inference.schema import PredictRequest, PredictResponse
 from tests.service.data import DEADLINE, error, service_of
 
 QUERY = {"q": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2.0, 3e-1]}

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from service.contract.models import HeldOutBlocks, Promotion
 from service.models.registry import answering
-from service.models.schema import HeldOutBlocks, Promotion
 from service.storage.database import LearnerRow, VersionRow
 from service.training.promotion import settle
 from tests.service.archives.packing import TAR, exported

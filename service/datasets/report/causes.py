@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lipcore.data.samples import Array
+from service.contract.datasets import Cause, JointExcitation, Remedy
 from service.datasets.report.advice import listed
 from service.datasets.report.bodies import (
     FREE,
@@ -30,7 +31,6 @@ from service.datasets.report.bodies import (
 from service.datasets.report.excitation import CLEAR, NOTICED
 from service.datasets.report.remedies import Upload, remedy
 from service.datasets.report.robots import LIKE, TRUSTED, heavy, other_robot
-from service.datasets.schema import Cause, JointExcitation, Remedy
 
 NEAR = 0.35
 """How far from 0 a factor may be that counts as 0."""

@@ -24,9 +24,9 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.friction import FRICTION_TERMS, SIGN_WIDTH
 from lipcore.robots.urdf import PARAMETERS, RigidBody
+from service.contract.datasets import JointExcitation, Verdict, Weight, WholeExcitation
 from service.datasets.report.fit import OWN, Fit, friction_terms, own_features
 from service.datasets.report.signals import Limits, Rows, spread
-from service.datasets.schema import JointExcitation, Verdict, Weight, WholeExcitation
 
 DETERMINED: tuple[tuple[float, Verdict], ...] = ((0.02, "well"), (0.1, "poorly"))
 """Largest share of the torque's spread that a weight's standard deviation may stand for, by verdict."""

@@ -14,9 +14,9 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipserve.wording import percent
+from service.contract.datasets import Lag
 from service.datasets.report.fit import EIGHTHS, Fit
 from service.datasets.report.signals import Rows
-from service.datasets.schema import Lag
 
 LARGEST_S = 0.25
 """Largest lag looked for, s."""

@@ -13,7 +13,7 @@ from lipcore.data.samples import Array
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
-from service.datasets import schema
+from service.contract import datasets as schema
 from service.datasets.mapping.choice import WARNING
 from service.datasets.report.advice import advice, in_words, warnings
 from service.datasets.report.bodies import Against, Bodies, Signals, compare

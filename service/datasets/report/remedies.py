@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from lipcore.profiles import profile
+from service.contract.datasets import Cause, Remedy
 from service.datasets.mapping.choice import listed as numbers
-from service.datasets.schema import Cause, Remedy
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import numpy as np
 
 from lipcore.extras import MissingExtraError
 from lipcore.profiles import Profile, profile, profiles, recognise
+from service.contract.datasets import Remedy
 from service.datasets.report.advice import listed
 from service.datasets.report.bodies import Against, Bodies, Signals, compare
 from service.datasets.report.remedies import Upload, remedy
 from service.datasets.report.signals import limits_of
-from service.datasets.schema import Remedy
 
 LIKE = (0.6, 1.7)
 """Factors that count as 1: URDFs are wrong by as much, and loads are not in them."""

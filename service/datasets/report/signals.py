@@ -13,7 +13,7 @@ from lipcore.data.samples import Array
 from lipcore.data.signals import DIFFERENCE_ORDERS
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
-from service.datasets.schema import Gap, JointLimits, JointSaturation, Timing
+from service.contract.datasets import Gap, JointLimits, JointSaturation, Timing
 from service.datasets.staging import EPISODE, TIME, Staged
 
 Rows = NDArray[np.int64]

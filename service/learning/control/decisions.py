@@ -16,13 +16,14 @@ from sqlalchemy.orm import Session
 from lipcore.fitting.base import RobotKind
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
+from service.contract import learning as schema
+from service.contract.observations import LearningOptions
 from service.foundation.errors import ConflictError, invalid_request, not_found, problem
 from service.journal import log
 from service.learning import owner
-from service.learning.control import schema, status
+from service.learning.control import status
 from service.learning.ingest.batches import state
 from service.learning.learners import Learners
-from service.learning.schema import LearningOptions
 from service.models import registry
 from service.storage import audit
 from service.storage.database import Database, EventRow, LearnerRow, VersionRow

@@ -10,8 +10,8 @@ import numpy as np
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from service.learning.control import payload
-from service.learning.control.overview_schema import (
+from service.contract.learning import Alarm
+from service.contract.overview import (
     ArmSketch,
     CoursePoint,
     ModelOverview,
@@ -19,7 +19,7 @@ from service.learning.control.overview_schema import (
     RecentQuality,
     SketchedJoint,
 )
-from service.learning.control.schema import Alarm
+from service.learning.control import payload
 from service.learning.ingest.monitor import Monitor, Window
 from service.learning.learners import Learners
 from service.models import registry

@@ -16,10 +16,7 @@ from lipcore.online.bodies import BELOW, DIAGONAL
 from lipcore.online.estimate import Estimate
 from lipcore.online.holding import Watch
 from lipcore.robots.urdf import RigidBody
-from service.foundation.errors import ConflictError, NotFoundError, invalid_request, problem
-from service.journal import log
-from service.learning import owner
-from service.learning.control.payload_schema import (
+from service.contract.payload import (
     LivePayload,
     PayloadBody,
     PayloadRequest,
@@ -29,6 +26,9 @@ from service.learning.control.payload_schema import (
     Tensor,
     Vector,
 )
+from service.foundation.errors import ConflictError, NotFoundError, invalid_request, problem
+from service.journal import log
+from service.learning import owner
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
 from service.learning.streams import PayloadRecord

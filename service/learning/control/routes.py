@@ -5,8 +5,12 @@ from __future__ import annotations
 from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
-from pydantic import BaseModel, ConfigDict
 
+from service.contract import learning as schema
+from service.contract.jobs import Job
+from service.contract.observations import MOST_SEQUENCE, LearningOptions, StreamId
+from service.contract.overview import OverviewPage
+from service.contract.payload import PAYLOAD_EXAMPLE, PayloadRequest, Payloads
 from service.foundation.errors import (
     BusyError,
     ConflictError,
@@ -15,14 +19,10 @@ from service.foundation.errors import (
     TooLargeError,
     UnreadableVersionError,
 )
-from service.learning.control import decisions, overview, payload, schema, status
-from service.learning.control.overview_schema import OverviewPage
-from service.learning.control.payload_schema import PAYLOAD_EXAMPLE, PayloadRequest, Payloads
+from service.learning.control import decisions, overview, payload, status
 from service.learning.learners import LearnersDep
-from service.learning.schema import MOST_SEQUENCE, LearningOptions, StreamId
 from service.training import jobs
 from service.training.queue import JobQueueDep
-from service.training.schema import Job
 from service.web.dependencies import PageQuery
 from service.web.errors import responses
 from service.web.route import Route
@@ -34,12 +34,6 @@ BATCH = "/{model}/observations/{stream_id}/{sequence}"
 router = APIRouter(
     prefix="/v1/models", tags=["learning"], responses=responses(InvalidRequestError, NotFoundError), route_class=Route
 )
-
-
-class RefreshRequest(BaseModel):
-    """Nothing to choose: estimator, options and robot are those of the version that serves."""
-
-    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{}]})
 
 
 overview_router = APIRouter(
@@ -197,7 +191,7 @@ def list_alarms(learners: LearnersDep, model: str, page: PageQuery) -> schema.Al
     summary="Train the version that serves anew",
     responses=responses(NotFoundError, ConflictError, TooLargeError, BusyError),
 )
-def create(queue: JobQueueDep, model: str, request: RefreshRequest, response: Response) -> Job:
+def create(queue: JobQueueDep, model: str, request: schema.RefreshRequest, response: Response) -> Job:
     """Queue a job that trains on the version's data sets and on what has been observed since.
 
     The version that it makes learns along and answers once it has predicted better than the one that serves.

@@ -13,15 +13,15 @@ from sqlalchemy.orm import Session
 from lipcore.online.batch import Rows
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
+from service.contract import learning as schema
+from service.contract.observations import ObservationResponse
 from service.foundation.errors import NotFoundError, not_found
 from service.foundation.fields import finite
 from service.journal import log, snapshots
 from service.learning import owner
-from service.learning.control import schema
 from service.learning.ingest.batches import state
 from service.learning.ingest.monitor import Window
 from service.learning.learners import Learners
-from service.learning.schema import ObservationResponse
 from service.models import registry
 from service.storage.database import EventRow, LearnerRow, StreamRow
 from service.storage.rows import Page

@@ -18,6 +18,7 @@ from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
 from lipcore.online.gates import check_rows
+from service.contract.observations import Derivation, ExpiredError, ObservationRequest, ObservationResponse, State
 from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import QUANTITIES, check_shapes
@@ -29,7 +30,6 @@ from service.learning.ingest.dating import Measured, StreamTime
 from service.learning.ingest.intake import Intake
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Answered
-from service.learning.schema import Derivation, ExpiredError, ObservationRequest, ObservationResponse, State
 from service.models.loaded import Served
 from service.storage.database import EventRow
 

@@ -15,9 +15,9 @@ from lipcore.online.batch import Rows
 from lipcore.online.gates import RowLimits, check_rows
 from lipcore.vocabulary import CODES, LEARNT
 from lipserve.wording import percent
+from service.contract.observations import DerivedAcceleration
 from service.foundation.errors import invalid_request
 from service.journal import log
-from service.learning.schema import DerivedAcceleration
 from service.storage.database import EventRow
 
 EDGE = CODES.index("edge")

@@ -17,6 +17,7 @@ from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
+from service.contract.observations import LearningOptions
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
 from service.journal.log import NewBatch
@@ -29,7 +30,6 @@ from service.learning.ingest.judging import Verdict
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
 from service.learning.intervals import ScaleRecord
-from service.learning.schema import LearningOptions
 from service.learning.streams import StreamRecord
 from service.learning.weigher.weighing import Weighing
 from service.models import registry

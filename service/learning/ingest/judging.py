@@ -16,10 +16,10 @@ from lipcore.online.departure import Departure
 from lipcore.online.gates import Patience, is_contact
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
+from service.contract.observations import LearningOptions
 from service.journal.log import AHEAD_S
 from service.learning.ingest.opening import Opening
 from service.learning.ingest.screening import Screened, Trained
-from service.learning.schema import LearningOptions
 
 CONTACT, CHANGE, PAYLOAD, PAUSED = (CODES.index(code) for code in ("contact", "change", "payload", "paused"))
 MOST_INNOVATIONS = 1000

@@ -10,15 +10,15 @@ from fastapi import APIRouter
 from msgspec import Meta, Struct
 from starlette.types import Scope
 
-from service.foundation.errors import BusyError, ConflictError, InvalidRequestError, NotFoundError, TooLargeError
-from service.inference.predicting import QUANTITIES, Array, to_array
-from service.learning.learners import Learners, LearnersDep
-from service.learning.schema import (
+from service.contract.observations import (
     MOST_SEQUENCE,
     ExpiredError,
     ObservationRequest,
     ObservationResponse,
 )
+from service.foundation.errors import BusyError, ConflictError, InvalidRequestError, NotFoundError, TooLargeError
+from service.inference.predicting import QUANTITIES, Array, to_array
+from service.learning.learners import Learners, LearnersDep
 from service.web.errors import responses
 from service.web.route import Reply, each_once, hot_route, is_json
 

@@ -13,8 +13,8 @@ from lipcore.online.adaptive import scores
 from lipcore.online.batch import Rows
 from lipcore.online.gates import RowLimits, is_implausible
 from lipcore.vocabulary import CODES, LEARNT
+from service.contract.observations import DerivedAcceleration, LearningOptions
 from service.foundation.settings import Settings
-from service.learning.schema import DerivedAcceleration, LearningOptions
 from service.models.served import Served
 
 LIMIT, STATIONARY, IMPLAUSIBLE = (CODES.index(code) for code in ("limit", "stationary", "implausible"))

@@ -22,9 +22,9 @@ from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.learner import uncovered
 from lipcore.vocabulary import CODES, LEARNT
+from service.contract.learning import DECIMALS, LiveLost, LiveNovelty, LivePart, LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
 from service.foundation.settings import Settings
-from service.learning.control.schema import DECIMALS, LiveLost, LiveNovelty, LivePart, LiveRows, LiveStatus
 from service.learning.ingest.deriving import EDGE
 from service.learning.ingest.intake import Judged
 from service.models.loaded import Served

@@ -11,11 +11,11 @@ from fastapi import APIRouter, Depends
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
 from lipcore.vocabulary import CODES
+from service.contract.learning import LiveAnswers, LiveNovelty, LiveStatus
 from service.foundation.errors import BusyError, InvalidRequestError, NotFoundError
 from service.journal import log
 from service.learning import owner
 from service.learning.control import decisions, payload, status
-from service.learning.control.schema import LiveAnswers, LiveNovelty, LiveStatus
 from service.learning.learners import Learners, LearnersDep
 from service.storage.rows import Page
 from service.telemetry.meters import OTHER, Meters, StreamMeter

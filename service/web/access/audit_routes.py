@@ -2,47 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query
-from pydantic import AwareDatetime, BaseModel, Field
+from pydantic import AwareDatetime
 
+from service.contract.audit import AuditEntry, AuditPage, Change
 from service.foundation.errors import InvalidRequestError
 from service.storage import audit
-from service.storage.audit import Change
 from service.storage.database import AuditRow
 from service.web.dependencies import PageQuery, StorageDep
 from service.web.errors import responses
 from service.web.route import Route
 
 router = APIRouter(prefix="/v1", tags=["audit"], responses=responses(InvalidRequestError), route_class=Route)
-
-
-class AuditEntry(BaseModel):
-    """One change of a model."""
-
-    id: int
-    at: str
-    key: str | None = Field(description="API key of who did it; null where keys are not needed, and of the service")
-    key_name: str | None = Field(description="Its name")
-    what: str = Field(
-        description="Method and route of the request, `job` and its id, or `service` for what that does by itself",
-        examples=["PUT /v1/models/{model}/aliases/{alias}"],
-    )
-    request_id: str | None = Field(description="Of that request, as in the log; of a job the one that queued it")
-    model: str
-    change: Change
-    version: int | None = Field(description="The version that it is about, null where it is about the model")
-    alias: str | None = Field(description="The alias that was moved; `serving` is what answers by default")
-    before: Any = Field(description="What was: a version, a revision, options; null where nothing was")
-    after: Any = Field(description="What is from then on; null where nothing is")
-
-
-class AuditPage(BaseModel):
-    """One page of the audit log."""
-
-    items: list[AuditEntry]
-    next_cursor: str | None = Field(description="Names the page after this one; null on the last")
 
 
 @router.get("/audit", summary="List what changed models, newest first")

@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 import lipcore
-from service.learning.schema import LearningOptions
+from service.contract.observations import LearningOptions
 from service.models import registry
 from service.storage.database import Database, LearningRow
 from service.storage.files import Files

@@ -10,12 +10,12 @@ import pytest
 from lipcore.online.batch import Rows
 from lipcore.online.change import ChangeDetector
 from lipcore.online.record import Record
+from service.contract.observations import LearningOptions
 from service.journal import log
 from service.learning.ingest import judging, screening
 from service.learning.ingest.judging import ContactGate, Innovations, Watch
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
-from service.learning.schema import LearningOptions
 from tests.service.learning import lessons
 from tests.service.learning.lessons import Pupil
 from tests.service.learning.recordings import codes, part, recording, send

@@ -8,10 +8,10 @@ import pytest
 
 from lipcore.data.independence import INDEPENDENT_HZ, stream_weights
 from lipcore.online.record import Record
+from service.contract.observations import ExpiredError
 from service.foundation.errors import ConflictError
 from service.journal import log, snapshots
 from service.learning.ingest.batches import Frames, FramesResult
-from service.learning.schema import ExpiredError
 from tests.service.learning.lessons import apart
 from tests.service.learning.recordings import codes, learnt_from, logged, part, recording, send
 

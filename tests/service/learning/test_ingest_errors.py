@@ -7,10 +7,10 @@ import pytest
 
 import lipcore
 from lipcore.robots.urdf import RigidBody
+from service.contract.observations import LearningOptions
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.learning.ingest.screening import limits
-from service.learning.schema import LearningOptions
 from tests.service.learning.lessons import apart
 from tests.service.learning.recordings import batch, codes, learnt_from, logged, part, recording, send
 

@@ -4,11 +4,11 @@ import time
 
 import pytest
 
+from service.contract.observations import LearningOptions
 from service.foundation.errors import NotFoundError
 from service.journal import log, snapshots
 from service.learning import owner
 from service.learning.control import decisions
-from service.learning.schema import LearningOptions
 from service.storage.database import LearnerRow
 from tests.service.learning.batches import MODEL, batch, everything, write
 from tests.service.learning.lessons import LESSON, Pupil, apart, lesson

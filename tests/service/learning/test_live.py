@@ -8,9 +8,9 @@ import pytest
 
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
+from service.contract.learning import LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
 from service.foundation.settings import Settings
-from service.learning.control.schema import LiveRows, LiveStatus
 from service.learning.ingest.intake import Judged
 from service.learning.ingest.screening import Screened
 from service.learning.live import feed

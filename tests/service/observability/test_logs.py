@@ -77,7 +77,7 @@ def test_a_traceback_is_complete_and_harmless(form):
 
 CONFIGURED = """
 import json, logging, warnings
-from service.web.observability import logs
+from service.telemetry import logs
 logs.configure(logs.LogOptions("debug", "json"))
 logs.configure(logs.LogOptions("debug", "json"))
 logging.getLogger("service.a").debug("ours")

@@ -92,7 +92,7 @@ def test_an_unexpected_error_is_answered_and_logged_with_its_id_and_goes_on_to_t
         return client.post("/v1/models/panda-sim/predict", json=query, headers={"x-request-id": "mine"})
 
     monkeypatch.setattr(inference, "predict", broken)
-    monkeypatch.setattr(logging.getLogger("service.foundation.errors"), "handlers", [Ids()])
+    monkeypatch.setattr(logging.getLogger("service.web.errors"), "handlers", [Ids()])
     answer = ask(TestClient(api.app, ADDRESS, raise_server_exceptions=False))
     assert answer.headers["x-request-id"] == "mine"
     assert "secret" not in str(error(answer, 500, "internal_error"))

@@ -11,8 +11,8 @@ import numpy as np
 from lipcore.preparation.recipe import Recipe
 from lipcore.robots.library import Robot, load_robot, profile_urdf
 from lipcore.robots.simulation import inverse_dynamics
+from service.contract.datasets import DatasetReport
 from service.datasets.report.making import make_report
-from service.datasets.schema import DatasetReport
 from service.datasets.staging import Staged, column, prepare
 from service.foundation.settings import Settings
 from service.storage.disk import Disk

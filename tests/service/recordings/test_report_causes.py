@@ -17,13 +17,13 @@ from lipcore import profiles
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import FAST, Stream, inverse_dynamics, simulate
+from service.contract.datasets import DatasetReport
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.datasets.options import upload_options
 from service.datasets.report.causes import TorqueWork
 from service.datasets.report.making import make_report
 from service.datasets.report.remedies import flags
-from service.datasets.schema import DatasetReport
 from service.datasets.staging import prepare
 from service.foundation.settings import Settings
 from service.storage.disk import Disk

@@ -8,8 +8,8 @@ import pytest
 
 from lipcore.preparation.recipe import Recipe
 from lipcore.robots.library import load_robot
+from service.contract.datasets import DatasetReport
 from service.datasets.report.excitation import collinearity, reversals
-from service.datasets.schema import DatasetReport
 from tests.service.recordings.report_data import profile_of, report_on, swing
 
 AS_IT_IS = Recipe(filtering="never")

@@ -8,9 +8,9 @@ import pytest
 
 from lipcore.data.signals import low_pass, noise_level
 from lipcore.preparation.recipe import Recipe
+from service.contract.datasets import DatasetReport
 from service.datasets.report.advice import listed
 from service.datasets.report.making import make_report
-from service.datasets.schema import DatasetReport
 from service.datasets.staging import prepare
 from service.foundation.settings import Settings
 from tests.service.recordings.report_data import profile_of, recording, report_on, staged

@@ -10,6 +10,7 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 
 from lipcore.data.signals import noise_level
 from lipcore.preparation.recipe import Recipe
+from service.contract.datasets import DatasetReport, Lag, Timing
 from service.datasets.report.advice import warnings
 from service.datasets.report.fit import Fit
 from service.datasets.report.lag import shifts
@@ -25,7 +26,6 @@ from service.datasets.report.signals import (
     thin,
     white_noise,
 )
-from service.datasets.schema import DatasetReport, Lag, Timing
 from service.datasets.store import extremes
 from tests.service.recordings.report_data import FakeProfile, recording, report_on, staged
 

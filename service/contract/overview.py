@@ -7,9 +7,9 @@ from typing import Literal
 from pydantic import BaseModel, Field
 
 from lipcore.vocabulary import JointType
-from service.learning.control.payload_schema import LivePayload
-from service.learning.control.schema import Alarm, Nullable
-from service.models.schema import HeldOutQuality
+from service.contract.learning import Alarm, Nullable
+from service.contract.models import HeldOutQuality
+from service.contract.payload import LivePayload
 
 Three = list[float]
 

@@ -8,15 +8,16 @@ from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchem
 
 from lipcore.online.record import LEVEL
 from lipcore.vocabulary import CODES, LEARNT, JointType
+from service.contract.models import VersionNumber
+from service.contract.observations import MOST_SEQUENCE, LearningOptions, State
+from service.contract.payload import LivePayload
 from service.foundation.errors import invalid_request
-from service.learning.control.payload_schema import LivePayload
-from service.learning.owner import AlarmKind
-from service.learning.schema import MOST_SEQUENCE, LearningOptions, State
-from service.models.schema import VersionNumber
 
 REPLAYABLE = tuple(code for code in CODES if code not in (CODES[LEARNT], "non_finite", "edge", "late"))
 """Codes whose rows are complete, so that they can be learnt after all."""
 Nullable = list[float | None]
+
+AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock"]
 
 
 class Figures(BaseModel):
@@ -386,3 +387,9 @@ class LiveLost(BaseModel):
     """Data of a `lost` event: whoever reads too slowly misses events rather than falling behind."""
 
     events: int = Field(description="Events of either kind that were dropped, the oldest ones")
+
+
+class RefreshRequest(BaseModel):
+    """Nothing to choose: estimator, options and robot are those of the version that serves."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{}]})

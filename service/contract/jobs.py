@@ -9,8 +9,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from lipserve.states import JobState, PromotionOption
+from service.contract.models import VERSION, HeldOutQuality, Holdout, ModelName
 from service.foundation.fields import LONGEST, MOST_NAMED
-from service.models.schema import VERSION, HeldOutQuality, Holdout, ModelName
 
 _DEFAULTS, _HOLDOUT = FitOptions(), Holdout()
 

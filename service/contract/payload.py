@@ -1,13 +1,64 @@
-"""What the API says of what arms carry, and what is declared to it."""
+"""Payloads: what a query or an owner declares, and what is known of what arms carry."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, WithJsonSchema
+from pydantic_core import PydanticCustomError
 
 from lipcore.vocabulary import PayloadState
-from service.learning.schema import StreamId
+from service.contract.observations import StreamId
+
+
+def _three(value: Any) -> Any:
+    """A list of three of whatever; raise PydanticCustomError for anything else."""
+    if not isinstance(value, list) or len(value) != 3:
+        raise PydanticCustomError("three", "a list of three")
+    return value
+
+
+MOST_NUMBER = 1e6
+"""Largest number of a payload in kg, m or kg·m², far beyond any arm's: what is answered stays a number."""
+_VECTOR = {
+    "type": "array",
+    "items": {"type": "number", "minimum": -MOST_NUMBER, "maximum": MOST_NUMBER},
+    "minItems": 3,
+    "maxItems": 3,
+}
+_MATRIX = {"type": "array", "items": _VECTOR, "minItems": 3, "maxItems": 3}
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MOST_NUMBER, le=MOST_NUMBER)]
+# tuples, so that payloads can be compared; of JSON they are lists
+Triple = Annotated[tuple[Number, Number, Number], Field(strict=False), BeforeValidator(_three), WithJsonSchema(_VECTOR)]
+Triples = Annotated[
+    tuple[Triple, Triple, Triple], Field(strict=False), BeforeValidator(_three), WithJsonSchema(_MATRIX)
+]
+
+
+class Payload(BaseModel):
+    """A body that the arm carries besides what it was learnt with, fixed to its last link: the one that the last joint
+    moves."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+    mass: Annotated[float, Field(gt=0, le=MOST_NUMBER, allow_inf_nan=False)] = Field(description="kg, above zero")
+    com: Triple = Field(
+        description="Centre of mass, m, in the frame of the last link. Of a model around a URDF that is the frame of "
+        "the URDF's last movable joint. An arm that was learnt from torque alone has frames of its own, which "
+        "`parameters.geometry` of the version lists. Its last one need not lie at the flange or point as it does, and "
+        "the arm may be mirrored: bring a position measured at the flange into that frame first"
+    )
+    inertia: Triples | None = Field(
+        None,
+        description="3 × 3, kg·m², about the centre of mass, along the axes of the last link; that of a point where it "
+        "is left out",
+    )
+
+    @property
+    def numbers(self) -> tuple[float, Triple, Triples | None]:
+        """What `Declared` knows it by."""
+        return self.mass, self.com, self.inertia
+
 
 MOST_MASS, MOST_DISTANCE = 1000.0, 10.0
 Finite = Annotated[float, Field(allow_inf_nan=False)]

@@ -18,10 +18,10 @@ from pydantic import (
 
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
 from lipserve.states import Outcome
+from service.contract.models import AliasName, Evaluation, VersionNumber
+from service.contract.payload import Payload
 from service.foundation.errors import invalid_request
 from service.foundation.fields import LONGEST, each_once, rows_of_numbers
-from service.inference.payload import Payload
-from service.models.schema import AliasName, Evaluation, VersionNumber
 
 _NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
 _ROWS: dict[str, Any] = {"type": "array", "items": _NUMBERS}

@@ -1,0 +1,1 @@
+"""What crosses the border: every object of the API, declared once."""
