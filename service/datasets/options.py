@@ -1,25 +1,18 @@
-"""How an upload is to be read and prepared: the query of its route, and what the command line passes on."""
+"""How an upload is to be read and prepared: the texts of a query, read."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Any
 
-from fastapi import Query
-
-from lipcore.data.signals import CUTOFF
-from lipcore.preparation.recipe import Filtering, Form, Recipe
+from lipcore.preparation.recipe import Recipe
 from lipcore.vocabulary import TorqueConvention
-from lipserve.asking import MEDIA_TYPES, SUFFIXES
+from service.contract.uploads import Effort, UploadQuery
 from service.foundation.errors import invalid_request
-from service.foundation.fields import BINARY, upload_body
-from service.web.route import read_json
+from service.foundation.json_text import read_json
 
-Effort = Literal["measured", "commanded", "current"]
-"""What the effort of a recording is: measured torque, gravity included; commanded torque, what is added to gravity
-compensation; motor current, A, that torque constants turn into torque."""
 EFFORT_CONVENTIONS: Mapping[Effort, TorqueConvention] = {
     "measured": "gravity_included",
     "commanded": "gravity_compensated",
@@ -66,126 +59,36 @@ class UploadOptions:
 
 
 QUANTITIES = ("t", "episode", "q", "dq", "ddq", "tau")
-MOST_TEXT = 8000
 MOST_NAMES = 1000
 MOST_NAME = 200
 
-Text = Annotated[str | None, Query(max_length=200)]
-Names = Annotated[str | None, Query(max_length=MOST_TEXT)]
-Positive = Annotated[float | None, Query(gt=0, le=1e6, allow_inf_nan=False)]
 
-
-UPLOAD_BODY = upload_body(
-    "A recording with at least positions, torques and times. Canonical columns are `t` (s), `q1..qn`, `dq1..`, "
-    "`ddq1..`, `tau1..`, optional `episode`, in SI units; other names and units are recognised or declared by "
-    "`columns` and `units`. `dq` and `ddq` may be absent and are then derived. NPZ holds `q`, `dq`, `ddq`, `tau` "
-    "(N, n), `t` or `dt`, `episode`, `joint_names`; bags hold `sensor_msgs/JointState` or the states of a Franka; a "
-    "zip is the directory of a LeRobot data set or of a rosbag2, or holds tables of text that are joined side by side: "
-    "positions.txt, velocities.txt, torques.txt may then lack column names.",
-    {
-        "text/csv": {"schema": {"type": "string"}, "example": "t,q1,dq1,ddq1,tau1\n0.0,0.1,0.0,0.2,1.5\n"},
-        "application/x-ndjson": {
-            "schema": {"type": "string"},
-            "example": '{"t": 0.0, "q": [0.1], "dq": [0.0], "tau": [1.5]}\n',
-        },
-        **{kind: {"schema": BINARY} for kind in MEDIA_TYPES if kind not in ("text/csv", "application/x-ndjson")},
-    },
-    f"A file whose name ends in {', '.join(SUFFIXES)}",
-)
-
-
-async def upload_options(
-    joint_names: Annotated[Names, Query(description="Names of joints 1..n, separated by commas")] = None,
-    robot: Annotated[
-        Text, Query(description="A profile such as panda, or the id of an uploaded URDF: its limits, joints, effort")
-    ] = None,
-    torque_convention: Annotated[
-        TorqueConvention | None,
-        Query(
-            description="Whether `tau` is the whole joint torque or what is added to gravity; by default what the "
-            "effort of the robot means, else the whole"
-        ),
-    ] = None,
-    effort: Annotated[
-        Effort | None,
-        Query(
-            description="What the column of torque holds: measured torque, gravity included; commanded torque without "
-            "gravity; or motor current, A, which needs torque constants. By default what the robot's profile says"
-        ),
-    ] = None,
-    torque_constants: Annotated[
-        Names, Query(description="N·m/A of joints 1..n, separated by commas, for motor currents")
-    ] = None,
-    torque_factors: Annotated[
-        Names,
-        Query(
-            description="By which the torques of joints 1..n are multiplied, separated by commas: -1 where the sign is "
-            "opposite, or a gear's ratio"
-        ),
-    ] = None,
-    joints: Annotated[Names, Query(description="Joints to keep, in this order; all by default")] = None,
-    drop_joints: Annotated[Names, Query(description="Joints to leave out: grippers, those that are locked")] = None,
-    columns: Annotated[
-        Names,
-        Query(
-            description="What the file calls its columns, as JSON: for `t`, `episode`, `q`, `dq`, `ddq`, `tau` a "
-            'pattern such as `{"q": "{joint}/position"}`, or a list of names. Found out where not given'
-        ),
-    ] = None,
-    units: Annotated[
-        Names,
-        Query(description='Units of columns as JSON, such as `{"q": "deg", "t": "ms"}`; SI, or as the header says'),
-    ] = None,
-    topic: Annotated[Text, Query(description="Topic of a bag, where several could be read")] = None,
-    delimiter: Annotated[
-        str | None, Query(min_length=1, max_length=1, description="Of a CSV; found out where not given")
-    ] = None,
-    column_names: Annotated[
-        Names,
-        Query(description="Names of the columns of text that has none, separated by commas; `q1..q7` stands for seven"),
-    ] = None,
-    dt: Annotated[
-        float | None, Query(gt=0, le=100, allow_inf_nan=False, description="s from row to row, of a file without times")
-    ] = None,
-    cutoff: Annotated[float, Query(gt=0, le=1000, allow_inf_nan=False, description="Of the low-pass, Hz")] = CUTOFF,
-    filtering: Annotated[
-        Filtering,
-        Query(description="When signals are low-passed: where velocity or acceleration is `derived`, always, or never"),
-    ] = "derived",
-    form: Annotated[
-        Form, Query(description="`causal` prepares as a live stream could be, late; `acausal` without delay")
-    ] = "acausal",
-    rate: Annotated[Positive, Query(description="Of the samples that come out, Hz; as recorded by default")] = None,
-    gap: Annotated[
-        float,
-        Query(gt=1, le=1e6, allow_inf_nan=False, description="A step of time that splits a recording, in usual steps"),
-    ] = 1.5,
-    trim: Annotated[
-        float | None,
-        Query(
-            ge=0,
-            le=1e6,
-            allow_inf_nan=False,
-            description="Cut off at both ends of every part, s; what the filter spoils by default",
-        ),
-    ] = None,
-) -> UploadOptions:
-    """How an upload is read and prepared; raise InvalidRequestError."""
+def upload_options(query: UploadQuery) -> UploadOptions:
+    """Read the texts of a query; raise InvalidRequestError for one that has no such meaning."""
     read = ReadOptions(
-        columns=_columns(columns),
-        units=_units(units),
-        topic=topic,
-        delimiter=delimiter,
-        joint_names=_names("joint_names", joint_names),
-        effort=effort,
-        torque_constants=_numbers("torque_constants", torque_constants, "N·m/A"),
-        torque_factors=_numbers("torque_factors", torque_factors, "no unit"),
-        column_names=_ranges("column_names", column_names),
-        dt=dt,
+        columns=_columns(query.columns),
+        units=_units(query.units),
+        topic=query.topic,
+        delimiter=query.delimiter,
+        joint_names=_names("joint_names", query.joint_names),
+        effort=query.effort,
+        torque_constants=_numbers("torque_constants", query.torque_constants, "N·m/A"),
+        torque_factors=_numbers("torque_factors", query.torque_factors, "no unit"),
+        column_names=_ranges("column_names", query.column_names),
+        dt=query.dt,
     )
-    recipe = Recipe(cutoff_hz=cutoff, filtering=filtering, form=form, rate_hz=rate, trim_s=trim, gap_steps=gap)
-    dropped = _names("drop_joints", drop_joints)
-    return UploadOptions(read, recipe, robot, torque_convention, _names("joints", joints), dropped or ())
+    recipe = Recipe(
+        cutoff_hz=query.cutoff,
+        filtering=query.filtering,
+        form=query.form,
+        rate_hz=query.rate,
+        trim_s=query.trim,
+        gap_steps=query.gap,
+    )
+    dropped = _names("drop_joints", query.drop_joints)
+    return UploadOptions(
+        read, recipe, query.robot, query.torque_convention, _names("joints", query.joints), dropped or ()
+    )
 
 
 def _names(field: str, given: str | None) -> tuple[str, ...] | None:

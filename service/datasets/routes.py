@@ -6,12 +6,13 @@ from functools import partial
 from typing import Annotated
 
 from anyio import to_thread
-from fastapi import APIRouter, Depends, Query, Request, Response, status
+from fastapi import APIRouter, Query, Request, Response, status
 
 from lipserve.asking import MEDIA_TYPES, SUFFIXES
 from service.contract.datasets import Dataset, DatasetPage, Preview
+from service.contract.uploads import UPLOAD_BODY, UploadQuery
 from service.datasets import store
-from service.datasets.options import UPLOAD_BODY, UploadOptions, upload_options
+from service.datasets.options import upload_options
 from service.datasets.staging import QUANTITIES
 from service.foundation.errors import (
     ConflictError,
@@ -24,11 +25,9 @@ from service.foundation.errors import (
     UnsupportedMediaTypeError,
     invalid_request,
 )
-from service.foundation.fields import NameForPeople
 from service.storage.rows import identity
-from service.web.dependencies import KeyHeader, PageQuery, StorageDep
+from service.web.dependencies import KeyHeader, PageQuery, StorageDep, UploadsDep
 from service.web.errors import responses
-from service.web.limits.requests import UploadsDep
 from service.web.limits.upload import Kinds, receive_to
 from service.web.route import Route
 
@@ -58,17 +57,17 @@ async def upload(
     response: Response,
     storage: StorageDep,
     turns: UploadsDep,
-    options: Annotated[UploadOptions, Depends(upload_options)],
-    name: Annotated[NameForPeople | None, Query(description="A name for people; the file's by default")] = None,
+    query: Annotated[UploadQuery, Query()],
     idempotency_key: KeyHeader = None,
 ) -> Dataset:
     """Validate a recording, prepare it and store it as an immutable data set, or say what is wrong and where."""
+    options = upload_options(query)
     path = storage.files.upload()
     try:
         kind, file_name = await receive_to(request, path, KINDS, storage.disk)
         asked = (sorted(request.query_params.multi_items()), kind, file_name)
         named = await to_thread.run_sync(partial(identity, idempotency_key, *asked, file=path))
-        called = name or file_name or "unnamed"
+        called = query.name or file_name or "unnamed"
         dataset = await to_thread.run_sync(store.add, storage, path, kind, called, options, named, limiter=turns)
     finally:
         path.unlink(missing_ok=True)

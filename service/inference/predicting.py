@@ -21,8 +21,8 @@ from service.contract.models import ALIAS
 from service.contract.payload import Payload
 from service.contract.predictions import PredictRequest
 from service.foundation.errors import invalid_request
+from service.foundation.json_text import each_once
 from service.models.loaded import LoadedModels, Served
-from service.web.route import each_once
 
 Array = NDArray[np.float64]
 QUANTITIES = ("q", "dq", "ddq", "tau")

@@ -20,10 +20,10 @@ from service.foundation.errors import (
 )
 from service.inference import comparison, evaluating, predicting
 from service.inference.predicting import decode, encode
-from service.models.loaded import LoadedModels, LoadedModelsDep
+from service.models.loaded import LoadedModels
 from service.models.served import Served, reached
+from service.web.dependencies import LoadedModelsDep, PredictionsDep
 from service.web.errors import responses
-from service.web.limits.requests import PredictionsDep
 from service.web.route import JSON, OCTETS, Reply, Route, hot_route, is_json, media_type
 
 _CONTENT: dict[str, Any] = {

@@ -12,9 +12,8 @@ from contextlib import AbstractContextManager
 from contextvars import copy_context
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Annotated, Any, TypeVar
+from typing import Any, TypeVar
 
-from fastapi import Depends
 from sqlalchemy import select
 
 from lipserve.states import PartState
@@ -31,7 +30,6 @@ from service.learning.live.feed import Feed
 from service.models.loaded import LoadedModels, Served
 from service.storage.database import StreamRow
 from service.telemetry.readiness import Lasting
-from service.web.dependencies import of_app
 
 logger = logging.getLogger(__name__)
 
@@ -283,6 +281,3 @@ class Learners:
         elif isinstance(message, Failed):
             logger.error("version %s of model %s does not learn: %s", message.version, message.model, message.error)
             self._note(message, failed=message)
-
-
-LearnersDep = Annotated[Learners, Depends(of_app("learners"))]

@@ -8,11 +8,9 @@ import logging
 import threading
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated
 from weakref import WeakValueDictionary
 
 import numpy as np
-from fastapi import Depends
 
 import lipcore
 from lipcore.data.samples import Array
@@ -28,7 +26,6 @@ from service.models.scales import Scales
 from service.models.served import Alias, Key, LearntStates, Served, Waiting
 from service.storage.database import VersionRow
 from service.storage.storage import Storage
-from service.web.dependencies import of_app
 
 logger = logging.getLogger(__name__)
 
@@ -389,6 +386,3 @@ def _warm(model: TorqueModel) -> TorqueModel:
     """The model after an answer, which brings its arrays into memory."""
     model.answer(np.zeros((3, model.n_joints)))
     return model
-
-
-LoadedModelsDep = Annotated[LoadedModels, Depends(of_app("loaded"))]

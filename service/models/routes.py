@@ -21,10 +21,8 @@ from service.foundation.errors import (
 )
 from service.foundation.fields import BINARY, upload_body
 from service.models import aliases, archive, archive_import, deletion, registry
-from service.models.loaded import LoadedModelsDep
-from service.web.dependencies import PageQuery
+from service.web.dependencies import ArchivesDep, LoadedModelsDep, PageQuery
 from service.web.errors import responses
-from service.web.limits.requests import ArchivesDep
 from service.web.limits.upload import Kinds, receive_to
 from service.web.route import Route
 

@@ -16,8 +16,8 @@ from service.contract.predictions import one_choice
 from service.foundation.errors import NotFoundError, NotReadyError, invalid_request
 from service.learning.learners import Learners
 from service.models.served import reached
+from service.runtime.counted import Counted
 from service.stream.session import Conversation, Echo, Session
-from service.web.limits.requests import Counted
 from service.web.server.connections import CONNECTION, StreamProtocol
 
 STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"

@@ -12,8 +12,8 @@ from typing import ClassVar
 from anyio import to_thread
 from sqlalchemy import select
 
+from service.runtime.counted import Counted
 from service.storage.database import Database, JobRow
-from service.web.limits.requests import Counted
 
 logger = logging.getLogger(__name__)
 

@@ -15,9 +15,7 @@ from collections.abc import Callable
 from concurrent.futures.process import BrokenProcessPool
 from datetime import UTC, datetime
 from functools import partial
-from typing import Annotated
 
-from fastapi import Depends
 from sqlalchemy import select
 
 from lipserve.states import ACTIVE, QUEUED, RUNNING
@@ -30,7 +28,6 @@ from service.storage.storage import Storage
 from service.training import lifecycle, worker
 from service.training.feed import Feed
 from service.training.lifecycle import Ended, Facts, Hand, Settled, Settler, queue_again
-from service.web.dependencies import of_app
 
 logger = logging.getLogger(__name__)
 
@@ -295,6 +292,3 @@ def queue_of(settings: Settings) -> type[JobQueue]:
     from service.training.cluster import ClusterQueue  # noqa: PLC0415 - it is one of these
 
     return ClusterQueue
-
-
-JobQueueDep = Annotated[JobQueue, Depends(of_app("jobs"))]

@@ -20,12 +20,12 @@ from service.foundation.errors import (
     NotInstalledError,
     TooLargeError,
 )
-from service.models.loaded import LoadedModels, LoadedModelsDep
+from service.models.loaded import LoadedModels
 from service.storage.database import JobRow
 from service.storage.rows import identity
 from service.training import jobs
-from service.training.queue import JobQueue, JobQueueDep
-from service.web.dependencies import KeyHeader, PageQuery, StoppingDep
+from service.training.queue import JobQueue
+from service.web.dependencies import JobQueueDep, KeyHeader, LoadedModelsDep, PageQuery, StoppingDep
 from service.web.errors import responses
 from service.web.route import Route
 

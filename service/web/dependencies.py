@@ -5,13 +5,17 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable
 from typing import Annotated, Any
 
+from anyio import CapacityLimiter
 from fastapi import Depends, Header, Query, Request
 
 from service.foundation.errors import invalid_request
+from service.learning.learners import Learners
+from service.models.loaded import LoadedModels
 from service.storage.rows import HEADER, USUAL, Page
 from service.storage.storage import Storage
 from service.telemetry.meters import Meters
 from service.telemetry.readiness import Readiness, Stopping
+from service.training.queue import JobQueue
 
 
 def of_app(name: str) -> Callable[[Request], Awaitable[Any]]:
@@ -23,7 +27,21 @@ def of_app(name: str) -> Callable[[Request], Awaitable[Any]]:
     return kept
 
 
+def _turns_of(kind: str) -> Callable[[Request], Awaitable[CapacityLimiter]]:
+    async def limiter(request: Request) -> CapacityLimiter:
+        kind_limiter: CapacityLimiter = getattr(request.app.state.turns, kind)
+        return kind_limiter
+
+    return limiter
+
+
 StorageDep = Annotated[Storage, Depends(of_app("storage"))]
+LoadedModelsDep = Annotated[LoadedModels, Depends(of_app("loaded"))]
+JobQueueDep = Annotated[JobQueue, Depends(of_app("jobs"))]
+LearnersDep = Annotated[Learners, Depends(of_app("learners"))]
+PredictionsDep = Annotated[CapacityLimiter, Depends(_turns_of("predictions"))]
+UploadsDep = Annotated[CapacityLimiter, Depends(_turns_of("uploads"))]
+ArchivesDep = Annotated[CapacityLimiter, Depends(_turns_of("archives"))]
 MetersDep = Annotated[Meters, Depends(of_app("meters"))]
 ReadinessDep = Annotated[Readiness, Depends(of_app("readiness"))]
 StoppingDep = Annotated[Stopping, Depends(of_app("stopping"))]

@@ -3,7 +3,6 @@ FastAPI looks at the request: its validation and dependencies cost 0.3 ms."""
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from typing import Any, NamedTuple
@@ -12,15 +11,16 @@ from urllib.parse import parse_qsl
 from fastapi import Request, Response
 from fastapi.dependencies.models import Dependant
 from fastapi.routing import APIRoute
+from pydantic import BaseModel
 from starlette.types import Message, Receive, Scope, Send
 
-from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem, sentence
-from service.foundation.fields import first_repeat
+from service.foundation.errors import UnsupportedMediaTypeError, invalid_request, problem, sentence
+from service.foundation.json_text import read_json
 
 JSON, OCTETS = b"application/json", b"application/octet-stream"
 _ANY_JSON = re.compile(rb"application/([^;/]+\+)?json\s*(;.*)?", re.IGNORECASE | re.DOTALL)
-MOST_PARAMETERS, MOST_FIELDS = 100, 1000
-"""Query parameters, and fields of a JSON object, that are read at all."""
+MOST_PARAMETERS = 100
+"""Query parameters that are read at all."""
 
 
 class Route(APIRoute):
@@ -68,32 +68,6 @@ def is_json(scope: Scope) -> bool:
     return given == JSON or given.partition(b";")[0].strip().lower() == JSON
 
 
-def read_json(body: bytes) -> Any:
-    """The value of a JSON text as RFC 8259 has it, besides NaN and Infinity, which are refused where they stand.
-
-    Raise InvalidRequestError naming the place where it is not UTF-8, no JSON, nested too deep, or names a field twice.
-    """
-    try:
-        return json.loads(body.decode("utf-8-sig"), object_pairs_hook=_object)
-    except UnicodeDecodeError as error:
-        reason = f"not UTF-8 at byte {error.start}"
-    except json.JSONDecodeError as error:
-        reason = f"not JSON at character {error.pos}: {error.msg}"
-    except RecursionError:
-        reason = "nested too deep"
-    except ValueError:  # Python reads no whole number of more digits
-        reason = "not JSON that can be read: a whole number has more than 4300 digits"
-    raise invalid_request("body", reason, "JSON")
-
-
-def each_once(body: bytes, *names: bytes) -> bool:
-    """Whether a JSON object that has only these fields surely has each once: False may also mean that it is not clear.
-
-    For readers that take the last of two; what is not clear is read again by `read_json`, which knows.
-    """
-    return b"\\" not in body and all(body.count(b'"%b"' % name) <= 1 for name in names)
-
-
 class _JsonRequest(Request):
     """A request whose JSON has been read."""
 
@@ -115,18 +89,6 @@ class _JsonRequest(Request):
         return self._value
 
 
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    if len(pairs) > MOST_FIELDS:
-        raise invalid_request("body", f"an object of {len(pairs)} fields", f"at most {MOST_FIELDS}")
-    value = dict(pairs)
-    if len(value) < len(pairs):
-        index = first_repeat(name for name, _ in pairs)
-        assert index is not None
-        item = problem(pairs[index][0], "given twice", "each field once")
-        raise InvalidRequestError(sentence(item), [item])
-    return value
-
-
 def _check_encoding(scope: Scope) -> None:
     given = next((value for name, value in scope["headers"] if name == b"content-encoding"), b"identity")
     if given.lower() != b"identity":
@@ -135,7 +97,12 @@ def _check_encoding(scope: Scope) -> None:
 
 
 def _parameters(dependant: Dependant) -> Iterator[str]:
-    yield from (parameter.alias for parameter in dependant.query_params)
+    for parameter in dependant.query_params:
+        annotation = parameter.field_info.annotation
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            yield from annotation.model_fields
+        else:
+            yield parameter.alias
     for below in dependant.dependencies:
         yield from _parameters(below)
 

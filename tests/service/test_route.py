@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from service.foundation.errors import InvalidRequestError, problem, readable
 from service.foundation.fields import first_repeat
-from service.web.route import Route, each_once, read_json
+from service.foundation.json_text import each_once, read_json
+from service.web.route import Route
 from tests.service.data import error, service_of
 
 VALUES = st.recursive(

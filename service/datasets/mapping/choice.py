@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from lipcore.profiles import Profile
 from lipcore.vocabulary import TorqueConvention
+from service.contract.uploads import Effort
 from service.datasets.mapping.joints import Joint, order_of
 from service.datasets.mapping.recognition import (
     AIM,
@@ -23,7 +24,7 @@ from service.datasets.mapping.recognition import (
     unfold,
 )
 from service.datasets.mapping.vocabulary import factor, is_current
-from service.datasets.options import EFFORT_CONVENTIONS, Effort, UploadOptions
+from service.datasets.options import EFFORT_CONVENTIONS, UploadOptions
 from service.foundation.errors import InvalidDataError, invalid_data, invalid_request
 
 MEANINGS: dict[Effort, str] = {

@@ -20,10 +20,8 @@ from service.foundation.errors import (
     UnreadableVersionError,
 )
 from service.learning.control import decisions, overview, payload, status
-from service.learning.learners import LearnersDep
 from service.training import jobs
-from service.training.queue import JobQueueDep
-from service.web.dependencies import PageQuery
+from service.web.dependencies import JobQueueDep, LearnersDep, PageQuery
 from service.web.errors import responses
 from service.web.route import Route
 

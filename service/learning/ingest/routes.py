@@ -17,10 +17,12 @@ from service.contract.observations import (
     ObservationResponse,
 )
 from service.foundation.errors import BusyError, ConflictError, InvalidRequestError, NotFoundError, TooLargeError
+from service.foundation.json_text import each_once
 from service.inference.predicting import QUANTITIES, Array, to_array
-from service.learning.learners import Learners, LearnersDep
+from service.learning.learners import Learners
+from service.web.dependencies import LearnersDep
 from service.web.errors import responses
-from service.web.route import Reply, each_once, hot_route, is_json
+from service.web.route import Reply, hot_route, is_json
 
 Number = float | None
 Numbers = list[Number | list[Number]]

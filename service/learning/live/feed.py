@@ -28,7 +28,7 @@ from service.foundation.settings import Settings
 from service.learning.ingest.deriving import EDGE
 from service.learning.ingest.intake import Judged
 from service.models.loaded import Served
-from service.web.limits.requests import Counted
+from service.runtime.counted import Counted
 
 logger = logging.getLogger(__name__)
 

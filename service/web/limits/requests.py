@@ -5,16 +5,14 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from ipaddress import IPv6Address, ip_address
 from math import ceil
 from time import monotonic
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 from anyio import CapacityLimiter, to_thread
-from fastapi import Depends, Request
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -175,27 +173,6 @@ class Gate:
             self.open -= 1
 
 
-class Counted:
-    """Counts what is open. too_many: the message beyond the most, with a place for the number; headers: go with it."""
-
-    too_many: ClassVar[str]
-    headers: ClassVar[dict[str, str]] = {}
-
-    def __init__(self) -> None:
-        self.open = 0
-
-    @contextmanager
-    def one_more(self, most: int) -> Iterator[None]:
-        """Count one while it lasts; raise BusyError beyond `most`."""
-        if self.open >= most:
-            raise BusyError(self.too_many.format(self.open), headers=self.headers)
-        self.open += 1
-        try:
-            yield
-        finally:
-            self.open -= 1
-
-
 @dataclass(frozen=True)
 class Turns:
     """One limiter a kind; to be made where an event loop runs."""
@@ -225,19 +202,6 @@ async def in_turn(turns: CapacityLimiter, make: Callable[..., Made], *args: Any)
     computing = asyncio.ensure_future(to_thread.run_sync(make, *args, limiter=CapacityLimiter(1)))
     computing.add_done_callback(over)
     return await asyncio.shield(computing)
-
-
-def _of(kind: str) -> Callable[[Request], Awaitable[CapacityLimiter]]:
-    async def limiter(request: Request) -> CapacityLimiter:
-        kind_limiter: CapacityLimiter = getattr(request.app.state.turns, kind)
-        return kind_limiter
-
-    return limiter
-
-
-PredictionsDep = Annotated[CapacityLimiter, Depends(_of("predictions"))]
-UploadsDep = Annotated[CapacityLimiter, Depends(_of("uploads"))]
-ArchivesDep = Annotated[CapacityLimiter, Depends(_of("archives"))]
 
 
 COUNTED = "lipserve.counted"

@@ -15,7 +15,7 @@ from service.learning.ingest.intake import Judged
 from service.learning.ingest.screening import Screened
 from service.learning.live import feed
 from service.learning.live.feed import MOST_UNREAD, Feed, FeedEvent, pick, thinned
-from service.learning.live.routes import at_most
+from service.learning.live.look import at_most
 from tests.service.data import error, eventually, service_of
 from tests.service.learning.batches import rows
 from tests.service.learning.following import following

@@ -3,7 +3,6 @@
 The arms are others than those that the thresholds were set on, see causes.py.
 """
 
-import asyncio
 import sys
 from collections import Counter
 from functools import cache
@@ -18,6 +17,7 @@ from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import FAST, Stream, inverse_dynamics, simulate
 from service.contract.datasets import DatasetReport
+from service.contract.uploads import UploadQuery
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import read
 from service.datasets.options import upload_options
@@ -68,7 +68,7 @@ def upload(folder: Path, columns: dict[str, np.ndarray], /, **query: str) -> Dat
         values += list(columns[quantity].T)
     file, settings = folder / "recording.csv", Settings(home=folder)
     np.savetxt(file, np.column_stack(values), fmt="%.9g", delimiter=",", header=",".join(names), comments="")
-    options = asyncio.run(upload_options(**query))
+    options = upload_options(UploadQuery.model_validate(query))
     robot, disk = profiles.profile(query["robot"]), Disk(settings)
     with open_table(file, "csv", options.read, settings) as table:
         got = read(table, folder, options, robot, settings, disk)

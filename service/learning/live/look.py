@@ -1,0 +1,101 @@
+"""The status that a follower of a model is sent once a second."""
+
+from __future__ import annotations
+
+import time
+
+from lipcore.vocabulary import CODES
+from service.contract.learning import LiveAnswers, LiveNovelty, LiveStatus
+from service.journal import log
+from service.learning import owner
+from service.learning.control import decisions, payload, status
+from service.learning.learners import Learners
+from service.storage.rows import Page
+from service.telemetry.meters import OTHER, Meters, StreamMeter
+
+MOST_ALARMS = 5
+COUNTS = (*CODES, "batches", "duplicates")
+
+
+class LiveLook:
+    """Makes the statuses of one model; not for the event loop."""
+
+    def __init__(self, learners: Learners, meters: Meters, model: str) -> None:
+        self.learners, self.model = learners, model
+        self._answers = Answers(meters, model)
+
+    def __call__(self, novel: list[LiveNovelty], passed: float | None) -> LiveStatus:
+        """Return how it stands; raise NotFoundError where it was deleted. passed: s since the last time."""
+        learners, model = self.learners, self.model
+        served, now = learners.loaded.get(model, None), time.time()
+        monitor, latest = learners.monitor(model), learners.status(model, served.version)
+        lag = learners.lag(served)
+        with learners.database.session() as session:
+            events = log.newest(session, model) - log.start_of(session, model, served.version)
+            options, held = owner.options(session, model), owner.held(session, model)
+        return LiveStatus(
+            model=model,
+            at=now,
+            version=served.version,
+            revision=served.revision,
+            lag_events=max(events - served.revision, 0),
+            lag_rows=lag.rows,
+            lag_s=lag.seconds,
+            joint_names=list(served.model.joint_names),
+            joint_types=list(served.model.joint_types),
+            torque_convention=served.model.torque_convention,
+            learns=options.enabled,
+            on_change=options.on_change,
+            contact_threshold=options.contact_threshold,
+            held=held,
+            failure=latest.failure,
+            novel_share=latest.novel_share,
+            novel=novel,
+            counts={name: monitor.counts[name] for name in COUNTS},
+            windows=[status.window(each, now) for each in monitor.windows],
+            scale=served.scales.asked,
+            payloads=payload.brief(monitor, served),
+            answers=self._answers.since(passed),
+            alarms=decisions.alarms(learners, model, Page(after=None, limit=MOST_ALARMS)).items,
+        )
+
+
+class Answers:
+    """Answers of a model's streams, from one look to the next."""
+
+    def __init__(self, meters: Meters, model: str) -> None:
+        self._meters, self._model = meters, model
+        self._before: tuple[list[int], int, int] | None = None
+
+    def since(self, passed: float | None) -> LiveAnswers | None:
+        """Answers since the last look, `passed` s ago; None at the first one."""
+        # read only: meters belong to the event loop, which makes them
+        meter = self._meters.streams().get(self._model)
+        if meter is None and OTHER in self._meters.streams():
+            return None
+        meter = meter or StreamMeter()
+        bounds, now = meter.durations.bounds, (list(meter.durations.counts), sum(meter.refused.values()), meter.late)
+        before, self._before = self._before, now
+        if before is None or passed is None:
+            return None
+        counts = [late - early for late, early in zip(now[0], before[0], strict=True)]
+        return LiveAnswers(
+            seconds=round(passed, 3),
+            count=sum(counts),
+            refused=now[1] - before[1],
+            late=now[2] - before[2],
+            p50_at_most_s=at_most(counts, bounds, 0.5),
+            p99_at_most_s=at_most(counts, bounds, 0.99),
+        )
+
+
+def at_most(counts: list[int], bounds: tuple[float, ...], share: float) -> float | None:
+    """The least bound below which this share of what was counted lies, None where there is none. counts: by bucket."""
+    total, below = sum(counts), 0
+    if not total:
+        return None
+    for count, bound in zip(counts, bounds, strict=False):  # the last bucket has no bound
+        below += count
+        if below >= share * total:
+            return bound
+    return None
