@@ -24,7 +24,7 @@ SHA512 = {
 REGISTRY = os.environ.get("NPM_CONFIG_REGISTRY", "https://registry.npmjs.org").rstrip("/")
 SECONDS = 30
 INSTEAD = "plotly>=6.1,<8"
-FOLDER = Path("service/dashboard/bundles")
+FOLDER = Path("service/api/dashboard/bundles")
 
 
 class Bundles(BuildHookInterface[Any]):

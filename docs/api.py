@@ -7,12 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from service.api.access.scopes import TABLE
+from service.api.guide.routes import anchor
+from service.api.limits.requests import body_limit, body_limits
+from service.api.openapi import METHODS
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.guide.routes import anchor
-from service.web.access.scopes import TABLE
-from service.web.limits.requests import body_limit, body_limits
-from service.web.openapi import METHODS
 
 TARGET = Path(__file__).parent / "reference/api.md"
 HEAD = """# API reference

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from service.api.openapi import error_table
 from service.app import create_app
-from service.web.openapi import error_table
 
 HEAD = """# Error codes
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 
+from service.api import metrics
 from service.learning import metrics as learning
 from service.telemetry.meters import MetricKind
 from service.training import metrics as training
-from service.web.observability import metrics
 
 KINDS: tuple[MetricKind, ...] = (
     *metrics.TRAFFIC_KINDS,

@@ -15,44 +15,46 @@ from threadpoolctl import threadpool_limits
 
 from lipserve.wording import counted
 from service import __version__
-from service.dashboard import routes as dashboard
-from service.datasets import routes as datasets
+from service.api import errors, metrics, openapi, requests
+from service.api.access.keys import Keyring
+from service.api.access.middleware import KeyAccess, LocalAccess
+from service.api.dashboard import routes as dashboard
+from service.api.guide import routes as guide
+from service.api.limits.requests import BodyLimit, Gate, RateLimit, Turns, body_limits
+from service.api.metrics import System, Traffic
+from service.api.oip import routes as oip
+from service.api.oip import rpc
+from service.api.requests import RequestContext, RequestLog
+from service.api.routes import (
+    audit,
+    datasets,
+    health,
+    jobs,
+    learning,
+    live,
+    models,
+    observations,
+    predictions,
+    robots,
+)
+from service.api.stream import routes as stream
 from service.foundation.settings import Settings
-from service.guide import routes as guide
-from service.inference import routes
-from service.inference import routes as inference
-from service.learning import metrics as learning_metrics
-from service.learning.control import routes as control
-from service.learning.ingest import routes as observations
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
-from service.learning.live import routes as live
+from service.learning.metrics import Learning
 from service.learning.refresh import attach
 from service.models import registry, signing
-from service.models import routes as models
 from service.models.loaded import LoadedModels
-from service.oip import routes as oip
-from service.oip import rpc
 from service.replication import Replication
-from service.robots import routes as robots
 from service.runtime.confinement import protections
-from service.storage import audit
+from service.storage.audit import cleaned
 from service.storage.files.store import start_sweeping
 from service.storage.storage import Storage, hold_home, look_database, look_files, look_home
-from service.stream import routes as stream
 from service.telemetry.meters import Meters
 from service.telemetry.readiness import Look, Readiness, Stopping
-from service.training import metrics as jobs_metrics
-from service.training import routes as training
+from service.training.metrics import JobMetrics
+from service.training.metrics import look as look_jobs
 from service.training.queue import JobQueue, queue_of
-from service.web import errors, openapi
-from service.web.access import audit_routes
-from service.web.access.keys import Keyring
-from service.web.access.middleware import KeyAccess, LocalAccess
-from service.web.limits.requests import BodyLimit, Gate, RateLimit, Turns, body_limits
-from service.web.observability import health, metrics, requests
-from service.web.observability.metrics import System, Traffic
-from service.web.observability.requests import RequestContext, RequestLog
 
 logger = logging.getLogger(__name__)
 
@@ -85,7 +87,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
             async with AsyncExitStack() as serving:
                 if keyring is not None:
                     await serving.enter_async_context(keyring.watching(storage.database))
-                await serving.enter_async_context(audit.cleaned(storage.database, settings))
+                await serving.enter_async_context(cleaned(storage.database, settings))
                 if calls:
                     await serving.enter_async_context(_calls(app, settings, stopping))
                 yield
@@ -98,7 +100,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                     rest.push_async_callback(to_thread.run_sync, replication.close)
                 await to_thread.run_sync(jobs.close)  # first: what learns needs the CPU to store its state
 
-    hot = [*inference.hot.routes, *routes.echo_hot.routes, *oip.hot.routes, *observations.hot.routes]
+    hot = [*predictions.hot.routes, *predictions.echo_hot.routes, *oip.hot.routes, *observations.hot.routes]
     if calls:
         hot.append(_calls_route())
     # the documentation page loads nothing from other hosts: robots' networks often have no way out
@@ -121,14 +123,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     for router in (
         health.router,
         metrics.router,
-        audit_routes.router,
+        audit.router,
         datasets.router,
         robots.router,
-        training.router,
+        jobs.router,
         models.router,
-        inference.router,
-        control.router,
-        control.overview_router,
+        predictions.router,
+        learning.router,
+        learning.overview_router,
         live.router,
         oip.router,
         stream.router(),
@@ -140,13 +142,13 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 
 def _calls_route() -> BaseRoute:
-    from service.oip.rpc.methods import Methods  # noqa: PLC0415 - of an extra
+    from service.api.oip.rpc.methods import Methods  # noqa: PLC0415 - of an extra
 
     return Methods()
 
 
 def _calls(app: FastAPI, settings: Settings, stopping: Stopping) -> AbstractAsyncContextManager[int]:
-    from service.oip.rpc.listening import listening  # noqa: PLC0415 - of an extra
+    from service.api.oip.rpc.listening import listening  # noqa: PLC0415 - of an extra
 
     return listening(app, settings, stopping)
 
@@ -202,14 +204,14 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners) -
         **({"files": lambda _: look_files(storage)} if storage.files.shared else {}),
         "models": loaded.look,
         "learner": learners.look,
-        "training": lambda lasting: jobs_metrics.look(jobs, lasting),
+        "training": lambda lasting: look_jobs(jobs, lasting),
     }
     state.storage, state.loaded, state.jobs, state.learners = storage, loaded, jobs, learners
     state.turns = Turns(CapacityLimiter(settings.max_concurrent_predictions))
     state.readiness = Readiness(looks, state.stopping)
     state.collectors = (
         Traffic(state.meters),
-        jobs_metrics.JobMetrics(storage.database),
-        learning_metrics.Learning(learners),
+        JobMetrics(storage.database),
+        Learning(learners),
         System(storage, state.readiness),
     )

@@ -16,7 +16,7 @@ from benchmarks.workload import MODEL, Bed
 from lipcore.data.samples import Array
 from lipserve import StreamClient
 from lipserve.frames import request_bytes
-from service.oip.schema import HEADER
+from service.api.oip.schema import HEADER
 
 CLIENT = "ws-client"
 _LABELS = {
@@ -166,8 +166,8 @@ def _infer(motion: Array, binary: bool) -> bytes:
 def _grpc(address: tuple[str, int], bed: Bed, stack: ExitStack) -> Subject:
     import grpc  # noqa: PLC0415 - of an extra, as what follows
 
-    from service.oip.rpc.definition import SERVICE  # noqa: PLC0415
-    from service.oip.rpc.messages import InferRequest, InferResponse  # noqa: PLC0415
+    from service.api.oip.rpc.definition import SERVICE  # noqa: PLC0415
+    from service.api.oip.rpc.messages import InferRequest, InferResponse  # noqa: PLC0415
 
     channel = stack.enter_context(grpc.insecure_channel("{}:{}".format(*address)))
     ask = channel.unary_unary(f"/{SERVICE}/ModelInfer")

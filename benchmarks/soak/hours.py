@@ -30,10 +30,10 @@ from benchmarks.soak.day import ARM, LOOP, Clock, Day, Tally
 from benchmarks.soak.errands import ERRANDS, SLOW, Desk
 from benchmarks.soak.resources import WARMING, Growth, Look, ResourceWatch, growth, series
 from lipcore.warm_up import warm_up
+from service.api.access import keys
 from service.contract.observations import LearningOptions
 from service.models import signing
 from service.storage.database import Database
-from service.web.access import keys
 
 MOTION_S = 600.0
 """Of the arm, repeated all day."""

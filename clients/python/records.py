@@ -18,11 +18,11 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic.json_schema import models_json_schema
 
+from service.api.oip import schema as oip
 from service.contract import audit, datasets, health, learning, models, overview, robots
 from service.contract import jobs as training
 from service.contract import observations as observing
 from service.contract import payload as payloads
-from service.oip import schema as oip
 
 TARGET = Path(__file__).parent / "lipserve/records"
 WIDTH = 120

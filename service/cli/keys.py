@@ -14,6 +14,8 @@ import typer
 from rich.markup import escape
 from rich.table import Column, Table
 
+from service.api.access import keys
+from service.api.access.scopes import SCOPES
 from service.cli.consoles import CommandError, note, out, print_json, print_result
 from service.cli.options import Json, group
 from service.foundation.errors import InvalidRequestError
@@ -21,8 +23,6 @@ from service.foundation.settings import Settings
 from service.models import signing
 from service.storage.database import ApiKeyRow, Database
 from service.storage.storage import HomeError, usable
-from service.web.access import keys
-from service.web.access.scopes import SCOPES
 
 app = group("API keys of the home LIPSERVE_HOME.")
 ERRORS = (HomeError, InvalidRequestError)

@@ -8,14 +8,14 @@ from typing import Annotated
 import typer
 import uvicorn
 
+from service.api.oip import rpc
+from service.api.server import sockets
+from service.api.server.connections import StreamProtocol, guarded
 from service.app import create_app
 from service.cli.options import alone, settings_of
-from service.oip import rpc
 from service.runtime.allocator import keep_little
 from service.storage.storage import HomeError, check_home
 from service.telemetry import logs
-from service.web.server import sockets
-from service.web.server.connections import StreamProtocol, guarded
 
 app = alone()
 ERRORS = (HomeError,)

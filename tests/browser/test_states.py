@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from service.api.access import keys
 from service.storage.database import Database
-from service.web.access import keys
 from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard, Visit
 from tests.browser.visitor import PHONE, Visitor

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import lipcore
+from service.api.access import keys
 from service.foundation.settings import Settings
 from service.storage.database import Database
-from service.web.access import keys
 from tests.clients.building import CPP, built, checked, here, sanitizers
 from tests.clients.driver import Driver
 from tests.docs.blocks import ROOT

@@ -7,7 +7,7 @@ import pytest
 from fastapi import FastAPI
 from fastapi.testclient import TestClient
 
-from service.guide import routes
+from service.api.guide import routes
 from tests.docs.blocks import ROOT
 
 

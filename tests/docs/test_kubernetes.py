@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import yaml
 
+from service.api.access.scopes import OPEN, rule_of
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.web.access.scopes import OPEN, rule_of
 from tests.docs.blocks import ROOT
 from tests.docs.test_deployments import PORT, check_command, port_of
 

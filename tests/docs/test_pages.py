@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import typer
 
+from service.api.guide.routes import anchor
 from service.cli.main import app
-from service.guide.routes import anchor
 from tests.docs.blocks import ROOT, all_pages, blocks, pages, prose
 
 LINK = re.compile(r"\]\(([^)\s]+)\)")

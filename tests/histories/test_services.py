@@ -14,11 +14,11 @@ import pytest
 
 import lipcore
 from lipcore.online.learner import OnlineModel
+from service.api.access import keys
 from service.foundation.settings import Settings
 from service.journal import log
 from service.storage.database import Database, VersionRow
 from service.storage.files import Files
-from service.web.access import keys
 from tests.cluster.pairs import HARMLESS, train
 from tests.cluster.servers import Shared
 from tests.histories.actors import ALIASES, WORK, Book, Client

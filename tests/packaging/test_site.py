@@ -7,7 +7,7 @@ from html import escape
 import pytest
 import yaml
 
-from service.guide import routes
+from service.api.guide import routes
 from tests.docs.blocks import ROOT
 
 CONFIGURATION = ROOT / "mkdocs.yml"

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lipcore.model import dynamics
-from service.oip import query as answering
+from service.api.oip import query as answering
 from tests.service.data import ADDRESS
 from tests.service.oip import message, path_of, refused
 

@@ -16,14 +16,14 @@ from tritonclient.grpc.service_pb2_grpc import GRPCInferenceServiceStub
 from tritonclient.utils import InferenceServerException
 
 from service import __version__
-from service.oip.query import PARTS
-from service.oip.rpc.messages import MOST
+from service.api.oip.query import PARTS
+from service.api.oip.rpc.messages import MOST
 from tests.service.data import DEADLINE, eventually
 from tests.service.oip import message, path_of, refused, tensors
 from tests.service.oip_grpc import MOTION, PATH, Code, request
 from tests.service.server import Server, free_port
 
-definition = pytest.importorskip("service.oip.rpc.definition")
+definition = pytest.importorskip("service.api.oip.rpc.definition")
 BATCH = {name: np.linspace(values, np.array(values) + 0.3, 4) for name, values in MOTION.items()}
 MOST_BYTES = 20_000
 BODY_S = 1.0

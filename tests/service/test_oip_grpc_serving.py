@@ -24,8 +24,8 @@ from tests.service.server import Server, free_port
 @pytest.fixture(scope="module")
 def guarded(tmp_path_factory) -> Iterator[tuple[GRPCInferenceServiceStub, dict[str, str], Server]]:
     """A service that asks for keys and limits rates, and a key of each of two scopes."""
+    from service.api.access import keys
     from service.storage.database import Database
-    from service.web.access import keys
 
     home, port = tmp_path_factory.mktemp("grpc-keys") / "home", free_port()
     settings = {"LIPSERVE_KEYS": "on", "LIPSERVE_MAX_REQUESTS_PER_S": "0.001", "LIPSERVE_MAX_REQUEST_BURST": "4"}

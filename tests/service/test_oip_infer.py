@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from lipcore.data.motion import Motion
 from lipcore.model import dynamics
-from service.oip.query import PARTS
+from service.api.oip.query import PARTS
 from tests.service.data import service_of
 from tests.service.oip import ask, listed, message, tensors
 

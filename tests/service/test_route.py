@@ -8,10 +8,10 @@ from fastapi.routing import APIRoute, iter_route_contexts
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.api.route import Route
 from service.foundation.errors import InvalidRequestError, problem, readable
 from service.foundation.fields import first_repeat
 from service.foundation.json_text import each_once, read_json
-from service.web.route import Route
 from tests.service.data import error, service_of
 
 VALUES = st.recursive(

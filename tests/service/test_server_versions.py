@@ -11,9 +11,9 @@ from packaging.specifiers import SpecifierSet
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 
-from service.web.server import HOLDS_FOR
-from service.web.server.connections import GuardedProtocol, StreamProtocol
-from service.web.server.sockets import Server
+from service.api.server import HOLDS_FOR
+from service.api.server.connections import GuardedProtocol, StreamProtocol
+from service.api.server.sockets import Server
 
 PYPROJECT = Path(__file__).parents[2] / "pyproject.toml"
 REPLACED = {

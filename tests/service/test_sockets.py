@@ -11,7 +11,7 @@ import pytest
 from websockets.sync.client import unix_connect
 
 from lipserve import Client
-from service.web.server.sockets import SocketError, UnixSocket
+from service.api.server.sockets import SocketError, UnixSocket
 from tests.service.data import DEADLINE
 from tests.service.server import Server
 from tests.service.warm import Served

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from anyio import to_thread
 
+from service.api.stream.session import Session
 from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
 from service.learning.ingest.batches import FramesResult
-from service.stream.session import Session
 from service.telemetry.meters import Meters
 from tests.service.data import DEADLINE
 from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, MOTION, STD, TAU, frame, read

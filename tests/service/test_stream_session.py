@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 
 from lipcore.model.torque_model import Fallback, TorqueAnswer
+from service.api.stream.session import Echo, Session
 from service.foundation.settings import Settings
 from service.models.loads import Carried, Loads
 from service.models.scales import Factor, Scales
-from service.stream.session import Echo, Session
 from service.telemetry.meters import Meters
 from tests.service.data import DEADLINE
 from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, FALLBACK, SCALE, STD, frame, read

@@ -6,7 +6,7 @@ import threading
 import pytest
 from anyio import CapacityLimiter
 
-from service.web.limits.requests import in_turn
+from service.api.limits.requests import in_turn
 from tests.service.data import DEADLINE
 
 

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import pytest
 from fastapi.testclient import TestClient
 
+from service.api.access import keys
+from service.api.access.scopes import SCOPES
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.storage.database import Database
-from service.web.access import keys
-from service.web.access.scopes import SCOPES
 from tests.service.cli.conftest import lipserve  # noqa: F401 - a fixture
 
 REFRESH_S = 0.05

@@ -8,6 +8,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy import event, select, text
 from sqlalchemy.exc import DBAPIError
 
+from service.api.access import keys
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.learning import owner
@@ -22,7 +23,6 @@ from service.storage.database import (
     ServingRow,
     VersionRow,
 )
-from service.web.access import keys
 from tests.service.access.conftest import bearer
 from tests.service.archives.packing import TAR, exported
 from tests.service.data import QUICK, ended, error, eventually, queue, service_of, stream, upload

@@ -6,10 +6,10 @@ from datetime import UTC, datetime, timedelta
 import pytest
 
 from lipserve.address import headers_of
+from service.api.access import keys
+from service.api.access.keys import digest_of
 from service.foundation.settings import Settings
 from service.storage.database import Database
-from service.web.access import keys
-from service.web.access.keys import digest_of
 from tests.service.access.conftest import bearer
 from tests.service.data import error, eventually
 

@@ -8,14 +8,14 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy import delete, update
 
+from service.api.access import keys
+from service.api.access import keys as keyring_module
+from service.api.access.keys import Keyring
+from service.api.access.scopes import ADMIN
 from service.app import create_app
 from service.foundation.errors import UnauthorizedError
 from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, Database
-from service.web.access import keys
-from service.web.access import keys as keyring_module
-from service.web.access.keys import Keyring
-from service.web.access.scopes import ADMIN
 from tests.service.access.conftest import REFRESH_S, bearer
 from tests.service.data import arrays, error, eventually, npz, stream
 

@@ -5,9 +5,9 @@ from unittest.mock import AsyncMock
 
 import pytest
 
-from service.web.access import keys
-from service.web.access.keys import Keyring
-from service.web.access.middleware import KEY_ID, MOST_KNOWN, KeyAccess, LocalAccess
+from service.api.access import keys
+from service.api.access.keys import Keyring
+from service.api.access.middleware import KEY_ID, MOST_KNOWN, KeyAccess, LocalAccess
 from tests.service.access.conftest import REFRESH_S, bearer
 from tests.service.data import error
 

@@ -4,9 +4,9 @@ import re
 
 import pytest
 
-from service.oip.rpc.methods import METHODS as CALLS
-from service.stream import routes as stream
-from service.web.access.scopes import ADMIN, LASTING, LONGEST_PATH, OPEN, SCOPES, TABLE, WEBSOCKET, rule_of
+from service.api.access.scopes import ADMIN, LASTING, LONGEST_PATH, OPEN, SCOPES, TABLE, WEBSOCKET, rule_of
+from service.api.oip.rpc.methods import METHODS as CALLS
+from service.api.stream import routes as stream
 from tests.service.access.conftest import bearer
 from tests.service.data import error
 

@@ -8,9 +8,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from lipserve import Client, StreamClient, StreamError
+from service.api.access import keys
 from service.foundation.settings import Settings
 from service.storage.database import Database
-from service.web.access import keys
 from tests.service.access.conftest import bearer
 from tests.service.data import eventually
 from tests.service.server import Server

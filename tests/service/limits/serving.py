@@ -13,10 +13,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.websockets import WebSocket
 
+from service.api.server.connections import guarded
+from service.api.server.sockets import Server
 from service.foundation.settings import Settings
 from service.telemetry.readiness import Stopping
-from service.web.server.connections import guarded
-from service.web.server.sockets import Server
 from tests.service.data import DEADLINE, eventually
 from tests.service.server import free_port
 

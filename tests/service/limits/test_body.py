@@ -6,7 +6,7 @@ from unittest.mock import AsyncMock
 import pytest
 from starlette.exceptions import HTTPException
 
-from service.web.limits.requests import BodyLimit
+from service.api.limits.requests import BodyLimit
 
 SOON = 0.05
 """Seconds that a body may take where it is meant to take too long."""

@@ -6,7 +6,7 @@ from contextlib import suppress
 import pytest
 from websockets.sync.client import connect
 
-from service.web.server.connections import REFUSED, GuardedProtocol
+from service.api.server.connections import REFUSED, GuardedProtocol
 from tests.service.data import DEADLINE, eventually
 from tests.service.limits.serving import Raw, Serving, refusal
 

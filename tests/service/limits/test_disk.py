@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 import lipcore
+from service.api.limits.upload import WRITE_BYTES
 from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings, shipped_models
 from service.models import registry
@@ -17,7 +18,6 @@ from service.storage.database import Database, RobotRow
 from service.storage.database.engine import FILE, LOG_BYTES
 from service.storage.disk import Disk, measure
 from service.storage.files import new_id
-from service.web.limits.upload import WRITE_BYTES
 from tests.service.data import QUICK, arrays, error, npz, post, service_of, stream
 
 KiB = 1024

@@ -5,8 +5,8 @@ import random
 import httpx
 import pytest
 
+from service.api.limits.upload import MAX_PARTS, FormFile
 from service.foundation.errors import InvalidRequestError
-from service.web.limits.upload import MAX_PARTS, FormFile
 
 CONTENT = b"--x\r\n\r\n" + bytes(range(256)) * 20 + b"\r\n--x"
 """What looks like the ends of parts, and is none."""

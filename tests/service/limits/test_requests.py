@@ -5,10 +5,10 @@ import json
 
 import pytest
 
+from service.api.access.middleware import KEY_ID, KeyAccess
+from service.api.limits.requests import OTHERS, BodyLimit, Gate, Rate, RateLimit, client_of
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.web.access.middleware import KEY_ID, KeyAccess
-from service.web.limits.requests import OTHERS, BodyLimit, Gate, Rate, RateLimit, client_of
 
 MODELS, STREAM = "/v1/models", "/v1/echo/stream"
 

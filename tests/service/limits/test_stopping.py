@@ -21,7 +21,7 @@ HELD = GET.replace(b"/ ", b"/held ", 1)
 HOLD = """
 import asyncio, sys, uvicorn
 from service.telemetry.readiness import Stopping
-from service.web.server.sockets import serve
+from service.api.server.sockets import serve
 
 async def app(scope, receive, send):
     print("begun", flush=True)

@@ -13,6 +13,8 @@ from opentelemetry.sdk.trace.export import SimpleSpanProcessor
 from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
 
 from lipcore.extras import EXTRAS, Extra, MissingExtraError
+from service.api import requests
+from service.api.requests import RequestContext, RequestLog
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.inference import predicting as inference
@@ -20,8 +22,6 @@ from service.learning.learners import IngestThreads
 from service.telemetry import logs
 from service.telemetry.logs import KEY_ID, given_request_id, new_request_id, request_id
 from service.telemetry.meters import Kind, Meters
-from service.web.observability import requests
-from service.web.observability.requests import RequestContext, RequestLog
 from tests.service.data import ADDRESS, error, stream, upload
 
 MADE = re.compile(r"[0-9a-f]{12}-[0-9a-f]+")
@@ -92,7 +92,7 @@ def test_an_unexpected_error_is_answered_and_logged_with_its_id_and_goes_on_to_t
         return client.post("/v1/models/panda-sim/predict", json=query, headers={"x-request-id": "mine"})
 
     monkeypatch.setattr(inference, "predict", broken)
-    monkeypatch.setattr(logging.getLogger("service.web.errors"), "handlers", [Ids()])
+    monkeypatch.setattr(logging.getLogger("service.api.errors"), "handlers", [Ids()])
     answer = ask(TestClient(api.app, ADDRESS, raise_server_exceptions=False))
     assert answer.headers["x-request-id"] == "mine"
     assert "secret" not in str(error(answer, 500, "internal_error"))

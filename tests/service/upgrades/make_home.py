@@ -23,10 +23,10 @@ from fastapi.testclient import TestClient
 import lipserve
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
+from service.api.access import keys
 from service.app import create_app
 from service.foundation.settings import Settings
 from service.storage.database import Database
-from service.web.access import keys
 
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations": 4}
 MODELS = (("chain", "lip-chain"), ("chain", "lip-chain"), ("bodies", "rigid-body"))

@@ -15,13 +15,13 @@ from lipcore.data import independence
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.vocabulary import LEARNT
+from service.api.access import keys
 from service.app import create_app
 from service.cli.verify import verify_home
 from service.foundation.settings import Settings
 from service.storage.backup import backup, restore
 from service.storage.database import Database
 from service.storage.database.migrations import HEAD
-from service.web.access import keys
 from tests.service.access.conftest import bearer
 from tests.service.data import QUICK, ended, eventually, queue
 

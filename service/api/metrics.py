@@ -1,0 +1,182 @@
+"""What monitoring reads at /metrics, in the format of Prometheus: computed when it is asked for."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import PlainTextResponse
+from prometheus_client import CollectorRegistry
+from prometheus_client.core import Metric
+from prometheus_client.exposition import choose_encoder
+from prometheus_client.process_collector import ProcessCollector
+from prometheus_client.registry import Collector
+
+from service import __version__
+from service.api.route import Route
+from service.storage.disk import measure
+from service.storage.storage import Storage
+from service.telemetry.meters import Durations, Kind, Meters, MetricKind, merged
+from service.telemetry.readiness import Readiness
+
+BUILD = MetricKind("gauge", "lipserve_build_info", "1; the version of LIPServe", ("version",))
+PARTS = MetricKind("gauge", "lipserve_ready", "1 where a part is in order, 0 where /health/ready names it", ("part",))
+USED = MetricKind("gauge", "lipserve_disk_used_bytes", "Bytes of the home's files, by what they are of", ("what",))
+FREE = MetricKind("gauge", "lipserve_disk_free_bytes", "Bytes that the disk of the home has free")
+MEMORY = MetricKind(
+    "gauge", "lipserve_process_memory_bytes", "Resident memory of the processes that learn and train", ("process",)
+)
+CPU = MetricKind(
+    "counter",
+    "lipserve_process_cpu_seconds_total",
+    "CPU time of the processes that learn and train which run now, s",
+    ("process",),
+)
+SYSTEM_KINDS = (BUILD, PARTS, USED, FREE, MEMORY, CPU)
+LEARNER = "lipserve-learner"
+_OF_PROCESSES = {"process_resident_memory_bytes": MEMORY, "process_cpu_seconds": CPU}
+
+
+class System(Collector):
+    """Of one service. Its own process has Prometheus's usual `process_…` metrics. Not for the event loop."""
+
+    def __init__(self, storage: Storage, readiness: Readiness) -> None:
+        self._storage, self._readiness = storage, readiness
+        self._own = ProcessCollector(registry=None)
+
+    def describe(self) -> list[Metric]:
+        """Nothing: what there is depends on the platform."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield every metric."""
+        yield BUILD.of([([__version__], 1)])
+        parts = self._readiness.report()
+        yield PARTS.of(([part.name], float(part.state != "failed")) for part in parts)
+        files, usage = self._storage.files, self._storage.disk.usage()
+        used = {what: measure(folder) for what, folder in files.folders.items()}
+        used["other"] = max(usage.used - sum(used.values()), 0)  # the database above all; measured a moment before
+        yield USED.of(([what], size) for what, size in used.items())
+        yield FREE.of([((), usage.free)])
+        yield from self._own.collect()
+        yield from _processes()
+
+
+def _processes() -> Iterator[Metric]:
+    """What the processes take that the service has started, where the platform says."""
+    figures: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
+    for process in multiprocessing.active_children():
+        name, pid = "learner" if process.name == LEARNER else "training", process.pid
+        for family in ProcessCollector(pid=lambda pid=pid: pid, registry=None).collect():  # type: ignore[misc]
+            if family.name in _OF_PROCESSES:
+                figures[family.name][name] += family.samples[0].value
+    for metric, kind in _OF_PROCESSES.items():
+        yield kind.of(([name], value) for name, value in figures[metric].items())
+
+
+DURATION = MetricKind(
+    "histogram",
+    "lipserve_request_duration_seconds",
+    "Time from a request's arrival until its answer began, s; of a stream, until it was accepted",
+    ("method", "route", "model"),
+)
+REQUESTS = MetricKind(
+    "counter",
+    "lipserve_requests_total",
+    "Requests that were answered; 101: a stream, 499: the client went away before",
+    ("method", "route", "status"),
+)
+ERRORS = MetricKind(
+    "counter", "lipserve_errors_total", "Requests that were answered with an error, by its code", ("route", "code")
+)
+IN_FLIGHT = MetricKind("gauge", "lipserve_requests_in_flight", "Requests that are being answered now")
+STREAMS = MetricKind("gauge", "lipserve_streams_open", "WebSocket connections that are open now")
+FRAMES = MetricKind(
+    "histogram",
+    "lipserve_stream_frame_duration_seconds",
+    "Time from the arrival of a stream's frame until its answer was ready, s; frames that were refused left out",
+    ("model",),
+)
+LATE = MetricKind(
+    "counter",
+    "lipserve_stream_late_total",
+    "Answers of streams after their deadline: the frame's budget, else LIPSERVE_STREAM_DEADLINE_S",
+    ("model",),
+)
+FRAME_ERRORS = MetricKind(
+    "counter", "lipserve_stream_errors_total", "Frames that were answered with an error, by its code", ("model", "code")
+)
+TRAFFIC_KINDS = (DURATION, REQUESTS, ERRORS, IN_FLIGHT, STREAMS, FRAMES, LATE, FRAME_ERRORS)
+
+
+class Traffic(Collector):
+    """What the meters have counted since the service started."""
+
+    def __init__(self, meters: Meters) -> None:
+        self._meters = meters
+
+    def describe(self) -> list[Metric]:
+        """Nothing: what there is depends on the requests."""
+        return []
+
+    def collect(self) -> Iterator[Metric]:
+        """Yield every metric."""
+        requests, streams = self._meters.requests, self._meters.streams()
+        seen = {Kind(*key): durations for key, durations in list(requests.known.items())}
+        yield DURATION.spread(_grouped(seen, lambda kind: (kind.method, kind.route, kind.model)))
+        answers = _grouped(seen, lambda kind: (kind.method, kind.route, str(kind.status)))
+        yield REQUESTS.of((labels, sum(each.counts)) for labels, each in answers)
+        refused = {kind: durations for kind, durations in seen.items() if kind.code}
+        errors = _grouped(refused, lambda kind: (kind.route, kind.code))
+        yield ERRORS.of((labels, sum(each.counts)) for labels, each in errors)
+        yield IN_FLIGHT.of([((), requests.in_flight)])
+        yield STREAMS.of([((), requests.streams)])
+        yield FRAMES.spread(([model], meter.durations) for model, meter in streams.items())
+        yield LATE.of(([model], meter.late) for model, meter in streams.items())
+        yield FRAME_ERRORS.of(
+            ([model, code], count) for model, meter in streams.items() for code, count in dict(meter.refused).items()
+        )
+
+
+def _grouped(
+    seen: dict[Kind, Durations], labels: Callable[[Kind], tuple[str, ...]]
+) -> list[tuple[tuple[str, ...], Durations]]:
+    groups: dict[tuple[str, ...], list[Durations]] = defaultdict(list)
+    for kind, durations in seen.items():
+        groups[labels(kind)].append(durations)
+    return [(group, merged(groups[group])) for group in sorted(groups)]
+
+
+EXAMPLE = """# HELP lipserve_requests_total Requests that were answered; 101: a stream, 499: the client went away before
+# TYPE lipserve_requests_total counter
+lipserve_requests_total{method="POST",route="/v1/models/{model}/predict",status="200"} 86400.0
+# HELP lipserve_quality_coverage Share of measurements inside the 95 % interval, noise included
+# TYPE lipserve_quality_coverage gauge
+lipserve_quality_coverage{joint="panda_joint1",model="panda-sim",window="60"} 0.953
+"""
+
+router = APIRouter(tags=["health"], route_class=Route)
+
+
+@router.get(
+    "/metrics",
+    summary="Metrics for Prometheus",
+    response_class=PlainTextResponse,
+    responses={
+        200: {
+            "description": "Text of Prometheus, or OpenMetrics where that is accepted",
+            "content": {"text/plain": {"example": EXAMPLE}},
+        }
+    },
+)
+def metrics(request: Request) -> Response:
+    """Latency and errors of requests and streams, training jobs, quality and lag of models that learn, disk, memory,
+    and which parts of the service are in order. docs/reference/metrics.md lists all.
+    """
+    registry = CollectorRegistry()
+    for collector in request.app.state.collectors:
+        registry.register(collector)
+    encode, media_type = choose_encoder(request.headers.get("accept", ""))
+    return Response(encode(registry), media_type=media_type)

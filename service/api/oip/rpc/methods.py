@@ -1,0 +1,122 @@
+"""Methods of the gRPC service. Each is a route of the application at the path that gRPC gives it, so that a call
+passes all that a request passes; no request over HTTP reaches it."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+from anyio import to_thread
+from starlette.datastructures import State
+from starlette.routing import BaseRoute, Match
+from starlette.types import Receive, Scope, Send
+
+from service import __version__
+from service.api.oip import dataplane, schema
+from service.api.oip.rpc.definition import SERVICE, message
+from service.api.oip.rpc.messages import InferRequest, Message, decode, encode
+from service.api.route import Reply
+from service.api.routes import health
+from service.foundation.errors import NotReadyError, invalid_request
+
+CALL = "lipserve.call"
+"""Key in the ASGI scope of a call, which the listener sets; no request has it."""
+
+Answerer = Callable[[State, Scope, bytes], Awaitable[Reply]]
+
+
+class Method(NamedTuple):
+    """path: as gRPC has it, and as metrics and logs name the route."""
+
+    path: str
+    answer: Answerer
+
+
+class Methods(BaseRoute):
+    """The route of all methods; path: none of its own."""
+
+    path = ""
+
+    def matches(self, scope: Scope) -> tuple[Match, Scope]:
+        """Whether a scope is that of a call of one of the methods."""
+        method = METHODS.get(scope["path"]) if CALL in scope else None
+        return (Match.NONE, {}) if method is None else (Match.FULL, {"route": method, "path_params": {}})
+
+    async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer a call; an error is raised."""
+        sent = await receive()
+        reply = await scope["route"].answer(scope["app"].state, scope, sent["body"])
+        await send({"type": "http.response.start", "status": 200, "headers": reply.headers()})
+        await send({"type": "http.response.body", "body": reply.body})
+
+
+async def _server_live(state: State, scope: Scope, body: bytes) -> Reply:
+    decode(message("ServerLiveRequest"), body)
+    return encode(message("ServerLiveResponse")(live=True))
+
+
+async def _server_ready(state: State, scope: Scope, body: bytes) -> Reply:
+    decode(message("ServerReadyRequest"), body)
+    try:
+        await to_thread.run_sync(health.ready, state.readiness)
+    except NotReadyError:
+        return encode(message("ServerReadyResponse")(ready=False))
+    return encode(message("ServerReadyResponse")(ready=True))
+
+
+async def _server_metadata(state: State, scope: Scope, body: bytes) -> Reply:
+    decode(message("ServerMetadataRequest"), body)
+    return encode(message("ServerMetadataResponse")(name="lipserve", version=__version__, extensions=[schema.BINARY]))
+
+
+async def _model_ready(state: State, scope: Scope, body: bytes) -> Reply:
+    name, version = _model(scope, decode(message("ModelReadyRequest"), body), "name", "version")
+    try:
+        await dataplane.ready(state.loaded, state.turns.predictions, name, version)
+    except NotReadyError:
+        return encode(message("ModelReadyResponse")(ready=False))
+    return encode(message("ModelReadyResponse")(ready=True))
+
+
+async def _model_metadata(state: State, scope: Scope, body: bytes) -> Reply:
+    name, version = _model(scope, decode(message("ModelMetadataRequest"), body), "name", "version")
+    served = await dataplane.find(state.loaded, state.turns.predictions, name, version)
+    description = await to_thread.run_sync(dataplane.metadata, state.loaded, served)
+    answer = message("ModelMetadataResponse")(
+        name=description.name, versions=description.versions, platform=description.platform
+    )
+    for tensors, described in ((answer.inputs, description.inputs), (answer.outputs, description.outputs)):
+        for each in described:
+            tensors.add(name=each.name, datatype=each.datatype, shape=each.shape)
+    return encode(answer)
+
+
+async def _model_infer(state: State, scope: Scope, body: bytes) -> Reply:
+    sent = decode(InferRequest, body)
+    name, version = _model(scope, sent, "model_name", "model_version")
+    return await dataplane.infer(
+        state.loaded, state.turns.predictions, name, version, len(body), partial(Message, sent)
+    )
+
+
+def _model(scope: Scope, sent: Any, name: str, version: str) -> tuple[str, str | None]:
+    """The model and version that a message names, which metrics tell calls apart by; raise InvalidRequestError."""
+    model: str = getattr(sent, name)
+    if not model:
+        raise invalid_request(name, "missing", "the name of a model")
+    scope["path_params"]["model"] = model
+    return model, getattr(sent, version) or None
+
+
+METHODS = {
+    path: Method(path, answer)
+    for path, answer in (
+        (f"/{SERVICE}/ServerLive", _server_live),
+        (f"/{SERVICE}/ServerReady", _server_ready),
+        (f"/{SERVICE}/ServerMetadata", _server_metadata),
+        (f"/{SERVICE}/ModelReady", _model_ready),
+        (f"/{SERVICE}/ModelMetadata", _model_metadata),
+        (f"/{SERVICE}/ModelInfer", _model_infer),
+    )
+}

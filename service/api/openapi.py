@@ -1,0 +1,178 @@
+"""What the OpenAPI document says of keys and scopes, and of errors that more than one route answers; the table of all
+error codes."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from base64 import b64encode
+from collections.abc import Iterator
+from typing import Any
+
+from fastapi import FastAPI
+from starlette.datastructures import MutableHeaders
+from starlette.routing import Mount
+from starlette.routing import Route as StarletteRoute
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.api.access.scopes import OPEN, SCOPES, TABLE
+from service.api.errors import OPEN_INFERENCE
+from service.foundation import errors
+from service.foundation.errors import ServiceError
+
+SCHEME = "key"
+DESCRIPTION = "An API key with scopes, `Authorization: Bearer lip_…`:\n\n" + "\n".join(
+    f"- `{scope}`: {allows}" for scope, allows in SCOPES.items()
+)
+
+
+PAGES = ("/docs", "/docs/oauth2-redirect", "/static-offline-docs")
+POLICY = (
+    "default-src 'self'; script-src 'self'{scripts}; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+"""Nothing comes from other hosts, no other site frames it, and only the scripts run that the page came with."""
+_SCRIPT = re.compile(rb"<script>(.*?)</script>", re.DOTALL)
+
+
+class Guarded:
+    """A page of the documentation, or a file of it, with a policy of what it may do."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer as the application does, which makes pages in one piece."""
+        started: Message | None = None
+
+        async def with_policy(message: Message) -> None:
+            nonlocal started
+            if message["type"] == "http.response.start":
+                started = message
+                return
+            if started is not None:
+                headers = MutableHeaders(scope=started)
+                html = headers.get("content-type", "").startswith("text/html")
+                headers["content-security-policy"] = policy(message.get("body", b"") if html else b"")
+                headers["x-content-type-options"] = "nosniff"
+                headers["referrer-policy"] = "no-referrer"
+                begun, started = started, None
+                await send(begun)
+            await send(message)
+
+        await self._app(scope, receive, with_policy)
+
+
+def policy(page: bytes) -> str:
+    """The policy of a page: of the scripts that stand in it each runs as it is, by its sha256."""
+    hashes = (b64encode(hashlib.sha256(each).digest()).decode() for each in _SCRIPT.findall(page))
+    return POLICY.format(scripts="".join(f" 'sha256-{each}'" for each in hashes))
+
+
+def install(app: FastAPI, keys_needed: bool) -> None:
+    """Complete the document that the application makes of its routes, once it is asked for; see `add_scopes`. Guard the
+    pages that show it."""
+    for route in app.router.routes:
+        if isinstance(route, Mount | StarletteRoute) and route.path in PAGES:
+            route.app = Guarded(route.app)
+    made = app.openapi
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            document = made()
+            _add_errors(document)
+            add_scopes(document, keys_needed)
+        return made()
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+
+def add_scopes(document: dict[str, Any], keys_needed: bool) -> None:
+    """Write the scheme of keys into the document, and into every operation the scope that it needs.
+
+    keys_needed: whether the service that is described asks for keys; one that does not takes requests without as well.
+    """
+    schemes = document.setdefault("components", {}).setdefault("securitySchemes", {})
+    schemes[SCHEME] = {"type": "http", "scheme": "bearer", "description": DESCRIPTION}
+    for path, methods in document["paths"].items():
+        for method, operation in methods.items():
+            scope = TABLE.get((method.upper(), path))
+            if scope is None:
+                operation["security"] = []
+                continue
+            operation["security"] = [{SCHEME: [scope]}] if keys_needed else [{}, {SCHEME: [scope]}]
+            operation["description"] = f"{operation.get('description', '')}\n\nScope: `{scope}`.".strip()
+
+
+METHODS = ("get", "put", "post", "delete")
+ANY = (errors.InvalidRequestError, errors.ForbiddenError, errors.RateLimitedError, ServiceError, errors.NotReadyError)
+"""What any route may answer, whatever it is asked for: the first to a query parameter that it does not know."""
+GUARDED = (errors.UnauthorizedError, errors.StorageUnavailableError)
+"""What every route may answer but those that need no key, which use no database either."""
+BODY = (errors.RequestTimeoutError, errors.TooLargeError, errors.UnsupportedMediaTypeError)
+"""What a route with a body may answer before it has read it."""
+WRITING = (errors.StorageFullError,)
+PURE = ("/predict", "/evaluate", "/trace", "/compare", "/echo", "/infer")
+"""Ends of the paths of POST routes that store nothing."""
+BEFORE_ROUTES = {
+    (405, "method_not_allowed"): "The path is there, the method is not: the header `Allow` lists those that are."
+}
+"""Errors that are no class, because no route raises them."""
+
+
+def error_table() -> str:
+    """All error codes with status and meaning, in Markdown."""
+    rows = {(kind.status, kind.code): _meaning(kind) for kind in _below(ServiceError)}
+    rows |= BEFORE_ROUTES | {(ServiceError.status, ServiceError.code): _meaning(ServiceError)}
+    lines = [f"| {status} | `{code}` | {meaning} |" for (status, code), meaning in sorted(rows.items())]
+    return "\n".join(["| status | code | meaning |", "|---|---|---|", *lines]) + "\n"
+
+
+def _add_errors(document: dict[str, Any]) -> None:
+    document["info"]["description"] += f"\n{error_table()}"
+    for path, operations in document["paths"].items():
+        for method in METHODS:
+            if method in operations:
+                _add(path, method, operations[method])
+
+
+def _add(path: str, method: str, operation: dict[str, Any]) -> None:
+    """Add to an operation's answers those that are not its own."""
+    kinds: list[type[ServiceError]] = [*ANY]
+    if (method.upper(), path) not in OPEN:
+        kinds += GUARDED
+    if "requestBody" in operation:
+        kinds += BODY
+    if method != "get" and not path.endswith(PURE):
+        kinds += WRITING
+    protocol = f"{path}/".startswith(f"{OPEN_INFERENCE}/")
+    answers = operation["responses"]
+    own = set(answers)
+    for kind in kinds:
+        status = str(400 if protocol and kind.status == 422 else kind.status)
+        meaning = _meaning(kind) if protocol else f"`{kind.code}`: {_meaning(kind)}"
+        answer = answers.setdefault(status, _answer("Failure" if protocol else "ErrorResponse"))
+        if status not in own or (not protocol and f"`{kind.code}`" not in answer["description"]):
+            answer["description"] = f"{answer['description']} {meaning}".strip()
+    for status, answer in answers.items():
+        if int(status) >= 400:  # FastAPI thinks of the media type of what is answered without an error
+            (schema,) = answer["content"].values()
+            answer["content"] = {"application/json": schema}
+    operation["responses"] = dict(sorted(answers.items()))
+
+
+def _answer(schema: str) -> dict[str, Any]:
+    content = {"application/json": {"schema": {"$ref": f"#/components/schemas/{schema}"}}}
+    return {"description": "", "content": content}
+
+
+def _meaning(kind: type[ServiceError]) -> str:
+    if kind is ServiceError:
+        return "An unexpected error: the service's log says more."
+    return " ".join((kind.__doc__ or "").split())
+
+
+def _below(kind: type[ServiceError]) -> Iterator[type[ServiceError]]:
+    for below in kind.__subclasses__():
+        yield below
+        yield from _below(below)

@@ -1,0 +1,39 @@
+"""`GET /v1/audit`: who changed what of which model."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query
+from pydantic import AwareDatetime
+
+from service.api.dependencies import PageQuery, StorageDep
+from service.api.errors import responses
+from service.api.route import Route
+from service.contract.audit import AuditEntry, AuditPage, Change
+from service.foundation.errors import InvalidRequestError
+from service.storage import audit
+from service.storage.database import AuditRow
+
+router = APIRouter(prefix="/v1", tags=["audit"], responses=responses(InvalidRequestError), route_class=Route)
+
+
+@router.get("/audit", summary="List what changed models, newest first")
+def list_audit(
+    storage: StorageDep,
+    page: PageQuery,
+    model: Annotated[str | None, Query(max_length=64, description="Only changes of this model")] = None,
+    key: Annotated[str | None, Query(max_length=40, description="Only by the API key of this id")] = None,
+    change: Annotated[Change | None, Query(description="Only changes of this kind")] = None,
+    since: Annotated[AwareDatetime | None, Query(description="Only from this moment on, ISO 8601 with a zone")] = None,
+    until: Annotated[AwareDatetime | None, Query(description="Only before this moment")] = None,
+) -> AuditPage:
+    """Who changed what of which model, when and by what. A line is written with the change and never altered; it is
+    kept for `LIPSERVE_AUDIT_RETENTION_S`. What is learnt from observations is in their own log."""
+    rows, following = audit.page(storage.database, page, model, key, change, since, until)
+    return AuditPage(items=[_show(row) for row in rows], next_cursor=following)
+
+
+def _show(row: AuditRow) -> AuditEntry:
+    names = [name for name in AuditEntry.model_fields if name != "id"]
+    return AuditEntry(id=row.seq, **{name: getattr(row, name) for name in names})

@@ -1,0 +1,127 @@
+"""Routes of data sets."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated
+
+from anyio import to_thread
+from fastapi import APIRouter, Query, Request, Response, status
+
+from lipserve.asking import MEDIA_TYPES, SUFFIXES
+from service.api.dependencies import KeyHeader, PageQuery, StorageDep, UploadsDep
+from service.api.errors import responses
+from service.api.limits.upload import Kinds, receive_to
+from service.api.route import Route
+from service.contract.datasets import Dataset, DatasetPage, Preview
+from service.contract.uploads import UPLOAD_BODY, UploadQuery
+from service.datasets import store
+from service.datasets.options import upload_options
+from service.datasets.staging import QUANTITIES
+from service.foundation.errors import (
+    ConflictError,
+    DamagedDataError,
+    InvalidDataError,
+    InvalidRequestError,
+    NotFoundError,
+    NotInstalledError,
+    TooLargeError,
+    UnsupportedMediaTypeError,
+    invalid_request,
+)
+from service.storage.rows import identity
+
+KINDS = Kinds(MEDIA_TYPES, SUFFIXES)
+
+router = APIRouter(
+    prefix="/v1/datasets", tags=["data sets"], responses=responses(InvalidRequestError), route_class=Route
+)
+
+
+@router.post(
+    "",
+    status_code=status.HTTP_201_CREATED,
+    summary="Upload a recording",
+    responses=responses(
+        InvalidDataError,
+        InvalidRequestError,
+        TooLargeError,
+        UnsupportedMediaTypeError,
+        ConflictError,
+        NotInstalledError,
+    ),
+    openapi_extra=UPLOAD_BODY,
+)
+async def upload(
+    request: Request,
+    response: Response,
+    storage: StorageDep,
+    turns: UploadsDep,
+    query: Annotated[UploadQuery, Query()],
+    idempotency_key: KeyHeader = None,
+) -> Dataset:
+    """Validate a recording, prepare it and store it as an immutable data set, or say what is wrong and where."""
+    options = upload_options(query)
+    path = storage.files.upload()
+    try:
+        kind, file_name = await receive_to(request, path, KINDS, storage.disk)
+        asked = (sorted(request.query_params.multi_items()), kind, file_name)
+        named = await to_thread.run_sync(partial(identity, idempotency_key, *asked, file=path))
+        called = query.name or file_name or "unnamed"
+        dataset = await to_thread.run_sync(store.add, storage, path, kind, called, options, named, limiter=turns)
+    finally:
+        path.unlink(missing_ok=True)
+    response.headers["Location"] = f"/v1/datasets/{dataset.id}"
+    return dataset
+
+
+@router.get("", summary="List data sets, newest first")
+def list_datasets(
+    storage: StorageDep,
+    page: PageQuery,
+    upload_sha256: Annotated[
+        str | None, Query(pattern="^[0-9a-f]{64}$", description="Only those of files with this sha256, however read")
+    ] = None,
+) -> DatasetPage:
+    """One page of data sets with their reports."""
+    return store.page(storage.database, page, upload_sha256)
+
+
+@router.get("/{dataset}", summary="One data set and its report", responses=responses(NotFoundError))
+def show(storage: StorageDep, dataset: str) -> Dataset:
+    """What was found in the recording and what was derived."""
+    return store.show(storage.database, dataset)
+
+
+@router.get(
+    "/{dataset}/preview",
+    summary="Points of a data set for a plot",
+    responses=responses(NotFoundError, DamagedDataError),
+)
+def preview(
+    storage: StorageDep,
+    dataset: str,
+    quantities: Annotated[
+        str, Query(max_length=100, description="Any of q, dq, ddq, tau, separated by commas")
+    ] = ",".join(QUANTITIES),
+    points: Annotated[
+        int, Query(ge=2, le=store.MOST_POINTS, description="Most points of one column")
+    ] = store.MOST_POINTS,
+) -> Preview:
+    """Columns thinned so that the largest and smallest values stay."""
+    names = [name.strip() for name in quantities.split(",")]
+    for name in names:
+        if name not in QUANTITIES or names.count(name) > 1:
+            raise invalid_request("quantities", name, f"each of {', '.join(QUANTITIES)} at most once")
+    return store.preview(storage, dataset, names, points)
+
+
+@router.delete(
+    "/{dataset}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    summary="Delete a data set",
+    responses=responses(NotFoundError, ConflictError),
+)
+def delete(storage: StorageDep, dataset: str) -> None:
+    """Delete the samples. Models trained on them stay."""
+    store.delete(storage, dataset)

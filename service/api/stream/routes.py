@@ -1,0 +1,138 @@
+"""WebSocket routes: streams of torque queries, and an echo as the floor of their latency."""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from typing import NamedTuple
+from urllib.parse import parse_qsl
+
+from fastapi import APIRouter
+from starlette.types import Receive, Scope, Send
+from uvicorn.protocols.utils import ClientDisconnected
+
+from service.api.server.connections import CONNECTION, StreamProtocol
+from service.api.stream.session import Conversation, Echo, Session
+from service.contract.models import ALIAS
+from service.contract.predictions import one_choice
+from service.foundation.errors import NotFoundError, NotReadyError, invalid_request
+from service.learning.learners import Learners
+from service.models.served import reached
+from service.runtime.counted import Counted
+
+STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
+NUMBER = "[0-9]{1,10}"
+PARAMETERS = {
+    "version": (NUMBER, "the number of a version"),
+    "alias": (ALIAS, f"a name that matches {ALIAS}"),
+    "std": ("[01]", "0 or 1"),
+    "scale": ("[01]", "0 or 1"),
+    "payload": ("[01]", "0 or 1"),
+    "stream_id": (STREAM_ID, f"a name that matches {STREAM_ID}"),
+    "min_revision": (NUMBER, "a revision of the version"),
+}
+"""What the address of a stream may say: how each is written, and that in words."""
+LEAST = {"version": 1, "min_revision": 0}
+PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"
+
+
+def router() -> APIRouter:
+    """Return the routes, which count their connections together."""
+    streams = Streams()
+    router = APIRouter()
+    # objects, not functions: those Starlette would wrap in its own WebSocket
+    router.add_websocket_route(PATH, StreamRoute(streams), name="stream")  # type: ignore[arg-type]
+    router.add_websocket_route(ECHO_PATH, EchoRoute(streams), name="echo")  # type: ignore[arg-type]
+    router.add_websocket_route("/{path:path}", NoRoute(), name="no stream")  # type: ignore[arg-type]
+    return router
+
+
+class Streams(Counted):
+    """How many connections are open."""
+
+    too_many = "{} streams are open, the most there may be: close one, or try again later"
+
+
+class EchoRoute:
+    """ASGI application of the echo. path: its address, by which metrics and logs name it."""
+
+    path = ECHO_PATH
+
+    def __init__(self, streams: Streams) -> None:
+        self.streams = streams
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Talk with one client. What is raised before it is accepted is answered in HTTP."""
+        learners: Learners = scope["app"].state.learners
+        with self.streams.one_more(learners.settings.max_streams):
+            conversation = await self.conversation(learners, scope, receive, send)
+            with suppress(ClientDisconnected):  # no error: it went away while it was answered, or its key ended
+                await conversation.run()
+
+    async def conversation(self, learners: Learners, scope: Scope, receive: Receive, send: Send) -> Conversation:
+        """Return what talks with the client; raise ServiceError where the address is wrong."""
+        return Echo(_connection(scope), receive, send, learners.settings)
+
+
+class StreamRoute(EchoRoute):
+    """ASGI application of torque streams."""
+
+    path = PATH
+
+    async def conversation(self, learners: Learners, scope: Scope, receive: Receive, send: Send) -> Conversation:
+        """Return what talks with the client; raise InvalidRequestError, NotFoundError, UnreadableVersionError or
+        RevisionNotReachedError."""
+        asked = _parameters(scope["query_string"])
+        model, version, alias = scope["path_params"]["model"], asked.version, asked.alias
+        # with 0 it waits for nothing but the model to be in memory
+        served = await reached(learners.loaded, model, version, alias, asked.min_revision)
+        pinned = version is not None
+        meter = scope["app"].state.meters.stream(served.name)
+        given = (served, meter, pinned, asked.std, asked.stream_id, alias, asked.scale, asked.payload)
+        return Session(_connection(scope), receive, send, learners, *given)
+
+
+class NoRoute:
+    """ASGI application of all other addresses, which Starlette would refuse without a word. To be the last."""
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Refuse to talk: raise NotFoundError."""
+        raise NotFoundError(f"no stream at {scope['path'][:200]}: streams are at {PATH}")
+
+
+class Asked(NamedTuple):
+    """What the address of a stream says. min_revision: that its first answer has at least."""
+
+    version: int | None
+    alias: str | None
+    std: bool
+    stream_id: str | None
+    min_revision: int
+    scale: bool
+    payload: bool
+
+
+def _parameters(query: bytes) -> Asked:
+    """Read the query of an address; raise InvalidRequestError."""
+    given: dict[str, str] = {}
+    for name, value in parse_qsl(query.decode("ascii", "backslashreplace"), keep_blank_values=True):
+        if name not in PARAMETERS:
+            raise invalid_request(
+                name, value, "no parameter but version, alias, std, scale, payload, stream_id and min_revision"
+            )
+        pattern, expected = PARAMETERS[name]
+        if not re.fullmatch(pattern, value) or (name in LEAST and not LEAST[name] <= int(value) < 2**31):
+            raise invalid_request(name, value, expected)
+        given[name] = value
+    version = int(given["version"]) if "version" in given else None
+    one_choice(version, given.get("alias"))
+    std, revision = given.get("std") == "1", int(given.get("min_revision", 0))
+    scale, payload = given.get("scale") == "1", given.get("payload") == "1"
+    return Asked(version, given.get("alias"), std, given.get("stream_id"), revision, scale, payload)
+
+
+def _connection(scope: Scope) -> StreamProtocol:
+    connection = scope.get("state", {}).get(CONNECTION)
+    if not isinstance(connection, StreamProtocol):
+        raise NotReadyError("streams need the server that `lipserve serve` starts")
+    return connection

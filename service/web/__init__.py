@@ -1,1 +1,0 @@
-"""What every request passes: routes, access, limits, metrics, health."""
