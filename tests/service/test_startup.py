@@ -61,6 +61,22 @@ def test_a_training_process_takes_its_place_before_numerics_start_their_threads(
     assert result.isdisjoint((*NUMERICS, "lipcore", "fastapi"))
 
 
+@pytest.mark.parametrize(
+    "module",
+    [
+        "service.training.worker",
+        "service.learning.learner.worker",
+        "service.learning.weigher.worker",
+        "service.datasets.caged",
+        "service.cli.verify",
+    ],
+)
+def test_what_speaks_no_http_imports_no_web_framework(module):
+    result = imported(f"import {module}")
+    assert module in result
+    assert result.isdisjoint(("fastapi", "starlette", "uvicorn", "service.api"))
+
+
 def test_the_command_starts_in_the_light_main_module():
     """Any other entry point would be imported again by every training process, with all that it imports."""
     (result,) = entry_points(group="console_scripts", name="lipserve")
