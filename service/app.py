@@ -13,7 +13,6 @@ from fastapi_offline import FastAPIOffline
 from starlette.routing import BaseRoute
 from threadpoolctl import threadpool_limits
 
-from lipserve.wording import counted
 from service import __version__
 from service.api import errors, metrics, openapi, requests
 from service.api.access.keys import Keyring
@@ -39,6 +38,7 @@ from service.api.routes import (
 )
 from service.api.stream import routes as stream
 from service.foundation.settings import Settings
+from service.foundation.text import counted
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
 from service.learning.metrics import Learning

@@ -1,7 +1,7 @@
-"""Writes lipserve/records/ from the schemas of the service: `python clients/python/records.py`.
+"""Writes what the client shares with the service: `python clients/python/records.py`.
 
-The client has no Pydantic and no server, but its records have the fields and descriptions of the server's. A test fails
-while the files are not what this writes.
+The client has no Pydantic and no server, but its records have the fields and descriptions of the server's schemas, and
+some modules are copies of the server's. A test fails while the files are not what this writes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,15 @@ from service.contract import jobs as training
 from service.contract import observations as observing
 from service.contract import payload as payloads
 
-TARGET = Path(__file__).parent / "lipserve/records"
+TARGET = Path(__file__).parent / "lipserve"
+SERVICE = Path(__file__).parents[2] / "service"
+COPIES = {
+    "states.py": "contract/states.py",
+    "frames.py": "contract/frames.py",
+    "media_types.py": "contract/media_types.py",
+    "wording.py": "foundation/text.py",
+}
+"""Modules of the client, and those of the service that they are copies of."""
 WIDTH = 120
 ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
     "datasets": ("Data sets and their reports.", (datasets.Dataset,)),
@@ -69,19 +77,19 @@ Schema = Mapping[str, Any]
 
 
 def documents() -> dict[str, str]:
-    """Every module by the name of its file."""
+    """The text of every module by its path in the client."""
     roots = [(kind, "serialization") for _, kinds in ROOMS.values() for kind in kinds]
     _, document = models_json_schema(roots)  # type: ignore[arg-type]
     known: dict[str, Schema] = document["$defs"]
     home: dict[str, str] = {}
-    made = {}
+    made = {name: (SERVICE / path).read_text("utf-8") for name, path in COPIES.items()}
     for room, (text, kinds) in ROOMS.items():
         reached = list(dict.fromkeys(name for kind in kinds for name in _reached(kind.__name__, known)))
         own = [name for name in reached if name not in home]
         home |= dict.fromkeys(own, room)
         classes = "\n\n".join(_record(name, known[name]) for name in own)
         others = {n: home[n] for n in reached if n not in own and re.search(rf"\b{n}\b", classes)}
-        made[f"{room}.py"] = _formatted(_head(text, classes, others) + classes)
+        made[f"records/{room}.py"] = _formatted(_head(text, classes, others) + classes)
     return made
 
 
@@ -162,7 +170,7 @@ def _type(schema: Schema) -> str:
 
 
 def _formatted(text: str) -> str:
-    command = [sys.executable, "-m", "ruff", "format", "-", "--stdin-filename", str(TARGET / "written.py")]
+    command = [sys.executable, "-m", "ruff", "format", "-", "--stdin-filename", str(TARGET / "records/written.py")]
     done = subprocess.run(command, input=text, capture_output=True, text=True, check=True)  # noqa: S603 - fixed
     return done.stdout
 

@@ -12,10 +12,10 @@ from rich.table import Table
 from lipcore.vocabulary import COMPONENTS
 from lipserve.address import DEFAULT_URL
 from lipserve.call import given
-from lipserve.wording import counted
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, out, print_json, print_warnings
 from service.cli.options import Alias, Data, Json, Model, Url, Version, alone, group, names, numbers
+from service.foundation.text import counted
 
 predict_app = alone()
 

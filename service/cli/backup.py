@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
-from lipserve.wording import counted
 from service.cli.consoles import CommandError, print_result
 from service.cli.options import Json, alone, settings_of
 from service.foundation.settings import Settings
+from service.foundation.text import counted
 from service.storage.backup import Backup, backup, restore
 from service.storage.storage import HomeError
 

@@ -24,9 +24,9 @@ from urllib.parse import quote, urlsplit
 import typer
 
 from lipserve.address import UNIX, headers_of, url_of
-from lipserve.asking import SUFFIXES
 from service.cli.consoles import START, CommandError, Explained, err, explain, note
 from service.cli.wording import FLAGS, in_shell
+from service.contract.media_types import SUFFIXES
 
 if TYPE_CHECKING:
     from lipserve import Client

@@ -10,13 +10,14 @@ import typer
 from rich.markup import escape
 
 from lipserve.address import DEFAULT_URL
-from lipserve.asking import SUFFIXES, Reading
-from lipserve.wording import counted
+from lipserve.asking import Reading
 from service.cli import connecting
 from service.cli.connecting import advised, connected, upload
 from service.cli.consoles import echo, out, print_json, print_result
 from service.cli.options import DatasetId, Json, Limit, Url, Yes, confirm, group, names, pairs
 from service.cli.wording import in_shell
+from service.contract.media_types import SUFFIXES
+from service.foundation.text import counted
 
 if TYPE_CHECKING:
     from lipserve.records.datasets import Dataset

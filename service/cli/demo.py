@@ -22,12 +22,12 @@ from lipcore.robots.simulation import FAST, Stream, simulate
 from lipserve import ApiError, Client, Evaluation, Prediction
 from lipserve.asking import Reading
 from lipserve.progress import follow
-from lipserve.states import SUCCEEDED
-from lipserve.wording import counted, percent
 from service.cli.consoles import out
 from service.cli.options import alone
 from service.cli.plotting import draw_torque
 from service.cli.simulate import write_recording
+from service.contract.states import SUCCEEDED
+from service.foundation.text import counted, percent
 
 MODEL = "panda-demo"
 START_SECONDS = 180.0

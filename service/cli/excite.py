@@ -31,10 +31,10 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 from lipserve import ApiError, Client
 from lipserve.address import DEFAULT_URL, URL_VARIABLE
-from lipserve.wording import counted, percent
 from service.cli import plotting
 from service.cli.consoles import err, print_json
 from service.cli.options import Json, alone
+from service.foundation.text import counted, percent
 from service.models import archive_reading as archive
 
 MAX_URDF_BYTES = 16 * 1024 * 1024

@@ -13,12 +13,12 @@ from rich.table import Column, Table
 
 from lipcore.vocabulary import CHOICES, DEFAULT_ESTIMATOR
 from lipserve.address import DEFAULT_URL
-from lipserve.wording import percent
 from service.cli import connecting
 from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, watch
 from service.cli.consoles import INTERRUPTED, CommandError, echo, note, out, print_json
 from service.cli.models import print_held_out, print_promotion, print_selection
 from service.cli.options import HELD_OUT_BY, JobId, Json, Limit, Promotion, Url, alone, group, names, pairs, value
+from service.foundation.text import percent
 
 if TYPE_CHECKING:
     from lipserve.records.jobs import Job

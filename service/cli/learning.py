@@ -10,10 +10,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
-from lipserve.wording import counted
 from service.cli.connecting import connected
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result
 from service.cli.options import Json, Limit, Model, Url, Yes, alone, confirm, group, pairs, value
+from service.foundation.text import counted
 
 if TYPE_CHECKING:
     from lipserve.records.learning import Quality

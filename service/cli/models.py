@@ -12,17 +12,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
-from lipserve.wording import counted
 from service.cli import connecting
 from service.cli.connecting import connected, dataset_of
 from service.cli.consoles import CommandError, echo, note, out, print_json, print_result, print_warnings
 from service.cli.options import Alias, Data, Json, Limit, Model, Promotion, Url, Version, Yes, confirm, group
+from service.foundation.text import counted
 
 if TYPE_CHECKING:
     from lipserve.records.models import Alias as AliasRecord
     from lipserve.records.models import Selection
     from lipserve.results.arm import Version as VersionRecord
-    from lipserve.states import PromotionOption
+    from service.contract.states import PromotionOption
 
 app = group("Models: list, show, promote, roll back, compare, export, import and delete them.")
 SERVING = "serving"

@@ -11,10 +11,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
-from lipserve.wording import counted
 from service.cli.connecting import connected
 from service.cli.consoles import CommandError, echo, out, print_json
 from service.cli.options import Json, Model, Url, alone, numbers
+from service.foundation.text import counted
 
 if TYPE_CHECKING:
     from lipserve.records.payloads import PayloadBody, Payloads, StreamPayload, Vector

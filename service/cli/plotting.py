@@ -11,7 +11,7 @@ from lipcore.data.samples import Samples
 from lipcore.excitation import Plan
 from lipcore.extras import need
 from lipserve import Prediction
-from lipserve.wording import percent
+from service.foundation.text import percent
 
 HEADINGS = ("position, rad (m)", "speed, per s", "acceleration, per s²")
 

@@ -11,10 +11,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
-from lipserve.wording import counted
 from service.cli.connecting import connected
 from service.cli.consoles import CommandError, echo, out, print_json, print_result
 from service.cli.options import Json, Limit, Url, Yes, confirm, group
+from service.foundation.text import counted
 
 app = group("Robots: list those that are known, show one, add and delete URDFs.")
 Robot = Annotated[str, typer.Argument(help="A profile such as panda, or the id of an uploaded URDF.")]

@@ -12,7 +12,6 @@ from lipcore.data.samples import Samples
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import ROBOTS, load_robot
 from lipcore.robots.simulation import FAST, Payload, Stream, simulate
-from lipserve.wording import counted
 from service.cli.consoles import print_result
 from service.cli.options import (
     Along,
@@ -30,6 +29,7 @@ from service.cli.options import (
     alone,
     simulation,
 )
+from service.foundation.text import counted
 
 COLUMNS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque"}
 """What stands behind a joint's name in the columns of a CSV."""

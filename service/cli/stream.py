@@ -11,7 +11,6 @@ import typer
 from rich.table import Table
 
 from lipserve.address import DEFAULT_URL
-from lipserve.wording import counted, percent
 from service.cli.connecting import connected
 from service.cli.consoles import INTERRUPTED, CommandError, Explained, echo, note, out, print_error, print_json
 from service.cli.options import (
@@ -35,6 +34,7 @@ from service.cli.options import (
     alone,
     simulation,
 )
+from service.foundation.text import counted, percent
 
 if TYPE_CHECKING:
     from lipserve import Client, StreamClient

@@ -14,7 +14,7 @@ from lipserve.records.models import HeldOutQuality, Selection
 from lipserve.results.arm import Arm
 from lipserve.results.evaluation import Comparison, Evaluation
 from lipserve.results.series import Prediction
-from lipserve.wording import counted, percent
+from service.foundation.text import counted, percent
 
 
 def prediction_tables(answer: Prediction) -> list[Table]:

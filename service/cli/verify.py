@@ -17,11 +17,11 @@ import lipcore
 from lipcore.files import persistence
 from lipcore.files.probing import probe
 from lipcore.online import transfer as state
-from lipserve.wording import counted
 from service.cli.consoles import echo, err, print_json
 from service.cli.options import Json, alone
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
+from service.foundation.text import counted
 from service.journal.log import decode
 from service.models import registry
 from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow

@@ -8,8 +8,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
-from lipserve.states import JobState, PromotionOption
 from service.contract.models import VERSION, HeldOutQuality, Holdout, ModelName
+from service.contract.states import JobState, PromotionOption
 from service.foundation.fields import LONGEST, MOST_NAMED
 
 _DEFAULTS, _HOLDOUT = FitOptions(), Holdout()

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, StringConstraint
 from lipcore.data.splits import Kind, Split
 from lipcore.model.acceptance import Acceptance
 from lipcore.vocabulary import JointType, TorqueConvention
-from lipserve.states import PromotionOption
+from service.contract.states import PromotionOption
 
 ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63}$")]
 """Lower-case letters, digits, dots, underscores and hyphens: safe in URLs and never a path."""

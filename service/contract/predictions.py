@@ -17,9 +17,9 @@ from pydantic import (
 )
 
 from lipcore.vocabulary import COMPONENTS, ComponentName, TorqueConvention
-from lipserve.states import Outcome
 from service.contract.models import AliasName, Evaluation, VersionNumber
 from service.contract.payload import Payload
+from service.contract.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import LONGEST, each_once, rows_of_numbers
 

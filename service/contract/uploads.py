@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 from lipcore.data.signals import CUTOFF
 from lipcore.preparation.recipe import Filtering, Form
 from lipcore.vocabulary import TorqueConvention
-from lipserve.asking import MEDIA_TYPES, SUFFIXES
+from service.contract.media_types import MEDIA_TYPES, SUFFIXES
 from service.foundation.fields import BINARY, NameForPeople, upload_body
 
 Effort = Literal["measured", "commanded", "current"]

@@ -18,8 +18,8 @@ from sqlalchemy.orm import Session
 from lipcore.data.samples import Array, Samples
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
-from lipserve.states import ACTIVE
 from service.contract.datasets import MOST_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
+from service.contract.states import ACTIVE
 from service.datasets.mapping.reading import Recording
 from service.datasets.options import UploadOptions
 from service.datasets.report.making import make_report

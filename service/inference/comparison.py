@@ -8,8 +8,8 @@ from math import isfinite
 from lipcore.data import metrics
 from lipcore.data.metrics import Answer, Comparison, Difference, evaluate
 from lipcore.data.samples import Samples
-from lipserve.states import Outcome
 from service.contract import predictions as schema
+from service.contract.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
 from service.inference.evaluating import measured

@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 
 from sqlalchemy import select
 
-from lipserve.states import PartState
 from service.contract.observations import ObservationRequest, ObservationResponse
+from service.contract.states import PartState
 from service.foundation.errors import BusyError
 from service.journal import log
 from service.learning.ingest.batches import Frames, FramesResult, observe_batch, observe_frames

@@ -16,12 +16,12 @@ from typing import Any, Literal
 from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
-from lipserve.states import ACTIVE
-from lipserve.wording import percent
 from service.contract.jobs import Job
 from service.contract.learning import AlarmKind
+from service.contract.states import ACTIVE
 from service.foundation.errors import BusyError, ConflictError
 from service.foundation.settings import Settings
+from service.foundation.text import percent
 from service.learning import owner
 from service.learning.learner.publication import Contested, Published
 from service.learning.learners import Learners

@@ -17,8 +17,8 @@ from lipcore.fitting.base import RobotKind
 from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings
-from lipserve.states import PromotionOption
 from service.contract.models import Promotion, Version
+from service.contract.states import PromotionOption
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
 from service.models import archive_reading, registry

@@ -9,7 +9,7 @@ from contextlib import suppress
 from sqlalchemy import delete, func, select
 from sqlalchemy.orm import Session
 
-from lipserve.states import ACTIVE
+from service.contract.states import ACTIVE
 from service.foundation.errors import ConflictError, NotFoundError, not_found
 from service.models import aliases, registry
 from service.models.loaded import LoadedModels

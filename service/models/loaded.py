@@ -16,7 +16,7 @@ import lipcore
 from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.transfer import Revision
-from lipserve.states import PartState
+from service.contract.states import PartState
 from service.foundation.errors import NotFoundError, UnreadableVersionError, not_found
 from service.models import registry
 from service.models.lineage import learnt_from

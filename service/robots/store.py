@@ -17,8 +17,8 @@ from lipcore.profiles.names import is_number
 from lipcore.robots.library import ROBOTS, UnknownRobotError, profile_urdf
 from lipcore.robots.urdf import Description, RigidBody
 from lipcore.robots.urdf_text import MOVABLE, UrdfError
-from lipserve.states import ACTIVE
 from service.contract.robots import ProfileJoint, Robot, RobotPage, RobotProfile
+from service.contract.states import ACTIVE
 from service.foundation.errors import (
     ConflictError,
     InvalidRequestError,

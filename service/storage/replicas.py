@@ -17,7 +17,7 @@ from sqlalchemy import Float, cast, delete, func, or_, select, update
 from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.orm import Session
 
-from lipserve.states import ACTIVE
+from service.contract.states import ACTIVE
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow, ReplicaRow, now
 from service.storage.files import new_id

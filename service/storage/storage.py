@@ -15,7 +15,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from lipcore.extras import MissingExtraError
 from lipcore.files.durable import make_folder
-from lipserve.states import PartState
+from service.contract.states import PartState
 from service.foundation.settings import Settings
 from service.storage.database.engine import FILE, Database
 from service.storage.database.migrations import DatabaseVersionError

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
-from lipserve.states import PartState
+from service.contract.states import PartState
 
 
 class Stopping:

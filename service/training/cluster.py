@@ -11,8 +11,8 @@ import logging
 import time
 from secrets import token_hex
 
-from lipserve.states import QUEUED
 from service import __version__
+from service.contract.states import QUEUED
 from service.runtime import remote
 from service.runtime.cluster import Cluster, needs_gpu
 from service.runtime.executors import ClusterUnavailableError, lost

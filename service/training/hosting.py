@@ -25,8 +25,8 @@ import distributed
 from sqlalchemy import select
 from sqlalchemy.exc import SQLAlchemyError
 
-from lipserve.states import ACTIVE, QUEUED, RUNNING
 from service import __version__
+from service.contract.states import ACTIVE, QUEUED, RUNNING
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
 from service.runtime import executors

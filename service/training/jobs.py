@@ -16,8 +16,8 @@ from lipcore.fitting.estimators import UnknownEstimatorError, check_estimator
 from lipcore.fitting.options import FitOptions
 from lipcore.robots.library import ROBOTS
 from lipcore.vocabulary import AUTO, CHOICES, DIFFERENTIATED, ROBOT_ESTIMATORS
-from lipserve.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
 from service.contract.jobs import Job, JobDraft, JobPage, JobRequest, Options
+from service.contract.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
 from service.datasets import store
 from service.foundation.errors import (
     BusyError,

@@ -14,7 +14,7 @@ from typing import Any, Literal
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipserve.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
+from service.contract.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files, new_id

@@ -10,8 +10,8 @@ from prometheus_client.registry import Collector
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from lipserve.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, PartState
-from lipserve.wording import counted
+from service.contract.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, PartState
+from service.foundation.text import counted
 from service.storage.database import Database, JobRow
 from service.telemetry.meters import Durations, MetricKind
 from service.telemetry.readiness import Lasting

@@ -19,8 +19,8 @@ from lipcore.files.manifest import ModelFormatError
 from lipcore.fitting.base import RobotKind
 from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.torque_model import TorqueModel
-from lipserve.states import PromotionOption
 from service.contract.models import HoldoutLineage, Promotion
+from service.contract.states import PromotionOption
 from service.models import aliases, registry
 from service.models.lineage import answer_of, held_out_figures, learnt_from
 from service.storage.database import Database, LearnerRow, VersionRow

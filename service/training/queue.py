@@ -18,7 +18,7 @@ from functools import partial
 
 from sqlalchemy import select
 
-from lipserve.states import ACTIVE, QUEUED, RUNNING
+from service.contract.states import ACTIVE, QUEUED, RUNNING
 from service.foundation.settings import Settings
 from service.runtime.cluster import Cluster
 from service.runtime.process import Slot, training_place

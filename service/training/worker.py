@@ -16,8 +16,8 @@ import lipcore
 from lipcore.extras import MissingExtraError
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import REFIT_ERROR
-from lipserve.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState, PromotionOption
 from service.contract.models import Promotion
+from service.contract.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState, PromotionOption
 from service.foundation.errors import NotInstalledError, ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.models import registry

@@ -52,8 +52,11 @@ def test_its_names_are_those_that_it_offers():
 
 def test_records_are_those_of_the_services_schemas():
     made = runpy.run_path(str(SOURCE / "records.py"))
-    written = {each.name: each.read_text("utf-8") for each in made["TARGET"].glob("*.py") if each.stem != "__init__"}
-    assert written == made["documents"](), "run: python clients/python/records.py"
+    target, documents = made["TARGET"], made["documents"]()
+    records = {f"records/{each.name}" for each in (target / "records").glob("*.py") if each.stem != "__init__"}
+    assert records == {name for name in documents if name.startswith("records/")}
+    written = {name: (target / name).read_text("utf-8") for name in documents}
+    assert written == documents, "run: python clients/python/records.py"
 
 
 def test_without_arguments_clients_ask_the_service_of_the_environment_with_its_key(monkeypatch):

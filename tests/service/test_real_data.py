@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lipserve.asking import MEDIA_TYPE_OF
+from lipserve.media_types import MEDIA_TYPE_OF
 from tests.service.data import post, train
 
 DATA = Path(__file__).parents[3] / "shared/data"

@@ -5,7 +5,7 @@ import io
 import numpy as np
 import pytest
 
-from lipserve.asking import MEDIA_TYPES, SUFFIXES
+from lipserve.media_types import MEDIA_TYPES, SUFFIXES
 from service.datasets import store
 from tests.service.data import QUICK, arrays, columns, csv, error, job, npz, post, queue, service_of, stream, upload
 

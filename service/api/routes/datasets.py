@@ -8,12 +8,12 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response, status
 
-from lipserve.asking import MEDIA_TYPES, SUFFIXES
 from service.api.dependencies import KeyHeader, PageQuery, StorageDep, UploadsDep
 from service.api.errors import responses
 from service.api.limits.upload import Kinds, receive_to
 from service.api.route import Route
 from service.contract.datasets import Dataset, DatasetPage, Preview
+from service.contract.media_types import MEDIA_TYPES, SUFFIXES
 from service.contract.uploads import UPLOAD_BODY, UploadQuery
 from service.datasets import store
 from service.datasets.options import upload_options

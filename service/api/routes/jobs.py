@@ -10,11 +10,11 @@ from anyio import to_thread
 from fastapi import APIRouter, Depends, Response, status
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
-from lipserve.states import ACTIVE
 from service.api.dependencies import JobQueueDep, KeyHeader, LoadedModelsDep, PageQuery, StoppingDep
 from service.api.errors import responses
 from service.api.route import Route
 from service.contract.jobs import Job, JobDraft, JobPage, JobRequest
+from service.contract.states import ACTIVE
 from service.foundation.errors import (
     BusyError,
     ConflictError,

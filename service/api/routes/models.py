@@ -8,12 +8,12 @@ from anyio import to_thread
 from fastapi import APIRouter, Path, Query, Request, Response, status
 from fastapi.responses import StreamingResponse
 
-from lipserve.states import PromotionOption
 from service.api.dependencies import ArchivesDep, LoadedModelsDep, PageQuery
 from service.api.errors import responses
 from service.api.limits.upload import Kinds, receive_to
 from service.api.route import Route
 from service.contract import models as schema
+from service.contract.states import PromotionOption
 from service.foundation.errors import (
     ConflictError,
     InvalidDataError,

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipserve.frames import NUMBER, REQUEST
+from service.contract.frames import NUMBER, REQUEST
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
 from service.learning.ingest.batches import Frames
 from service.learning.ingest.host_clock import SET_S

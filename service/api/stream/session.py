@@ -18,10 +18,10 @@ from anyio import to_thread
 from starlette.types import Message, Receive, Send
 
 from lipcore.model.external import external
-from lipserve import frames
 from service.api.access.middleware import subprotocol_of
 from service.api.server.connections import StreamProtocol
 from service.api.stream.learning import Learning, Taught
+from service.contract import frames
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import Query, check_answer

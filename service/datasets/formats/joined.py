@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipserve.asking import SUFFIXES
+from service.contract.media_types import SUFFIXES
 from service.datasets.formats.table import Table, block_rows, checked_names, first_line
 from service.datasets.formats.zips import ERRORS, PIECE, measure, open_zip, within
 from service.datasets.mapping.recognition import clocks

@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from lipcore.profiles import Profile
-from lipserve.wording import counted
 from service.datasets.mapping.choice import Torque, choose, source, source_or_none, torque
 from service.datasets.mapping.joints import Joint, arrange
 from service.datasets.mapping.recognition import CANONICAL, Family, clocks, is_episode
 from service.datasets.mapping.vocabulary import KNOWN, factor
 from service.datasets.options import UploadOptions
 from service.foundation.errors import invalid_data, invalid_request
+from service.foundation.text import counted
 
 LISTED = 8
 """Most columns that a sentence names."""

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.profiles import Profile
 from lipcore.vocabulary import TorqueConvention
-from lipserve.wording import counted
 from service.datasets.formats.table import Table
 from service.datasets.mapping import checks
 from service.datasets.mapping.checks import Clockwork, Rows, Seen, Turns
@@ -23,6 +22,7 @@ from service.datasets.options import UploadOptions
 from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
+from service.foundation.text import counted
 from service.storage.disk import Disk, Room
 
 

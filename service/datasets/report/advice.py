@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from lipserve.wording import percent
 from service.contract.datasets import Excitation, JointExcitation, JointLimits, JointNoise, JointSaturation, Lag, Timing
 from service.datasets.report.excitation import SELDOM, SLOW
 from service.datasets.report.lag import SURE, clear
+from service.foundation.text import percent
 
 TERMS = (("viscous friction", "viscous"), ("Coulomb friction", "coulomb"), ("constant torque", "offset"))
 STILL = 0.02

@@ -13,10 +13,10 @@ from __future__ import annotations
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipserve.wording import percent
 from service.contract.datasets import Lag
 from service.datasets.report.fit import EIGHTHS, Fit
 from service.datasets.report.signals import Rows
+from service.foundation.text import percent
 
 LARGEST_S = 0.25
 """Largest lag looked for, s."""

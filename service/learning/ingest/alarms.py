@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipserve.wording import percent
+from service.foundation.text import percent
 from service.journal import log
 from service.learning import owner
 from service.learning.ingest.judging import Verdict

@@ -14,9 +14,9 @@ from lipcore.online.acceleration import JITTER, RateError
 from lipcore.online.batch import Rows
 from lipcore.online.gates import RowLimits, check_rows
 from lipcore.vocabulary import CODES, LEARNT
-from lipserve.wording import percent
 from service.contract.observations import DerivedAcceleration
 from service.foundation.errors import invalid_request
+from service.foundation.text import percent
 from service.journal import log
 from service.storage.database import EventRow
 

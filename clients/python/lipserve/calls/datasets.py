@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Unpack
 
-from lipserve.asking import MEDIA_TYPE_OF, SUFFIXES, Reading, query_of
+from lipserve.asking import Reading, query_of
 from lipserve.call import KEY_HEADER, Call, Page, Route, given, new_key, nothing, page, record, route
+from lipserve.media_types import MEDIA_TYPE_OF, SUFFIXES
 from lipserve.records.datasets import Dataset
 from lipserve.records.robots import Robot, RobotProfile
 from lipserve.results.series import Preview, read_preview

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
-from lipserve.wording import counted
 from service.datasets.formats.bags import files
 from service.datasets.formats.bags.container import Bag, Channel, JoinedBags
 from service.datasets.formats.bags.states import (
@@ -32,6 +31,7 @@ from service.datasets.formats.zips import unpacked_bag
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, invalid_data, invalid_request, readable
 from service.foundation.settings import Settings
+from service.foundation.text import counted
 
 BagKind = Literal["rosbag1", "rosbag2", "mcap"]
 KINDS = {"rosbag1": "a rosbag of ROS 1", "rosbag2": "a rosbag2: a .db3 file, or a zip of its folder", "mcap": "an MCAP"}
