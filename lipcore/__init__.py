@@ -4,16 +4,17 @@ The floors, from the top; what stands higher imports what stands lower, never th
 pyproject.toml, checks it):
 
     warm_up                                 above all: trains one of each, so that all is compiled
-    training, files, online, excitation     on one floor; none of them knows another:
+    training, export, online, excitation    on one floor; none of them knows another:
         training     samples in, a model out; `auto` chooses the estimator
-        files        a model as files: manifest, tensors, checked when read; as URDF and as C
-        online       learning from a live stream: gates, records, changes, what is learnt and taken back
+        export       a model that leaves: URDF, C
+        online       learning from a live stream: gates, records, changes, payloads, what is learnt and taken back
         excitation   the motion that tells a model most
+    files        a model on disk: manifest, tensors, checked when read
     arm          the rigid arm learnt from torque alone: geometry, masses, friction (sections 6 and 7)
     model        a trained model: torque, dynamics, energies, parameters, warnings (section 9)
-    fitting      estimators, hyperparameters, noise, options, what a training is given
+    estimators   what an estimator is made of: prior, hyperparameters, noise, options, what a training is given
     posterior    exact and compact posteriors, what answers queries, sums over samples, linear algebra (section 8)
-    kernels      the torque priors and their compiled loops (sections 2 to 5)
+    kernels      the torque priors as formulas, and their compiled loops in `fast` (sections 2 to 5)
     profiles     robots by name: limits, and what their effort field means
     preparation  from recordings to samples: filters, rates, derivatives
     robots       URDFs, Pinocchio models, simulated recordings
@@ -29,10 +30,10 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from lipcore.data.samples import Samples
+    from lipcore.estimators.hyperparameters import FitCancelledError, FitProgress
+    from lipcore.estimators.options import FitOptions
     from lipcore.files.manifest import ModelFormatError
     from lipcore.files.persistence import copy_model, load, save
-    from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
-    from lipcore.fitting.options import FitOptions
     from lipcore.model.torque_model import TorqueModel, TorquePrediction
     from lipcore.posterior.linalg import NotPositiveDefiniteError
     from lipcore.training.train import train
@@ -52,9 +53,9 @@ __all__ = [
     "train",
 ]
 _PLACES = {
-    "FitCancelledError": "fitting.hyperparameters",
-    "FitOptions": "fitting.options",
-    "FitProgress": "fitting.hyperparameters",
+    "FitCancelledError": "estimators.hyperparameters",
+    "FitOptions": "estimators.options",
+    "FitProgress": "estimators.hyperparameters",
     "ModelFormatError": "files.manifest",
     "NotPositiveDefiniteError": "posterior.linalg",
     "Samples": "data.samples",

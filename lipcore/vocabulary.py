@@ -36,7 +36,7 @@ RIGID, LOCAL, CHAINED_ARM = "rigid-body", "rigid-body+local", "rigid-body+lip-ch
 ROBOT_ESTIMATORS = (RIGID, LOCAL, CHAINED_ARM)
 """Estimators with the term `rigid_body`, which take a robot."""
 CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", *ROBOT_ESTIMATORS)
-"""What may be asked for: `auto`, and the estimators of `lipcore.fitting.estimators`."""
+"""What may be asked for: `auto`, and the estimators of `lipcore.estimators.catalogue`."""
 
 DIFFERENTIATED = ("se", "gip", "lse")
 """Estimators that torch differentiates as they are trained: the extra `train`. What they answer needs none."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Samples
-from lipcore.fitting.options import FitOptions
+from lipcore.estimators.options import FitOptions
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.payload import PayloadKernel

@@ -20,7 +20,7 @@ from benchmarks.latency.targets import Target
 from benchmarks.timing import Timing, measure
 from benchmarks.workload import BenchError, simulator
 from lipcore.data.samples import Array
-from lipcore.files.c_writer import SOURCE, Origin, c_files
+from lipcore.export.c_writer import SOURCE, Origin, c_files
 from lipcore.files.persistence import load
 from lipcore.robots.library import Robot, pinocchio
 

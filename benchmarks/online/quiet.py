@@ -16,7 +16,7 @@ from benchmarks.online.scene import rows_of
 from lipcore.data.samples import Array, Samples
 from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
-from lipcore.online.holding import Watch
+from lipcore.online.payload.holding import Watch
 from lipcore.robots.library import Robot, pinocchio
 from lipcore.robots.simulation import Stream, simulate
 

@@ -16,8 +16,8 @@ from benchmarks.reproduce import figures, report, table
 from benchmarks.reproduce.experiment import YARDSTICK, Cell, Experiment
 from benchmarks.reproduce.results import FILE, Results
 from benchmarks.reproduce.running import ReproductionError, run
-from lipcore.fitting.estimators import ESTIMATORS
-from lipcore.fitting.task import MIN_SAMPLES
+from lipcore.estimators.catalogue import ESTIMATORS
+from lipcore.estimators.task import MIN_SAMPLES
 from lipcore.robots.library import ROBOTS
 from service.cli.consoles import print_json
 from service.cli.options import Json

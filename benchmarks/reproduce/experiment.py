@@ -18,8 +18,8 @@ import lipcore
 from benchmarks.reproduce.memory import peak_mb, reset_peak
 from lipcore.data.metrics import evaluate
 from lipcore.data.samples import Array, Samples
-from lipcore.fitting.estimators import check_estimator
-from lipcore.fitting.options import FitOptions
+from lipcore.estimators.catalogue import check_estimator
+from lipcore.estimators.options import FitOptions
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody

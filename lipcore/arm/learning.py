@@ -18,11 +18,11 @@ from lipcore.arm.scales import rescale
 from lipcore.arm.search import Pool, SearchResult, search
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
-from lipcore.fitting import noise
-from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
-from lipcore.fitting.task import Task
+from lipcore.estimators import noise
+from lipcore.estimators.hyperparameters import FitCancelledError, FitProgress
+from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Alternative, Arm, chain
-from lipcore.kernels.compiled.arm import PARAMETERS
+from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.friction import FRICTION_TERMS
 from lipcore.kernels.geometry import Geometry
 from lipcore.posterior.misfit import Misfit, estimate, shared_rows

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from lipcore.arm.problem import Expected, Problem
 from lipcore.data.samples import Array, Samples
-from lipcore.fitting import noise
-from lipcore.fitting.task import Task
+from lipcore.estimators import noise
+from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import Arm, arm_of_robot, in_chain, unit_anywhere
-from lipcore.kernels.compiled.arm import PARAMETERS
+from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.friction import FRICTION_TERMS, friction_features
 from lipcore.kernels.geometry import Geometry
 from lipcore.vocabulary import GeometryMode, JointType

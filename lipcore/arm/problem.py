@@ -17,7 +17,7 @@ from scipy.linalg import cho_solve, lapack, solve_triangular
 
 from lipcore.data.motion import Indices
 from lipcore.data.samples import Array
-from lipcore.kernels.compiled.arm import PARAMETERS, arm_masses, arm_shapes
+from lipcore.kernels.fast.arm import PARAMETERS, arm_masses, arm_shapes
 from lipcore.kernels.geometry import Geometry
 
 ANGLE, LENGTH = 1.0, 0.5

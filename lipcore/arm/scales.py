@@ -21,7 +21,7 @@ from scipy.linalg import solve_triangular
 from lipcore.arm.problem import Point, Problem, root_of
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS
-from lipcore.kernels.compiled.arm import PARAMETERS
+from lipcore.kernels.fast.arm import PARAMETERS
 
 MAX_LOG_SHARE = 2.5
 """Limit on the shares of masses and rotors, as a logarithm either way: a factor of 12."""

@@ -14,11 +14,11 @@ import numpy as np
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
+from lipcore.estimators.catalogue import make_estimator
+from lipcore.estimators.hyperparameters import fit
+from lipcore.estimators.options import FitOptions
 from lipcore.excitation.limits import Limits
 from lipcore.excitation.motions import draw
-from lipcore.fitting.estimators import make_estimator
-from lipcore.fitting.hyperparameters import fit
-from lipcore.fitting.options import FitOptions
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.base import Params, TorqueKernel
 from lipcore.model.torque_model import TorqueModel

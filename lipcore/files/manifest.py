@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
+from lipcore.estimators.catalogue import Calibration
+from lipcore.estimators.options import FitOptions
 from lipcore.files import strict_json
 from lipcore.files.arm import check_inertia, check_rotor, read_geometry
 from lipcore.files.checks import (
@@ -19,8 +21,6 @@ from lipcore.files.checks import (
     wrong,
 )
 from lipcore.files.strict_json import quote
-from lipcore.fitting.estimators import Calibration
-from lipcore.fitting.options import FitOptions
 from lipcore.kernels.friction import FRICTION_TERMS, STRIBECK
 from lipcore.model.selection import MOST_TEXT, Candidate, HeldOut, Selection
 from lipcore.posterior.conformal import Conformal

@@ -19,6 +19,7 @@ import numpy as np
 from safetensors.numpy import save as save_tensors
 
 from lipcore.data.motion import Array, Indices, Motion
+from lipcore.estimators.catalogue import Calibration, make_estimator
 from lipcore.files.arm import arm_tensors, is_of_arm, read_arm, read_mode
 from lipcore.files.durable import make_folder, sync
 from lipcore.files.manifest import (
@@ -33,7 +34,6 @@ from lipcore.files.manifest import (
     read_manifest_bytes,
 )
 from lipcore.files.tensors import FLOOR, INDUCING, MISFIT, OUTPUTS, PARAMS, A, B, read_tensors
-from lipcore.fitting.estimators import Calibration, make_estimator
 from lipcore.kernels.arm_prior import Arm
 from lipcore.model.parameters import report
 from lipcore.model.torque_model import TorqueModel

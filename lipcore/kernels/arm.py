@@ -8,7 +8,7 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS, Arm
 from lipcore.kernels.base import LinearKernel, Params, Regressor
-from lipcore.kernels.compiled.arm import (
+from lipcore.kernels.fast.arm import (
     arm_energies,
     arm_features,
     arm_queries,
@@ -16,8 +16,8 @@ from lipcore.kernels.compiled.arm import (
     arm_size,
     arm_torques,
 )
-from lipcore.kernels.compiled.arm_recursion import PARAMETERS
-from lipcore.kernels.compiled.views import Memory
+from lipcore.kernels.fast.arm_recursion import PARAMETERS
+from lipcore.kernels.fast.views import Memory
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.mixture import MixtureKernel
 

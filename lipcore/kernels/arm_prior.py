@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
-from lipcore.kernels.compiled.arm_recursion import PARAMETERS
+from lipcore.kernels.fast.arm_recursion import PARAMETERS
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import GeometryMode, Prior

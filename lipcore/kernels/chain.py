@@ -21,9 +21,6 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion, check_joint_types
 from lipcore.kernels.base import Params, State, on_last_diagonal
-from lipcore.kernels.compiled.chain import chain_cross, chain_gradient, chain_gram, chain_size
-from lipcore.kernels.compiled.kernel import CompiledKernel, Driver
-from lipcore.kernels.compiled.pairs import Hyper
 from lipcore.kernels.energy import PRIOR_STD as WEIGHTS_PRIOR_STD
 from lipcore.kernels.energy import (
     initial_weights,
@@ -32,6 +29,9 @@ from lipcore.kernels.energy import (
     velocity_adjoint,
     velocity_weights,
 )
+from lipcore.kernels.fast.chain import chain_cross, chain_gradient, chain_gram, chain_size
+from lipcore.kernels.fast.kernel import CompiledKernel, Driver
+from lipcore.kernels.fast.pairs import Hyper
 from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, chain_sum
 from lipcore.vocabulary import JointType
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lipcore.data.motion import Array, Motion
 from lipcore.kernels.base import LinearKernel, Params, Regressor
-from lipcore.kernels.compiled.compile import brief, compiled
+from lipcore.kernels.fast.compile import brief, compiled
 
 SIGN_WIDTH = 0.02
 """Velocity over which the Coulomb sign turns over, rad/s (m/s): tanh(dq / width) avoids a jump at standstill."""

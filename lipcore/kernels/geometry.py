@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Array
-from lipcore.kernels.compiled.arm_recursion import ACROSS, AXIS, CONSTANTS, KIND, PLACE, SCREWS, TURN
+from lipcore.kernels.fast.arm_recursion import ACROSS, AXIS, CONSTANTS, KIND, PLACE, SCREWS, TURN
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 

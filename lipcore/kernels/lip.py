@@ -9,9 +9,6 @@ from array_api_compat import array_namespace
 
 from lipcore.data.motion import Array, Motion, check_joint_types
 from lipcore.kernels.base import Params, State
-from lipcore.kernels.compiled.kernel import CompiledKernel, Driver
-from lipcore.kernels.compiled.lip import lip_cross, lip_gradient, lip_gram, lip_size
-from lipcore.kernels.compiled.pairs import Hyper
 from lipcore.kernels.energy import (
     PRIOR_STD,
     initial_weights,
@@ -22,6 +19,9 @@ from lipcore.kernels.energy import (
     velocity_adjoint,
     velocity_weights,
 )
+from lipcore.kernels.fast.kernel import CompiledKernel, Driver
+from lipcore.kernels.fast.lip import lip_cross, lip_gradient, lip_gram, lip_size
+from lipcore.kernels.fast.pairs import Hyper
 from lipcore.kernels.polynomial import Derivatives, base_kernels, product
 from lipcore.vocabulary import JointType
 

@@ -11,8 +11,8 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.base import LinearKernel, Params, Regressor
-from lipcore.kernels.compiled.arm import arm_differences
-from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.fast.arm import arm_differences
+from lipcore.kernels.fast.compile import compiled
 from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED
 
 

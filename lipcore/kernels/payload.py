@@ -8,10 +8,10 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.base import LinearKernel, Params, Regressor
-from lipcore.kernels.compiled.arm import arm_energies
-from lipcore.kernels.compiled.arm_recursion import PARAMETERS
-from lipcore.kernels.compiled.payload import payload_queries, payload_query, payload_size
-from lipcore.kernels.compiled.views import Memory
+from lipcore.kernels.fast.arm import arm_energies
+from lipcore.kernels.fast.arm_recursion import PARAMETERS
+from lipcore.kernels.fast.payload import payload_queries, payload_query, payload_size
+from lipcore.kernels.fast.views import Memory
 
 
 class PayloadKernel(LinearKernel):

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lipcore.data.motion import Array, Motion
-from lipcore.fitting.estimators import Estimator
+from lipcore.estimators.catalogue import Estimator
 from lipcore.kernels.base import SumKernel, TorqueKernel
 from lipcore.model.functionals import (
     EnergyKernel,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.fast.compile import compiled
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.fitting.estimators import Estimator
+from lipcore.estimators.catalogue import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.base import LinearKernel
 from lipcore.kernels.friction import FrictionKernel, friction_terms

@@ -20,7 +20,7 @@ import numpy as np
 from lipcore.data.metrics import quantile
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.fitting.estimators import Estimator
+from lipcore.estimators.catalogue import Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.friction import FrictionKernel

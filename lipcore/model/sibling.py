@@ -19,7 +19,7 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.kernels.arm import SCALES, ArmKernel
 from lipcore.kernels.arm_prior import KINDS, Arm, widths_of
-from lipcore.kernels.compiled.arm_recursion import PARAMETERS
+from lipcore.kernels.fast.arm_recursion import PARAMETERS
 from lipcore.model.parameters import precision, weight_posterior
 from lipcore.model.torque_model import TorqueModel
 

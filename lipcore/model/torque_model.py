@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from lipcore.data.metrics import Answer
 from lipcore.data.motion import Motion, motion_arrays
 from lipcore.data.samples import Array
-from lipcore.fitting.estimators import NO_CALIBRATION, Calibration, Estimator
+from lipcore.estimators.catalogue import NO_CALIBRATION, Calibration, Estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Arm
 from lipcore.model import external

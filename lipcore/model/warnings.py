@@ -11,7 +11,7 @@ import numpy as np
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm import ArmKernel
-from lipcore.kernels.compiled.arm import PARAMETERS
+from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.model.parameters import weight_posterior
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compression import checks

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
 from lipcore.kernels.base import LinearKernel, PairKernel, Params
-from lipcore.kernels.compiled.answer import COVARIANCE, MEAN, ROWS, STD, WIDTH, answer, answer_one, pack
+from lipcore.kernels.fast.answer import COVARIANCE, MEAN, ROWS, STD, WIDTH, answer, answer_one, pack
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.posterior.misfit import Misfit

@@ -38,7 +38,7 @@ class Posterior(ABC):
     the posterior variance var s − |whiten(c)|².
 
     kernel: prior of the torques; params: its hyperparameters; std_factor: calibration of every standard deviation that
-    is not noise (see `fitting.estimators`); weights: (M,).
+    is not noise (see `lipcore.estimators.catalogue`); weights: (M,).
     """
 
     kernel: TorqueKernel

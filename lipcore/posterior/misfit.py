@@ -13,7 +13,7 @@ from lipcore.data.motion import Motion
 from lipcore.data.repetition import distinct
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
-from lipcore.kernels.compiled.answer import ACCELERATED
+from lipcore.kernels.fast.answer import ACCELERATED
 from lipcore.kernels.friction import SIGN_WIDTH
 
 LASTS_S = 1.0

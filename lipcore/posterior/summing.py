@@ -17,7 +17,7 @@ import numpy as np
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
 from lipcore.kernels.base import PairKernel, Params, TorqueKernel
-from lipcore.kernels.compiled.compile import compiled
+from lipcore.kernels.fast.compile import compiled
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.linalg import add_square_of_rows, pack_symmetric, whiten_rows

@@ -17,8 +17,8 @@ from lipcore.data.metrics import Answer, compare, evaluate
 from lipcore.data.samples import Samples
 from lipcore.data.signals import noise_level
 from lipcore.data.splits import SplitError, taken
-from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress, Progress
-from lipcore.fitting.task import Task
+from lipcore.estimators.hyperparameters import FitCancelledError, FitProgress, Progress
+from lipcore.estimators.task import Task
 from lipcore.model.selection import Candidate, HeldOut, plain, selection, unjudged
 from lipcore.model.torque_model import TorqueModel
 from lipcore.training.choice import HeldOutSamples, choose_estimator

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lipcore.data.samples import Array, Samples
-from lipcore.fitting.hyperparameters import FitCancelledError
-from lipcore.fitting.options import FitOptions
+from lipcore.estimators.hyperparameters import FitCancelledError
+from lipcore.estimators.options import FitOptions
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.linalg import unpack_symmetric

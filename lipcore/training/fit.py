@@ -11,10 +11,10 @@ from lipcore.arm.learning import Learnt, learn
 from lipcore.arm.search import known_geometries
 from lipcore.data.independence import motion_dimensions
 from lipcore.data.samples import Samples
-from lipcore.fitting.estimators import Estimator, calibrate, check_estimator, make_estimator
-from lipcore.fitting.hyperparameters import FitProgress, fit
-from lipcore.fitting.options import FitOptions
-from lipcore.fitting.task import Task
+from lipcore.estimators.catalogue import Estimator, calibrate, check_estimator, make_estimator
+from lipcore.estimators.hyperparameters import FitProgress, fit
+from lipcore.estimators.options import FitOptions
+from lipcore.estimators.task import Task
 from lipcore.kernels.base import Params, SumKernel
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.parameters import friction_coefficients
@@ -42,7 +42,7 @@ def fit_estimator(
 ) -> TorqueModel:
     """Train one estimator on the samples of a task.
 
-    name: one of `lipcore.fitting.estimators.ESTIMATORS`; learnt: what these samples have led to of the rigid bodies,
+    name: one of `lipcore.estimators.catalogue.ESTIMATORS`; learnt: what these samples have led to of the rigid bodies,
     where that is known already, which tells estimators without them how unsure friction at rest is; geometries: base to
     tip, that a search for one looks at first; corrected: joints that an earlier fit has corrected.
     Raise ValueError as `check_estimator` does, FitCancelledError, or NotPositiveDefiniteError.

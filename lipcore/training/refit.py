@@ -9,8 +9,8 @@ from dataclasses import replace
 from lipcore.arm.learning import learn
 from lipcore.data.independence import motion_dimensions
 from lipcore.data.samples import Samples
-from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
-from lipcore.fitting.task import Task
+from lipcore.estimators.hyperparameters import FitCancelledError, FitProgress
+from lipcore.estimators.task import Task
 from lipcore.model.selection import Selection, shortened
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.selection import spread_out

@@ -9,11 +9,11 @@ from lipcore.data import outliers
 from lipcore.data.independence import recording_weights
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Samples
-from lipcore.fitting.base import RobotKind, check_base
-from lipcore.fitting.estimators import check_estimator
-from lipcore.fitting.hyperparameters import Cancelled, Progress
-from lipcore.fitting.options import FitOptions
-from lipcore.fitting.task import Task
+from lipcore.estimators.base import RobotKind, check_base
+from lipcore.estimators.catalogue import check_estimator
+from lipcore.estimators.hyperparameters import Cancelled, Progress
+from lipcore.estimators.options import FitOptions
+from lipcore.estimators.task import Task
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.sibling import arm_of_sibling
 from lipcore.model.torque_model import TorqueModel
@@ -37,9 +37,9 @@ def train(
 ) -> TorqueModel:
     """Train a model on samples of n joints.
 
-    joint_types: (n,), `revolute` or `prismatic`; estimator: one of `lipcore.fitting.estimators.ESTIMATORS`, or `auto`,
+    joint_types: (n,), `revolute` or `prismatic`; estimator: one of `ESTIMATORS`, or `auto`,
     which chooses (`lipcore.training.auto`); torque_convention: what `samples.tau` holds; on_progress, cancelled: see
-    `lipcore.fitting.hyperparameters.fit`; robot: for estimators of rigid bodies, built for the joints of the samples;
+    `lipcore.estimators.hyperparameters.fit`; robot: for estimators of rigid bodies, of the joints of the samples;
     base: for them, too, a model of another unit of the same robot, whose arm is expected (`lipcore.model.sibling`).
     Corrupt rows are left out before anything sees them, and the fit's report names them (`lipcore.data.outliers`).
     Raise ValueError for bad arguments, BaseMismatchError, CorruptError, FitCancelledError, or NotPositiveDefiniteError.

@@ -17,11 +17,11 @@ from rich.table import Table
 import lipcore
 from lipcore import profiles
 from lipcore.data.samples import Array
+from lipcore.estimators.catalogue import ESTIMATORS
 from lipcore.excitation import Belief, Limits, Plan, PlanOptions, plan
 from lipcore.extras import MissingExtraError
 from lipcore.files import persistence
 from lipcore.files.manifest import DEFAULT_LIMITS, MANIFEST, ROBOT, TENSORS, ModelFormatError
-from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.profiles import Profile, names

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.fitting.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
+from lipcore.estimators.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
 from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
 from service.contract.models import VERSION, HeldOutQuality, Holdout, ModelName
 from service.contract.states import JobState, PromotionOption

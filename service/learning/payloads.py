@@ -15,8 +15,8 @@ from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
-from lipcore.online.estimate import Estimate
-from lipcore.online.holding import Watch
+from lipcore.online.payload.estimate import Estimate
+from lipcore.online.payload.holding import Watch
 from lipcore.vocabulary import CODES, LEARNT
 from service.journal import log
 from service.learning.streams import PayloadRecord, Streams

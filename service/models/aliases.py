@@ -5,7 +5,7 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipcore.fitting.base import RobotKind
+from lipcore.estimators.base import RobotKind
 from service.contract.models import Alias, AliasList, AliasMove, AliasRequest
 from service.foundation.errors import ConflictError, invalid_request, not_found
 from service.models import registry

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from lipcore.export.c_writer import Origin, c_files
+from lipcore.export.urdf_writer import urdf_of_parameters
 from lipcore.files import persistence
-from lipcore.files.c_writer import Origin, c_files
 from lipcore.files.manifest import MANIFEST, TENSORS, ModelFormatError
-from lipcore.files.urdf_writer import urdf_of_parameters
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, problem
 from service.models import registry, signing
@@ -43,7 +43,7 @@ def export(
 ) -> Exported:
     """Archive a version, the one that serves where none is named. Not for the event loop.
 
-    learnt: with what it has learnt online, else as trained; as_c: as the source and header of `lipcore.files.c_writer`.
+    learnt: with what it has learnt online, else as trained; as_c: as source and header of `lipcore.export.c_writer`.
     Nothing is sent before all of it has been checked. Raise NotFoundError, InvalidRequestError for both a version and
     an alias and for what is not written as C, UnreadableVersionError for damaged files, StorageFullError.
     """

@@ -29,7 +29,7 @@ class Strict(BaseModel):
 
 
 class FitFields(Strict):
-    """What a fit did: see `lipcore.fitting.hyperparameters.FitReport` and `lipcore.arm.learning`."""
+    """What a fit did: see `lipcore.estimators.hyperparameters.FitReport` and `lipcore.arm.learning`."""
 
     __pydantic_extra__: dict[str, Plain]
 

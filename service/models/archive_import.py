@@ -10,10 +10,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from lipcore.estimators.base import RobotKind
 from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, ModelFormatError, read_manifest_bytes
 from lipcore.files.probing import probe
-from lipcore.fitting.base import RobotKind
 from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings

@@ -12,8 +12,8 @@ from sqlalchemy import bindparam, func, select, tuple_, update
 from sqlalchemy.orm import Session
 
 import lipcore
+from lipcore.estimators.base import RobotKind
 from lipcore.files.persistence import checksums, read_manifest
-from lipcore.fitting.base import RobotKind
 from service.contract.models import HeldOutQuality, Model, ModelPage, Promotion, Version, VersionSummary
 from service.foundation.errors import ConflictError, NoServingVersionError, NotFoundError, not_found
 from service.foundation.settings import shipped_models

@@ -23,8 +23,8 @@ from math import inf
 from multiprocessing.process import BaseProcess
 from typing import Any, ParamSpec, Protocol, Self, TypeVar
 
+from lipcore.estimators.hyperparameters import FitCancelledError
 from lipcore.extras import need
-from lipcore.fitting.hyperparameters import FitCancelledError
 from service.foundation.settings import Settings
 from service.runtime import remote
 from service.runtime.process import Place, start_process

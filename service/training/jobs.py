@@ -11,9 +11,9 @@ from sqlalchemy import Select, func, select
 from sqlalchemy.orm import Session
 
 from lipcore import extras
-from lipcore.fitting.base import BaseMismatchError, RobotKind, check_base
-from lipcore.fitting.estimators import UnknownEstimatorError, check_estimator
-from lipcore.fitting.options import FitOptions
+from lipcore.estimators.base import BaseMismatchError, RobotKind, check_base
+from lipcore.estimators.catalogue import UnknownEstimatorError, check_estimator
+from lipcore.estimators.options import FitOptions
 from lipcore.robots.library import ROBOTS
 from lipcore.vocabulary import AUTO, CHOICES, DIFFERENTIATED, ROBOT_ESTIMATORS
 from service.contract.jobs import Job, JobDraft, JobPage, JobRequest, Options

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from lipcore.data.metrics import BlockScores
-from lipcore.fitting.noise import white
+from lipcore.estimators.noise import white
 from lipcore.model.torque_model import TorqueModel
 from service.contract.models import Evaluation
 from service.foundation.fields import finite

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from lipcore.data.samples import Samples
+from lipcore.estimators.hyperparameters import Progress
+from lipcore.estimators.options import FitOptions
+from lipcore.estimators.task import Task
 from lipcore.files.checks import MAX_NAME
-from lipcore.fitting.hyperparameters import Progress
-from lipcore.fitting.options import FitOptions
-from lipcore.fitting.task import Task
 from lipcore.model.selection import shortened
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import REFIT_ERROR

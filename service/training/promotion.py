@@ -15,8 +15,8 @@ from sqlalchemy.orm import Session
 
 from lipcore.data.metrics import BlockScores, Difference
 from lipcore.data.samples import Samples
+from lipcore.estimators.base import RobotKind
 from lipcore.files.manifest import ModelFormatError
-from lipcore.fitting.base import RobotKind
 from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.torque_model import TorqueModel
 from service.contract.models import HoldoutLineage, Promotion

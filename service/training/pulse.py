@@ -12,7 +12,7 @@ from math import inf
 from types import TracebackType
 from typing import Any, Self
 
-from lipcore.fitting.hyperparameters import FitProgress
+from lipcore.estimators.hyperparameters import FitProgress
 from service.runtime.progress import Progress
 from service.storage.database import Database, JobRow, now
 

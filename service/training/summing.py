@@ -19,8 +19,8 @@ import numpy as np
 
 from lipcore.data import independence
 from lipcore.data.samples import Array, Samples
+from lipcore.estimators.options import FitOptions
 from lipcore.files import persistence
-from lipcore.fitting.options import FitOptions
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.statistics import empty
 from lipcore.posterior.summing import Summing

@@ -14,7 +14,7 @@ from benchmarks import run
 from benchmarks.reproduce.command import ERRORS, app
 from benchmarks.reproduce.experiment import Cell, Experiment
 from benchmarks.reproduce.results import Results, ResultsError
-from lipcore.fitting.options import FitOptions
+from lipcore.estimators.options import FitOptions
 from lipcore.robots.library import ROBOTS, load_robot
 from lipcore.robots.simulation import Stream, simulate
 

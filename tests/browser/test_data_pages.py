@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.estimators.catalogue import ESTIMATORS
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard

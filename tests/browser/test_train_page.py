@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.estimators.catalogue import ESTIMATORS
 from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard
 from tests.browser.visitor import Visitor

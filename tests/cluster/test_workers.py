@@ -4,7 +4,7 @@ from functools import partial
 
 import pytest
 
-from lipcore.fitting.hyperparameters import FitCancelledError
+from lipcore.estimators.hyperparameters import FitCancelledError
 from service.foundation.settings import Settings
 from service.runtime.executors import ClusterUnavailableError, lost, sent, shard_executor, summed
 from tests.cluster.workers import cluster

@@ -12,7 +12,7 @@ from torch.func import grad, jvp
 from lipcore import FitOptions, TorqueModel, train
 from lipcore.arm.learning import learn
 from lipcore.data.samples import Samples
-from lipcore.fitting.task import Task
+from lipcore.estimators.task import Task
 from lipcore.kernels.geometry import Geometry
 from lipcore.online.batch import Rows
 from lipcore.robots.library import Robot, load_robot

@@ -9,7 +9,7 @@ from torch.func import jacrev
 from lipcore.data.motion import Motion
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
-from lipcore.kernels.compiled.arm import arm_energies, arm_features, arm_masses, arm_shapes, arm_torques
+from lipcore.kernels.fast.arm import arm_energies, arm_features, arm_masses, arm_shapes, arm_torques
 from lipcore.kernels.geometry import Geometry, aligned, rotation_of, skew, turn_of
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import inverse_dynamics

@@ -16,10 +16,10 @@ from safetensors.numpy import save as save_tensors
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Array, Motion
+from lipcore.estimators.catalogue import make_estimator
 from lipcore.files import persistence
 from lipcore.files.arm import bodies_of, read_geometry
 from lipcore.files.manifest import read_manifest_bytes
-from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.friction import friction_features

@@ -19,8 +19,8 @@ from lipcore.arm.scales import MAX_LOG_SHARE, MIN_FRICTION_SHARE, _Evidence, res
 from lipcore.arm.search import SearchResult, search
 from lipcore.data.metrics import evaluate
 from lipcore.data.signals import noise_level
-from lipcore.fitting.hyperparameters import FitCancelledError, FitProgress
-from lipcore.fitting.task import Task
+from lipcore.estimators.hyperparameters import FitCancelledError, FitProgress
+from lipcore.estimators.task import Task
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.geometry import Geometry
 from lipcore.posterior.linalg import NotPositiveDefiniteError

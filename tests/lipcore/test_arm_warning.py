@@ -12,8 +12,8 @@ import pytest
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save, train
 from lipcore.arm import learning
 from lipcore.data.motion import Motion
+from lipcore.estimators.catalogue import make_estimator
 from lipcore.files.arm import arm_tensors, read_arm
-from lipcore.fitting.estimators import make_estimator
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.geometry import Geometry

@@ -9,11 +9,11 @@ import pytest
 
 from lipcore.data.samples import Samples
 from lipcore.data.splits import SplitError
+from lipcore.estimators.catalogue import MissingRobotError, check_estimator
+from lipcore.estimators.hyperparameters import FitCancelledError
+from lipcore.estimators.options import FitOptions
 from lipcore.files.manifest import ModelFormatError, read_manifest_bytes
 from lipcore.files.persistence import load, manifest_bytes, save
-from lipcore.fitting.estimators import MissingRobotError, check_estimator
-from lipcore.fitting.hyperparameters import FitCancelledError
-from lipcore.fitting.options import FitOptions
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate

@@ -16,10 +16,10 @@ import pytest
 from lipcore import FitOptions, TorqueModel, load, train
 from lipcore.arm.learning import learn
 from lipcore.data.motion import Motion
-from lipcore.files.c_weights import UnsupportedEstimatorError
-from lipcore.files.c_writer import HEADER, SOURCE, Origin, c_files
-from lipcore.fitting.estimators import make_estimator
-from lipcore.fitting.task import Task
+from lipcore.estimators.catalogue import make_estimator
+from lipcore.estimators.task import Task
+from lipcore.export.c_weights import UnsupportedEstimatorError
+from lipcore.export.c_writer import HEADER, SOURCE, Origin, c_files
 from lipcore.kernels.base import PairKernel
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier

@@ -8,9 +8,9 @@ import pytest
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Samples
+from lipcore.estimators.options import FitOptions
+from lipcore.estimators.task import Task
 from lipcore.files.persistence import load, save
-from lipcore.fitting.options import FitOptions
-from lipcore.fitting.task import Task
 from lipcore.kernels.local import LocalKernel
 from lipcore.model.selection import selection
 from lipcore.robots.library import load_robot

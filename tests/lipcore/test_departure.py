@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lipcore.online.departure import BOUND, SLACK, Departure
+from lipcore.online.changes.departure import BOUND, SLACK, Departure
 from tests.choosing import slow
 
 HOUR = 36_000

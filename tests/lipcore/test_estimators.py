@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
-from lipcore.fitting.estimators import (
+from lipcore.estimators.catalogue import (
     ESTIMATORS,
     FUNCTION_STD_FACTOR,
     NO_CALIBRATION,

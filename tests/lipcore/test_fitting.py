@@ -8,11 +8,11 @@ import pytest
 from scipy.optimize import minimize
 
 from lipcore.data.samples import Array, Samples
-from lipcore.fitting import hyperparameters as fitting
-from lipcore.fitting import options
-from lipcore.fitting.estimators import make_estimator
-from lipcore.fitting.hyperparameters import Fit, FitCancelledError, FitProgress, fit
-from lipcore.fitting.options import FitOptions
+from lipcore.estimators import hyperparameters as fitting
+from lipcore.estimators import options
+from lipcore.estimators.catalogue import make_estimator
+from lipcore.estimators.hyperparameters import Fit, FitCancelledError, FitProgress, fit
+from lipcore.estimators.options import FitOptions
 from lipcore.posterior import exact as evidence
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.robots.library import load_robot

@@ -8,9 +8,9 @@ import torch
 from hypothesis import given
 
 from lipcore.data.motion import Array, Motion
-from lipcore.fitting.estimators import make_estimator
+from lipcore.estimators.catalogue import make_estimator
 from lipcore.kernels.base import SumKernel
-from lipcore.kernels.compiled.lanes import LANES
+from lipcore.kernels.fast.lanes import LANES
 from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED, FrictionKernel
 from lipcore.kernels.lip import LipKernel
 from lipcore.posterior.exact import negative_log_evidence

@@ -10,8 +10,8 @@ from lipcore import FitOptions, Samples, load, save, train
 from lipcore.arm.learning import learn
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
-from lipcore.fitting.task import Task
-from lipcore.kernels.compiled.answer import ACCELERATED
+from lipcore.estimators.task import Task
+from lipcore.kernels.fast.answer import ACCELERATED
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.misfit import AT_REST, ROWS, Misfit, estimate, low_speed_variance, shared_rows

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from lipcore.data.motion import Array, Motion
 from lipcore.data.samples import Samples
-from lipcore.fitting import noise
+from lipcore.estimators import noise
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.posterior.exact import negative_log_evidence, noisy_gram

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lipcore.online.change import Change, ChangeDetector, friction_share, suspect
+from lipcore.online.changes.detectors import Change, ChangeDetector, friction_share, suspect
 from lipcore.online.record import Record
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate

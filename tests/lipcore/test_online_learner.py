@@ -10,8 +10,8 @@ import pytest
 from lipcore import FitOptions, ModelFormatError, TorqueModel, load, save, train
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Samples
+from lipcore.estimators.catalogue import ESTIMATORS
 from lipcore.files.probing import probe
-from lipcore.fitting.estimators import ESTIMATORS
 from lipcore.online import transfer
 from lipcore.online.batch import Rows
 from lipcore.online.learner import ForgottenError, OnlineModel, uncovered

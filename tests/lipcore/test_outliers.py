@@ -9,7 +9,7 @@ import lipcore
 from lipcore.data import outliers
 from lipcore.data.outliers import CorruptError, of_long, of_samples
 from lipcore.data.samples import Samples
-from lipcore.fitting.options import FitOptions
+from lipcore.estimators.options import FitOptions
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate

@@ -7,14 +7,14 @@ import pytest
 
 import lipcore
 from lipcore.data.motion import Motion
-from lipcore.fitting.options import FitOptions
+from lipcore.estimators.options import FitOptions
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier, Linearised, Load, NoArmError
 from lipcore.online.batch import Rows
-from lipcore.online.bodies import ANY, body, eta_of
-from lipcore.online.draws import arms
-from lipcore.online.estimate import known
-from lipcore.online.payload import estimate, refine
+from lipcore.online.payload.bodies import ANY, body, eta_of
+from lipcore.online.payload.draws import arms
+from lipcore.online.payload.estimate import known
+from lipcore.online.payload.payload import estimate, refine
 from lipcore.robots.library import load_robot, pinocchio
 from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody

@@ -9,8 +9,8 @@ import lipcore
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.online.batch import Rows
-from lipcore.online.holding import Watch
 from lipcore.online.learner import OnlineModel
+from lipcore.online.payload.holding import Watch
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
 from tests.lipcore.stepping import finished

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from lipcore import FitOptions, Samples, TorqueModel, load, train
 from lipcore.data.motion import Array, Motion
-from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.estimators.catalogue import ESTIMATORS
 from lipcore.kernels.base import Params, SumKernel, TorqueKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.model import dynamics

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.fitting.hyperparameters import FitCancelledError
-from lipcore.fitting.options import FitOptions
-from lipcore.fitting.task import Task
+from lipcore.estimators.hyperparameters import FitCancelledError
+from lipcore.estimators.options import FitOptions
+from lipcore.estimators.task import Task
 from lipcore.model.selection import selection
 from lipcore.model.sibling import arm_of_sibling
 from lipcore.online.batch import Rows

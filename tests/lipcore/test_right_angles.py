@@ -20,8 +20,8 @@ from lipcore.arm.right_angles import (
     shares,
 )
 from lipcore.data.samples import Samples
-from lipcore.fitting.options import FitOptions
-from lipcore.fitting.task import Task
+from lipcore.estimators.options import FitOptions
+from lipcore.estimators.task import Task
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Stream, simulate

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import lipcore
 from lipcore.data.motion import Array, Motion
-from lipcore.fitting.options import FitOptions
+from lipcore.estimators.options import FitOptions
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.posterior.basis import Basis

@@ -9,7 +9,7 @@ import pytest
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
-from lipcore.fitting.base import BaseMismatchError, RobotKind, check_base
+from lipcore.estimators.base import BaseMismatchError, RobotKind, check_base
 from lipcore.kernels.arm import ArmKernel
 from lipcore.model.sibling import arm_as_expected, arm_of_sibling
 from lipcore.robots.library import Robot, another_unit

@@ -8,10 +8,10 @@ import pinocchio as pin
 import pytest
 
 from lipcore import FitOptions
-from lipcore.files.urdf_writer import ArmJoints, rpy, urdf_of_parameters, urdf_text
-from lipcore.fitting.estimators import MissingRobotError, UnknownEstimatorError, check_estimator, make_estimator
+from lipcore.estimators.catalogue import MissingRobotError, UnknownEstimatorError, check_estimator, make_estimator
+from lipcore.export.urdf_writer import ArmJoints, rpy, urdf_of_parameters, urdf_text
 from lipcore.kernels.arm_prior import arm_of_robot
-from lipcore.kernels.compiled.arm import arm_torques
+from lipcore.kernels.fast.arm import arm_torques
 from lipcore.kernels.geometry import rotation_of
 from lipcore.robots.library import ROBOTS, UnknownRobotError, load_robot, profile_urdf
 from lipcore.robots.urdf import JointMismatchError, RigidBody, describe

@@ -17,8 +17,8 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Samples
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
-from lipcore.kernels.compiled import compile as compiling
-from lipcore.kernels.compiled.compile import source_stamp, use_cache
+from lipcore.kernels.fast import compile as compiling
+from lipcore.kernels.fast.compile import source_stamp, use_cache
 from lipcore.model.functionals import kinetic_energy
 from lipcore.warm_up import COMPILED, warm_up
 from tests.choosing import few

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import arm_of_robot
-from lipcore.kernels.compiled.arm import arm_torques
+from lipcore.kernels.fast.arm import arm_torques
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.robots.urdf import RigidBody
 from service.datasets.report.fit import EIGHTHS

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from lipcore.fitting.base import RobotKind
+from lipcore.estimators.base import RobotKind
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.contract import learning as schema

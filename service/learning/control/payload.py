@@ -12,9 +12,9 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
-from lipcore.online.bodies import BELOW, DIAGONAL
-from lipcore.online.estimate import Estimate
-from lipcore.online.holding import Watch
+from lipcore.online.payload.bodies import BELOW, DIAGONAL
+from lipcore.online.payload.estimate import Estimate
+from lipcore.online.payload.holding import Watch
 from lipcore.robots.urdf import RigidBody
 from service.contract.payload import (
     LivePayload,

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
-from lipcore.online.change import RATIO, Change, ChangeDetector, friction_share
-from lipcore.online.departure import Departure
+from lipcore.online.changes.departure import Departure
+from lipcore.online.changes.detectors import RATIO, Change, ChangeDetector, friction_share
 from lipcore.online.gates import Patience, is_contact
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT

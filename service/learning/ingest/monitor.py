@@ -15,8 +15,8 @@ from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
 from lipcore.data.samples import Array
-from lipcore.online.change import ChangeDetector
-from lipcore.online.departure import Departure
+from lipcore.online.changes.departure import Departure
+from lipcore.online.changes.detectors import ChangeDetector
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.settings import Settings

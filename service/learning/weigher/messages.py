@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
-from lipcore.online.holding import Watch
+from lipcore.online.payload.holding import Watch
 
 Stream = tuple[str, int, str]
 """A model, the version that answers, and one of its streams."""

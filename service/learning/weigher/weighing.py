@@ -11,7 +11,7 @@ from dataclasses import replace
 
 from sqlalchemy import select
 
-from lipcore.online.holding import Watch
+from lipcore.online.payload.holding import Watch
 from service.foundation.errors import ServiceError
 from service.journal import log
 from service.journal.log import NewBatch

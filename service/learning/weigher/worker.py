@@ -15,10 +15,10 @@ import numpy as np
 from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
-from lipcore.online.draws import arms
-from lipcore.online.held import Held
-from lipcore.online.holding import Watch
-from lipcore.online.payload import estimate
+from lipcore.online.payload.draws import arms
+from lipcore.online.payload.held import Held
+from lipcore.online.payload.holding import Watch
+from lipcore.online.payload.payload import estimate
 from service.foundation.settings import Settings
 from service.learning.weigher.messages import MOST_STREAMS, Asked, Message, Revised, Stream, Unweighed, Weighed
 from service.models import registry

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from lipcore.fitting.estimators import ESTIMATORS
+from lipcore.estimators.catalogue import ESTIMATORS
 from lipcore.robots.library import ROBOTS
 from lipcore.vocabulary import AUTO, CHOICES
 from lipserve import ApiError

@@ -67,7 +67,7 @@ JOBS = [
     *_around_commit("job queued", actions.Train, "service.training.jobs:create"),
     Point("job queued: before it is handed on", actions.Train, Fault("service.training.queue:JobQueue.submit"), "all"),
     *_both("job claimed", actions.Train, Fault(COMMIT, "after", "service.training.worker:_claim")),
-    *_both("job at work: fit begun", actions.Train, Fault("lipcore.fitting.hyperparameters:fit", "before", WORK)),
+    *_both("job at work: fit begun", actions.Train, Fault("lipcore.estimators.hyperparameters:fit", "before", WORK)),
     *_both("job at work: fit ended", actions.Train, Fault("service.training.planned_fit:PlannedFit.first", "after")),
     *_both("version: half of its files", actions.Train, Fault(FSYNC, "before", WORK)),
     *_both("version: files complete, no row", actions.Train, Fault(RENAME, "after", WORK)),
@@ -77,7 +77,7 @@ JOBS = [
     Point(
         "job at work: its process stands still",
         actions.Train,
-        Fault("lipcore.fitting.hyperparameters:fit", "before", WORK, victim="frozen"),
+        Fault("lipcore.estimators.hyperparameters:fit", "before", WORK, victim="frozen"),
         "all",
     ),
     *_around_commit("job cancelled while it runs", actions.Cancel, "service.training.jobs:cancel"),

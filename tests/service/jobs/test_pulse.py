@@ -6,7 +6,7 @@ import pytest
 from sqlalchemy import select
 from sqlalchemy.exc import OperationalError
 
-from lipcore.fitting.hyperparameters import FitProgress
+from lipcore.estimators.hyperparameters import FitProgress
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.training import pulse

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lipcore.online.batch import Rows
-from lipcore.online.change import ChangeDetector
+from lipcore.online.changes.detectors import ChangeDetector
 from lipcore.online.record import Record
 from service.contract.observations import LearningOptions
 from service.journal import log

@@ -8,8 +8,8 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families as parse
 
 from lipcore.model.body import Body
-from lipcore.online.bodies import CENTRE, WIDTH
-from lipcore.online.bodies import body as parameters_of
+from lipcore.online.payload.bodies import CENTRE, WIDTH
+from lipcore.online.payload.bodies import body as parameters_of
 from lipserve import ApiError, AsyncClient, Client
 from service.learning.control import payload
 from tests.service.data import eventually

@@ -15,7 +15,7 @@ import lipcore
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.online.batch import Rows
-from lipcore.online.holding import Watch
+from lipcore.online.payload.holding import Watch
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
 from service.foundation.settings import Settings

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lipcore.fitting.hyperparameters import FitCancelledError
+from lipcore.estimators.hyperparameters import FitCancelledError
 from service.foundation.settings import Settings
 from service.runtime import executors
 from service.runtime.executors import AHEAD, Inline, ShardFailedError, shard_executor, summed

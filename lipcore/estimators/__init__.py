@@ -1,0 +1,1 @@
+"""The estimators: which there are, their hyperparameters, noise, options, and what a training is given."""

@@ -1,0 +1,77 @@
+"""What a training may start from: the version of another unit of the same robot, its base."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+from lipcore.estimators.options import FitOptions
+from lipcore.vocabulary import AUTO, CHAINED_ARM, ROBOT_ESTIMATORS
+
+
+class BaseMismatchError(ValueError):
+    """A training cannot start from the base that is named.
+
+    field: of the training that does not go with it, as the API names it; value: what it is; expected: what it may be.
+    """
+
+    def __init__(self, field: str, value: object, expected: str) -> None:
+        super().__init__(f"{field} is {value!r}, expected {expected}")
+        self.field, self.value, self.expected = field, value, expected
+
+
+@dataclass(frozen=True)
+class RobotKind:
+    """What two units of one robot have in common: the names and types of their joints, and what their torque means."""
+
+    joint_names: tuple[str, ...]
+    joint_types: tuple[str, ...]
+    torque_convention: str
+
+    @classmethod
+    def of_manifest(cls, manifest: Mapping[str, Any]) -> RobotKind:
+        """The robot of a saved model."""
+        names, types = tuple(manifest["joint_names"]), tuple(manifest["joint_types"])
+        return cls(names, types, manifest["torque_convention"])
+
+    def difference(self, other: RobotKind) -> tuple[str, str, str] | None:
+        """Return a field in which another robot differs, its text here and there; None where there is none."""
+        for name in (each.name for each in fields(RobotKind)):
+            own, others = getattr(self, name), getattr(other, name)
+            if own != others:
+                own, others = (part if isinstance(part, str) else ", ".join(part) for part in (own, others))
+                return name, own, others
+        return None
+
+
+def check_base(
+    name: str,
+    base: RobotKind,
+    order: Sequence[int] | None,
+    data: RobotKind,
+    estimator: str,
+    options: FitOptions,
+    robot: str | None,
+) -> None:
+    """Raise BaseMismatchError unless a training can start from a base.
+
+    name: of the base; order: the data's joint at each place of its arm's chain, (n,), None where it has no arm; data:
+    of what is trained on; estimator, options, robot: of the training.
+    """
+    robots = (AUTO, *ROBOT_ESTIMATORS)
+    if order is None:
+        raise BaseMismatchError("base", name, f"a version whose estimator has an arm, {' or '.join(ROBOT_ESTIMATORS)}")
+    if estimator not in robots:
+        raise BaseMismatchError("estimator", estimator, f"one of {', '.join(robots)} with a base")
+    if (found := data.difference(base)) is not None:
+        field, own, others = found
+        raise BaseMismatchError("base", name, f"a version with the {field} of the data, {own}; it has {others}")
+    if estimator == CHAINED_ARM and list(order) != list(range(len(order))):
+        raise BaseMismatchError("estimator", estimator, f"{' or '.join(robots[:2])}: the base's joints go another way")
+    if robot is not None:
+        raise BaseMismatchError("robot", robot, "none with a base, whose arm is expected")
+    if options.geometry == "learn":
+        raise BaseMismatchError("options.geometry", "learn", "auto, calibrate or fixed with a base")
+    if options.prior != "urdf":
+        raise BaseMismatchError("options.prior", options.prior, "the default with a base, whose masses are expected")

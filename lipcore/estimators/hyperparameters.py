@@ -1,0 +1,261 @@
+"""Fitting: hyperparameters by penalised marginal likelihood on a subset, then the exact posterior."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.data.motion import Motion
+from lipcore.data.samples import Array, Samples
+from lipcore.estimators import noise
+from lipcore.estimators.options import FitOptions
+from lipcore.kernels.base import Params, TorqueKernel
+from lipcore.posterior.exact import negative_log_evidence
+from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.posterior.selection import spread_out
+from lipcore.vocabulary import Place
+
+PRIOR_STD = {"noise.log_std": noise.PRIOR_STD, "logits": 4.0, "log": 3.0}
+"""Widths of the Gaussian priors on hyperparameters around their starting values: weak, but for the noise, which a
+small data set cannot tell from misfit. 3 on a logarithm admits a factor of 20 either way within one deviation."""
+LINE_SEARCH_PENALTY = 1e4
+TOLERANCE = 1e-7
+"""The fit has converged when an iteration improves the objective by less than this share of it."""
+MEMORY = 30
+"""Corrections that L-BFGS keeps."""
+SCREENING_SAMPLES, SCREENING_ITERATIONS = 60, 15
+START_SPREAD = 0.3
+"""How far other starts lie from the kernel's own, in widths of the prior."""
+
+
+class FitCancelledError(RuntimeError):
+    """The caller asked to stop."""
+
+
+@dataclass(frozen=True)
+class FitProgress:
+    """How far a fit is.
+
+    stage: `geometry`, `hyperparameters` or `posterior`; iteration, of max_iterations; objective: penalised −log
+    evidence, nats; fraction: 0..1 of the work; elapsed: s; estimator: the one at work, where `auto` trains several.
+    """
+
+    stage: str
+    iteration: int
+    max_iterations: int
+    objective: float
+    fraction: float
+    elapsed: float
+    estimator: str | None = None
+
+
+@dataclass(frozen=True)
+class FitReport:
+    """What a fit did.
+
+    objective: penalised −log evidence at the end, nats; iterations: of the search that was followed; evaluations: of it
+    and of the screening; rejected_steps: line-search points whose covariance could not be factored; converged: whether
+    the search ended by itself; start: number of the start that was followed, 0 for the kernel's own; samples_given,
+    samples_hyperparameters, samples_posterior: how many there were, and how many each stage used; seconds: wall time of
+    the hyperparameters' fit; device: that it ran on.
+    """
+
+    objective: float
+    iterations: int
+    evaluations: int
+    rejected_steps: int
+    converged: bool
+    start: int
+    samples_given: int
+    samples_hyperparameters: int
+    samples_posterior: int
+    seconds: float
+    device: str
+
+
+Progress = Callable[[FitProgress], None]
+Cancelled = Callable[[], bool]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fitted hyperparameters and the rows of the data that the posterior stands on."""
+
+    params: dict[str, Array]
+    rows: NDArray[np.int64]
+    report: FitReport
+
+
+def fit(
+    kernel: TorqueKernel,
+    samples: Samples,
+    options: FitOptions,
+    on_progress: Progress | None = None,
+    cancelled: Cancelled | None = None,
+    stretches: Samples | None = None,
+    begin: Params | None = None,
+) -> Fit:
+    """Fit hyperparameters to samples; on_progress after every iteration, `cancelled` asked at every evaluation.
+
+    stretches: contiguous samples that tell the white noise, where `samples` are thinned; begin: hyperparameters that
+    are known better than the kernel's own start.
+    Raise FitCancelledError when `cancelled` answers true, NotPositiveDefiniteError where no hyperparameters give a
+    covariance that can be factored.
+    """
+    device, motion, tau = options.place(), samples.motion(), samples.tau
+    floor = np.log(noise.floor(samples))
+    start = kernel.initial(motion, tau)
+    start["noise.log_std"] = np.log(noise.start(samples, stretches))
+    start |= begin or {}
+    stop = cancelled or (lambda: False)
+    rows = spread_out(motion, options.hyperparameter_samples)
+    search = _Search(kernel, start, floor, motion[rows], tau[rows], stop, device)
+
+    began, iteration = time.monotonic(), 0
+
+    def report_progress(stage: str, objective: float) -> None:
+        if on_progress is not None:
+            done, most, elapsed = iteration, options.max_iterations, time.monotonic() - began
+            fraction = 0.95 * (1.0 if stage == "posterior" else iteration / most)
+            on_progress(FitProgress(stage, done, most, objective, fraction, elapsed))
+
+    def callback(intermediate_result: Any) -> None:
+        nonlocal iteration
+        iteration += 1
+        report_progress("hyperparameters", float(intermediate_result.fun))
+
+    few = spread_out(motion, min(SCREENING_SAMPLES, options.hyperparameter_samples))
+    screening = _Search(kernel, start, floor, motion[few], tau[few], stop, device)
+    chosen, origin = _best_start(screening, options.starts)
+    result = search.run(origin, options.max_iterations, callback)
+    seconds = time.monotonic() - began
+    report_progress("posterior", float(result.fun))
+
+    used = spread_out(motion, options.posterior_samples)
+    # evenly among those of the posterior: spread-out samples are the odd ones
+    even = used[np.linspace(0, len(used) - 1, min(len(used), noise.SAMPLES)).round().astype(np.int64)]
+    params = search.unpack(result.x)
+    params = noise.refine(kernel, params, motion[even], tau[even], start["noise.log_std"], floor)
+    report = FitReport(
+        objective=float(result.fun),
+        iterations=int(result.nit),
+        evaluations=search.evaluations + screening.evaluations,
+        rejected_steps=search.rejected,
+        converged=bool(result.success),
+        start=chosen,
+        samples_given=len(samples),
+        samples_hyperparameters=len(rows),
+        samples_posterior=len(used),
+        seconds=seconds,
+        device=device,
+    )
+    return Fit(params, used, report)
+
+
+def _best_start(screening: _Search, starts: int) -> tuple[int, Array]:
+    """Return which of several starts leads to the best evidence of few samples in few steps, and where it led.
+
+    The first is the kernel's own, the others are drawn from the prior. A poor optimum mostly shows early, and few
+    samples cost little: this finds it before the long search.
+    """
+    rng = np.random.default_rng(0)
+    centre, width = screening.pack(screening.start), screening.pack(screening.width_tensors())
+    best, chosen, origin = np.inf, 0, centre
+    for number in range(starts):
+        begin = centre if number == 0 else centre + START_SPREAD * width * rng.standard_normal(len(centre))
+        screening.best = np.inf
+        try:
+            result = screening.run(begin, SCREENING_ITERATIONS)
+        except NotPositiveDefiniteError:
+            if number == 0 and starts == 1:
+                raise
+            continue
+        if result.fun < best:
+            best, chosen, origin = float(result.fun), number, result.x
+    return chosen, origin
+
+
+class _Search:
+    """Penalised negative log evidence as a function of one flat vector, for scipy."""
+
+    def __init__(
+        self,
+        kernel: TorqueKernel,
+        start: Params,
+        floor: Array,
+        motion: Motion,
+        tau: Array,
+        cancelled: Cancelled,
+        device: Place,
+    ) -> None:
+        self.kernel, self.start, self.floor, self.motion, self.tau = kernel, start, floor, motion, tau
+        self.widths = {name: prior_std(name) for name in start} | kernel.prior_std()
+        self.cancelled, self.device = cancelled, device
+        self.evaluations = self.rejected = 0
+        self.best = np.inf
+
+    def __call__(self, flat: Array) -> tuple[float, Array]:
+        if self.cancelled():
+            raise FitCancelledError("the fit was cancelled")
+        self.evaluations += 1
+        params = self.unpack(flat)
+        try:
+            # a line search may step to where exponentials overflow: that covariance is not finite, and is refused
+            with np.errstate(over="ignore", invalid="ignore"):
+                evidence = negative_log_evidence(self.kernel, params, self.motion, self.tau, self.device)
+        except NotPositiveDefiniteError:
+            if not np.isfinite(self.best):
+                raise  # not even the starting point is well posed
+            self.rejected += 1
+            return self.best + LINE_SEARCH_PENALTY, np.zeros_like(flat)
+        value, gradient = evidence.value, evidence.gradient
+        for name, centre in self.start.items():
+            width = self.widths[name]
+            deviation = (params[name] - centre) / width
+            value += float(0.5 * np.square(deviation).sum())
+            gradient[name] = gradient[name] + deviation / width
+        self.best = min(self.best, value)
+        return value, self.pack(gradient)
+
+    def run(self, begin: Array, iterations: int, callback: Callable[..., None] | None = None) -> Any:
+        """Minimise by L-BFGS-B from `begin`; scipy's result. The noise stays above its floor."""
+        from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
+
+        free = {name: np.full_like(value, -np.inf) for name, value in self.start.items()}
+        lower = self.pack({**free, "noise.log_std": self.floor})
+        return minimize(
+            self,
+            np.maximum(begin, lower),
+            jac=True,
+            method="L-BFGS-B",
+            callback=callback,
+            bounds=[(low, np.inf) for low in lower.tolist()],
+            options={"maxiter": iterations, "maxcor": MEMORY, "ftol": TOLERANCE},
+        )
+
+    def width_tensors(self) -> dict[str, Array]:
+        """Width of the prior of every hyperparameter."""
+        return {name: np.full_like(value, self.widths[name]) for name, value in self.start.items()}
+
+    def pack(self, params: Params) -> Array:
+        return np.concatenate([params[name].ravel() for name in self.start])
+
+    def unpack(self, flat: Array) -> dict[str, Array]:
+        params, at = {}, 0
+        for name, like in self.start.items():
+            part = flat[at : at + like.size].copy()
+            params[name] = part.reshape(like.shape)
+            at += like.size
+        return params
+
+
+def prior_std(name: str) -> float:
+    """Width of the prior on hyperparameter `name` around its starting value."""
+    if name in PRIOR_STD:
+        return PRIOR_STD[name]
+    return PRIOR_STD["logits" if name.endswith("logits") else "log"]

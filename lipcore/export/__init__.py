@@ -1,0 +1,1 @@
+"""A model that leaves: as a URDF, and as C."""

@@ -1,0 +1,136 @@
+"""The weights of arm and friction as C needs them: tau = Φ w, w ~ N(ŵ, C), in as few features as there are.
+
+φ_b are the features that are not sums of others, Φᵀ = T φ_b, and Tᵀ C T = U Uᵀ, so that φᵀ C φ = |Uᵀ φ_b|².
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lipcore.data.samples import Array
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.fast.arm_recursion import PARAMETERS
+from lipcore.kernels.friction import FrictionKernel
+from lipcore.kernels.geometry import Geometry
+from lipcore.model.body import LOWER
+from lipcore.model.torque_model import TorqueModel
+
+MASS, HX, HY, HZ, XX, XY, YY, XZ, YZ, ZZ = range(PARAMETERS)
+
+
+class UnsupportedEstimatorError(ValueError):
+    """The model is of an estimator that is not written as C."""
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """A model's weights. arm, friction: its terms; mean: (p,) of all weights, the arm's first; left: Q Λ, (p, p), with
+    their prior variances Λ, so that their covariance is (Q Λ)ᵀ Q Λ; shared: (p, m), what m torques of a nonlinear term
+    add to Q Λ Φᵀ where they have the covariances c with a query's: Q c; factor: on their deviations."""
+
+    arm: ArmKernel
+    friction: FrictionKernel
+    mean: Array
+    left: Array
+    shared: Array
+    factor: float
+
+    @classmethod
+    def of(cls, model: TorqueModel) -> Learnt:
+        """What a model has learnt; raise UnsupportedEstimatorError where its weights are others than those two's."""
+        posterior, terms = model.posterior, model.estimator.terms
+        arm, friction = terms["rigid_body"], terms["friction"]
+        assert isinstance(arm, ArmKernel)
+        assert isinstance(friction, FrictionKernel)
+        if list(posterior.basis.linear) != [arm, friction]:
+            raise UnsupportedEstimatorError("the posterior holds more weights than those of rigid bodies and friction")
+        diagonals = [each.variances(posterior.params) for each in (arm, friction)]
+        prior, centre, first = np.concatenate(diagonals), arm.prior_weights(), len(posterior.basis.outputs)
+        assert centre is not None
+        mean = posterior.weights[first:] * prior
+        mean[: arm.size] += centre
+        rows = posterior.root[first:]
+        return cls(arm, friction, mean, rows[:, first:] * prior, rows[:, :first], posterior.std_factor)
+
+    def root(self, expand: Array) -> tuple[Array, Array]:
+        """U, upper triangular, with U Uᵀ = Tᵀ C T, and V, (p_b, m): the deviation is |Uᵀ φ_b + V c|. expand: T, (p,
+        p_b)."""
+        size = expand.shape[1]
+        # with columns and rows in reverse order, and without the product, whose condition is the square
+        turn, made = np.linalg.qr((self.left @ expand)[:, ::-1])
+        shared = turn.T @ self.shared
+        return self.factor * made[::-1, ::-1].T, self.factor * shared[:size][::-1]
+
+
+def axes_of(geometry: Geometry) -> Array:
+    """Axes of the written frames in those of the geometry: (n, 3, 3), the two across the joint's axis and itself."""
+    return np.concatenate([geometry.across, geometry.axis[:, None]], axis=1).mT
+
+
+def moved(turn: Array, place: Array, body: Array) -> Array:
+    """Ten parameters of a body in the frame where its own, (3, 3) axes turned by `turn`, lies at `place`, (3,) m."""
+    about = np.zeros((3, 3))
+    about[LOWER] = body[XX:]
+    about = about + np.tril(about, -1).T
+    mass, first = body[MASS], turn @ body[HX:XX]
+    # second moments, which are those of points
+    second = turn @ (0.5 * np.trace(about) * np.eye(3) - about) @ turn.T
+    second = second + np.outer(place, first) + np.outer(first, place) + mass * np.outer(place, place)
+    return np.concatenate([[mass], first + mass * place, (np.trace(second) * np.eye(3) - second)[LOWER]])
+
+
+def regrouped(learnt: Learnt) -> tuple[list[list[int]], Array]:
+    """Which of each body's ten numbers torque depends on, and T: (p, p_b), rows as the model's weights.
+
+    A body that is symmetric about a joint's axis may as well be fixed to the link before: three numbers of a body
+    behind a revolute joint, and all inertia behind a prismatic one, are sums of those of the link before.
+    """
+    arm = learnt.arm.arm
+    n, axes, unit = arm.n_joints, axes_of(arm.geometry), np.eye(PARAMETERS)
+    before = np.concatenate([np.eye(3)[None], axes[:-1]])
+    slides = [kind == "prismatic" for kind in arm.geometry.joint_types]
+    # the first joint moves its body about, or along, one axis only
+    kept = [[MASS] if slides[0] else [HX, HY, ZZ]]
+    kept += [[MASS, HX, HY, HZ] if each else [HX, HY, XX, XY, XZ, YZ, ZZ] for each in slides[1:]]
+    size = sum(map(len, kept))
+    expand, at = np.zeros((n, PARAMETERS, size)), 0
+    for j, names in enumerate(kept):
+        expand[j, names, at + np.arange(len(names))] = 1.0
+        at += len(names)
+        if j == 0:
+            continue
+        turn = before[j].T @ arm.geometry.rotation[j] @ axes[j]
+        place = before[j].T @ arm.geometry.translation[j]
+        if slides[j]:
+            for name in range(XX, PARAMETERS):
+                expand[j, name] = moved(turn, place, unit[name]) @ expand[j - 1]
+        else:
+            for name in (MASS, HZ):
+                expand[j, name] = moved(turn, place, unit[name]) @ expand[j - 1]
+            round_ = moved(turn, place, unit[XX] + unit[YY]) @ expand[j - 1]
+            expand[j, YY] = round_ - expand[j, XX]
+    return kept, _in_weights(learnt, axes, expand)
+
+
+def _in_weights(learnt: Learnt, axes: Array, expand: Array) -> Array:
+    """T of all weights. expand: (n, 10, b), what features of the bodies in their written frames are."""
+    arm, n, size = learnt.arm.arm, learnt.arm.n_joints, expand.shape[2]
+    rubbing = len(learnt.friction.terms)
+    rest = learnt.arm.size - (PARAMETERS + 1) * n
+    out = np.zeros((len(learnt.mean), n * (1 + rubbing) + size + rest))
+    first = n * (1 + rubbing)
+    for j, joint in enumerate(arm.order):
+        # features turn as the parameters' dual: Y' π' = Y π for π' = M π, so Y = Y' M
+        turned = np.stack([moved(axes[j].T, np.zeros(3), each) for each in np.eye(PARAMETERS)], axis=1)
+        out[PARAMETERS * joint : PARAMETERS * (joint + 1), first : first + size] = turned.T @ expand[j]
+        own = j * (1 + rubbing)
+        out[PARAMETERS * n + joint, own] = 1.0
+        for term in range(rubbing):
+            out[learnt.arm.size + rubbing * joint + term, own + 1 + term] = 1.0
+    steps = learnt.arm.steps
+    out[steps, first + size : first + size + arm.steps] = np.eye(arm.steps)
+    if learnt.arm.others is not None:
+        out[steps.stop : learnt.arm.size, first + size + arm.steps :] = learnt.arm.others.mixing.T
+    return out

@@ -1,0 +1,269 @@
+"""A model of rigid bodies as C99 for hard real time: a source and a header, from the templates in `lipcore/files/c`.
+
+Torque is linear in the weights w of arm and friction, tau = Φ w with w ~ N(ŵ, C). The mean is written as one recursion
+over the bodies and their change with the learnt step (no features), the standard deviation as |Uᵀ φ_b|, see
+`c_weights`. A nonlinear term adds its covariances with stored torques, see `c_rest`. Each joint's frame is turned
+so that its axis is z, and the two vectors across it, which the steps of the geometry are about, are x and y.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import numpy as np
+
+from lipcore.data.metrics import LEVEL, quantile
+from lipcore.data.samples import Array
+from lipcore.export.c_rest import Rest
+from lipcore.export.c_weights import Learnt, UnsupportedEstimatorError, axes_of, moved, regrouped
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.fast.answer import ACCELERATED
+from lipcore.kernels.fast.arm_recursion import PARAMETERS
+from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED
+from lipcore.kernels.geometry import Geometry
+from lipcore.kernels.payload import PayloadKernel
+from lipcore.model.body import Body
+from lipcore.model.torque_model import TorqueModel
+from lipcore.vocabulary import ROBOT_ESTIMATORS
+
+TEMPLATES = Path(__file__).parent / "c"
+SOURCE, HEADER = "lipserve_model.c", "lipserve_model.h"
+WIDE = 8
+"""Columns of a panel of the root."""
+LINE = 100
+"""Characters of a line of numbers."""
+VECTORS = 16
+"""Queries that the self-test asks, half of them with PAYLOAD."""
+PAYLOAD = Body(1.3, np.array([0.02, -0.03, 0.11]), np.diag([0.004, 0.005, 0.003]))
+"""What these carry."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What a file says of where it is from. model: name; version, revision: numbers; digest: of the model's tensors."""
+
+    model: str
+    version: int
+    revision: int
+    digest: str
+
+
+def c_files(model: TorqueModel, origin: Origin) -> dict[str, str]:
+    """The texts of SOURCE and HEADER by name, ASCII. Raise UnsupportedEstimatorError for an estimator that is not of
+    ROBOT_ESTIMATORS."""
+    if model.estimator.name not in ROBOT_ESTIMATORS:
+        raise UnsupportedEstimatorError(
+            f"estimator is {model.estimator.name!r}, expected one of {', '.join(ROBOT_ESTIMATORS)} for C"
+        )
+    learnt = Learnt.of(model)
+    fields = _texts(model, origin) | _tables(model, learnt) | {"stack": _stack(model)}
+    written = {}
+    for name in (SOURCE, HEADER):
+        written[name] = _template(name).substitute(fields)
+    return written
+
+
+def _template(name: str) -> Template:
+    return Template((TEMPLATES / f"{name}.in").read_text(encoding="ascii"))
+
+
+def _tables(model: TorqueModel, learnt: Learnt) -> dict[str, str]:
+    """All numbers of the source."""
+    arm, posterior = learnt.arm.arm, model.posterior
+    n, size, order = arm.n_joints, PARAMETERS * arm.n_joints, arm.order
+    kept, expand = regrouped(learnt)
+    root, shared = learnt.root(expand)
+    others = 0 if learnt.arm.others is None else learnt.arm.others.size
+    rubbing = learnt.mean[learnt.arm.size :].reshape(n, -1)
+    own = np.concatenate([learnt.mean[size : size + n, None], rubbing], axis=1)[order]
+    bodies = learnt.mean[:size].reshape(n, PARAMETERS)[order]
+    table = _arm_table(arm.geometry, learnt.mean[learnt.arm.steps], arm.parameters, bodies - arm.parameters, own)
+    arms, share = "{0}", "{0}"
+    if learnt.arm.others is not None:
+        each = [
+            _arm_table(
+                replace(alone.geometry, gravity=arm.alternatives[0].geometry.gravity),
+                np.zeros(0),
+                alone.parameters,
+                np.zeros_like(alone.parameters),
+                np.concatenate([alone.rotor[:, None], alone.friction], axis=1)[order],
+            )
+            for alone in arm.alternatives
+        ]
+        arms = "{" + ",\n".join(each) + "}"
+        share = _braced(learnt.arm.others.mixing @ learnt.mean[learnt.arm.steps.stop : learnt.arm.size])
+    padded = [[*names, *[0] * (7 - len(names))] for names in kept]
+    counts = [len(names) for names in kept]
+    limits = [[model.training_range[name][end] for end in ("min", "max")] for name in ("q", "dq", "ddq")]
+    body = PAYLOAD.inertia
+    assert body is not None
+    return {
+        "n": str(n),
+        "friction": str(rubbing.shape[1]),
+        "bodies": str(sum(counts)),
+        "steps": str(arm.steps),
+        "others": str(others),
+        "vectors": str(VECTORS),
+        "order": _integers(order),
+        "slides": _integers([kind == "prismatic" for kind in arm.geometry.joint_types]),
+        "screws": _integers(arm.geometry.screws if arm.steps else [0] * n),
+        "first": _integers(np.concatenate([[0], np.cumsum(counts)[:-1]])),
+        "count": _integers(counts),
+        "kept": "{" + ", ".join(_integers(names) for names in padded) + "}",
+        "tip": _braced(axes_of(arm.geometry)[-1].T.reshape(-1)),
+        "sign_width": repr(SIGN_WIDTH),
+        "slow_speed": repr(STRIBECK_SPEED),
+        "accelerated": repr(ACCELERATED),
+        "quantile": repr(quantile(LEVEL)),
+        "arm": table,
+        "arms": arms,
+        "share": share,
+        "root": _braced(_panels(root)),
+        **_rest(Rest.of(posterior), shared),
+        "misfit": _braced(posterior.misfit.packed()),
+        "floor": _braced(posterior.floor),
+        "range": _braced(np.array(limits)),
+        "payload": "{" + f"{PAYLOAD.mass!r}, {_braced(PAYLOAD.com)}, {_braced(body.reshape(-1))}" + "}",
+        "vector": _braced(_vectors(model, learnt)),
+        "noise": _braced(model.noise_std),
+        "scale": _braced(model.scale),
+    }
+
+
+def _texts(model: TorqueModel, origin: Origin) -> dict[str, str]:
+    """All words of both files: names are anyone's, and must not end a comment or a string."""
+    names = [name.encode() for name in model.joint_names]
+    limits = model.training_range
+    joints = []
+    for k, name in enumerate(model.joint_names):
+        unit = "m" if model.joint_types[k] == "prismatic" else "rad"
+        seen = [
+            f"{what} {limits[what]['min'][k]:.4g} to {limits[what]['max'][k]:.4g}{mark}"
+            for what, mark in (("q", f" {unit}"), ("dq", "/s"), ("ddq", "/s^2"))
+        ]
+        joints.append(f" *       {k}  {_comment(name)}, {model.joint_types[k]}, trained for {', '.join(seen)}")
+    mode = model.arm is not None and model.arm.mode == "learn"
+    frame = "in the last link's frame of the learnt arm, see\n * `parameters.geometry` of the version"
+    return {
+        "title": f"Inverse dynamics of {_comment(origin.model)}, version {origin.version}",
+        "model": _comment(origin.model),
+        "version": str(origin.version),
+        "revision": str(origin.revision),
+        "digest": _comment(origin.digest),
+        "estimator": model.estimator.name,
+        "convention": _comment(model.torque_convention.replace("_", " ")),
+        "joints": "\n".join(joints),
+        "names": "{" + ", ".join(_string(name) for name in names) + "}",
+        "name_size": str(max(map(len, names)) + 1),
+        "model_text": _string(origin.model.encode()),
+        "frame": frame if mode else "in the frame of the URDF's last movable joint",
+    }
+
+
+def _arm_table(geometry: Geometry, step: Array, bodies: Array, change: Array, own: Array) -> str:
+    """An `arm_t`. step: (g,), none where the geometry is fixed; bodies, change: (n, 10), own: (n, 4 or 5), base to
+    tip."""
+    n, axes = geometry.n_joints, axes_of(geometry)
+    before = np.concatenate([np.eye(3)[None], axes[:-1]])
+    turn = before.mT @ geometry.rotation @ axes
+    place = (before.mT @ geometry.translation[..., None])[..., 0]
+    tilt, along, at = np.zeros((n, 2)), np.zeros((n, 3)), 0
+    for j, count in enumerate(geometry.screws if len(step) else [0] * n):
+        tilt[j, : min(count, 2)] = step[at : at + min(count, 2)]
+        along[j, : max(count - 2, 0)] = step[at + 2 : at + count]
+        at += count
+    shift = (turn @ along[..., None])[..., 0]
+    turned = [np.stack([moved(axes[j].T, np.zeros(3), each[j]) for j in range(n)]) for each in (bodies, change)]
+    names = ("gravity", "turn", "place", "tilt", "shift", "body", "change", "own")
+    numbers = (geometry.gravity, turn.reshape(n, 9), place, tilt, shift, *turned, own)
+    fields = [f".{name} = {_braced(value)}" for name, value in zip(names, numbers, strict=True)]
+    return "{\n" + ",\n".join(fields) + "}"
+
+
+def _rest(rest: Rest | None, shared: Array) -> dict[str, str]:
+    """What a nonlinear term adds; nothing for rigid bodies alone. shared: V of `Learnt.root`."""
+    if rest is None:
+        return {"outputs": "0", "alpha": "{0}", "learnt": "{0}", "shared": "{0}", "factor": "0", "term": ""}
+    padded = np.pad(shared, ((0, -len(shared) % WIDE), (0, 0)))
+    tables = {name: _braced(values) for name, values in rest.tables.items()}
+    places = "{" + ",\n".join(_integers(row) for row in rest.places) + "}"
+    return {
+        "outputs": str(len(rest.alpha)),
+        "alpha": _braced(rest.alpha),
+        "learnt": _braced(_panels(rest.factor * rest.learnt.T)),
+        "shared": _braced(padded.reshape(-1, WIDE, padded.shape[1]).transpose(0, 2, 1).reshape(-1)),
+        "factor": repr(rest.factor**2),
+        "term": _template(rest.template).substitute(tables, groups=str(rest.groups), places=places),
+    }
+
+
+def _stack(model: TorqueModel) -> str:
+    """Kilobytes that a call takes, of its largest arrays: links; covariances and products of energies."""
+    n, outputs = model.n_joints, len(model.posterior.basis.outputs)
+    return str(round(2 * n + (8e-3 * n * outputs + 0.6 * n**2 if outputs else 0.0)))
+
+
+def _panels(root: Array) -> Array:
+    """The root's columns, WIDE at a time, row by row down to the diagonal: flat; zeros fill the last."""
+    size = len(root)
+    padded = np.pad(root, ((0, 0), (0, -size % WIDE)))
+    starts = range(0, size, WIDE)
+    return np.concatenate([padded[: min(at + WIDE, size), at : at + WIDE].reshape(-1) for at in starts])
+
+
+def _vectors(model: TorqueModel, learnt: Learnt) -> Array:
+    """Queries within the training's range, and the model's own answers: (VECTORS, 5, n)."""
+    limits, draw, n = model.training_range, np.random.default_rng(0).uniform, model.n_joints
+    motions = [draw(limits[name]["min"], limits[name]["max"], (VECTORS, n)) for name in ("q", "dq", "ddq")]
+    out = []
+    for rows, carried in ((slice(0, VECTORS // 2), False), (slice(VECTORS // 2, VECTORS), True)):
+        motion = [each[rows] for each in motions]
+        q, dq, ddq = motion
+        mean, std, *_ = (_carrying(model, learnt) if carried else model).evaluator.many(q, dq, ddq)
+        more = np.zeros_like(mean)
+        if carried:
+            features = PayloadKernel(learnt.arm.arm, np.ones(PARAMETERS)).rows(np.stack(motion, axis=1))
+            more = np.einsum("nkj,k->nj", features, PAYLOAD.parameters)
+        out.append(np.stack([*motion, mean + more, std], axis=1))
+    return np.concatenate(out)
+
+
+def _carrying(model: TorqueModel, learnt: Learnt) -> TorqueModel:
+    """The model whose torque changes with the geometry as that of an arm with PAYLOAD does."""
+    parameters = learnt.arm.arm.parameters.copy()
+    parameters[-1] += PAYLOAD.parameters
+    loaded = ArmKernel(replace(learnt.arm.arm, parameters=parameters))
+    basis = replace(model.posterior.basis, linear=(loaded, learnt.friction))
+    return replace(model, posterior=replace(model.posterior, basis=basis))
+
+
+def _braced(values: Any) -> str:
+    """Numbers as an initializer, from which they read back as they are; a line at most each."""
+    if np.ndim(values) > 1:
+        return "{" + ",\n".join(_braced(each) for each in values) + "}"
+    texts, lines, line = [repr(float(each)) for each in values], list[str](), ""
+    for text in texts:
+        if len(line) + len(text) > LINE:
+            lines.append(line.rstrip())
+            line = ""
+        line += f"{text}, "
+    return "{" + "\n".join([*lines, line]).rstrip(", ") + "}"
+
+
+def _integers(values: Iterable[Any]) -> str:
+    return "{" + ", ".join(str(int(each)) for each in values) + "}"
+
+
+def _comment(text: str) -> str:
+    """Text within a comment, which it cannot end: ASCII, without line ends, backslashes and slashes."""
+    return "".join(each if each.isascii() and each.isprintable() and each not in "/\\?" else "_" for each in text)
+
+
+def _string(text: bytes) -> str:
+    """A string literal of these bytes: three octal digits for all but letters, digits and a few marks."""
+    plain = b"abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-. "
+    return '"' + "".join(chr(each) if each in plain else f"\\{each:03o}" for each in text) + '"'

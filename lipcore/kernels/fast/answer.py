@@ -1,0 +1,248 @@
+"""Mean and covariance of the torques at a few queries, from their covariances with the anchors (see `Evaluator`).
+
+The inner loop of every standard deviation is a lower triangular matrix times a few columns. BLAS is made for larger
+products and reaches half of what a core can do on these; it also starts threads when it sees fit. Here the matrix lies
+in panels of ROWS rows, each stored column by column up to its diagonal, and one loop over Lanes holds all of
+ROWS × WIDTH sums in registers (12 of AVX2's 16).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lipcore.kernels.fast.compile import brief, compiled, inlined
+from lipcore.kernels.fast.lanes import LANES, spread
+from lipcore.kernels.fast.views import lay, numbers
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+ROWS = 6
+"""Rows of a panel."""
+WIDTH = LANES
+"""Columns that a panel is multiplied with; a robot of more joints takes several rounds."""
+
+
+def pack(matrix: Array, before: int) -> Array:
+    """Panels of `matrix`, (K, M), one after the other, flat; zeros fill the last.
+
+    before: columns before those of the diagonal; what lies right of each panel's last diagonal element is zero, and
+    left out.
+    """
+    panels = [np.zeros(0)]
+    for first in range(0, matrix.shape[0], ROWS):
+        rows = matrix[first : first + ROWS, : before + min(first + ROWS, matrix.shape[0])]
+        panel = np.zeros((rows.shape[1], ROWS))
+        panel[:, : len(rows)] = rows.T
+        panels.append(panel.reshape(-1))
+    return np.concatenate(panels)
+
+
+@inlined
+def multiply(panels: Array, panel: int, columns: Array, first: int, count: int, out: Array, at: int) -> None:
+    """out[at:] = Σ_k panels[panel + ROWS k + r] columns[first + WIDTH k + c], (ROWS, WIDTH) at (r, c); k < count.
+
+    All arrays are flat; count is the number of the panel's columns.
+    """
+    (x,), (y,) = lay(columns, first, ((count,),))[0], lay(out, at, ((ROWS,),))[0]
+    rows = numbers(panels, panel, (count, ROWS))
+    a = b = c = d = e = f = spread(0.0)
+    for k in range(count):
+        factors = x[k]
+        a, b, c = a + rows[k, 0] * factors, b + rows[k, 1] * factors, c + rows[k, 2] * factors
+        d, e, f = d + rows[k, 3] * factors, e + rows[k, 4] * factors, f + rows[k, 5] * factors
+    y[0], y[1], y[2], y[3], y[4], y[5] = a, b, c, d, e, f
+
+
+MEAN, STD, COVARIANCE = range(3)  # how much to answer: each takes what is before it, too
+FALLBACK_START, FALLBACK_END = 1.0, 3.0
+"""Posterior variance of a torque, as a multiple of its variance in training, where the fallback begins and where it is
+complete. Chosen on ten short recordings of seven real arms: a start at 0.25 to 0.75 made more good joints worse, and no
+more bad joints harmless."""
+ACCELERATED = 0.1
+"""How much a mean square of accelerations counts beside one of speeds, where motion is beyond the training's: errors of
+inertias grow with the former, of friction with the latter. Chosen on simulated arms with `Dirt` (seeds 50 and 51 of
+`benchmarks/studies/dirty_arms.py`) among 0, 0.02, 0.05, 0.1 and 0.2: of motion three times as fast, 1 to 3 % of the
+arms' joints have a coverage below 85 % with it, 6 to 9 % without."""
+
+
+@inlined
+def fallback_share(variance: float, usual: float) -> float:
+    """Return the share of the fallback in an answer, 0 to 1, of its posterior variance and the training's, (N·m)²."""
+    if not variance > FALLBACK_START * usual:  # a joint whose torque has never varied has a `usual` of zero
+        return 0.0
+    return min((variance - FALLBACK_START * usual) / ((FALLBACK_END - FALLBACK_START) * usual), 1.0)
+
+
+@compiled
+def answer(
+    fixed: Array,
+    outputs: Indices,
+    blocks: Array,
+    features: Array,
+    std_factor: float,
+    floor: Array,
+    misfit: Array,
+    usual: Array,
+    motions: Array,
+    what: int,
+    memory: Array,
+    tau: Array,
+    std: Array,
+    covariance: Array,
+    share: Array,
+) -> bool:
+    """Write the torques of N queries, and as much of their uncertainty as `what` says. Return whether any of `share` is
+    above zero.
+
+    fixed: the panel of the mean, those of the root's rows that are subtracted, one an output, then those that are
+    added, one a linear weight; blocks: (N, S + 1, n, n) from `Cross`; features: (N, P, n), Φᵀ; floor: (n,), smallest
+    variance, at least 0;
+    misfit: (5, n), variance at rest, the speed where it has faded to exp(−1), variance that grows with speed and
+    acceleration beyond the usual ones, and those, see `posterior.misfit`; usual: (n,), variance of the torque in
+    training, infinite if unknown; motions: (N, 3, n), of which dq and ddq are read;
+    tau, std: (N, n); covariance: (N, n, n), work unless asked for; share: (N, n), of the fallback, see
+    `fallback_share`, not written for MEAN.
+    """
+    queries, n = tau.shape
+    chosen, linear = outputs.shape[0], features.shape[1]
+    size, groups = chosen + linear, (n + WIDTH - 1) // WIDTH
+    step = groups * size * WIDTH
+    products = queries * step
+    for query in range(queries):
+        _gather(blocks[query].reshape(-1), outputs, features[query], n, query * step, memory)
+        for group in range(groups):
+            multiply(fixed, 0, memory, query * step + group * size * WIDTH, size, memory, products)
+            for j in range(min(WIDTH, n - group * WIDTH)):
+                tau[query, group * WIDTH + j] = memory[products + j]
+    if what == MEAN:
+        return False
+
+    any_share = False
+    full = what == COVARIANCE
+    for query in range(queries):
+        _begin(blocks[query, -1], full, covariance[query])
+    panel = _add_panels(fixed, ROWS * size, 0, chosen, size, memory, full, covariance)
+    for query in range(queries):
+        _scale(-1.0, full, covariance[query])
+    _add_panels(fixed, panel, chosen, size, size, memory, full, covariance)
+    for query in range(queries):
+        _scale(std_factor * std_factor, full, covariance[query])
+        speed, acceleration = 0.0, 0.0
+        for j in range(n):
+            speed += (motions[query, 1, j] / misfit[3, j]) ** 2
+            acceleration += (motions[query, 2, j] / misfit[4, j]) ** 2
+        faster = max(speed / n - 1.0, 0.0) + ACCELERATED * max(acceleration / n - 1.0, 0.0)
+        for j in range(n):
+            share[query, j] = fallback_share(covariance[query, j, j], usual[j])
+            any_share |= share[query, j] > 0.0
+            more = misfit[0, j] * np.exp(-((motions[query, 1, j] / misfit[1, j]) ** 2)) + misfit[2, j] * faster
+            covariance[query, j, j] = max(covariance[query, j, j] + more, floor[j])
+            std[query, j] = np.sqrt(covariance[query, j, j])
+    return any_share
+
+
+@brief
+def answer_one(
+    fixed: Array,
+    outputs: Indices,
+    blocks: Array,
+    features: Array,
+    std_factor: float,
+    floor: Array,
+    misfit: Array,
+    usual: Array,
+    motions: Array,
+    what: int,
+    memory: Array,
+    tau: Array,
+    std: Array,
+    covariance: Array,
+    share: Array,
+) -> bool:
+    """`answer` of one query."""
+    return answer(
+        fixed,
+        outputs,
+        blocks,
+        features,
+        std_factor,
+        floor,
+        misfit,
+        usual,
+        motions,
+        what,
+        memory,
+        tau,
+        std,
+        covariance,
+        share,
+    )
+
+
+@compiled
+def _gather(rows: Array, outputs: Indices, features: Array, n: int, at: int, memory: Array) -> None:
+    """Covariances of the query's torques with all anchors, (groups, M, WIDTH); columns past the last are never read."""
+    chosen, linear = outputs.shape[0], features.shape[0]
+    for group in range(0, n, WIDTH):
+        count = min(WIDTH, n - group)
+        for row in range(chosen):
+            for j in range(count):
+                memory[at + j] = rows[outputs[row] * n + group + j]
+            at += WIDTH
+        for row in range(linear):
+            for j in range(count):
+                memory[at + j] = features[row, group + j]
+            at += WIDTH
+
+
+@compiled
+def _begin(prior: Array, full: bool, out: Array) -> None:
+    """Write minus the nonlinear term's own covariance, (n, n); unless `full` only its diagonal."""
+    out[:] = 0.0
+    for i in range(prior.shape[0]):
+        for j in range(0 if full else i, i + 1):
+            out[i, j] = -prior[i, j]
+
+
+@compiled
+def _add_panels(
+    fixed: Array, panel: int, first: int, last: int, size: int, memory: Array, full: bool, out: Array
+) -> int:
+    """Add the squares of the root's rows from `first` to before `last`, whose panels begin at `panel`, times the
+    columns in memory, to those of N queries, (N, n, n). Return where the next panel begins."""
+    queries, groups = out.shape[0], (out.shape[1] + WIDTH - 1) // WIDTH
+    step = groups * size * WIDTH
+    products = queries * step
+    for row in range(first, last, ROWS):  # all queries meet a panel while the cache holds it
+        reach = min(row + ROWS, last)
+        for query in range(queries):
+            for group in range(groups):
+                columns = query * step + group * size * WIDTH
+                multiply(fixed, panel, memory, columns, reach, memory, products + group * ROWS * WIDTH)
+            _add_squares(memory, products, full, out[query])
+        panel += ROWS * reach
+    return panel
+
+
+@compiled
+def _add_squares(memory: Array, products: int, full: bool, out: Array) -> None:
+    """Add Vᵀ V of one panel's products V, (groups, ROWS, WIDTH); unless `full` only its diagonal."""
+    for i in range(out.shape[0]):
+        left = products + (i // WIDTH) * ROWS * WIDTH + i % WIDTH
+        for r in range(ROWS):
+            out[i, i] += memory[left + r * WIDTH] * memory[left + r * WIDTH]
+        if full:
+            for j in range(i):
+                right = products + (j // WIDTH) * ROWS * WIDTH + j % WIDTH
+                for r in range(ROWS):
+                    out[i, j] += memory[left + r * WIDTH] * memory[right + r * WIDTH]
+
+
+@compiled
+def _scale(factor: float, full: bool, out: Array) -> None:
+    """Multiply by a factor, both triangles where `full`."""
+    for i in range(out.shape[0]):
+        for j in range(0 if full else i, i + 1):
+            out[i, j] = out[j, i] = factor * out[i, j]

@@ -1,0 +1,1 @@
+"""A robot that is no longer the one that was learnt, and a model that is led away."""

@@ -1,0 +1,280 @@
+"""A robot that is no longer the one that was learnt: detectors on prequential records, and their evidence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
+from typing import Any, Literal
+
+import numpy as np
+
+from lipcore.data.samples import Array
+from lipcore.online.record import Record, number
+
+Kind = Literal["sudden", "drift", "departure"]
+
+BUCKET_S, BUCKET_ROWS = 0.5, 50
+"""A bucket holds at least both. The mean of 50 squared standard normals deviates by 0.2 from 1."""
+RECENT_S, RECENT_BUCKETS = 2.0, 2
+REFERENCE_S, SHORTEST_REFERENCE_S, FEWEST_REFERENCE_ROWS = 20.0, 10.0, 200
+MOST_BUCKETS = round((RECENT_S + REFERENCE_S) / BUCKET_S)
+RATIO = 4.0
+"""Errors twice as large as before and as stated: 30 standard errors of the mean of 200 independent rows."""
+DEVIATIONS = 5.0
+"""Of the Gaussian that the tail of the bucket means is mapped to: one chance in 3 million where RATIO is not enough."""
+PRIOR_VARIATION, PRIOR_BUCKETS = 0.5, 10
+"""Variation of the buckets' means assumed while few have been seen, and how many buckets it counts for."""
+SHARE = 0.75
+"""Share of the recent buckets that must exceed each by itself: 3 of 4, where a collision of 0.5 s touches 2."""
+ALLOWANCE = float(np.log(2.0))
+"""Drift that is let pass: squared errors up to twice those of the best two minutes."""
+LARGEST_RATIO = 8.0
+"""Ratios count up to here, so that no single bucket moves the sum by more than log 4 = 1.4."""
+DRIFT_BOUND = 10.0
+"""Eight buckets of the largest step. On independent rows nothing comes near it (a step is −0.7 ± 0.2)."""
+FIRST_EPOCH_S, EPOCH_S = 20.0, 120.0
+LONGEST_BUCKET_S = 10.0
+"""A bucket that took longer contains a pause, of which no more than this is counted as time observed."""
+FRICTION_SHARE = 0.6
+"""Between what was measured over 10 s (three simulated arms, three speeds, noise 0.05 N·m): new friction explains 0.98
+or more of the median joint, a payload 0.03 to 0.5. Over 4 s a tenth of the slow motions do not reverse a joint, whose
+friction then looks like a weight (0.5)."""
+FEWEST_FRICTION_ROWS = 20
+
+
+@dataclass(frozen=True, eq=False)
+class Bucket:
+    """Record of the rows with start < event time ≤ end, s."""
+
+    start: float
+    end: float
+    record: Record
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """Errors have grown. at: event time from which on, s; joints: whose; before, after: records of then and now.
+
+    kind: `sudden` within seconds (a payload, a tool), `drift` over longer (friction, wear, temperature), `departure`
+    where errors have not grown but what is learnt has left what was trained on (`lipcore.online.changes.departure`).
+    """
+
+    at: float
+    joints: tuple[int, ...]
+    before: Record
+    after: Record
+    kind: Kind
+
+    def evidence(self, joint_names: Sequence[str], friction: Array | None = None) -> dict[str, Any]:
+        """What speaks for the change, for JSON. friction: `friction_share` of innovations after it, which adds it.
+
+        Per joint: nmse, rmse (N·m), standardised (mean of e²/s², 1 where intervals are true) and innovation (mean of e,
+        N·m), each before and after; None where not known.
+        """
+        figures = [
+            (name, getattr(self.before, field), getattr(self.after, field))
+            for name, field in (
+                ("nmse", "nmse"),
+                ("rmse", "rmse"),
+                ("standardised", "standardised"),
+                ("innovation", "error"),
+            )
+        ]
+        joints: dict[str, dict[str, Any]] = {
+            joint: {name: {"before": number(old[j]), "after": number(new[j])} for name, old, new in figures}
+            for j, joint in enumerate(joint_names)
+        }
+        evidence: dict[str, Any] = {
+            "kind": self.kind,
+            "at": self.at,
+            "joints": [joint_names[j] for j in self.joints],
+            "rows": {"before": self.before.rows, "after": self.after.rows},
+            "per_joint": joints,
+        }
+        if friction is not None:
+            for joint, share in zip(joint_names, friction, strict=True):
+                joints[joint]["friction_share"] = number(share)
+            evidence["suspect"] = suspect(friction, self.joints)
+        return evidence
+
+
+@dataclass(frozen=True, eq=False)
+class ChangeDetector:
+    """Compares the errors of the last seconds with those before them: immutable, of bounded size, per model.
+
+    Records of rows that passed the gates are summed in buckets of at least 0.5 s and 50 rows, by event time. With
+    z² the record's `standardised` of a joint, and ref = max(1, z² of the 20 s before the last 2 s, at least 10 s):
+
+    - sudden: z² of the last 2 s (at least 2 buckets) exceeds r · ref, as a whole and in three of four of its buckets:
+      after 1 to 2 s, where 50 rows take no longer than 0.5 s. r is 4, or more where errors are not independent from row
+      to row: with c² the squared coefficient of variation of the buckets' z² before, that of χ² of 2/c² degrees of
+      freedom, r = (1 − c²/9 + 5 c/3)³ by Wilson and Hilferty, once in 3 million. Independent rows have c² = 2/rows;
+      a model outside what it was trained on has 1 to 7, where a fixed r of 4 gave ten false alarms in four minutes.
+    - drift: a CUSUM of (log(z² of each bucket / max(1, z² of the best two minutes so far)) − log 2) / (1 + c²)² passes
+      10: on independent rows, squared errors of 3 times their level are found after 34 buckets, of 8 times after 10.
+      The divisor, chosen by measurement, keeps errors that persist for seconds from adding up as if they were many.
+
+    A ref of less than 1 counts as 1: errors that were smaller than stated may grow to what is stated. Buckets and not
+    the clock delimit the windows, so that a pause, in which a tool may have been changed, is bridged. After an alarm
+    there is none until `acknowledged`.
+    """
+
+    buckets: tuple[Bucket, ...] = ()
+    open: Bucket | None = None
+    excess: Array | None = None
+    since: Array | None = None
+    best: Record | None = None
+    epoch: Record | None = None
+    epoch_s: float = 0.0
+    alarm: Change | None = None
+
+    def step(self, record: Record, at: float) -> tuple[ChangeDetector, Change | None]:
+        """Take in a record whose last row has event time `at`, s; return the detector and the change that it detects.
+
+        Records of up to about 0.5 s are kept apart; longer ones are one bucket each. A record that is late counts as of
+        now. Raise ValueError for other joints than before.
+        """
+        if not record.rows:
+            return self, None
+        last = self.open.end if self.open else self.buckets[-1].end if self.buckets else at
+        current = Bucket(last, max(at, last), record)
+        if self.open:
+            current = Bucket(self.open.start, current.end, self.open.record + record)
+        if current.record.rows < BUCKET_ROWS or current.end - current.start < BUCKET_S * (1 - 1e-6):
+            return replace(self, open=current), None
+        buckets = (*self.buckets, current)[-MOST_BUCKETS:]
+        if self.alarm:
+            return replace(self, open=None, buckets=buckets), None
+        following = replace(self, open=None, buckets=buckets)._accumulate(current)
+        change = following._sudden() or following._drift()
+        return replace(following, alarm=change), change
+
+    def moved(self, seconds: float) -> ChangeDetector:
+        """The same with all its times later by so much."""
+
+        def later(bucket: Bucket) -> Bucket:
+            return Bucket(bucket.start + seconds, bucket.end + seconds, bucket.record)
+
+        return replace(
+            self,
+            buckets=tuple(later(each) for each in self.buckets),
+            open=None if self.open is None else later(self.open),
+            since=None if self.since is None else self.since + seconds,
+            alarm=None if self.alarm is None else replace(self.alarm, at=self.alarm.at + seconds),
+        )
+
+    def acknowledged(self) -> ChangeDetector:
+        """The detector that takes what has arrived since the last alarm for the new reference."""
+        if not self.alarm:
+            return self
+        return ChangeDetector(tuple(b for b in self.buckets if b.start >= self.alarm.at), self.open)
+
+    def _accumulate(self, bucket: Bucket) -> ChangeDetector:
+        """Sum the log-ratio of one more bucket and keep the best epoch."""
+        n = bucket.record.n_joints
+        excess = np.zeros(n) if self.excess is None else self.excess
+        since = np.full(n, bucket.start) if self.since is None else self.since
+        if self.best is not None:
+            ratio = bucket.record.standardised / _level(self.best)
+            weight = (1 + _variation(self._split()[1])) ** 2
+            step = (np.log(np.clip(ratio, 1 / LARGEST_RATIO, LARGEST_RATIO)) - ALLOWANCE) / weight
+            since = np.where(excess > 0, since, bucket.start)
+            excess = np.maximum(excess + step, 0.0)
+        epoch = bucket.record if self.epoch is None else self.epoch + bucket.record
+        seconds = self.epoch_s + _observed(bucket)
+        best = self.best
+        if seconds >= (FIRST_EPOCH_S if best is None else EPOCH_S) and epoch.rows >= FEWEST_REFERENCE_ROWS:
+            if best is None or np.log(_level(epoch)).sum() < np.log(_level(best)).sum():
+                best = epoch
+            return replace(self, excess=excess, since=since, best=best, epoch=None, epoch_s=0.0)
+        return replace(self, excess=excess, since=since, epoch=epoch, epoch_s=seconds)
+
+    def _sudden(self) -> Change | None:
+        recent, used = self._split()
+        seconds, rows = sum(_observed(b) for b in used), sum(b.record.rows for b in used)
+        if seconds < SHORTEST_REFERENCE_S * (1 - 1e-6) or rows < FEWEST_REFERENCE_ROWS:
+            return None
+        variation = _variation(used)
+        tail = (1 - variation / 9 + DEVIATIONS * np.sqrt(variation) / 3) ** 3
+        bound = np.maximum(RATIO, tail) * np.maximum(_mean(used), 1.0)
+        exceeding = np.array([bucket.record.standardised > bound for bucket in recent])
+        joints = (_mean(recent) > bound) & (exceeding.sum(axis=0) >= np.ceil(SHARE * len(recent)))
+        if not joints.any():
+            return None
+        first = int(exceeding[:, joints].any(axis=1).argmax())
+        return Change(recent[first].start, _places(joints), _sum(used), _sum(recent), "sudden")
+
+    def _drift(self) -> Change | None:
+        if self.best is None or self.excess is None or self.since is None or not (self.excess > DRIFT_BOUND).any():
+            return None
+        joints = self.excess > DRIFT_BOUND
+        recent, _ = self._split()
+        return Change(float(self.since[joints].min()), _places(joints), self.best, _sum(recent), "drift")
+
+    def _split(self) -> tuple[tuple[Bucket, ...], tuple[Bucket, ...]]:
+        """The recent buckets, and those of the 20 s before them."""
+        recent = min(RECENT_BUCKETS, len(self.buckets))
+        while recent < len(self.buckets) and self.buckets[-1].end - self.buckets[-recent].start < RECENT_S * (1 - 1e-6):
+            recent += 1
+        first, seconds = len(self.buckets) - recent, 0.0
+        while first and seconds < REFERENCE_S * (1 - 1e-6):
+            first -= 1
+            seconds += _observed(self.buckets[first])
+        return self.buckets[-recent:], self.buckets[first:-recent]
+
+
+def friction_share(dq: Array, error: Array) -> Array:
+    """Share of the variance of each joint's innovations that friction explains: (n,), 0 … 1.
+
+    R² of the least-squares fit of error (N, n) on [dq, sign dq, 1] of the same joint, adjusted for the two slopes. The
+    offset explains no variance: a payload's constant weight does not count as friction. 0 where nothing varies or for
+    fewer than 20 rows.
+    """
+    rows, n = error.shape
+    out = np.zeros(n)
+    if rows < FEWEST_FRICTION_ROWS:
+        return out
+    for j in range(n):
+        features = np.column_stack([dq[:, j], np.sign(dq[:, j]), np.ones(rows)])
+        total = float(((error[:, j] - error[:, j].mean()) ** 2).sum())
+        if np.ptp(error[:, j]) > 0 and total > 0:
+            left = error[:, j] - features @ np.linalg.lstsq(features, error[:, j], rcond=None)[0]
+            out[j] = 1 - float(left @ left) / total * (rows - 1) / (rows - 3)
+    return np.clip(out, 0.0, 1.0)
+
+
+def suspect(friction: Array, joints: tuple[int, ...]) -> str:
+    """What a change looks like: `friction` where it explains the median alarmed joint, or `payload or contact`."""
+    return "friction" if np.median(friction[list(joints)]) > FRICTION_SHARE else "payload or contact"
+
+
+def _observed(bucket: Bucket) -> float:
+    return min(bucket.end - bucket.start, LONGEST_BUCKET_S)
+
+
+def _variation(buckets: Sequence[Bucket]) -> Array:
+    """Squared coefficient of variation of the buckets' standardised errors: (n,), or () without buckets."""
+    means = np.array([bucket.record.standardised for bucket in buckets])
+    centre = means.mean(axis=0) if len(means) else np.ones(1)
+    seen = means.var(axis=0) / np.where(centre > 0, centre, 1.0) ** 2 if len(means) else np.zeros(1)
+    return np.asarray((len(means) * seen + PRIOR_BUCKETS * PRIOR_VARIATION) / (len(means) + PRIOR_BUCKETS))
+
+
+def _mean(buckets: Sequence[Bucket]) -> Array:
+    """Standardised errors of all rows of the buckets; without the rest of their sum, as it is taken twice a second."""
+    rows = [bucket.record.rows for bucket in buckets]
+    return np.asarray(np.average([bucket.record.standardised for bucket in buckets], axis=0, weights=rows))
+
+
+def _level(record: Record) -> Array:
+    return np.maximum(record.standardised, 1.0)
+
+
+def _sum(buckets: Sequence[Bucket]) -> Record:
+    return reduce(add, (bucket.record for bucket in buckets))
+
+
+def _places(joints: np.ndarray[Any, np.dtype[np.bool_]]) -> tuple[int, ...]:
+    return tuple(int(j) for j in np.flatnonzero(joints))

@@ -1,0 +1,1 @@
+"""What a stream's arm carries, weighed against contacts and other friction."""

@@ -1,0 +1,72 @@
+"""A payload estimated with an arm whose geometry is known, or as linear as its posterior takes it.
+
+Given the variables w of the arm, N(ŵ, Σ), torque is linear in the payload's ten parameters π around its mean (see
+`lipcore.model.payload`). With H = [F, b] the features of rows and R their variance, w is integrated out:
+
+    V = (Σ⁻¹ + Fᵀ R⁻¹ F)⁻¹,    Λ = bᵀ R⁻¹ b − bᵀ R⁻¹ F V Fᵀ R⁻¹ b,    ξ = bᵀ R⁻¹ r − bᵀ R⁻¹ F V Fᵀ R⁻¹ r,
+
+is all that the rows say of π, of which the most likely body is sought (`bodies.most_likely`); the rows are linearised
+anew around it until it stays.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from lipcore.data.samples import Array
+from lipcore.model.payload import Carrier, Linearised, Load
+from lipcore.online.batch import Rows
+from lipcore.online.payload.bodies import Known, body, inverse, most_likely
+from lipcore.online.payload.errors import correlation_roots, whitened
+from lipcore.online.payload.estimate import Estimate, alone
+from lipcore.robots.urdf import PARAMETERS
+
+ROUNDS, STILL = 6, 0.05
+"""Linearisations at most, and the change in standard deviations from which on there is no other."""
+
+
+def linear(carrier: Carrier, rows: Rows, before: Rows | None, prior: Known, start: Estimate | None) -> Estimate:
+    """The payload that rows carry, arguments as of `payload.estimate`."""
+    before = before if before is not None and len(before) else None
+    both = rows if before is None else Rows.concatenate([before, rows])
+    roots, mean, size = correlation_roots(carrier, both), carrier.mean, len(carrier.mean)
+    loaded = rows.motion(), carrier.rest(rows.motion())
+    free = None if before is None else (before.motion(), carrier.rest(before.motion()))
+    empty = carrier.known(np.zeros(PARAMETERS))
+    eta = prior.centre if start is None else start.eta
+    load = empty if start is None else carrier.known(body(eta)[0])
+    root = carrier.covariance_root
+    for _ in range(ROUNDS):
+        features, base = Linearised(carrier, load).rows(*loaded)
+        if free is not None:
+            others, torque = Linearised(carrier, empty).rows(*free)
+            others[size:] = 0.0
+            features, base = np.concatenate([others, features], axis=1), np.concatenate([torque, base])
+        residual = both.tau - base - np.tensordot(mean, features[:size], axes=1)
+        features, residual = whitened(roots, features, residual)
+        information, score = features @ features.T, features @ residual
+        arm, cross = information[:size, :size], information[:size, size:]
+        inner = np.linalg.cholesky(np.eye(size) + root.T @ arm @ root)
+        half = solve_triangular(inner, root.T, lower=True, check_finite=False)
+        open_ = half.T @ half  # (Σ⁻¹ + Fᵀ R⁻¹ F)⁻¹
+        precision = information[size:, size:] - cross.T @ open_ @ cross
+        pull = score[size:] - cross.T @ open_ @ score[:size]
+        last = eta
+        eta, spread, slope, gain = most_likely(precision, pull, prior, eta)
+        payload = body(eta)[0]
+        of_payload = slope @ spread @ slope.T
+        back = -open_ @ cross
+        joint: Array = np.empty((size + PARAMETERS,) * 2)
+        joint[:size, :size] = open_ + back @ of_payload @ back.T
+        joint[:size, size:] = back @ of_payload
+        joint[size:, :size] = joint[:size, size:].T
+        joint[size:, size:] = of_payload
+        room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
+        w = mean + open_ @ score[:size] + back @ payload
+        left = residual - features.T @ np.concatenate([w - mean, payload])
+        load = Load(np.concatenate([w, payload]), joint, room)
+        if np.sqrt(np.max((eta - last) ** 2 / np.diagonal(spread))) < STILL:
+            break
+    contact = alone(carrier, free, loaded, both.tau, roots)[2]
+    return Estimate(eta, max(1.0, float((left**2).mean())) * spread, load, gain, contact)
