@@ -43,7 +43,7 @@ from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
 from service.learning.metrics import Learning
 from service.learning.refresh import attach
-from service.models import registry, signing
+from service.models import deletion, registry, signing
 from service.models.loaded import LoadedModels
 from service.replication import Replication
 from service.runtime.confinement import protections
@@ -186,7 +186,12 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     registry.install_shipped(database, files)
     loaded = LoadedModels(storage, LearntVersions(database, files))
     logger.info("loaded %s of %s", counted(loaded.preload(), "model"), settings.home)
-    jobs = queue_of(settings)(storage, lambda model, _: loaded.changed(model))
+
+    def trained(model: str, _: int) -> None:
+        loaded.changed(model)
+        deletion.delete_refreshed(loaded, model)
+
+    jobs = queue_of(settings)(storage, trained)
     if recovered := jobs.recover():
         logger.warning("queued again after an interruption: %s", ", ".join(recovered))
     learners = Learners(loaded)

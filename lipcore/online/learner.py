@@ -22,10 +22,6 @@ Novel = Callable[[NDArray[np.bool_]], None]
 """Called with which of some rows, (N,), lie beyond the basis; see `uncovered`."""
 
 
-class ForgottenError(ValueError):
-    """Rows are to be taken back from a time of which only the conclusion is kept."""
-
-
 @dataclass(frozen=True)
 class OnlineModel:
     """A trained version and what it has learnt since; immutable, every method returns another one.
@@ -95,29 +91,7 @@ class OnlineModel:
         to the last bit. novel: called for the rows as they are learnt, since their features show whether the basis
         covers them.
         """
-        return self._add(rows.learnt, 1.0, own, novel)
-
-    def unlearn(self, rows: Rows, own: bool = False) -> OnlineModel:
-        """Take back rows that were learnt; raise ForgottenError for some from before the regime before this one.
-
-        own: as in `learn`.
-        """
-        self.check_unlearn(rows)
-        return self._add(rows.learnt, -1.0, own)
-
-    def check_unlearn(self, rows: Rows) -> None:
-        """Raise ForgottenError where rows cannot be taken back: from before the regime before this one, or folded."""
-        oldest, time = (self.now if self.before is None else self.before).begins, rows.learnt.time
-        if not len(time):
-            return
-        if float(time.min()) < oldest:
-            raise ForgottenError(f"rows from before {oldest:.3f} s cannot be taken back: two changes have come since")
-        if self.walk is None:
-            return
-        numbers, current = self.walk.number(time), time >= self.now.begins
-        for regime, numbered in ((self.now, numbers[current]), (self.before, numbers[~current])):
-            if regime is not None and regime.has_folded(numbered):
-                raise ForgottenError(f"rows of epochs up to {regime.at} cannot be taken back: friction has gone on")
+        return self._add(rows.learnt, own, novel)
 
     def detached(self) -> OnlineModel:
         """The same model with sums of its own, which can be added to."""
@@ -181,42 +155,42 @@ class OnlineModel:
                 regime.symmetrise()
         return self
 
-    def _add(self, rows: Rows, sign: float, own: bool, novel: Novel | None = None) -> OnlineModel:
+    def _add(self, rows: Rows, own: bool, novel: Novel | None) -> OnlineModel:
         if not len(rows):
             return self
         model = self if own else self.detached()
         parts = [rows] if len(rows) <= CHUNK else [rows.take(slice(i, i + CHUNK)) for i in range(0, len(rows), CHUNK)]
         for part in parts:
-            model = model._add_chunk(part, sign, novel)
+            model = model._add_chunk(part, novel)
         return model if own else model.symmetrised()
 
-    def _add_chunk(self, rows: Rows, sign: float, novel: Novel | None) -> OnlineModel:
+    def _add_chunk(self, rows: Rows, novel: Novel | None) -> OnlineModel:
         latest = max(self.reference, float(rows.time.max()))
         model = self._aged(latest, float(rows.time.min()) if self.since is None else self.since)
         current = rows.time >= model.now.begins
         now, before = model.now, model.before
         if current.any():
             taken = rows if current.all() else rows.take(current)
-            now = model._learnt(now, taken, sign, novel)
+            now = model._learnt(now, taken, novel)
         if before is not None and (late := ~current & (rows.time >= before.begins)).any():
-            before = model._learnt(before, rows.take(late), sign, novel)
+            before = model._learnt(before, rows.take(late), novel)
             # folded epochs of `now` were drawn back to the centre of then: a share √(1 − s) from here, which is near 1
             now = replace(now, centre=before.solve(model.walk).mean)
         return replace(model, now=now, before=before)
 
-    def _learnt(self, regime: Regime, rows: Rows, sign: float, novel: Novel | None) -> Regime:
-        """A regime, overwritten, with its rows added (sign 1) or taken back (−1)."""
+    def _learnt(self, regime: Regime, rows: Rows, novel: Novel | None) -> Regime:
+        """A regime, overwritten, with its rows added."""
         if self.walk is None:
-            return replace(regime, statistics=self._summed(regime.statistics, rows, sign, novel))
+            return replace(regime, statistics=self._summed(regime.statistics, rows, novel))
         numbers = regime.place(self.walk.number(rows.time))
         for number in sorted(set(numbers.tolist())):
             of_epoch = numbers == number
             part = rows if of_epoch.all() else rows.take(of_epoch)
-            regime = regime.with_epoch(number, self._summed(regime.of_epoch(number), part, sign, novel))
+            regime = regime.with_epoch(number, self._summed(regime.of_epoch(number), part, novel))
         return regime.folded(self.walk)
 
-    def _summed(self, statistics: Statistics, rows: Rows, sign: float, novel: Novel | None) -> Statistics:
-        """These statistics, overwritten, with the rows added (sign 1) or taken back (−1)."""
+    def _summed(self, statistics: Statistics, rows: Rows, novel: Novel | None) -> Statistics:
+        """These statistics, overwritten, with the rows added."""
         posterior, motion = self.base.posterior, rows.motion()
         weights = rows.weight
         if self.forgetting_s is not None:
@@ -225,7 +199,7 @@ class OnlineModel:
         features, open_ = posterior.basis.features_and_uncovered(motion)
         if novel is not None:
             novel(np.any(open_ > posterior.noise_variance, axis=1))
-        return add_to(statistics, features, posterior.row_variance(motion) + open_, residual, weights, sign)
+        return add_to(statistics, features, posterior.row_variance(motion) + open_, residual, weights)
 
     def _aged(self, reference: float, since: float) -> OnlineModel:
         """The same knowledge as it weighs at a later reference time; its sums are overwritten."""

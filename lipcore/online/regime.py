@@ -26,7 +26,7 @@ On benchmarks/studies/drifting_friction.py (seeds 50 and 51), a third or three t
 twice as many epochs moved the nMSE of no case by more than 1 %.
 """
 KEPT = 4
-"""Epochs whose rows can still come or be taken back; earlier ones are folded into what is known of before."""
+"""Epochs whose rows can still come; earlier ones are folded into what is known of before."""
 COLD = 10
 """Epochs between a version's own samples and the first row of a stream: the arm may have been switched off. One epoch
 or four time constants did as well there over the first two minutes, within 2 % of the nMSE."""
@@ -126,13 +126,10 @@ class Regime:
         statistics = copied(regime.statistics) if regime.shared else regime.statistics
         return replace(regime, statistics=statistics, at=at, shared=False)
 
-    def has_folded(self, numbers: NDArray[np.int64]) -> bool:
-        """Whether rows of some of these epochs can no longer be told from what is known of before."""
-        return bool((numbers <= self.at).any())
-
     def place(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
         """The epochs in which rows of such epochs count: the oldest one kept for those that are folded."""
-        return np.where(numbers <= self.at, self.epochs[0].number, numbers) if self.has_folded(numbers) else numbers
+        folded = numbers <= self.at
+        return np.where(folded, self.epochs[0].number, numbers) if folded.any() else numbers
 
     def of_epoch(self, number: int) -> Statistics:
         """Sums of an epoch, which can be added to."""

@@ -28,7 +28,7 @@ def consolidate(online: OnlineModel, floor: Array | None = None) -> TorqueModel:
 
     The posterior of a regime is that of the sums A and b with the prior N(centre, I): its mean (I + A)⁻¹ (centre + b)
     is also that of the sums A and centre + b with the prior of a trained model, N(0, I). What it no longer holds is
-    which part was trained and which learnt: it neither unlearns nor forgets the rows of before.
+    which part was trained and which learnt: it does not forget the rows of before.
     """
     base, now = online.base.posterior, online.now
     trained = base.statistics

@@ -137,12 +137,12 @@ def add_diagonal(matrix: Array, values: Array | float) -> None:
     np.einsum("ii->i", matrix)[:] += values
 
 
-def add_square(a: Array, features: Array, sign: float = 1.0) -> None:
-    """Add sign F Fᵀ to the lower triangle of A, in place. a: (M, M); features: F, (M, K); both in C's order."""
+def add_square(a: Array, features: Array) -> None:
+    """Add F Fᵀ to the lower triangle of A, in place. a: (M, M); features: F, (M, K); both in C's order."""
     if not (a.flags.c_contiguous and features.flags.c_contiguous):
         raise ValueError("a and features are not both C-contiguous, expected arrays that BLAS can write to in place")
     if features.size:
-        _blas.dsyrk(sign, features.T, beta=1.0, c=a.T, trans=1, lower=0, overwrite_c=1)
+        _blas.dsyrk(1.0, features.T, beta=1.0, c=a.T, trans=1, lower=0, overwrite_c=1)
 
 
 def add_square_of_rows(a: Array, rows: Array) -> None:

@@ -107,15 +107,8 @@ def merge(one: Statistics, other: Statistics) -> Statistics:
     return Statistics(one.a + other.a, one.b + other.b, one.samples + other.samples)
 
 
-def subtract(all_samples: Statistics, some: Statistics) -> Statistics:
-    """Statistics without some of their samples: what `merge` did is undone, to rounding."""
-    return Statistics(all_samples.a - some.a, all_samples.b - some.b, all_samples.samples - some.samples)
-
-
-def add_to(
-    statistics: Statistics, features: Array, variance: Array, residual: Array, weights: Array, sign: float = 1.0
-) -> Statistics:
-    """Statistics with N samples more, or fewer where sign is −1, that overwrite these: for few samples, often.
+def add_to(statistics: Statistics, features: Array, variance: Array, residual: Array, weights: Array) -> Statistics:
+    """Statistics with N samples more, that overwrite these: for few samples, often.
 
     Of A only the lower triangle is kept up, which is all that `solve` reads; `mirror` follows with the other. The same
     to rounding as to `merge` what `collect` finds. features: φ, (M, N n), overwritten; variance: R, (N, n); residual:
@@ -124,9 +117,8 @@ def add_to(
     root = np.sqrt(weights[:, None] / variance)
     features *= root.reshape(-1)
     b = features @ (residual * root).reshape(-1)
-    add_square(statistics.a, features, sign)
-    samples = statistics.samples + sign * float(weights.sum())
-    return Statistics(statistics.a, statistics.b + sign * b, samples)
+    add_square(statistics.a, features)
+    return Statistics(statistics.a, statistics.b + b, statistics.samples + float(weights.sum()))
 
 
 def decay(statistics: Statistics, factor: float, own: bool = False) -> Statistics:

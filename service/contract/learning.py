@@ -209,13 +209,6 @@ class Snapshot(BaseModel):
     created_at: str
 
 
-class Candidate(BaseModel):
-    """A refreshed version that is compared with the one that serves, on rows that neither has learnt."""
-
-    version: int
-    revision: int
-
-
 class LearningStatus(BaseModel):
     """Where learning stands."""
 
@@ -237,7 +230,9 @@ class LearningStatus(BaseModel):
     )
     failure: str | None = Field(description="Why the version does not learn, where it should; it is tried again")
     held: Held | None
-    candidate: Candidate | None
+    candidate: None = Field(
+        None, deprecated=True, description="Always null: a refreshed version is compared before it is published"
+    )
     streams: list[Stream]
     reachable: list[list[int]] = Field(
         description="Ranges [first, last] of revisions that a rollback can return to; 0 is the version as trained"

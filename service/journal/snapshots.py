@@ -19,18 +19,18 @@ from service.storage.files import Files, new_id
 
 
 def save(
-    database: Database, files: Files, model: str, version: int, number: int, payload: bytes, *, most: int
+    database: Database, files: Files, model: str, version: int, number: int, seen: int, payload: bytes, *, most: int
 ) -> str | None:
     """Store a version's state after event `number` durably and return its id; thin what is kept to `most`.
 
-    None, and nothing is stored, where a rollback has gone back behind that event since: nothing goes on from there any
-    more; and where the version has been deleted. Unlearnings make none outdated: whoever goes on from it comes to them.
+    seen: the event up to which undoing is taken into account. None, and nothing is stored, where what the state
+    contains has been undone since, and where the version has been deleted.
     """
     snapshot = new_id("snap")
     digest = files.write_snapshot(snapshot, payload)
     try:
         with database.transaction(model) as session:
-            outdated = _is_outdated(session, model, version, number)
+            outdated = _is_outdated(session, model, version, number, seen)
             gone = [snapshot] if outdated else _add(session, snapshot, digest, model, version, number, most)
     except SQLAlchemyError as error:
         if not undecided(error):
@@ -95,15 +95,11 @@ def _of(model: str, version: int) -> Select[SnapshotRow]:
     return of_version.order_by(SnapshotRow.number.desc())
 
 
-def _is_outdated(session: Session, model: str, version: int, number: int) -> bool:
-    """Whether a rollback has undone event `number`, or the version is no more."""
-    of_version = (VersionRow.model == model, VersionRow.version == version)
-    if session.scalar(select(VersionRow.version).where(*of_version)) is None:
+def _is_outdated(session: Session, model: str, version: int, number: int, seen: int) -> bool:
+    """Whether part of a state has been undone, or the version is no more."""
+    if session.get(VersionRow, (model, version)) is None:
         return True
-    since = select(EventRow.detail).where(
-        EventRow.model == model, EventRow.number > number, EventRow.kind == "rollback"
-    )
-    return any(detail["to"] < number for detail in session.scalars(since))
+    return log.must_fold_again(session, model, version, seen, number)
 
 
 def _add(session: Session, snapshot: str, digest: str, model: str, version: int, number: int, most: int) -> list[str]:
@@ -126,8 +122,8 @@ CHUNK = 200
 def retain(database: Database, settings: Settings, model: str, now: float) -> int:
     """Delete the oldest events of a model that are too old or too many; return how many batches and replays went.
 
-    now: Unix time, s. Events stay, whatever their age, while a learning version has no snapshot that contains them or
-    has still to unlearn them. So do settings, which say what a rollback returns to, and the newest event, which the
+    now: Unix time, s. Events stay, whatever their age, while a learning version has no snapshot that contains them. So
+    do settings, which say what a rollback returns to, and the newest event, which the
     next number follows.
     """
     gone = 0
@@ -148,12 +144,12 @@ def retain(database: Database, settings: Settings, model: str, now: float) -> in
 
 
 def contained(session: Session, model: str) -> int:
-    """Number of the newest event that every learning version has learnt for good, by training or in a snapshot."""
-    through = []
-    for version in registry.learning(session, model):
-        row = latest(session, model, version, None)
-        through.append(log.start_of(session, model, version) if row is None else row.number)
-    return min(through, default=0)
+    """Number of the newest event that the version that learns has learnt for good, by training or in a snapshot."""
+    version = registry.answering(session, model)
+    if version is None:
+        return 0
+    row = latest(session, model, version, None)
+    return log.start_of(session, model, version) if row is None else row.number
 
 
 def _chosen(session: Session, settings: Settings, model: str, now: float) -> list[int]:
@@ -175,20 +171,7 @@ def _deletable(session: Session, model: str) -> list[ColumnElement[bool]]:
     """Conditions of the events that nothing needs."""
     through = min(contained(session, model), log.newest(session, model) - 1)
     in_force = and_(EventRow.kind == "settings", EventRow.void.is_(False))
-    within = [EventRow.model == model, EventRow.number <= through, not_(in_force)]
-    pending = select(EventRow).where(EventRow.model == model, EventRow.number > through, EventRow.kind == "unlearn")
-    if batches := {batch for event in session.scalars(pending) if (batch := _batch(event)) is not None}:
-        replays = session.scalars(select(EventRow).where(*within, EventRow.kind == "replay"))
-        needed = batches | {event.number for event in replays if _batch(event) in batches}
-        rollbacks = select(EventRow.number).where(*within, EventRow.kind == "rollback", EventRow.number > min(batches))
-        needed |= set(session.scalars(rollbacks))  # they tell which of the replays are learnt
-        within.append(EventRow.number.not_in(needed))
-    return within
-
-
-def _batch(event: EventRow) -> int | None:
-    """Number of the batch that an event is about."""
-    return (event.detail or {}).get("event")
+    return [EventRow.model == model, EventRow.number <= through, not_(in_force)]
 
 
 def _forget(session: Session, event: EventRow) -> None:

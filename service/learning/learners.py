@@ -25,7 +25,7 @@ from service.learning.ingest.intake import Intake
 from service.learning.ingest.monitor import Monitor
 from service.learning.learner import publication
 from service.learning.learner.process import LearnerProcess
-from service.learning.learner.publication import Contested, Failed, Message, Published
+from service.learning.learner.publication import Failed, Message, Published
 from service.learning.live.feed import Feed
 from service.models.loaded import LoadedModels, Served
 from service.storage.database import StreamRow
@@ -117,8 +117,8 @@ class Learners:
 
     process: the learner process; weighing: what streams carry. threads: those that take observations. live: the feed of
     those who follow models.
-    when_published, when_contested: called with each such message of the learner process, in its reader's thread, after
-    a revision answers; to be filled before the first batch.
+    when_published: called with each such message of the learner process, in its reader's thread, after a revision
+    answers; to be filled before the first batch.
     """
 
     def __init__(self, loaded: LoadedModels) -> None:
@@ -126,7 +126,6 @@ class Learners:
         settings, database = storage.settings, storage.database
         self.settings, self.database, self.loaded = settings, database, loaded
         self.when_published: list[Callable[[Published], None]] = []
-        self.when_contested: list[Callable[[Contested], None]] = []
         self.threads = IngestThreads()
         self._lock = threading.Lock()
         self._monitors: dict[str, Monitor] = {}
@@ -275,9 +274,6 @@ class Learners:
             self._note(message, published=message, failed=None)
             for call in self.when_published:
                 call(message)
-        elif isinstance(message, Contested):
-            for act in self.when_contested:
-                act(message)
         elif isinstance(message, Failed):
             logger.error("version %s of model %s does not learn: %s", message.version, message.model, message.error)
             self._note(message, failed=message)

@@ -7,7 +7,6 @@ from typing import Any
 from sqlalchemy import bindparam, select
 from sqlalchemy.orm import Session
 
-from service.contract.learning import AlarmKind
 from service.contract.observations import (
     CONTACT_THRESHOLD,
     FORGETTING_S,
@@ -18,8 +17,7 @@ from service.contract.observations import (
 from service.foundation.errors import invalid_request, not_found
 from service.journal import log
 from service.storage import audit
-from service.storage.database import AlarmRow, Database, LearningRow, ModelRow, fetch, now
-from service.storage.rows import Page, newest
+from service.storage.database import Database, LearningRow, ModelRow, fetch
 
 _SET = select(LearningRow.options, LearningRow.held).where(LearningRow.model == bindparam("model"))
 
@@ -85,19 +83,6 @@ def held(session: Session, model: str) -> dict[str, Any] | None:
 def declare(session: Session, model: str, payload: dict[str, Any]) -> None:
     """Keep what was declared of the payload of all streams, see `streams.PayloadRecord`."""
     _row(session, model).payload = payload
-
-
-def raise_alarm(session: Session, model: str, kind: AlarmKind, message: str, evidence: dict[str, Any]) -> AlarmRow:
-    """Add an alarm; it is visible once the session commits."""
-    row = AlarmRow(model=model, kind=kind, at=now(), message=message, evidence=evidence)
-    session.add(row)
-    session.flush()
-    return row
-
-
-def alarms(session: Session, model: str, part: Page) -> tuple[list[AlarmRow], str | None]:
-    """Alarms of a page, newest first, and the cursor after it."""
-    return newest(session, AlarmRow, part, AlarmRow.model == model)
 
 
 def _row(session: Session, model: str) -> LearningRow:

@@ -118,9 +118,6 @@ def _check_unused(session: Session, model: str, version: int) -> None:
         raise ConflictError(f"{name} serves: let another version serve first, or delete the model")
     if session.scalar(select(func.count()).select_from(VersionRow).where(VersionRow.model == model)) == 1:
         raise ConflictError(f"{name} is its only one: delete the model")
-    learner = session.get(LearnerRow, (model, version))
-    if learner is not None and learner.role == "candidate":
-        raise ConflictError(f"{name} is compared with the version that serves: wait until that is decided")
     for job in _active_jobs(session):
         if job.model == model and (job.request.get("refresh") or {}).get("version") == version:
             raise ConflictError(f"{job.id} trains {name} anew: cancel it or wait for its end")

@@ -93,7 +93,7 @@ def publish(
     )
     if start is None:
         start = session.scalar(select(func.max(EventRow.number)).where(EventRow.model == model)) or 0
-    session.add(LearnerRow(model=model, version=version, start=start, role="candidate"))
+    session.add(LearnerRow(model=model, version=version, start=start, role="dismissed"))
     if not candidate:
         serve(session, model, version)
     return version
@@ -134,13 +134,6 @@ def answering(session: Session, model: str) -> int | None:
     """The version that answers where none is named, None where there is none."""
     chosen = session.get(ServingRow, model)
     return None if chosen is None else chosen.version
-
-
-def learning(session: Session, model: str) -> list[int]:
-    """Versions that learn: candidates for the place of the one that serves, and last that one."""
-    candidates = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.role == "candidate")
-    serves = answering(session, model)
-    return [*(each for each in session.scalars(candidates) if each != serves), *([] if serves is None else [serves])]
 
 
 def has_model(session: Session, model: str) -> bool:

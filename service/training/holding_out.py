@@ -1,8 +1,8 @@
 """Holding part of the data sets out of the fit that is judged, and finding the same samples again by a lineage.
 
 A refresh holds out what its version held out, where it still learns from that data set. The figures of both are then
-those of their judged fits on the same samples, which neither fit has learnt. The versions themselves have learnt them:
-which of both serves is decided by a contest on rows that arrive later (`service.learning.learner.contest`).
+those of their judged fits on the same samples, which neither fit has learnt. Which of both serves is decided on the
+newest logged rows (`service.training.refreshed`).
 """
 
 from __future__ import annotations

@@ -29,6 +29,7 @@ from service.storage.files import Files
 from service.storage.sample_file import ARRAYS
 from service.training import holding_out, refresh_data
 from service.training.holding_out import Divided
+from service.training.refresh_data import Logged, Scope, Unlearnt
 from service.training.repeating import unrepeated
 from service.training.table import Table, TablePart, opened
 
@@ -58,8 +59,9 @@ class Material:
     """Samples and what is known of their robot.
 
     samples: what a fit chooses from; stretches: contiguous samples, where these are thinned, else None; table: the data
-    sets' rows to learn from; logged: what the model has observed, with weights (N,), None where that is nothing; rows:
-    how many both are; lineage: where they come from; seen: number of the newest
+    sets' rows to learn from; logged: what the model has observed, with weights (N,), None where that is nothing;
+    logged_last: all of that, for the last fit; unlearnt: the newest of it, on which a refresh is compared before it
+    learns it; rows: how many are learnt from; lineage: where they come from; seen: number of the newest
     event of the model's log when it was read; held_out: the data sets' rows that the version is judged on before it
     learns them; every: all their rows, for its last fit, None if there is none; geometries: of an arm, as an earlier
     version has learnt them; sibling: the arm of another unit, which is expected of this one.
@@ -72,6 +74,8 @@ class Material:
     robot: RigidBody | None
     lineage: dict[str, Any]
     logged: tuple[Samples, Array] | None = None
+    logged_last: tuple[Samples, Array] | None = None
+    unlearnt: Unlearnt | None = None
     seen: int = 0
     held_out: Table | None = None
     every: Table | None = None
@@ -86,8 +90,14 @@ class Material:
     def for_last_fit(self) -> Material:
         """The same with all rows to learn from, those held out included."""
         assert self.every is not None  # there is a last fit
-        samples, stretches = _candidates(self.every, None if self.logged is None else self.logged[0])
-        return replace(self, samples=samples, stretches=stretches, table=self.every, every=None)
+        logged = self.logged_last
+        samples, stretches = _candidates(self.every, None if logged is None else logged[0])
+        return replace(self, samples=samples, stretches=stretches, table=self.every, logged=logged, every=None)
+
+    @property
+    def learns_held_out(self) -> bool:
+        """Whether the last fit learns what the data sets have held out."""
+        return self.held_out is not None and self.every is not None and self.every is not self.table
 
 
 def recorded(settings: Settings, database: Database, files: Files, request: dict[str, Any]) -> Material:
@@ -137,12 +147,15 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
         version = session.get_one(VersionRow, (model, refresh["version"]))
         seen = log.newest(session, model)
         within = refresh_data.scope_of(session, model, refresh["through"])
+        after = refresh_data.newest_part(session, model, within, log.start_of(session, model, version.version))
         rows, left_out = refresh_data.split_datasets(session, within, version.manifest["lineage"])
     rows = [row for row in rows if row.id in request["datasets"]]  # what may be deleted meanwhile was not promised
     base, lineage = files.load_version(version.folder, version.checksums), version.manifest["lineage"]
-    logged = refresh_data.read_log(
-        database, model, base.joint_names, within, settings.max_refresh_samples, settings.max_time_gap_s
-    )
+
+    def read(scope: Scope, most: int, above: int = 0) -> Logged:
+        return refresh_data.read_log(database, model, base.joint_names, scope, most, settings.max_time_gap_s, above)
+
+    logged = judged = read(within, settings.max_refresh_samples)
     parts = opened(files, rows)
     divided = holding_out.hold_out_again(rows, [part.clock() for part in parts], version.manifest["lineage"])
     corrupt = [sound(part) for part in parts]
@@ -150,16 +163,19 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
     table, held_out, every = _tables(parts, divided, corrupt)
     if not table.parts and logged.rows < settings.min_samples:
         raise NothingToLearnError(f"the log has {logged.rows} rows to train on, expected {settings.min_samples}")
+    newest, before = read(within, settings.max_evaluation_samples, after), Logged(None, 0)
+    unlearnt = None
+    if newest.samples is not None:
+        before = read(replace(within, through=after), settings.max_refresh_samples)
+        if len(table) + before.rows >= settings.min_samples:
+            unlearnt, judged = Unlearnt(after, newest.samples), before
+            every = table if every is None else every
     log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.rows}
-    weighted = None
     if (samples := logged.samples) is not None:
         span = {"first": float(samples.t.min()), "last": float(samples.t.max())}
         log_lineage |= {"rows": len(samples), **span}
-        ages = refresh_data.age_weights(samples.t, within)
-        counted = independence.recording_weights(samples.t, samples.episode)
-        weighted = samples, counted if ages is None else counted * ages
     return Material(
-        *_candidates(table, logged.samples),
+        *_candidates(table, judged.samples),
         table,
         base.torque_convention,
         base.robot,
@@ -171,13 +187,24 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
             "refresh": {**refresh, "left_out": left_out},
             "log": log_lineage,
         },
-        weighted,
+        _weighted(judged, within),
+        _weighted(logged, within),
+        unlearnt,
         seen,
         held_out,
         every,
         () if base.arm is None else base.arm.geometries,
         arm_as_expected(base.arm) if base.arm is not None and "base" in lineage else None,
     )
+
+
+def _weighted(logged: Logged, within: Scope) -> tuple[Samples, Array] | None:
+    """Samples of the log, and what each counts, (N,)."""
+    if (samples := logged.samples) is None:
+        return None
+    ages = refresh_data.age_weights(samples.t, within)
+    counted = independence.recording_weights(samples.t, samples.episode)
+    return samples, counted if ages is None else counted * ages
 
 
 def _tables(
@@ -227,7 +254,7 @@ def _candidates(table: Table, logged: Samples | None) -> tuple[Samples, Samples 
     return Samples.concatenate(parts), Samples.concatenate(stretches) if many else None
 
 
-def _aged(row: DatasetRow, within: refresh_data.Scope) -> float:
+def _aged(row: DatasetRow, within: Scope) -> float:
     """What a data set's samples count where the model forgets: their age counts from their upload."""
     weights = refresh_data.age_weights(np.array([datetime.fromisoformat(row.created_at).timestamp()]), within)
     return 1.0 if weights is None else float(weights[0])

@@ -53,20 +53,6 @@ def judge(
     return Promotion.of(found, number, option)
 
 
-def compare_refreshed(
-    database: Database, files: Files, model: str, version: int, trained: TorqueModel, held_out: Samples, lineage: Any
-) -> str | None:
-    """How the judged fit of a refresh compares with the version that it refreshes; None if that has been deleted.
-
-    This decides nothing, as the robot may have changed since the samples held out were recorded.
-    """
-    with database.session() as session:
-        refreshed = session.get(VersionRow, (model, version))
-    if refreshed is None:
-        return None
-    return _against(files, refreshed, trained, held_out, lineage).reason
-
-
 def settle(session: Session, model: str, judged: Promotion, option: PromotionOption) -> Promotion:
     """The same as of the moment when the version is added: it waits where another one answers by now."""
     serving = registry.answering(session, model)

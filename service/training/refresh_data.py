@@ -98,6 +98,29 @@ def datasets(session: Session, names: Collection[str]) -> dict[str, DatasetRow]:
 
 PAGE = 50
 """Events read at a time."""
+COMPARED = 1 / 3
+"""Share of the rows in scope, the newest, on which a refreshed version is compared before it learns them."""
+
+
+@dataclass(frozen=True)
+class Unlearnt:
+    """Rows of the log after event `after`, which neither a judged fit nor the version as of that event has learnt."""
+
+    after: int
+    samples: Samples
+
+
+def newest_part(session: Session, model: str, scope: Scope, start: int) -> int:
+    """The event after which the newest COMPARED of the rows in scope lie, from event `start` on."""
+    live = (EventRow.model == model, EventRow.number <= scope.through, EventRow.void.is_(False), EventRow.learnt > 0)
+    query = select(EventRow.number, EventRow.learnt).where(*live, EventRow.last >= scope.since)
+    counts = session.execute(query.order_by(EventRow.number.desc())).all()
+    left = COMPARED * sum(learnt for _, learnt in counts)
+    for number, learnt in counts:
+        left -= learnt
+        if left <= 0:
+            return max(number - 1, start)
+    return scope.through
 
 
 @dataclass(frozen=True)
@@ -109,11 +132,17 @@ class Logged:
 
 
 def read_log(
-    database: Database, model: str, joint_names: tuple[str, ...], scope: Scope, most: int, longest_step: float
+    database: Database,
+    model: str,
+    joint_names: tuple[str, ...],
+    scope: Scope,
+    most: int,
+    longest_step: float,
+    after: int = 0,
 ) -> Logged:
-    """Rows in scope that teach, at most `most` of them, thinned evenly. Sorted by stream and time; where time steps by
-    more than `longest_step` seconds a new episode begins."""
-    kept, count = _thinned(database, model, scope, most)
+    """Rows in scope that teach, of events above number `after`, at most `most`, thinned evenly. Sorted by stream and
+    time; where time steps by more than `longest_step` seconds a new episode begins."""
+    kept, count = _thinned(database, model, scope, most, after)
     if count == 0:
         return Logged(None, 0)
     rows, source = Rows.concatenate([part for part, _ in kept]), np.concatenate([stream for _, stream in kept])
@@ -131,12 +160,14 @@ def age_weights(times: Array, scope: Scope) -> Array | None:
     return np.exp(np.minimum(times - scope.newest, 0.0) / scope.forgetting_s)
 
 
-def _thinned(database: Database, model: str, scope: Scope, most: int) -> tuple[list[tuple[Rows, Array]], int]:
+def _thinned(
+    database: Database, model: str, scope: Scope, most: int, after: int
+) -> tuple[list[tuple[Rows, Array]], int]:
     """Every k-th row in scope in the order of the log, each with the number of its stream, and how many there are. One
     pass, and never more than twice `most` rows in memory: k doubles whenever there are that many."""
     kept: list[tuple[Rows, Array]] = []
     streams: dict[str | None, int] = {}
-    step, count, held, after = 1, 0, 0, 0
+    step, count, held = 1, 0, 0
     while True:
         with database.session() as session:
             events = log.events(session, model, after, PAGE)

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import update
 from sqlalchemy.orm import Session
 
 import lipcore
+from lipcore.data.samples import Samples
 from lipcore.extras import MissingExtraError
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import REFIT_ERROR
@@ -25,11 +25,11 @@ from service.models.lineage import MOST_SAMPLES, figures, software
 from service.runtime.allocator import give_back
 from service.runtime.executors import ClusterUnavailableError
 from service.storage import errors as storage_errors
-from service.storage.database import Database, JobRow, LearnerRow, now
+from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
 from service.telemetry.logs import job_id
-from service.training import judging, lifecycle, promotion, refresh_data
+from service.training import judging, lifecycle, promotion, refresh_data, refreshed
 from service.training.holding_out import CannotHoldOutError
 from service.training.material import Material, observed, recorded
 from service.training.planned_fit import PlannedFit
@@ -125,7 +125,7 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
 
 def _version(
     settings: Settings, database: Database, files: Files, claim: Claim, material: Material, pulse: Pulse
-) -> tuple[TorqueModel, dict[str, Any], Promotion | None]:
+) -> tuple[TorqueModel, dict[str, Any], Promotion]:
     """The model of a version, its lineage, and what came of its judgement: it is judged before its last fit."""
     fit = PlannedFit.of(claim.request, material)
     last = None if material.every is None else PlannedFit.of(claim.request, material.for_last_fit())
@@ -135,10 +135,13 @@ def _version(
         pulse.stage("evaluating")
         lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(settings, trained, material)}
     judged, learnt = _judged(settings, database, files, claim, material, trained, lineage), material
-    if last is not None and material.held_out is not None:
-        trained = last.last(settings, trained, material.held_out.thinned(settings.max_evaluation_samples), pulse)
+    judged_on = _judged_on(settings, material)
+    if last is not None and judged_on is not None:
+        trained = last.last(settings, trained, judged_on, pulse)
         if REFIT_ERROR not in trained.fit:
-            lineage["holdout"]["learnt"], learnt = True, last.material
+            learnt = last.material
+            if material.learns_held_out:
+                lineage["holdout"]["learnt"] = True
     lineage |= {
         "trained_at": now(),
         "training_process": {"seconds": round(pulse.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
@@ -154,6 +157,13 @@ def _option(settings: Settings, claim: Claim) -> PromotionOption:
     return option
 
 
+def _judged_on(settings: Settings, material: Material) -> Samples | None:
+    """What a version is judged on before it learns it: of a refresh the newest logged rows, else what was held out."""
+    if material.unlearnt is not None:
+        return material.unlearnt.samples
+    return None if material.held_out is None else material.held_out.thinned(settings.max_evaluation_samples)
+
+
 def _judged(
     settings: Settings,
     database: Database,
@@ -162,19 +172,18 @@ def _judged(
     material: Material,
     trained: TorqueModel,
     lineage: dict[str, Any],
-) -> Promotion | None:
-    """Whether the version answers by itself; None for one of a refresh, which has to prove better first. The lineage
-    of that says how it compares with the version that it refreshes."""
-    held_out = None
-    if material.held_out is not None:
-        held_out = material.held_out.thinned(settings.max_evaluation_samples)
+) -> Promotion:
+    """Whether the version answers by itself. The lineage of a refresh says how it compares with the version that it
+    refreshes."""
     refresh = claim.request.get("refresh")
     if refresh is None:
-        return promotion.judge(database, files, claim.model, trained, held_out, lineage, _option(settings, claim))
-    if held_out is not None:
-        given = database, files, claim.model, refresh["version"], trained, held_out, lineage
-        lineage["refresh"] = {**lineage["refresh"], "compared": promotion.compare_refreshed(*given)}
-    return None
+        judged_on, option = _judged_on(settings, material), _option(settings, claim)
+        return promotion.judge(database, files, claim.model, trained, judged_on, lineage, option)
+    with database.session() as session:
+        serving = session.get_one(VersionRow, (claim.model, refresh["version"]))
+    compared = refreshed.compare(database, files, serving, trained, material.unlearnt)
+    lineage["refresh"] = {**lineage["refresh"], "compared": compared.acceptance.reason, "evidence": compared.evidence}
+    return Promotion.of(compared.acceptance, serving.version)
 
 
 def _publish(
@@ -184,24 +193,21 @@ def _publish(
     material: Material,
     folder: str,
     manifest: dict[str, Any],
-    judged: Promotion | None,
+    judged: Promotion,
 ) -> tuple[int, str]:
-    """Add the version that was trained; return its number, and in words what came of it where it was compared."""
-    if judged is not None:
+    """Add the version that was trained; return its number, and in words what came of it."""
+    if (refresh := claim.request.get("refresh")) is None:
         judged = promotion.settle(session, claim.model, judged, _option(settings, claim))
         waits = not judged.answers
         version = registry.publish(session, claim.model, folder, manifest, claim.job, candidate=waits, promotion=judged)
         if waits:
             promotion.wait(session, claim.model, version, settings.max_aliases)
         return version, f" and {'waits as candidate' if waits else 'answers'}: {judged.reason}"
-    refresh = claim.request["refresh"]
     if refresh_data.taken_back(session, claim.model, refresh["through"], material.seen):
         raise TakenBackError("part of what was observed has been taken back while it was trained on: refresh again")
-    earlier = (LearnerRow.model == claim.model, LearnerRow.role == "candidate")
-    session.execute(update(LearnerRow).where(*earlier).values(role="dismissed"))  # the newer one has seen more
-    start, compared = refresh["through"], manifest["lineage"]["refresh"].get("compared")
-    version = registry.publish(session, claim.model, folder, manifest, claim.job, candidate=True, start=start)
-    return version, "" if compared is None else f": {compared}"
+    start, evidence = refresh["through"], manifest["lineage"]["refresh"]["evidence"]
+    version = registry.publish(session, claim.model, folder, manifest, claim.job, True, start, judged)
+    return version, f": {refreshed.promote(session, claim.model, version, judged, evidence)}"
 
 
 def _code(error: Exception) -> str:

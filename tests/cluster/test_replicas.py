@@ -13,10 +13,8 @@ from sqlalchemy import select
 
 from service import replication
 from service.app import create_app
-from service.learning import refresh
-from service.learning.learner.publication import Contested
 from service.models import aliases
-from service.storage.database import AlarmRow, Database, EventRow, LearnerRow, ServingRow
+from service.storage.database import Database, EventRow
 from tests.cluster.pairs import HARMLESS, Pair, answers, both, folder_store, made, train
 from tests.cluster.servers import S3, Postgres, Shared, sharing
 from tests.service.data import ADDRESS, eventually, service_of
@@ -196,23 +194,6 @@ def test_what_is_deleted_at_one_is_gone_at_the_other(pair, arm):
     # one of the same name has nothing of the one before
     again = pair.enrol(first.model)
     assert [pupil.predict()["version"] for pupil in again] == [3, 3]
-
-
-def test_of_two_services_that_decide_the_same_contest_one_acts(pair, arm):
-    first = arm[0]
-    services = [service_of(client) for client in pair.clients]
-    publish(services[0].database, services[0].files, pair.trained, first.model, candidate=True)
-    said = Contested(first.model, 1, 2, "promote", {"rows": 700, "gain": 0.5, "standard_error": 0.1})
-    acted = both(
-        *(partial(refresh.decide, each.database, each.loaded, each.learners.process.wake, said) for each in services)
-    )
-    assert sorted(acted) == [False, True]
-    eventually(lambda: [pupil.predict()["version"] for pupil in arm] == [2, 2])
-    with services[0].database.session() as session:
-        of_model = session.scalars(select(AlarmRow).where(AlarmRow.model == first.model))
-        assert [alarm.kind for alarm in of_model] == ["promotion"]
-        assert session.get(ServingRow, first.model).change == 2
-        assert session.get(LearnerRow, (first.model, 1)).role == "dismissed"
 
 
 @pytest.mark.slow

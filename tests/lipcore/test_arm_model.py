@@ -175,19 +175,12 @@ def heavier(seed: int, size: int) -> Samples:
     return recorded(robot, seed, size)
 
 
-def test_an_arm_learns_online_and_unlearns(learnt: TorqueModel) -> None:
-    more, asked, unseen = heavier(5, 300), heavier(6, 60), recorded(ROBOT, 2, 60)
-    first = more.q, more.dq, more.ddq
+def test_an_arm_learns_online(learnt: TorqueModel) -> None:
+    more, asked = heavier(5, 300), heavier(6, 60)
     start, rows = OnlineModel.start(learnt, forgetting_s=None), as_rows(more, began=0.0)
     before = errors(start.model(), asked)
     changed = errors(start.change(-1.0).learn(rows).model(), asked)
     assert (changed < 0.01 * before).all(), (before, changed)
-    taught = start.learn(rows)  # a change that nobody named: in between
-    assert (np.abs(taught.model().predict(*first).tau - learnt.predict(*first).tau) > 0.01).any()
-    back = taught.unlearn(rows).model()
-    one, other = (each.predict(unseen.q, unseen.dq, unseen.ddq) for each in (learnt, back))
-    np.testing.assert_allclose(other.tau, one.tau, rtol=0, atol=1e-4 * np.abs(one.tau).max())
-    np.testing.assert_allclose(other.tau_std, one.tau_std, rtol=1e-2)
 
 
 def test_what_is_reported_of_a_learnt_arm(learnt: TorqueModel) -> None:

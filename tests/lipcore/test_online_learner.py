@@ -14,7 +14,7 @@ from lipcore.estimators.catalogue import ESTIMATORS
 from lipcore.files.probing import probe
 from lipcore.online import transfer
 from lipcore.online.batch import Rows
-from lipcore.online.learner import ForgottenError, OnlineModel, uncovered
+from lipcore.online.learner import OnlineModel, uncovered
 from lipcore.online.transfer import Revision, consolidate
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.misfit import shared_rows
@@ -67,19 +67,6 @@ def test_forgetting_knows_no_order_either(model: TorqueModel, rows: Rows) -> Non
         backwards = backwards.learn(rows.take(part))
     same_answers(backwards.model(), start.learn(rows).model(), rows)
     assert start.learn(rows).samples < 0.9 * len(rows)
-
-
-def test_unlearning_is_the_inverse(model: TorqueModel, rows: Rows) -> None:
-    kept, gone = rows.take(slice(0, 40)), rows.take(slice(40, None))
-    for forgetting in (None, 20.0):
-        start = OnlineModel.start(model, forgetting, since=float(rows.time.min()))
-        without = start.learn(kept).learn(gone).unlearn(gone)
-        # the clock goes on all the same: what was kept has aged as if the others had never come
-        expected = start.learn(kept)
-        age = 0.0 if forgetting is None else (without.reference - expected.reference) / forgetting
-        assert np.isclose(without.samples, expected.samples * np.exp(-age), rtol=1e-9)
-        if forgetting is None:
-            same_answers(without.model(), expected.model(), rows)
 
 
 def test_memory_is_constant(model: TorqueModel, rows: Rows) -> None:
@@ -244,26 +231,13 @@ def test_rows_that_come_after_a_change_but_are_from_before_it_move_what_it_start
     in_time = OnlineModel.start(base).learn(rows).change(5000.0).learn(new)
     too_late = OnlineModel.start(base).learn(early).change(5000.0).learn(new).learn(late)
     same_answers(too_late.model(), in_time.model(), new, 1e-7)
-    same_answers(
-        too_late.unlearn(late).model(),
-        OnlineModel.start(base).learn(early).change(5000.0).learn(new).model(),
-        new,
-        1e-6,
-    )
 
 
 def test_a_row_belongs_to_one_regime_for_good(base: TorqueModel, rows: Rows) -> None:
-    """A change is noticed after it began: rows learnt meanwhile stay where they were, and can be taken back."""
+    """A change is noticed after it began: rows learnt meanwhile stay where they were."""
     online = OnlineModel.start(base).learn(rows).change(float(rows.time[30]))
     assert online.now.begins > rows.time.max()
     assert online.before is not None
-    assert online.unlearn(rows).before is not None
-    again = online.unlearn(rows).before
-    assert again is not None
-    assert abs(again.statistics.samples) < 1e-9
-    twice = online.change(float(rows.time.max()) + 9.0)
-    with pytest.raises(ForgottenError, match="two changes have come since"):
-        twice.unlearn(rows)
 
 
 def test_novel_rows_are_told_and_stay_uncertain(base: TorqueModel) -> None:
@@ -328,7 +302,7 @@ def test_adding_in_place_gives_the_same_bits(base: TorqueModel, rows: Rows, forg
     for part in parts:
         usual, own = usual.learn(part), own.learn(part, own=True)
     usual, own = usual.change(5000.0), own.change(5000.0)
-    usual, own = usual.unlearn(parts[1]), own.unlearn(parts[1], own=True)
+    usual, own = usual.learn(parts[1]), own.learn(parts[1], own=True)
     assert transfer.dump(own.symmetrised()) == transfer.dump(usual)
     assert transfer.dump(OnlineModel.start(base, forgetting, since=float(rows.time.min()))) == untouched
     assert np.array_equal(usual.now.statistics.a, usual.now.statistics.a.T)

@@ -9,7 +9,7 @@ from lipcore import FitOptions, TorqueModel, train
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.online import regime, transfer
 from lipcore.online.batch import Rows
-from lipcore.online.learner import ForgottenError, OnlineModel
+from lipcore.online.learner import OnlineModel
 from lipcore.online.transfer import consolidate
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
@@ -119,20 +119,10 @@ def test_order_does_not_matter_while_epochs_are_kept(base: TorqueModel, rows: Ro
     same_answers(shuffled.model(), at_once.model(), rows)
 
 
-def test_what_is_taken_back_was_never_there(base: TorqueModel, rows: Rows) -> None:
-    gone = np.random.default_rng(1).permutation(len(rows))[:50]
-    left, taken = rows.take(np.setdiff1d(np.arange(len(rows)), gone)), rows.take(gone)
-    start = walking(base, 40.0)
-    same_answers(start.learn(rows).unlearn(taken).model(), start.learn(left).model(), rows, 1e-7)
-
-
 def test_folded_epochs_are_closed(base: TorqueModel, rows: Rows) -> None:
     online = walking(base, 10.0).learn(rows)  # epochs of 1 s: 8 to 11 are kept
     assert [each.number for each in online.now.epochs] == [8, 9, 10, 11]
-    early, kept = rows.take(slice(70, 80)), rows.take(slice(80, 90))
-    with pytest.raises(ForgottenError, match="epochs up to 7 cannot be taken back"):
-        online.unlearn(early)
-    assert online.unlearn(kept).samples == pytest.approx(len(rows) - 10)
+    early = rows.take(slice(70, 80))
     moved = replace(early, time=early.time + 1.0)
     assert transfer.dump(online.learn(early)) == transfer.dump(online.learn(moved))
 
@@ -194,9 +184,6 @@ def test_a_change_keeps_the_friction_of_then(base: TorqueModel, rows: Rows) -> N
     assert in_time.before is not None
     too_late = start.learn(early).change(float(new.time[0])).learn(new).learn(late)
     same_answers(too_late.model(), in_time.model(), new, 1e-6)
-    same_answers(
-        in_time.unlearn(late).model(), start.learn(early).change(float(new.time[0])).learn(new).model(), new, 1e-6
-    )
 
 
 def test_what_cannot_be_is_refused(base: TorqueModel) -> None:

@@ -20,6 +20,7 @@ from service.contract import learning as schema
 from service.contract.observations import LearningOptions
 from service.foundation.errors import ConflictError, invalid_request, not_found, problem
 from service.journal import log
+from service.journal.alarms import page as alarms_page
 from service.learning import owner
 from service.learning.control import status
 from service.learning.ingest.batches import state
@@ -58,6 +59,8 @@ def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> sc
     version = serving(learners.database, model)
     with learners.database.turn(model), learners.database.transaction(model) as session:
         batch = find_learnt(session, model, stream_id, sequence)
+        if log.start_of(session, model, version) < batch.number:
+            _check_fold(session, model, version, batch)
         rows = batch.learnt + sum(each.learnt for each in log.about(session, batch, "replay") if not each.void)
         trained = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.start >= batch.number)
         versions = list(session.scalars(trained.order_by(LearnerRow.version)))
@@ -67,6 +70,16 @@ def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> sc
         audit.note(session, model, "observations unlearnt", version, before=taken)
     learners.process.wake(model)
     return schema.Unlearnt(**revised.model_dump(), stream_id=stream_id, sequence=sequence, rows=rows, trained=versions)
+
+
+def _check_fold(session: Session, model: str, version: int, batch: EventRow) -> None:
+    """Raise ConflictError if what a version has learnt cannot be made again without a batch."""
+    if not log.can_fold_again(session, model, version, batch.number):
+        name = f"batch {batch.sequence} of stream {batch.stream_id!r}"
+        raise ConflictError(
+            f"{name} can no longer be unlearnt: the log does not reach back to a stored state without it. Roll back to "
+            "an earlier revision, or train the model anew"
+        )
 
 
 def delete_stream(learners: Learners, model: str, stream_id: str) -> None:
@@ -248,7 +261,7 @@ def alarms(learners: Learners, model: str, part: Page) -> schema.AlarmPage:
     """List the alarms of a model, newest first; raise NotFoundError where there is no such model."""
     registry.find(learners.database, model, None)
     with learners.database.session() as session:
-        rows, following = owner.alarms(session, model, part)
+        rows, following = alarms_page(session, model, part)
     names = ("kind", "at", "message", "evidence")
     items = [schema.Alarm(id=row.seq, **{name: getattr(row, name) for name in names}) for row in rows]
     return schema.AlarmPage(items=items, next_cursor=following)

@@ -23,7 +23,7 @@ from service.learning.ingest.batches import state
 from service.learning.ingest.monitor import Window
 from service.learning.learners import Learners
 from service.models import registry
-from service.storage.database import EventRow, LearnerRow, StreamRow
+from service.storage.database import EventRow, StreamRow
 from service.storage.rows import Page
 
 Range = tuple[int, int]
@@ -50,7 +50,6 @@ def learning(learners: Learners, model: str) -> schema.Learning:
             linearisation_error=None if latest.published is None else latest.published.linearisation,
             failure=latest.failure,
             held=owner.held(session, model),
-            candidate=_candidate(session, model, version),
             streams=_streams(session, model),
             reachable=[list(each) for each in reachable(session, model, version)],
             snapshots=[
@@ -87,16 +86,6 @@ def window(sums: Window, now: float) -> schema.QualityWindow:
         rejected=dict(counts),
         coverage_answered=sums.held(now).coverage(),
     )
-
-
-def _candidate(session: Session, model: str, serving: int) -> schema.Candidate | None:
-    query = select(LearnerRow.version).where(
-        LearnerRow.model == model, LearnerRow.role == "candidate", LearnerRow.version != serving
-    )
-    version = session.scalar(query.order_by(LearnerRow.version.desc()).limit(1))
-    if version is None:
-        return None
-    return schema.Candidate(version=version, revision=current(session, model, version))
 
 
 def _streams(session: Session, model: str) -> list[schema.Stream]:

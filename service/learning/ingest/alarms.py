@@ -7,6 +7,7 @@ from sqlalchemy.orm import Session
 
 from service.foundation.text import percent
 from service.journal import log
+from service.journal.alarms import raise_alarm
 from service.learning import owner
 from service.learning.ingest.judging import Verdict
 from service.models.loaded import Served
@@ -48,7 +49,7 @@ def raise_clock_alarm(session: Session, model: str, stream_id: str, leap: float)
         f"the clock of stream {stream_id} has leapt {leap:.0f} s ahead of its rows' arrival. These rows wait: they are "
         "logged with the code time_jump, and can be replayed. Set the clock back, or go on under another stream_id"
     )
-    owner.raise_alarm(session, model, "clock", message, {"stream_id": stream_id, "ahead_s": leap})
+    raise_alarm(session, model, "clock", message, {"stream_id": stream_id, "ahead_s": leap})
 
 
 def _alarm(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
@@ -72,7 +73,7 @@ def _alarm(session: Session, served: Served, follows: str, verdict: Verdict, eve
             f"stream {event.stream_id} does not fit the model: {share} of its first second lies within the 95 % band; "
             f"is it this robot, with the friction and the payload that were learnt? {CONSEQUENCES[follows]}"
         )
-    owner.raise_alarm(session, served.name, "change", message, evidence)
+    raise_alarm(session, served.name, "change", message, evidence)
     known = {"at": change.at, "event": event.number}
     if follows == "hold":
         owner.hold(session, served.name, known | {"evidence": evidence})

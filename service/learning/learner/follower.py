@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,19 +19,16 @@ from lipcore.online.transfer import Revision
 from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
+from service.journal.floor import error_floor_of
+from service.journal.restore import advance, restore
 from service.learning.learner import publication
-from service.learning.learner.course import RewoundError
-from service.learning.learner.learnt import floor
 from service.learning.learner.publication import Published
-from service.learning.learner.restore import Arrival, advance, restore
 from service.storage.database import Database
 from service.storage.disk import Disk
 from service.storage.errors import translated
 from service.storage.files import Files
 
 logger = logging.getLogger(__name__)
-
-Watcher = Callable[["Follower", Sequence[Arrival]], None]
 
 
 class Novelty:
@@ -57,9 +53,7 @@ class Novelty:
 class Follower:
     """A version in the learner process. Times are seconds of `time.monotonic`.
 
-    base: the version as trained; known: what it has learnt, and up to which event; answering: the model as it was last
-    solved, which has not seen the batches that `watchers` are called with.
-    watchers: called with the follower and the batches of a page before it learns them, in order.
+    base: the version as trained; known: what it has learnt, and up to which event.
     """
 
     def __init__(
@@ -71,8 +65,7 @@ class Follower:
         with database.session() as session:
             self.start = log.start_of(session, model, version)
         # only what needs no learning: pages are taken one by one, and others have their turn in between
-        self.known = restore(database, files, model, version, base, most_rows=0)
-        self.answering, self.watchers = base, list[Watcher]()
+        self.known = restore(database, files, model, version, base, pages=0)
         self.novelty = Novelty(settings.novelty_rows)
         self.woken, self.behind = True, True
         self.due = 0.0
@@ -92,12 +85,7 @@ class Follower:
     def step(self) -> None:
         """Learn the next page, if there is one; `behind` says whether there may be more."""
         began = time.monotonic()
-        try:
-            following = advance(self.database, self.known, watch=self._watch, novel=self.novelty.add)
-        except RewoundError as error:
-            following = restore(
-                self.database, self.files, self.model, self.version, self.base, rewound=error, most_rows=0
-            )
+        following = advance(self.database, self.files, self.known, novel=self.novelty.add)
         self.behind = self.woken = following is not self.known
         self.known = following
         self._seconds += time.monotonic() - began
@@ -105,12 +93,12 @@ class Follower:
     @property
     def unpublished(self) -> bool:
         """Whether there is something that the service does not know."""
-        return self.known.number > self._published and self.known.settled
+        return self.known.number > self._published
 
     def publish(self) -> Published:
         """Solve, write the arrays for the service, and return the message that goes with them."""
         began = time.monotonic()
-        variance = floor(self.database, self.model, self.version, self.number, self.base.n_joints)
+        variance = error_floor_of(self.database, self.model, self.version, self.number, self.base.n_joints)
         revision = self._solve(variance)
         path = publication.write(publication.folder(self.files), revision)
         ended = time.monotonic()
@@ -135,7 +123,7 @@ class Follower:
     @property
     def snapshot_due(self) -> float:
         """When the state is to be stored; infinity where it is stored or cannot be yet."""
-        if self.number == self._stored or not self.known.settled:
+        if self.number == self._stored:
             return np.inf
         return self._stored_at + self.settings.snapshot_every_s
 
@@ -153,9 +141,9 @@ class Follower:
         self.store()
 
     def store(self) -> None:
-        """Store the state, unless it is stored, or a later one, or it is a stage on the way to another one. Where there
+        """Store the state, unless it is stored, or a later one. Where there
         is no room for it, learning goes on all the same: the log has everything."""
-        if self.number == self._stored or not self.known.settled or self._is_stored():
+        if self.number == self._stored or self._is_stored():
             return
         self._stored_at = time.monotonic()
         payload = state.dump(self.known.online)
@@ -167,6 +155,7 @@ class Follower:
                 self.model,
                 self.version,
                 self.number,
+                self.known.seen,
                 payload,
                 most=self.settings.max_snapshots,
             )
@@ -191,13 +180,9 @@ class Follower:
         online = self.known.online
         known, at = self._solved or (None, floor)
         if self._revision is None or known is not online or not np.array_equal(at, floor):
-            self.answering = online.model(floor)
-            self._revision, self._solved = Revision.of(self.answering), (online, floor)
-            error = linearisation_error(self.answering)
+            answering = online.model(floor)
+            self._revision, self._solved = Revision.of(answering), (online, floor)
+            error = linearisation_error(answering)
             # a joint whose errors are no larger than stated needs nothing mended
             self._linearisation = None if error is None else tuple(np.where(floor > 0, error, 0.0).tolist())
         return self._revision
-
-    def _watch(self, arrivals: Sequence[Arrival]) -> None:
-        for watcher in self.watchers:
-            watcher(self, arrivals)

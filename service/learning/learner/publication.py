@@ -10,7 +10,6 @@ from __future__ import annotations
 import shutil
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
 
 import numpy as np
 
@@ -44,17 +43,6 @@ class Published:
 
 
 @dataclass(frozen=True)
-class Contested:
-    """The contest between the version that serves and a candidate is decided."""
-
-    model: str
-    serving: int
-    candidate: int
-    verdict: Literal["promote", "dismiss"]
-    evidence: dict[str, Any]
-
-
-@dataclass(frozen=True)
 class Failed:
     """A version cannot learn; it is tried again later. error: why, for people."""
 
@@ -63,7 +51,7 @@ class Failed:
     error: str
 
 
-Message = Published | Contested | Failed
+Message = Published | Failed
 
 
 def folder(files: Files) -> Path:

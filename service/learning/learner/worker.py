@@ -1,4 +1,4 @@
-"""What the learner process does: every version that learns has a follower, and they take turns."""
+"""What the learner process does: the version of each model that serves has a follower, and they take turns."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from multiprocessing.connection import Connection
 from service.foundation.settings import Settings
 from service.journal import snapshots
 from service.learning.learner import publication
-from service.learning.learner.contest import Duels
 from service.learning.learner.follower import Follower
 from service.learning.learner.publication import Failed, Message
 from service.models import registry
@@ -55,7 +54,6 @@ class Learner:
     def __init__(self, database: Database, files: Files, settings: Settings) -> None:
         self.database, self.files, self.settings = database, files, settings
         self.followers: dict[Key, Follower] = {}  # in the order in which they were woken last
-        self.duels = Duels(settings)
         self._woken: set[str] = set()
         self._unread: dict[str, float] = {}  # when models are looked up again, where the database was away
         self._failed: dict[Key, tuple[float, float]] = {}
@@ -88,7 +86,6 @@ class Learner:
                 yield from self._serve(follower)
             except Exception as error:  # the others learn all the same
                 yield self._fail(key, error)
-        yield from self.duels.outcomes()
 
     def close(self) -> None:
         """Store what has been learnt."""
@@ -106,39 +103,33 @@ class Learner:
             follower.store_in_turn()
 
     def _enlist(self, model: str) -> Iterator[Message]:
-        """Wake the followers of a model: of the version that serves and of the candidates for its place."""
+        """Wake the follower of the version that serves, and drop that of one that no longer does."""
         try:
-            versions = self._learning(model)
-        except Exception:  # of the database; the followers keep what they have learnt meanwhile
-            logger.exception("which versions of model %r learn cannot be read: tried again", model)
+            with self.database.session() as session:
+                version = registry.answering(session, model)
+        except Exception:  # of the database; the follower keeps what it has learnt meanwhile
+            logger.exception("which version of model %r learns cannot be read: tried again", model)
             self._unread[model] = time.monotonic() + FIRST_PAUSE
             return
         self._unread.pop(model, None)
-        for key in [key for key in self.followers if key[0] == model and key[1] not in versions]:
+        for key in [key for key in self.followers if key[0] == model and key[1] != version]:
             self._drop(key)
-        self._failed = {key: tried for key, tried in self._failed.items() if key[0] != model or key[1] in versions}
-        for version in versions:
-            key = (model, version)
-            at, pause = self._failed.get(key, (0.0, 0.0))
-            if at > time.monotonic() and key not in self.followers:
-                continue
-            try:
-                follower = self.followers.pop(key, None) or self._follow(key)
-            except Exception as error:
-                yield self._fail(key, error)
-                continue
-            follower.woken = True
-            self.followers[key] = follower
-            if key in self._failed:
-                self._failed[key] = (inf, pause)  # forgotten once it has published
-        enlisted = [self.followers[model, version] for version in versions if (model, version) in self.followers]
-        serving = next((each for each in enlisted if each.version == versions[-1]), None)
-        self.duels.arrange(model, serving, [each for each in enlisted if each is not serving])
-
-    def _learning(self, model: str) -> list[int]:
-        """Versions of a model that learn; the one that serves last, so that it is the last to be dropped."""
-        with self.database.session() as session:
-            return registry.learning(session, model)
+        self._failed = {key: tried for key, tried in self._failed.items() if key[0] != model or key[1] == version}
+        if version is None:
+            return
+        key = (model, version)
+        at, pause = self._failed.get(key, (0.0, 0.0))
+        if at > time.monotonic() and key not in self.followers:
+            return
+        try:
+            follower = self.followers.pop(key, None) or self._follow(key)
+        except Exception as error:
+            yield self._fail(key, error)
+            return
+        follower.woken = True
+        self.followers[key] = follower
+        if key in self._failed:
+            self._failed[key] = (inf, pause)  # forgotten once it has published
 
     def _follow(self, key: Key) -> Follower:
         while len(self.followers) >= self.settings.max_learning_models:

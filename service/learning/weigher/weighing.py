@@ -14,8 +14,8 @@ from sqlalchemy import select
 from lipcore.online.payload.holding import Watch
 from service.foundation.errors import ServiceError
 from service.journal import log
+from service.journal.alarms import raise_alarm
 from service.journal.log import NewBatch
-from service.learning import owner
 from service.learning.ingest.monitor import Monitor
 from service.learning.ingest.screening import Screened
 from service.learning.streams import PayloadRecord
@@ -154,7 +154,7 @@ class Weighing:
                     monitor.payload_alarm_at = message.received
                     text, mass = _told(stream_id, watch)
                     evidence = {"stream_id": stream_id, "at": watch.since, **mass}
-                    owner.raise_alarm(session, model, "payload", text, evidence)
+                    raise_alarm(session, model, "payload", text, evidence)
             monitor.number = event.number
             monitor.streams.change(stream_id, scale=None)  # its errors on the way say nothing of its intervals
             served.scales.take(monitor.streams.factors(served.version))

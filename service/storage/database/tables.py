@@ -190,8 +190,7 @@ class ServingRow(Base):
 class LearnerRow(Base):
     """How a version learns: it contains the model's events up to number `start` by training, later ones by updates.
 
-    role: "serving" or, while a refreshed version is compared with the one that serves, "candidate"; "dismissed" where
-    that one stayed better. A version without such a row starts at 0.
+    role: "serving", or "dismissed" for one that does not learn. A version without such a row starts at 0.
     """
 
     __tablename__ = "learners"

@@ -5,7 +5,7 @@ from datetime import UTC, datetime, timedelta, timezone
 
 import pytest
 from fastapi.testclient import TestClient
-from sqlalchemy import event, select, text
+from sqlalchemy import event, select
 from sqlalchemy.exc import DBAPIError
 
 from service.api.access import keys
@@ -101,14 +101,7 @@ def import_(api):
 
 def remove_version(api):
     version = publish(api, "arm", candidate=True)
-    settle(api, version)
     good(api.delete(f"/v1/models/arm/versions/{version}"))
-
-
-def settle(api, version):
-    """Let a version be nobody's rival."""
-    with service_of(api).database.transaction() as session:
-        session.execute(text(f"UPDATE learners SET role = 'dismissed' WHERE version = {version}"))
 
 
 def move(api, alias="production", version=1):

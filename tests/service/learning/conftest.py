@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from service.learning.learner import course
+from service.journal import restore
 from service.models import registry
 from service.storage.database import Database
 from tests.service.conftest import Trained
@@ -54,4 +54,4 @@ def arm(home: Path) -> Iterator[Arm]:
 @pytest.fixture(params=[1, 25, 500], ids="pages of {} rows".format)
 def pages(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages of one batch, of a few, and of all."""
-    monkeypatch.setattr(course, "PAGE_ROWS", request.param)
+    monkeypatch.setattr(restore, "PAGE_ROWS", request.param)

@@ -23,9 +23,9 @@ from lipcore.posterior.statistics import collect, merge
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.journal.log import NewBatch
+from service.journal.restore import Restored, advance, restore
 from service.learning.learner import publication
 from service.learning.learner.publication import Published
-from service.learning.learner.restore import Restored, advance, restore
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import Database, EventRow
@@ -101,16 +101,16 @@ class Arm:
 
     def followed(self, known: Restored) -> Restored:
         """Advance a state until there is nothing new."""
-        while (following := advance(self.database, known)) is not known:
+        while (following := advance(self.database, self.files, known)) is not known:
             known = following
         return known
 
     def snapshot(self, at_most: int | None = None) -> int:
         """Store the state after an event, the last one unless said; return the number of the event that it is of."""
         known = self.restored(at_most=at_most)
-        assert known.settled
         payload, most = transfer.dump(known.online), self.settings.max_snapshots
-        assert snapshots.save(self.database, self.files, self.model, 1, known.number, payload, most=most) is not None
+        state = 1, known.number, known.seen
+        assert snapshots.save(self.database, self.files, self.model, *state, payload, most=most) is not None
         return known.number
 
     def batch(self, number: int, size: int = ROWS, model: str | None = None, **fields: Any) -> int:

@@ -17,9 +17,9 @@ import lipcore
 from lipcore.online import transfer
 from lipcore.online.transfer import Revision
 from service.journal import log, snapshots
-from service.learning.learner import course, learnt
-from service.learning.learner.course import RewoundError
-from service.learning.learner.restore import advance, restore
+from service.journal import restore as restoring
+from service.journal.floor import error_floor_of
+from service.journal.restore import advance, restore
 from service.models import registry
 from service.storage.database import Database, SnapshotRow
 from service.storage.files import Files
@@ -86,35 +86,32 @@ class Story:
         with self.arm.database.session() as session:
             return Fold(self.base, log.events(session, ARM, 0, 1000, void=True), self.start)
 
-    def begun(self, error: RewoundError | None = None):
+    def begun(self):
         """A state to go on from."""
-        return restore(self.arm.database, self.arm.files, ARM, self.version, self.base, rewound=error, most_rows=0)
+        return restore(self.arm.database, self.arm.files, ARM, self.version, self.base, pages=0)
 
     def followed(self, known, pages: int | None, fold: Fold):
-        """Learn some pages, or all; check every state that could be published."""
+        """Learn some pages, or all; check every state."""
         while pages is None or pages > 0:
-            try:
-                following = advance(self.arm.database, known)
-            except RewoundError as error:
-                following = self.begun(error)
+            following = advance(self.arm.database, self.arm.files, known)
             if following is known:
                 return known
             known, pages = following, pages and pages - 1
-            if known.settled:
-                assert transfer.dump(known.online) == transfer.dump(fold.after(known.number)), known.number
+            assert transfer.dump(known.online) == transfer.dump(fold.after(known.number)), known.number
         return known
 
     def store(self, known) -> None:
         """Store a snapshot."""
-        if known.settled and known.number > self.start:
+        if known.number > self.start:
             payload = transfer.dump(known.online)
-            snapshots.save(self.arm.database, self.arm.files, ARM, self.version, known.number, payload, most=4)
+            place = ARM, self.version, known.number, known.seen
+            snapshots.save(self.arm.database, self.arm.files, *place, payload, most=4)
 
 
 def tell(pieces, page_rows: int, start: int) -> None:
     """Let a log grow piece by piece while it is followed, and others begin late."""
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setattr(course, "PAGE_ROWS", page_rows)
+        patch.setattr(restoring, "PAGE_ROWS", page_rows)
         story = Story(Path(folder), 0)
         for number in range(start):
             story.log("settings" if number == 1 else "batch", 2.0 if number == 1 else number)
@@ -131,7 +128,7 @@ def tell(pieces, page_rows: int, start: int) -> None:
         known = story.followed(known, None, fold)
         late = story.followed(story.begun(), None, fold)
         assert known.number == late.number == len(fold.events)
-        patch.setattr(course, "PAGE_ROWS", 500)
+        patch.setattr(restoring, "PAGE_ROWS", 500)
         with story.arm.database.transaction() as session:
             session.execute(delete(SnapshotRow))
         first = story.followed(story.begun(), None, fold)
@@ -166,11 +163,11 @@ def test_long_logs_too(pieces, page_rows, start):
 def make(home: Path, page_rows: int, connection) -> None:
     """Make the state of a log in a process, and send a digest of it and of the answers that are solved from it."""
     threadpool_limits(1)
-    course.PAGE_ROWS = page_rows
+    restoring.PAGE_ROWS = page_rows
     database, files = Database(home), Files(home)
     base = lipcore.load(files.version_folder(registry.find(database, ARM, 1).folder))
     known = restore(database, files, ARM, 1, base)
-    floor = learnt.floor(database, ARM, 1, known.number, 2)
+    floor = error_floor_of(database, ARM, 1, known.number, 2)
     revision = Revision.of(known.online.model(floor))
     arrays = [getattr(revision, each.name) for each in fields(revision)]
     made = [transfer.dump(known.online), *(np.ascontiguousarray(each).tobytes() for each in arrays)]
@@ -192,7 +189,7 @@ def test_two_processes_reach_the_same_bits(home):
     assert first == second
     known = arm.restored(at_most=7)
     payload = transfer.dump(known.online)
-    assert snapshots.save(arm.database, arm.files, ARM, 1, known.number, payload, most=4) is not None
+    assert snapshots.save(arm.database, arm.files, ARM, 1, known.number, known.seen, payload, most=4) is not None
     assert _made(home, 500)[0] == first[0]
     arm.database.close()
 

@@ -136,23 +136,6 @@ def test_a_clock_that_is_set_back_keeps_no_state_from_being_stored(arm, follower
     assert stored(arm) == [1, 2]
 
 
-def test_watchers_see_batches_before_they_are_learnt(arm, follower):
-    seen = []
-
-    def watch(who, arrivals):
-        seen.append((who.number, [each.event.number for each in arrivals], who.answering))
-
-    follower.watchers.append(watch)
-    arm.batches(0, 1)
-    caught_up(follower).publish()
-    arm.batches(2)
-    caught_up(follower).publish()
-    assert [(number, events) for number, events, _ in seen] == [(0, [1, 2]), (2, [3])]
-    same(seen[0][2], at_once())
-    same(seen[1][2], at_once(range(2)))
-    same(follower.answering, at_once(range(3)))
-
-
 def test_motion_beyond_the_basis_is_counted():
     novelty, seen = Novelty(window=80), []
     for count, novel in ((76, 76), (4, 4), (80, 0), (40, 40), (60, 0)):  # not told from few rows
@@ -177,7 +160,7 @@ def test_the_error_of_a_learnt_arms_linearisation_is_published(arm, follower, mo
     monkeypatch.setattr(following, "linearisation_error", lambda model: np.array([0.1, 0.7]))
     arm.batch(1)
     assert caught_up(follower).publish().linearisation == (0.0, 0.0)  # both joints are predicted as well as stated
-    monkeypatch.setattr(following, "floor", lambda *_: np.array([0.0, 0.5]))
+    monkeypatch.setattr(following, "error_floor_of", lambda *_: np.array([0.0, 0.5]))
     arm.batch(2)
     assert caught_up(follower).publish().linearisation == (0.0, 0.7)
 
@@ -201,15 +184,14 @@ def followers(learner):
     return list(learner.followers.values())
 
 
-def test_the_version_that_serves_and_candidates_learn(arm, learner):
+def test_only_the_version_that_serves_learns(arm, learner):
     arm.batches(0, 1)
     arm.publish(candidate=True, start=1)
     arm.publish("other")
     arm.batch(0, model="other")
     messages = {(each.model, each.version): each for each in turns(learner, ARM)}
-    assert set(messages) == {(ARM, 1), (ARM, 2)}
+    assert set(messages) == {(ARM, 1)}
     same(answering(arm, messages[ARM, 1]), at_once(range(2)))
-    same(answering(arm, messages[ARM, 2]), at_once([1]))
 
 
 def test_a_version_that_serves_no_more_is_stored_and_left(arm, learner):

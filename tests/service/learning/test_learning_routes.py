@@ -9,7 +9,6 @@ from service.foundation.errors import NotFoundError
 from service.journal import log, snapshots
 from service.learning import owner
 from service.learning.control import decisions
-from service.storage.database import LearnerRow
 from tests.service.learning.batches import MODEL, batch, everything, write
 from tests.service.learning.lessons import LESSON, Pupil, apart, lesson
 
@@ -87,18 +86,13 @@ def test_where_learning_stands(school):
     assert abs(streams["arm"]["offset_s"] - time.time()) < 600
 
 
-def test_stored_states_and_the_candidate_are_listed(school):
-    pupil = school.enrol("candidate")
+def test_stored_states_are_listed(school):
+    pupil = school.enrol("stored")
     pupil.teach(0, 1)
     service = school.service
-    school.publish("candidate", candidate=True, start=1)
-    assert snapshots.save(service.database, service.files, "candidate", 1, 2, b"state", most=9) is not None
+    assert snapshots.save(service.database, service.files, "stored", 1, 2, 2, b"state", most=9) is not None
     status = pupil.get("learning")["status"]
-    assert (status["version"], status["candidate"]) == (1, {"version": 2, "revision": 1})
     assert [each["revision"] for each in status["snapshots"]] == [2]
-    with service.database.transaction() as session:
-        session.get(LearnerRow, ("candidate", 2)).role = "dismissed"
-    assert pupil.get("learning")["status"]["candidate"] is None
 
 
 @pytest.mark.parametrize("chunk", [decisions.CHUNK, 1])

@@ -45,7 +45,7 @@ def batch(number: int) -> dict[str, Any]:
 pytestmark = pytest.mark.slow
 PAUSE_S = 0.01
 """Between two questions of the watcher: the learner needs the processor too."""
-SETTINGS = {"novelty_rows": 400, "promotion_rows": 600, "refresh_pause_s": 0.0}
+SETTINGS = {"novelty_rows": 400, "refresh_pause_s": 0.0}
 
 
 @contextmanager
@@ -82,13 +82,9 @@ def story(tmp_path_factory):
         with watched(pupil, queries) as answers:
             eventually(lambda: sent() and alarms_of("novelty"))
             job = ended(api, alarms_of("novelty")[0]["evidence"]["job"])
-            before = answered(api.get("/v1/models/arm"))
-            eventually(lambda: sent() and alarms_of("promotion"))
             eventually(lambda: sent() and answers[-1].json()["version"] == 2)
         alarms = pupil.get("alarms")["items"]
-        yield SimpleNamespace(
-            pupil=pupil, school=school, dataset=dataset, job=job, before=before, answers=answers, alarms=alarms
-        )
+        yield SimpleNamespace(pupil=pupil, school=school, dataset=dataset, job=job, answers=answers, alarms=alarms)
 
 
 def test_novel_motion_is_told_and_a_candidate_trained_on_data_and_log(story):
@@ -99,10 +95,9 @@ def test_novel_motion_is_told_and_a_candidate_trained_on_data_and_log(story):
     refresh = story.job["refresh"]
     assert (story.job["state"], story.job["version"], refresh["version"]) == ("succeeded", 2, 1)
     assert refresh["trigger"] == "novelty"
-    assert (story.before["latest_version"], story.before["serving_version"]) == (2, 1)
     lineage = answered(story.pupil.client.get("/v1/models/arm/versions/2"))["lineage"]
     assert [each["id"] for each in lineage["datasets"]] == story.job["datasets"] == [story.dataset["id"]]
-    assert lineage["refresh"] == {**refresh, "left_out": []}
+    assert lineage["refresh"].items() >= {**refresh, "left_out": []}.items()
     assert (lineage["log"]["through"], lineage["log"]["rows"]) == (refresh["through"], 50 * refresh["through"])
 
 
@@ -110,7 +105,7 @@ def test_the_candidate_predicts_better_and_is_promoted(story):
     [alarm] = [each for each in story.alarms if each["kind"] == "promotion"]
     evidence = alarm["evidence"]
     assert (evidence["serving"], evidence["candidate"], evidence["promoted"]) == (1, 2, True)
-    assert evidence["rows"] >= SETTINGS["promotion_rows"]
+    assert evidence["blocks"] >= 20
     assert evidence["gain"] > 2 * evidence["standard_error"] > 0
     assert max(evidence["figures"]["candidate"]["nmse"]) < 0.02
     assert answered(story.pupil.client.get("/v1/models/arm"))["serving_version"] == 2

@@ -128,7 +128,7 @@ def test_what_is_learnt_while_a_version_is_being_loaded_is_not_lost(arm, loaded,
 
 
 def test_a_learner_is_woken_for_what_was_loaded_without_all_of_its_log(arm, monkeypatch):
-    monkeypatch.setattr(learnt, "MOST_ROWS", 0)
+    monkeypatch.setattr(learnt, "PAGES", 0)
     woken = []
     started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
     arm.batches(*range(4))

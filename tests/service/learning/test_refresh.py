@@ -51,7 +51,7 @@ def refreshed(school):
     return pupil, dataset, ended(school.client, job["id"])
 
 
-def test_a_refresh_is_a_job_that_makes_a_candidate(school, refreshed):
+def test_a_refresh_with_too_few_rows_to_compare_waits(school, refreshed):
     pupil, dataset, job = refreshed
     assert (job["state"], job["version"], job["datasets"]) == ("succeeded", 2, [dataset["id"]])
     assert job["refresh"] == {"version": 1, "through": 4, "trigger": "asked"}
@@ -162,6 +162,12 @@ def alarms(pupil):
     return [(each["kind"], each["message"]) for each in pupil.get("alarms")["items"]]
 
 
+@pytest.fixture(autouse=True)
+def soon(monkeypatch):
+    """Few rows are enough to be refreshed by itself."""
+    monkeypatch.setattr(refresh, "LEAST_S", 0.0)
+
+
 @pytest.fixture
 def ready(waiting, pupil):
     """A model that can be refreshed, whose owner wants it to be."""
@@ -215,10 +221,9 @@ def test_a_model_that_is_held_is_not_refreshed(ready):
     assert consider(school, pupil) is not None
 
 
-def test_a_candidate_in_contest_is_waited_for(ready):
-    school, pupil = ready
-    school.publish(pupil.model, candidate=True)
-    assert consider(school, pupil) is None
+def test_a_version_that_has_observed_too_little_to_be_compared_is_not_refreshed(ready, monkeypatch):
+    monkeypatch.setattr(refresh, "LEAST_S", 60.0)
+    assert consider(*ready) is None
 
 
 def test_refreshes_pause_and_each_longer_than_the_one_before(ready):

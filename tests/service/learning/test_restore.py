@@ -5,11 +5,11 @@ import pytest
 
 from lipcore.online.learner import OnlineModel
 from service.journal import log, snapshots
-from service.learning.learner import course, learnt
-from service.learning.learner import restore as restoring
-from service.learning.learner.course import RewoundError
+from service.journal import restore as restoring
+from service.journal.floor import error_floor_of
+from service.journal.restore import advance
+from service.learning.learner import learnt
 from service.learning.learner.learnt import LearntVersions
-from service.learning.learner.restore import advance
 from tests.service.faults.damage import cut, flip, remove
 from tests.service.learning.pendulums import (
     ARM,
@@ -26,14 +26,15 @@ from tests.service.learning.pendulums import (
 
 
 def test_a_page_takes_no_more_rows_than_it_may_and_at_least_a_batch(arm, monkeypatch):
-    monkeypatch.setattr(course, "PAGE_ROWS", 25)
+    monkeypatch.setattr(restoring, "PAGE_ROWS", 25)
     arm.batches(0, 1, 2)
     arm.batch(1, size=40, stream_id="other")
-    known, seen = arm.restored(most_rows=0), []
+    known, ends = arm.restored(pages=0), []
     for _ in range(3):
-        known = advance(arm.database, known, watch=lambda page: seen.append([each.event.number for each in page]))
-    assert seen == [[1, 2], [3], [4]]
-    assert advance(arm.database, known) is known
+        known = advance(arm.database, arm.files, known)
+        ends.append(known.number)
+    assert ends == [2, 3, 4]
+    assert advance(arm.database, arm.files, known) is known
 
 
 @pytest.mark.each_once
@@ -71,10 +72,8 @@ def test_who_is_overtaken_by_retention_goes_on_from_the_newest_snapshot(arm):
     arm.batches(4)
     with arm.database.transaction() as session:
         session.connection().exec_driver_sql("DELETE FROM events WHERE number <= 4")
-    with pytest.raises(RewoundError) as rewound:
-        advance(arm.database, known)
-    assert rewound.value.number is None
-    same(arm.restored(rewound=rewound.value).online, at_once(range(5)))
+    assert advance(arm.database, arm.files, known).number == 4
+    same(arm.followed(known).online, at_once(range(5)))
 
 
 def test_where_that_snapshot_is_lost_what_is_left_of_the_log_is_learnt(arm):
@@ -96,8 +95,8 @@ def test_little_is_learnt_where_a_version_is_loaded_and_the_rest_is_left_to_the_
     found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
     assert (found.revision, found.behind) == (6, False)
     same(found.model, at_once(range(6)))
-    monkeypatch.setattr(course, "PAGE_ROWS", 10)
-    monkeypatch.setattr(learnt, "MOST_ROWS", 20)
+    monkeypatch.setattr(restoring, "PAGE_ROWS", 10)
+    monkeypatch.setattr(learnt, "PAGES", 2)
     found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
     assert (found.revision, found.behind) == (2, True)
     same(found.model, at_once(range(2)))
@@ -119,11 +118,11 @@ def test_the_stated_uncertainty_is_not_below_the_errors_of_the_last_seconds(arm)
     for number in range(1, 5):
         arm.batch(number, received=110.0 + number, record=record(0.5))
     noise = trained().noise_std[0] ** 2
-    floor = learnt.floor(arm.database, ARM, 1, 5, 2)
+    floor = error_floor_of(arm.database, ARM, 1, 5, 2)
     np.testing.assert_allclose(floor, [0.25 - noise, 0.0], rtol=1e-9)
-    assert learnt.floor(arm.database, ARM, 1, 1, 2)[0] == pytest.approx(9.0 - noise)
-    assert learnt.floor(arm.database, ARM, 2, 5, 2).tolist() == [0.0, 0.0]
-    assert learnt.floor(arm.database, ARM, 1, 0, 2).tolist() == [0.0, 0.0]
+    assert error_floor_of(arm.database, ARM, 1, 1, 2)[0] == pytest.approx(9.0 - noise)
+    assert error_floor_of(arm.database, ARM, 2, 5, 2).tolist() == [0.0, 0.0]
+    assert error_floor_of(arm.database, ARM, 1, 0, 2).tolist() == [0.0, 0.0]
     found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
     assert found.model.predict(*QUERIES).tau_std[:, 0].min() >= np.sqrt(0.25 - noise) * (1 - 1e-9)
 
@@ -131,8 +130,8 @@ def test_the_stated_uncertainty_is_not_below_the_errors_of_the_last_seconds(arm)
 def test_slow_streams_are_judged_by_enough_rows(arm):
     for number in range(4):
         arm.batch(number, received=100.0 + 60 * number, record=record(1.0 if number < 2 else 0.0))
-    assert learnt.floor(arm.database, ARM, 1, 4, 2)[0] == 0.0  # 200 rows without error
-    assert learnt.floor(arm.database, ARM, 1, 3, 2)[0] > 0.1
+    assert error_floor_of(arm.database, ARM, 1, 4, 2)[0] == 0.0  # 200 rows without error
+    assert error_floor_of(arm.database, ARM, 1, 3, 2)[0] > 0.1
 
 
 @pytest.mark.each_once
@@ -160,16 +159,14 @@ def test_a_rollback_leads_back(arm, pages):
     known = arm.restored()
     assert arm.rollback(5) == 8
     same(arm.restored().online, at_once(range(5)))
-    with pytest.raises(RewoundError) as rewound:
-        arm.followed(known)
-    assert rewound.value.number == 5
+    same(arm.followed(known).online, at_once(range(5)))
     arm.batches(7)
     same(arm.restored().online, at_once([0, 1, 2, 3, 4, 7]))
     assert arm.restored().number == 9
 
 
 def test_a_rollback_between_two_pages_of_a_restart_is_followed(arm, monkeypatch):
-    monkeypatch.setattr(course, "PAGE_ROWS", 10)
+    monkeypatch.setattr(restoring, "PAGE_ROWS", 10)
     arm.batches(*range(6))
     calls, real = [], restoring.advance
 
@@ -185,26 +182,6 @@ def test_a_rollback_between_two_pages_of_a_restart_is_followed(arm, monkeypatch)
     same(found.online, at_once(range(2)))
 
 
-def test_the_state_of_an_earlier_event_is_told_with_or_without_what_has_been_unlearnt_since(arm):
-    arm.batches(*range(5))
-    arm.snapshot(at_most=3)
-    arm.unlearn(2)
-    same(arm.restored(at_most=3).online, at_once(range(3)))
-    found = arm.restored(at_most=3, taken_back=True)
-    assert found.number == 3
-    same(found.online, at_once([0, 2]))
-
-
-def changed_twice(arm):
-    """Two batches, then a change before each of two more; return the state after the last."""
-    arm.batches(0, 1)
-    arm.event("change", t=BEGIN + 0.2)
-    arm.batches(2)
-    arm.event("change", t=BEGIN + 0.3)
-    arm.batches(3)
-    return arm.restored()
-
-
 def test_a_change_begins_a_regime_where_the_log_says(arm, pages):
     arm.batches(0, 1, 2)
     arm.event("change", t=BEGIN + 0.3)
@@ -217,13 +194,24 @@ def test_a_change_begins_a_regime_where_the_log_says(arm, pages):
     assert differ(predicted(expected.model()), at_once(range(5)))
 
 
-def test_where_the_log_reaches_back_no_more_such_a_batch_stays_and_that_is_said(arm, caplog):
-    known = changed_twice(arm)
-    arm.unlearn(2)
+def test_where_the_log_reaches_back_no_more_a_batch_stays_and_that_is_said(arm, caplog):
+    arm.batches(*range(4))
+    known = arm.restored()
     with arm.database.transaction() as session:
         session.connection().exec_driver_sql("DELETE FROM events WHERE number = 1")
-    same(arm.followed(known).online, predicted(known.online.model()))
-    assert "events 2 of model 'arm' stay in what is learnt" in caplog.text
+    arm.unlearn(2)
+    same(arm.followed(known).online, at_once(range(4)))
+    assert "batch 1 of stream 's' stays in what model 'arm' has learnt" in caplog.text
+
+
+def test_a_snapshot_of_what_was_undone_meanwhile_is_not_stored(arm):
+    arm.batches(*range(4))
+    known = arm.restored()
+    arm.unlearn(2)
+    state = ARM, 1, known.number, known.seen, b"state"
+    assert snapshots.save(arm.database, arm.files, *state, most=4) is None
+    known = arm.followed(known)
+    assert arm.snapshot() == known.number == 5
 
 
 @pytest.mark.each_once

@@ -72,17 +72,15 @@ def test_what_is_in_no_snapshot_stays(database):
     assert kept(database) == [7, 8, 9, 10]
 
 
-def test_what_any_learning_version_needs_stays(database):
+def test_what_the_version_that_learns_needs_stays(database):
     write(database, *(batch(k) for k in range(10)))
     with database.transaction() as session:
         session.get_one(ServingRow, MODEL).version = 2
-    learner(database, 2, 0, "serving")
-    snapshot(database, 9, version=2)
-    learner(database, 3, 2, "candidate")  # trained on 1 and 2, no snapshot yet
+    learner(database, 2, 2, "serving")  # trained on 1 and 2, no snapshot yet
     learner(database, 4, 0, "dismissed")
     snapshot(database, 1, version=1)  # served once
     assert retain(database, batches=0) == 2
-    snapshot(database, 5, version=3)
+    snapshot(database, 5, version=2)
     assert retain(database, batches=0) == 3
     assert kept(database) == [6, 7, 8, 9, 10]
 
@@ -101,18 +99,17 @@ def test_other_events_go_with_the_batches_but_settings_in_force_stay(database):
         assert log.memory(session, MODEL, 7) == Memory(60.0)
 
 
-def test_what_a_version_has_still_to_unlearn_stays(database):
-    write(database, batch(0), batch(1))  # 1, 2
-    note(database, "replay", {"event": 1}, rows=rows())  # 3
-    write(database, batch(2))  # 4
+def test_what_is_to_be_folded_again_without_a_batch_stays(database):
+    write(database, batch(0), batch(1), batch(2))  # 1, 2, 3
+    snapshot(database, 1)
+    snapshot(database, 3)
+    take_back(database, 2)  # 4: the snapshot after 3 contains it
+    assert retain(database, batches=0) == 1
+    assert kept(database) == [2, 3, 4]
     snapshot(database, 4)
-    take_back(database, 1)  # 5
+    write(database, batch(3))  # 5
     assert retain(database, batches=0) == 2
-    assert kept(database) == [1, 3, 5]
-    snapshot(database, 5)
-    write(database, batch(3))  # 6
-    assert retain(database, batches=0) == 2
-    assert kept(database) == [6]
+    assert kept(database) == [5]
 
 
 def test_a_deleted_batch_is_not_taken_for_a_new_one(database):

@@ -5,14 +5,14 @@ from dataclasses import replace
 import pytest
 from sqlalchemy import select
 
+from service.contract.models import Promotion
 from service.foundation.errors import NoServingVersionError, NotFoundError
-from service.learning import refresh
 from service.learning.learner.learnt import LearntVersions
-from service.learning.learner.publication import Contested
-from service.models import registry
+from service.models import deletion, registry
 from service.models.loaded import LoadedModels
 from service.models.registry import Serving
 from service.storage.database import JobRow, LearnerRow, VersionRow, now
+from service.training import refreshed
 from tests.service.learning.lessons import answered
 from tests.service.learning.pendulums import ARM
 
@@ -42,7 +42,7 @@ def test_a_candidate_does_not_serve_until_it_is_promoted(arm):
     arm.batches(0, 1, 2)
     assert arm.publish(candidate=True, start=1) == 2
     assert serving(arm) == Serving(1, 1)
-    assert roles(arm) == {1: (0, "serving"), 2: (1, "candidate")}
+    assert roles(arm) == {1: (0, "serving"), 2: (1, "dismissed")}
     assert registry.find(arm.database, ARM, None).version == 1
     shown = registry.show(arm.database, ARM)
     assert (shown.latest_version, shown.serving_version) == (2, 1)
@@ -112,11 +112,15 @@ def test_a_decision_that_is_heard_of_late_does_not_undo_a_later_one(arm, loaded)
 EVIDENCE = {"rows": 700, "gain": 0.5, "standard_error": 0.1}
 
 
-def decide(school, pupil, candidate=2, verdict="promote", serving=1):
-    """Act on a verdict; return whether the candidate answers, and which models the learner was told of."""
-    service, woken = school.service, []
-    said = Contested(pupil.model, serving, candidate, verdict, EVIDENCE)
-    return refresh.decide(service.database, service.loaded, woken.append, said), woken
+def decide(school, pupil, version=2, better=True, serving=1):
+    """What the job of a refresh does with the version that it has added, and the service then; in words."""
+    service, reason = school.service, f"it predicts the newest logged rows {'' if better else 'no '}better"
+    judged = Promotion(answers=better, passed=better, serving=serving, reason=reason)
+    with service.database.transaction() as session:
+        outcome = refreshed.promote(session, pupil.model, version, judged, EVIDENCE)
+    service.loaded.changed(pupil.model)
+    deletion.delete_refreshed(service.loaded, pupil.model)
+    return outcome
 
 
 def roles_of(school, pupil):
@@ -136,7 +140,7 @@ def test_a_better_candidate_answers_and_learns_from_then_on(school, pupil):
     assert answering(pupil) == (1, 1)
     school.publish(pupil.model, candidate=True)
     assert answering(pupil) == (1, 1)
-    assert decide(school, pupil) == (True, [pupil.model])
+    assert decide(school, pupil).startswith("version 2 answers from now on: it predicts")
     assert school.service.loaded.hot(pupil.model, None).version == 2
     assert answering(pupil) == (2, 2)
     assert roles_of(school, pupil) == {1: "dismissed", 2: "serving"}
@@ -155,7 +159,7 @@ def audited(pupil):
 
 def test_one_that_is_not_better_is_dismissed_for_good(school, pupil):
     school.publish(pupil.model, candidate=True)
-    assert decide(school, pupil, verdict="dismiss") == (False, [pupil.model])
+    assert decide(school, pupil, better=False).startswith("version 2 is dismissed: it predicts")
     assert answering(pupil) == (1, 1)
     assert roles_of(school, pupil) == {1: "serving", 2: "dismissed"}
     [alarm] = pupil.get("alarms")["items"]
@@ -163,8 +167,6 @@ def test_one_that_is_not_better_is_dismissed_for_good(school, pupil):
     line = audited(pupil)
     assert (line["change"], line["version"], line["what"]) == ("candidate dismissed", 2, "service")
     assert line["after"] == {"verdict": "dismiss", "serving": 1}
-    assert decide(school, pupil) == (False, [])
-    assert answering(pupil) == (1, 1)
 
 
 def test_of_versions_that_refreshed_themselves_the_newest_are_kept_and_those_that_are_needed(
@@ -174,8 +176,8 @@ def test_of_versions_that_refreshed_themselves_the_newest_are_kept_and_those_tha
     few = loaded.storage.settings.model_copy(update={"max_refreshed_versions": 1})
     monkeypatch.setattr(loaded, "storage", replace(loaded.storage, settings=few))
 
-    def end(version, trigger, verdict):
-        """A contest of a version that a refresh has made."""
+    def end(version, trigger, better):
+        """The end of a refresh."""
         school.publish(pupil.model, candidate=True)
         job = f"job_{pupil.model[-20:]}_{version}"
         with school.service.database.transaction() as session:
@@ -184,15 +186,15 @@ def test_of_versions_that_refreshed_themselves_the_newest_are_kept_and_those_tha
                 JobRow(id=job, model=pupil.model, state="succeeded", request=request, progress={}, created_at=now())
             )
             session.get_one(VersionRow, (pupil.model, version)).job = job
-        assert decide(school, pupil, version, verdict, answering(pupil)[0])[0] == (verdict == "promote")
+        decide(school, pupil, version, better, answering(pupil)[0])
 
-    end(2, "novelty", "promote")
-    end(3, "asked", "promote")  # a rollback returns to 2
-    end(4, "linearisation", "dismiss")
+    end(2, "novelty", True)
+    end(3, "asked", True)  # a rollback returns to 2
+    end(4, "linearisation", False)
     answered(pupil.client.put(f"/v1/models/{pupil.model}/aliases/liked", json={"version": 4}))
-    end(5, "novelty", "dismiss")
+    end(5, "novelty", False)
     assert versions_of(pupil) == [1, 2, 3, 4, 5]
-    end(6, "novelty", "dismiss")
+    end(6, "novelty", False)
     assert versions_of(pupil) == [1, 2, 3, 4, 6]
     lines = answered(pupil.client.get("/v1/audit", params={"model": pupil.model}))["items"]
     assert [line["version"] for line in lines if line["change"] == "version deleted"] == [5]
@@ -207,7 +209,7 @@ def versions_of(pupil):
 def test_the_owner_may_decide_alone(school, pupil):
     pupil.put("learning", {"auto_promote": False})
     school.publish(pupil.model, candidate=True)
-    assert decide(school, pupil) == (False, [pupil.model])
+    assert decide(school, pupil).startswith("version 2 waits")
     assert answering(pupil) == (1, 1)
     [alarm] = pupil.get("alarms")["items"]
     assert alarm["evidence"] == {"serving": 1, "candidate": 2, "verdict": "promote", "promoted": False, **EVIDENCE}
@@ -216,18 +218,8 @@ def test_the_owner_may_decide_alone(school, pupil):
     assert answering(pupil) == (2, 2)
 
 
-def test_a_verdict_on_a_version_that_serves_no_more_is_void(school, pupil):
+def test_one_that_was_compared_with_a_version_that_serves_no_more_waits(school, pupil):
     school.publish(pupil.model, candidate=True)
     school.publish(pupil.model)
-    assert decide(school, pupil) == (False, [])
+    assert decide(school, pupil).startswith("version 2 waits")
     assert answering(pupil) == (3, 3)
-    assert pupil.get("alarms")["items"] == []
-
-
-def test_one_that_knows_what_has_been_taken_back_is_dismissed(school, pupil):
-    pupil.teach(0, 1)
-    school.publish(pupil.model, candidate=True)
-    pupil.delete("observations/arm/0")
-    assert decide(school, pupil) == (False, [pupil.model])
-    assert answering(pupil) == (1, 1)
-    assert "taken back" in pupil.get("alarms")["items"][0]["message"]

@@ -28,9 +28,10 @@ def files(home):
     return Files(home)
 
 
-def save(database, files, number, version=1, most=20, model=MODEL):
+def save(database, files, number, version=1, most=20, model=MODEL, seen=None):
     payload = f"{model} {version} {number}".encode()
-    return snapshots.save(database, files, model, version, number, payload, most=most)
+    seen = number if seen is None else seen
+    return snapshots.save(database, files, model, version, number, seen, payload, most=most)
 
 
 def latest(database, version=1, at_most=None, model=MODEL):

@@ -66,7 +66,7 @@ def test_where_nothing_reaches_back_the_oldest_revision_that_can_is_named(school
     with service.database.transaction() as session:
         for event in log.events(session, "forgot", 0, 2):
             session.delete(event)
-    snapshots.save(service.database, service.files, "forgot", 1, 3, b"state", most=20)
+    snapshots.save(service.database, service.files, "forgot", 1, 3, 4, b"state", most=20)
     assert pupil.get("learning")["status"]["reachable"] == [[0, 0], [3, 4]]
     body = pupil.refused("POST", "rollback", 409, "conflict", json={"revision": 1})
     assert body["message"].endswith("is 3")
@@ -84,7 +84,7 @@ def test_reach_follows_snapshots_and_what_is_left_of_the_log(database):
             pass
 
     for number in (2, 4, 5):
-        assert snapshots.save(database, Kept(), MODEL, 1, number, b"", most=20) is not None
+        assert snapshots.save(database, Kept(), MODEL, 1, number, 10, b"", most=20) is not None
     with database.transaction() as session:
         for event in log.events(session, MODEL, 0, 5):
             session.delete(event)

@@ -60,7 +60,7 @@ def job(api, model, state, **request):
 
 def snapshot(api, model, version, number=1):
     service = service_of(api)
-    return snapshots.save(service.database, service.files, model, version, number, b"state", most=5)
+    return snapshots.save(service.database, service.files, model, version, number, number, b"state", most=5)
 
 
 def observe(api, model, sequence=1):
@@ -100,14 +100,6 @@ def test_what_an_alias_points_to_stays(api, arm):
     delete(api, f"{arm}/aliases/canary")
     api.put(f"/v1/models/{arm}/aliases/production", json={"version": 2})
     assert delete(api, f"{arm}/versions/1").status_code == 204
-
-
-def test_a_candidate_in_contest_stays(api, arm):
-    assert publish(api, arm, candidate=True) == 4
-    assert "is compared with the version that serves" in refusal(api, f"{arm}/versions/4")
-    with service_of(api).database.transaction() as session:
-        session.get(LearnerRow, (arm, 4)).role = "dismissed"
-    assert delete(api, f"{arm}/versions/4").status_code == 204
 
 
 def test_what_a_job_trains_anew_stays(api, arm):

@@ -105,13 +105,6 @@ class Held(Record, frozen=True, kw_only=True):
     evidence: dict[str, Any]
 
 
-class Candidate(Record, frozen=True, kw_only=True):
-    """A refreshed version that is compared with the one that serves, on rows that neither has learnt."""
-
-    version: int
-    revision: int
-
-
 class Stream(Record, frozen=True, kw_only=True):
     """A source of observations.
 
@@ -155,6 +148,7 @@ class LearningStatus(Record, frozen=True, kw_only=True):
         square of each joint in units of √(tau_std² + noise_std²); zero for a joint predicted as well as stated, null
         without such an arm and until something is learnt
     failure: Why the version does not learn, where it should; it is tried again
+    candidate: Always null: a refreshed version is compared before it is published
     reachable: Ranges [first, last] of revisions that a rollback can return to; 0 is the version as trained
     snapshots: Those whose state is stored, newest first
     """
@@ -170,7 +164,7 @@ class LearningStatus(Record, frozen=True, kw_only=True):
     linearisation_error: list[float] | None = None
     failure: str | None
     held: Held | None
-    candidate: Candidate | None
+    candidate: None = None
     streams: list[Stream]
     reachable: list[list[int]]
     snapshots: list[Snapshot]

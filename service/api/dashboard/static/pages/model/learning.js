@@ -48,7 +48,6 @@ function status({ options, status: at }, name) {
       ["Rows beyond what it was trained on", percent(at.novel_share)],
       ...(at.linearisation_error ? [["Linearisation error of the arm", `${percent(Math.max(...at.linearisation_error))} of the stated uncertainty`]] : []),
       ["Sources", at.streams.length ? at.streams.map((each) => each.stream_id).join(", ") : "none"],
-      ["Candidate", at.candidate ? `version ${at.candidate.version}, which must predict better before it answers` : "none"],
     ]),
     h("p", {}, live),
   );

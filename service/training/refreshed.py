@@ -1,0 +1,97 @@
+"""Whether a refreshed version takes the place of the one that serves.
+
+Both predict the newest logged rows, which neither has learnt: the refreshed one is fitted without them first, and the
+one that serves is taken as it was before them. Compared is the negative log predictive density of a row's torques,
+summed over the joints, with the noise that each version states: it rewards small errors and honest uncertainty alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy.orm import Session
+
+from lipcore.data import metrics
+from lipcore.data.metrics import MIN_BLOCKS, BlockScores
+from lipcore.data.samples import Samples
+from lipcore.model.acceptance import Acceptance
+from lipcore.model.torque_model import TorqueModel
+from service.contract.models import Promotion
+from service.foundation.fields import finite
+from service.journal.alarms import raise_alarm
+from service.journal.floor import error_floor_of
+from service.journal.restore import restore
+from service.models import registry
+from service.models.lineage import answer_of
+from service.storage import audit
+from service.storage.database import Database, LearningRow, VersionRow
+from service.storage.files import Files
+from service.training.refresh_data import Unlearnt
+
+
+@dataclass(frozen=True)
+class Compared:
+    """How a refreshed version compares with the one that it refreshes. evidence: the figures of it, as JSON."""
+
+    acceptance: Acceptance
+    evidence: dict[str, Any]
+
+
+def compare(
+    database: Database, files: Files, serving: VersionRow, trained: TorqueModel, rows: Unlearnt | None
+) -> Compared:
+    """Compare the judged fit of a refresh with the version that it refreshes. rows: what neither has learnt."""
+    name = f"version {serving.version}"
+    if rows is None or len(metrics.blocks(rows.samples)) < MIN_BLOCKS:
+        return Compared(Acceptance(unknown=(f"too few rows are logged to compare it with {name}",)), {})
+    samples, key = rows.samples, (serving.model, serving.version)
+    base = files.load_version(serving.folder, serving.checksums)
+    known = restore(database, files, *key, base, rows.after)
+    before = known.online.model(error_floor_of(database, *key, rows.after, base.n_joints))
+    answers = {"serving": answer_of(before, samples), "candidate": answer_of(trained, samples)}
+    scores = {which: BlockScores.of(samples, answer) for which, answer in answers.items()}
+    found = scores["candidate"].less(scores["serving"])
+    evidence = {
+        "rows": len(samples),
+        "blocks": len(scores["serving"].rows),
+        "gain": -float(found.mean[0]),
+        "standard_error": float(found.standard_error[0]),
+        "figures": {which: _figures(samples, answer) for which, answer in answers.items()},
+    }
+    amount = f"negative log density {found.mean[0]:+.3g} ± {found.half_width[0]:.2g} nats a row"
+    if found.significant[0] and found.mean[0] < 0:
+        better = f"it predicts the newest logged rows better than {name}: {amount}"
+        return Compared(Acceptance(speaks_for=(better,)), evidence)
+    return Compared(
+        Acceptance(against=(f"it predicts the newest logged rows no better than {name}: {amount}",)), evidence
+    )
+
+
+def promote(session: Session, model: str, version: int, judged: Promotion, evidence: dict[str, Any]) -> str:
+    """Let a refreshed version that was just added serve if it is better and its owner wants that; raise the alarm that
+    says what came of it, and return it in words."""
+    options = session.get(LearningRow, model)
+    promotes = options is None or options.options.get("auto_promote", True)
+    serving = registry.answering(session, model)
+    promoted = judged.answers and promotes and serving == judged.serving
+    if promoted:
+        registry.serve(session, model, version)
+        outcome = f"version {version} answers from now on: {judged.reason}"
+    elif judged.answers:
+        outcome = f"version {version} waits: {judged.reason}; a rollback to version {version} lets it answer"
+    else:
+        outcome = f"version {version} is dismissed: {judged.reason}"
+    if not promoted:
+        after = {"verdict": "promote" if judged.answers else "dismiss", "serving": serving}
+        audit.note(session, model, "candidate dismissed", version, after=after)
+    named = {"serving": judged.serving, "candidate": version, "promoted": promoted}
+    verdict = {"verdict": "promote" if judged.answers else "dismiss"}
+    raise_alarm(session, model, "promotion", outcome, {**named, **verdict, **evidence})
+    return outcome
+
+
+def _figures(samples: Samples, answer: metrics.Answer) -> dict[str, list[float | None]]:
+    """nMSE and coverage per joint; null where the torque did not vary."""
+    found = metrics.evaluate(samples.tau, *answer)
+    return {"nmse": finite(found.nmse), "coverage": finite(found.coverage)}
