@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from service.api.access.scopes import TABLE
 from service.api.guide.routes import anchor
 from service.api.limits.requests import body_limit, body_limits
 from service.api.openapi import METHODS
@@ -62,7 +61,7 @@ def _route(method: str, path: str, operation: Document) -> Iterator[str]:
     yield f"### {method} {path}\n"
     said = re.sub(r"\s*Scope: [^\n]*$", "", operation.get("description", "")).strip()
     yield f"**{operation.get('summary', '')}.** {_prose(said)}\n".replace("?.**", "?**")
-    if scope := TABLE.get((method, path)):
+    for scope in operation["security"][-1]["key"] if operation["security"] else ():
         yield f"Scope: `{scope}`.\n"
     if parameters := operation.get("parameters"):
         yield from ("| parameter | in | type | meaning |", "| --- | --- | --- | --- |")

@@ -17,6 +17,7 @@ from service import __version__
 from service.api import errors, metrics, openapi, requests
 from service.api.access.keys import Keyring
 from service.api.access.middleware import KeyAccess, LocalAccess
+from service.api.access.scopes import Rules
 from service.api.dashboard import routes as dashboard
 from service.api.guide import routes as guide
 from service.api.limits.requests import BodyLimit, Gate, RateLimit, Turns, body_limits
@@ -138,6 +139,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         app.include_router(router)
     dashboard.install(app)
     guide.install(app)
+    app.state.rules = Rules(app.routes)
     return app
 
 

@@ -15,6 +15,7 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
 from service import __version__
+from service.api.access.scopes import READ, needs
 from service.api.route import Route
 from service.storage.disk import measure
 from service.storage.storage import Storage
@@ -171,6 +172,7 @@ router = APIRouter(tags=["health"], route_class=Route)
         }
     },
 )
+@needs(READ)
 def metrics(request: Request) -> Response:
     """Latency and errors of requests and streams, training jobs, quality and lag of models that learn, disk, memory,
     and which parts of the service are in order. docs/reference/metrics.md lists all.

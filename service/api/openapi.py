@@ -15,7 +15,7 @@ from starlette.routing import Mount
 from starlette.routing import Route as StarletteRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.api.access.scopes import OPEN, SCOPES, TABLE
+from service.api.access.scopes import SCOPES, Rules
 from service.api.errors import OPEN_INFERENCE
 from service.foundation import errors
 from service.foundation.errors import ServiceError
@@ -80,14 +80,15 @@ def install(app: FastAPI, keys_needed: bool) -> None:
     def openapi() -> dict[str, Any]:
         if app.openapi_schema is None:
             document = made()
-            _add_errors(document)
-            add_scopes(document, keys_needed)
+            rules = app.state.rules
+            _add_errors(document, rules)
+            add_scopes(document, rules, keys_needed)
         return made()
 
     app.openapi = openapi  # type: ignore[method-assign]
 
 
-def add_scopes(document: dict[str, Any], keys_needed: bool) -> None:
+def add_scopes(document: dict[str, Any], rules: Rules, keys_needed: bool) -> None:
     """Write the scheme of keys into the document, and into every operation the scope that it needs.
 
     keys_needed: whether the service that is described asks for keys; one that does not takes requests without as well.
@@ -96,7 +97,7 @@ def add_scopes(document: dict[str, Any], keys_needed: bool) -> None:
     schemes[SCHEME] = {"type": "http", "scheme": "bearer", "description": DESCRIPTION}
     for path, methods in document["paths"].items():
         for method, operation in methods.items():
-            scope = TABLE.get((method.upper(), path))
+            scope = rules.table[method.upper(), path].scope
             if scope is None:
                 operation["security"] = []
                 continue
@@ -128,18 +129,18 @@ def error_table() -> str:
     return "\n".join(["| status | code | meaning |", "|---|---|---|", *lines]) + "\n"
 
 
-def _add_errors(document: dict[str, Any]) -> None:
+def _add_errors(document: dict[str, Any], rules: Rules) -> None:
     document["info"]["description"] += f"\n{error_table()}"
     for path, operations in document["paths"].items():
         for method in METHODS:
             if method in operations:
-                _add(path, method, operations[method])
+                _add(path, method, operations[method], rules)
 
 
-def _add(path: str, method: str, operation: dict[str, Any]) -> None:
+def _add(path: str, method: str, operation: dict[str, Any], rules: Rules) -> None:
     """Add to an operation's answers those that are not its own."""
     kinds: list[type[ServiceError]] = [*ANY]
-    if (method.upper(), path) not in OPEN:
+    if rules.table[method.upper(), path].scope is not None:
         kinds += GUARDED
     if "requestBody" in operation:
         kinds += BODY

@@ -13,7 +13,7 @@ from anyio import CancelScope
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.access.keys import CHALLENGE, Key, Keyring, refusal
-from service.api.access.scopes import ADMIN, WEBSOCKET, rule_of, scopes_of_stream
+from service.api.access.scopes import ADMIN, WEBSOCKET, Rules, scopes_of_stream
 from service.api.errors import refuse
 from service.api.limits.requests import COUNTED
 from service.api.server.connections import CONNECTION, StreamProtocol
@@ -140,8 +140,9 @@ class KeyAccess:
         if kind == "lifespan":
             await self.app(scope, receive, send)
             return
-        rule = rule_of(scope["method"] if kind == "http" else WEBSOCKET, scope["path"])
-        if rule is not None and not rule.scopes:
+        rules: Rules = scope["app"].state.rules
+        rule = rules.of(scope["method"] if kind == "http" else WEBSOCKET, scope["path"])
+        if rule is not None and rule.scope is None:
             await self.app(scope, receive, send)
             return
         try:
@@ -154,7 +155,8 @@ class KeyAccess:
             if rule is None:
                 _check_unknown(key, scope)
             else:
-                _check(key, rule.scopes if kind == "http" else scopes_of_stream(scope["query_string"]))
+                assert rule.scope is not None
+                _check(key, (rule.scope,) if kind == "http" else scopes_of_stream(scope["query_string"]))
         except ServiceError as error:
             await refuse(error, scope, receive, send)
             return

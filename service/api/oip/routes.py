@@ -10,6 +10,7 @@ from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
 from service import __version__
+from service.api.access.scopes import PREDICT, READ, needs
 from service.api.dependencies import ReadinessDep
 from service.api.oip import dataplane, schema, wire
 from service.api.route import Reply, Route, hot_route
@@ -25,18 +26,21 @@ hot = APIRouter(prefix="/v2", tags=_TAGS)
 
 
 @router.get("", summary="What serves")
+@needs(READ)
 async def server_metadata() -> schema.ServerMetadata:
     """Name, version, and the extensions of the protocol that are supported."""
     return schema.ServerMetadata(name="lipserve", version=__version__, extensions=[schema.BINARY])
 
 
 @router.get("/health/live", summary="Is the server alive?")
+@needs(None)
 async def live() -> schema.ServerLive:
     """Answer while the event loop turns."""
     return schema.ServerLive()
 
 
 @router.get("/health/ready", summary="Can the server answer?", responses=schema.failures(503))
+@needs(None)
 def ready(readiness: ReadinessDep) -> schema.ServerReady:
     """Answer once the models are loaded and while the database answers."""
     health.ready(readiness)
@@ -57,6 +61,7 @@ def ready(readiness: ReadinessDep) -> schema.ServerReady:
     response_model_exclude_none=True,
     openapi_extra=_ONE,
 )
+@needs(READ)
 async def model_metadata(request: Request) -> schema.ModelMetadata:
     """Inputs that a request brings, outputs that it may ask for, and the versions there are."""
     loaded: LoadedModels = request.app.state.loaded
@@ -78,6 +83,7 @@ async def model_metadata(request: Request) -> schema.ModelMetadata:
     responses=schema.failures(404, 503),
     openapi_extra=_ONE,
 )
+@needs(READ)
 async def model_ready(request: Request) -> schema.ModelReady:
     """Answer once the version is in memory; it is loaded if it is not."""
     loaded: LoadedModels = request.app.state.loaded
@@ -96,6 +102,7 @@ async def _answer(scope: Scope, body: bytes) -> Reply:
     )
 
 
+@needs(PREDICT)
 async def infer(request: Request) -> Response:
     """Answer one query, [n], or a batch, [N, n], in JSON or binary. Only what `outputs` names is computed: `tau` and
     `tau_std` where it names nothing. Nothing is clipped. `noise_std` [n] is the measurement's own deviation; an

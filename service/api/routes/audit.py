@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 from pydantic import AwareDatetime
 
+from service.api.access.scopes import ADMIN, needs
 from service.api.dependencies import PageQuery, StorageDep
 from service.api.errors import responses
 from service.api.route import Route
@@ -19,6 +20,7 @@ router = APIRouter(prefix="/v1", tags=["audit"], responses=responses(InvalidRequ
 
 
 @router.get("/audit", summary="List what changed models, newest first")
+@needs(ADMIN)
 def list_audit(
     storage: StorageDep,
     page: PageQuery,

@@ -8,6 +8,7 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response, status
 
+from service.api.access.scopes import READ, TRAIN, needs
 from service.api.dependencies import KeyHeader, PageQuery, StorageDep, UploadsDep
 from service.api.errors import responses
 from service.api.limits.upload import Kinds, receive_to
@@ -52,6 +53,7 @@ router = APIRouter(
     ),
     openapi_extra=UPLOAD_BODY,
 )
+@needs(TRAIN)
 async def upload(
     request: Request,
     response: Response,
@@ -76,6 +78,7 @@ async def upload(
 
 
 @router.get("", summary="List data sets, newest first")
+@needs(READ)
 def list_datasets(
     storage: StorageDep,
     page: PageQuery,
@@ -88,6 +91,7 @@ def list_datasets(
 
 
 @router.get("/{dataset}", summary="One data set and its report", responses=responses(NotFoundError))
+@needs(READ)
 def show(storage: StorageDep, dataset: str) -> Dataset:
     """What was found in the recording and what was derived."""
     return store.show(storage.database, dataset)
@@ -98,6 +102,7 @@ def show(storage: StorageDep, dataset: str) -> Dataset:
     summary="Points of a data set for a plot",
     responses=responses(NotFoundError, DamagedDataError),
 )
+@needs(READ)
 def preview(
     storage: StorageDep,
     dataset: str,
@@ -122,6 +127,7 @@ def preview(
     summary="Delete a data set",
     responses=responses(NotFoundError, ConflictError),
 )
+@needs(TRAIN)
 def delete(storage: StorageDep, dataset: str) -> None:
     """Delete the samples. Models trained on them stay."""
     store.delete(storage, dataset)

@@ -10,6 +10,7 @@ from fastapi import APIRouter, Depends
 
 from lipcore.extras import EXTRAS, install_line, installed
 from service import __version__
+from service.api.access.scopes import needs
 from service.api.dependencies import ReadinessDep, of_app
 from service.api.errors import responses
 from service.api.route import Route
@@ -20,6 +21,7 @@ router = APIRouter(prefix="/health", tags=["health"], route_class=Route)
 
 
 @router.get("", summary="What can the service do?")
+@needs(None)
 async def health(confined: Annotated[dict[str, bool], Depends(of_app("confined"))]) -> Health:
     """Answer which extras are installed. Who asks for what needs another one is answered 501 `not_installed`."""
     return Health(version=__version__, can=dict(_can()), missing=list(_missing()), confined=confined)
@@ -38,12 +40,14 @@ def _missing() -> Iterator[Missing]:
 
 
 @router.get("/live", summary="Is the process alive?")
+@needs(None)
 async def live() -> Live:
     """Answer while the event loop turns."""
     return Live()
 
 
 @router.get("/ready", summary="Can the service answer?", responses=responses(NotReadyError))
+@needs(None)
 def ready(readiness: ReadinessDep) -> Ready:
     """Answer once the models are loaded, and while each part works: the database and the home can be written and are
     not full, the versions that serve can be read, the learner gets on where something learns, training jobs are

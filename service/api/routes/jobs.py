@@ -10,6 +10,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Depends, Response, status
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from service.api.access.scopes import READ, TRAIN, needs
 from service.api.dependencies import JobQueueDep, KeyHeader, LoadedModelsDep, PageQuery, StoppingDep
 from service.api.errors import responses
 from service.api.route import Route
@@ -80,6 +81,7 @@ router = APIRouter(
     summary="Train a model",
     responses=responses(NotFoundError, TooLargeError, BusyError, ConflictError, NotInstalledError),
 )
+@needs(TRAIN)
 def create(queue: JobQueueDep, request: JobRequest, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a training job. It runs in another process and ends in a new version of the model."""
     named = identity(idempotency_key, "train", request.model_dump(mode="json", exclude_unset=True))
@@ -94,6 +96,7 @@ def create(queue: JobQueueDep, request: JobRequest, response: Response, idempote
     summary="Check a job before its data are uploaded",
     responses=responses(NotFoundError, ConflictError),
 )
+@needs(TRAIN)
 def check(queue: JobQueueDep, draft: JobDraft) -> None:
     """Refuse what a request to train would be refused for, as far as the data sets that are there tell. Nothing is
     queued."""
@@ -101,12 +104,14 @@ def check(queue: JobQueueDep, draft: JobDraft) -> None:
 
 
 @router.get("", summary="List jobs, newest first")
+@needs(READ)
 def list_jobs(queue: JobQueueDep, loaded: LoadedModelsDep, page: PageQuery) -> JobPage:
     """One page of jobs with their progress."""
     return jobs.page(queue, loaded, page)
 
 
 @router.get("/{job}", summary="One job and its progress", responses=responses(NotFoundError))
+@needs(READ)
 def show(queue: JobQueueDep, loaded: LoadedModelsDep, job: str) -> Job:
     """State, progress, and the version it made or why it failed."""
     return jobs.show(queue, loaded, job)
@@ -118,6 +123,7 @@ def show(queue: JobQueueDep, loaded: LoadedModelsDep, job: str) -> Job:
     response_class=EventSourceResponse,
     responses=responses(NotFoundError, BusyError),
 )
+@needs(READ, lasting=True)
 async def follow(
     queue: JobQueueDep, loaded: LoadedModelsDep, stopping: StoppingDep, row: FollowedDep
 ) -> AsyncIterable[ServerSentEvent]:
@@ -129,6 +135,7 @@ async def follow(
 
 
 @router.post("/{job}/cancel", summary="Cancel a job", responses=responses(NotFoundError, ConflictError))
+@needs(TRAIN)
 def cancel(queue: JobQueueDep, job: str) -> Job:
     """Cancel a waiting job at once, a running one within two seconds: a process that does not obey is killed."""
     return jobs.cancel(queue, job)
@@ -140,6 +147,7 @@ def cancel(queue: JobQueueDep, job: str) -> Job:
     summary="Repeat a job that failed or was cancelled",
     responses=responses(NotFoundError, ConflictError, BusyError),
 )
+@needs(TRAIN)
 def retry(queue: JobQueueDep, job: str, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a new job with the same request; `retry_of` names the old one. What it needs must still be there."""
     again = jobs.retry(queue, job, identity(idempotency_key, "retry", job))

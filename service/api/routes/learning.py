@@ -6,6 +6,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path, Query, Response
 
+from service.api.access.scopes import ADMIN, READ, TRAIN, UPDATE, needs
 from service.api.dependencies import JobQueueDep, LearnersDep, PageQuery
 from service.api.errors import responses
 from service.api.route import Route
@@ -40,6 +41,7 @@ overview_router = APIRouter(
 
 
 @overview_router.get("", summary="Models at a glance, newest first")
+@needs(READ)
 def show_overview(learners: LearnersDep, page: PageQuery) -> OverviewPage:
     """One page of models, each with all that a card of it shows: the learnt arm and its posture, error and coverage on
     what was held out and on what came in the last hour, what it carries, and its newest alarm. Loads no model."""
@@ -47,12 +49,14 @@ def show_overview(learners: LearnersDep, page: PageQuery) -> OverviewPage:
 
 
 @router.get("/{model}/quality", summary="How well a model predicts what it has not learnt yet")
+@needs(READ)
 def show_quality(learners: LearnersDep, model: str) -> schema.Quality:
     """Figures over sliding windows: every row is predicted, compared with what was measured, and learnt only then."""
     return status.quality(learners, model)
 
 
 @router.get("/{model}/observations", summary="List observation batches, newest first")
+@needs(READ)
 def list_observations(
     learners: LearnersDep,
     model: str,
@@ -65,6 +69,7 @@ def list_observations(
 
 
 @router.get(BATCH, summary="One observation batch")
+@needs(READ)
 def show_observation(
     learners: LearnersDep,
     model: str,
@@ -77,6 +82,7 @@ def show_observation(
 
 
 @router.delete(BATCH, summary="Unlearn an observation batch", responses=responses(ConflictError))
+@needs(UPDATE)
 def unlearn(learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence) -> schema.Unlearnt:
     """Take the rows that a batch has taught, and replayed ones, out of what is learnt, exactly. It stays in the log.
 
@@ -88,6 +94,7 @@ def unlearn(learners: LearnersDep, model: str, stream_id: StreamId, sequence: Se
 @router.post(
     f"{BATCH}/replay", summary="Learn rejected rows of a batch", responses=responses(ConflictError, TooLargeError)
 )
+@needs(UPDATE)
 def replay(
     learners: LearnersDep, model: str, stream_id: StreamId, sequence: Sequence, request: schema.ReplayRequest
 ) -> schema.Replayed:
@@ -100,6 +107,7 @@ def replay(
     summary="Go back to a revision or a version",
     responses=responses(ConflictError, TooLargeError, UnreadableVersionError),
 )
+@needs(ADMIN)
 def rollback(learners: LearnersDep, model: str, request: schema.RollbackRequest) -> schema.RolledBack:
     """Forget what was learnt since a revision of the version that serves, or let another version serve.
 
@@ -109,6 +117,7 @@ def rollback(learners: LearnersDep, model: str, request: schema.RollbackRequest)
 
 
 @router.get("/{model}/learning", summary="How a model learns")
+@needs(READ)
 def show_learning(learners: LearnersDep, model: str) -> schema.Learning:
     """What is set, how far learning is, what it waits for, and where it can go back to."""
     return status.learning(learners, model)
@@ -120,6 +129,7 @@ def show_learning(learners: LearnersDep, model: str) -> schema.Learning:
     responses=responses(TooLargeError),
     openapi_extra={"requestBody": {"content": {"application/json": {"example": EXAMPLE}}}},
 )
+@needs(ADMIN)
 def set_learning(learners: LearnersDep, model: str, options: LearningOptions) -> schema.Learning:
     """Set all options, those left out to their defaults. What has been learnt stays."""
     decisions.set_options(learners, model, options)
@@ -131,12 +141,14 @@ def set_learning(learners: LearnersDep, model: str, options: LearningOptions) ->
     summary="Decide about a change of the robot",
     responses=responses(ConflictError, TooLargeError),
 )
+@needs(ADMIN)
 def decide(learners: LearnersDep, model: str, request: schema.ChangeRequest) -> schema.Decided:
     """End the hold that a detected change has led to: adapt to the changed robot, or go on as if nothing had been."""
     return decisions.decide(learners, model, request)
 
 
 @router.get("/{model}/payload", summary="What the arm carries")
+@needs(READ)
 def show_payload(learners: LearnersDep, model: str) -> Payloads:
     """Mass, centre of mass and inertia of what each stream's robot carries, with what is not known of them.
 
@@ -151,12 +163,14 @@ def show_payload(learners: LearnersDep, model: str) -> Payloads:
     responses=responses(ConflictError, TooLargeError),
     openapi_extra={"requestBody": {"content": {"application/json": {"example": PAYLOAD_EXAMPLE}}}},
 )
+@needs(UPDATE)
 def declare_payload(learners: LearnersDep, model: str, request: PayloadRequest) -> Payloads:
     """Answer with a payload from now on, as robot controllers are told theirs. Rows that say otherwise overrule it."""
     return payload.declare(learners, model, request)
 
 
 @router.delete("/{model}/payload", summary="Say that the arm carries nothing", responses=responses(ConflictError))
+@needs(UPDATE)
 def remove_payload(
     learners: LearnersDep,
     model: str,
@@ -171,6 +185,7 @@ def remove_payload(
 @router.delete(
     "/{model}/streams/{stream_id}", status_code=204, summary="Delete a stream", responses=responses(ConflictError)
 )
+@needs(UPDATE)
 def delete_stream(learners: LearnersDep, model: str, stream_id: StreamId) -> None:
     """Forget a stream: its payload, its clock, and how wide its intervals are. What it has taught stays learnt, and its
     batches stay in the log. `GET …/learning` lists the streams."""
@@ -178,6 +193,7 @@ def delete_stream(learners: LearnersDep, model: str, stream_id: StreamId) -> Non
 
 
 @router.get("/{model}/alarms", summary="List alarms, newest first")
+@needs(READ)
 def list_alarms(learners: LearnersDep, model: str, page: PageQuery) -> schema.AlarmPage:
     """One page of what the model's owner should know: changes, motion beyond what is known, new versions."""
     return decisions.alarms(learners, model, page)
@@ -189,6 +205,7 @@ def list_alarms(learners: LearnersDep, model: str, page: PageQuery) -> schema.Al
     summary="Train the version that serves anew",
     responses=responses(NotFoundError, ConflictError, TooLargeError, BusyError),
 )
+@needs(TRAIN)
 def create(queue: JobQueueDep, model: str, request: schema.RefreshRequest, response: Response) -> Job:
     """Queue a job that trains on the version's data sets and on what has been observed since.
 

@@ -9,6 +9,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends
 from fastapi.sse import EventSourceResponse, ServerSentEvent
 
+from service.api.access.scopes import READ, needs
 from service.api.dependencies import LearnersDep, MetersDep, StoppingDep
 from service.api.errors import responses
 from service.api.route import Route
@@ -51,6 +52,7 @@ router = APIRouter(
     response_class=EventSourceResponse,
     responses=responses(BusyError),
 )
+@needs(READ, lasting=True)
 async def follow(
     learners: LearnersDep, meters: MetersDep, stopping: StoppingDep, model: FollowedDep
 ) -> AsyncIterable[ServerSentEvent]:

@@ -8,6 +8,7 @@ from anyio import to_thread
 from fastapi import APIRouter, Path, Query, Request, Response, status
 from fastapi.responses import StreamingResponse
 
+from service.api.access.scopes import ADMIN, READ, needs
 from service.api.dependencies import ArchivesDep, LoadedModelsDep, PageQuery
 from service.api.errors import responses
 from service.api.limits.upload import Kinds, receive_to
@@ -44,6 +45,7 @@ router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(Inv
     responses=responses(InvalidDataError, InvalidRequestError, TooLargeError, UnsupportedMediaTypeError),
     openapi_extra=_BODY,
 )
+@needs(ADMIN)
 async def import_version(
     request: Request,
     response: Response,
@@ -80,6 +82,7 @@ async def import_version(
         200: {"description": "A tar file", "content": {archive.MEDIA_TYPE: _BINARY}},
     },
 )
+@needs(READ)
 async def export_version(
     loaded: LoadedModelsDep,
     turns: ArchivesDep,
@@ -114,6 +117,7 @@ async def export_version(
         },
     },
 )
+@needs(READ)
 def version_urdf(
     loaded: LoadedModelsDep, model: str, version: WhichVersion = None, alias: WhichAlias = None
 ) -> Response:
@@ -128,6 +132,7 @@ def version_urdf(
 
 
 @router.get("", summary="List models, newest first")
+@needs(READ)
 def list_models(loaded: LoadedModelsDep, page: PageQuery) -> schema.ModelPage:
     """One page of models with their versions."""
     listed = registry.page(loaded.database, page)
@@ -136,6 +141,7 @@ def list_models(loaded: LoadedModelsDep, page: PageQuery) -> schema.ModelPage:
 
 
 @router.get("/{model}", summary="One model and its versions", responses=responses(NotFoundError))
+@needs(READ)
 def show(loaded: LoadedModelsDep, model: str) -> schema.Model:
     """Which versions there are and which one answers."""
     record = registry.show(loaded.database, model)
@@ -144,6 +150,7 @@ def show(loaded: LoadedModelsDep, model: str) -> schema.Model:
 
 
 @router.get("/{model}/versions/{version}", summary="One version", responses=responses(NotFoundError))
+@needs(READ)
 def show_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNumber) -> schema.Version:
     """Joints, noise, training range, options, what the fit reported, and the data it came from."""
     return registry.show_version(loaded.database, model, version)
@@ -155,6 +162,7 @@ def show_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNum
     summary="Delete a version",
     responses=responses(NotFoundError, ConflictError),
 )
+@needs(ADMIN)
 def delete_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNumber) -> None:
     """Delete a version that nothing needs: no alias, not the service, no contest and no job. Its number is not given
     again."""
@@ -167,12 +175,14 @@ def delete_version(loaded: LoadedModelsDep, model: str, version: schema.VersionN
     summary="Delete a model",
     responses=responses(NotFoundError, ConflictError),
 )
+@needs(ADMIN)
 def delete_model(loaded: LoadedModelsDep, model: str) -> None:
     """Delete a model with its versions, aliases and all that it has observed and learnt. Jobs and data sets stay."""
     deletion.delete_model(loaded, model)
 
 
 @router.get("/{model}/aliases", summary="List the aliases of a model", responses=responses(NotFoundError))
+@needs(READ)
 def list_aliases(loaded: LoadedModelsDep, model: str) -> schema.AliasList:
     """Where each points, since when, and where it pointed before. `serving` is the version that answers by default."""
     return aliases.page(loaded, model)
@@ -183,6 +193,7 @@ def list_aliases(loaded: LoadedModelsDep, model: str) -> schema.AliasList:
     summary="Point an alias to a version",
     responses=responses(NotFoundError, ConflictError, UnreadableVersionError),
 )
+@needs(ADMIN)
 def put_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath, request: schema.AliasRequest) -> schema.Alias:
     """Make or move an alias. The version is loaded first: queries follow in one step, and none fails or waits."""
     return aliases.put(loaded, model, alias, request)
@@ -194,6 +205,7 @@ def put_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath, request: sc
     summary="Remove an alias",
     responses=responses(NotFoundError, ConflictError),
 )
+@needs(ADMIN)
 def remove_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath) -> None:
     """Remove an alias; the version stays, and a rollback brings the alias back. `serving` cannot be removed."""
     aliases.remove(loaded, model, alias)
@@ -204,6 +216,7 @@ def remove_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath) -> None:
     summary="Point an alias to where it pointed before",
     responses=responses(NotFoundError, ConflictError, UnreadableVersionError),
 )
+@needs(ADMIN)
 def rollback_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath) -> schema.Alias:
     """Take back the last move, the next time the one before it, and so on."""
     return aliases.rollback(loaded, model, alias)

@@ -10,6 +10,7 @@ from fastapi import APIRouter
 from msgspec import Meta, Struct
 from starlette.types import Scope
 
+from service.api.access.scopes import UPDATE, needs
 from service.api.dependencies import LearnersDep
 from service.api.errors import responses
 from service.api.route import Reply, hot_route, is_json
@@ -109,6 +110,7 @@ def _decoded(learners: Learners, model: str, body: bytes) -> bytes | None:
     return None if request is None else learners.observe(model, request).model_dump_json().encode()
 
 
+@needs(UPDATE)
 async def observe(learners: LearnersDep, model: str, request: ObservationRequest) -> ObservationResponse:
     """Take a batch of measured rows to learn from, durable once it is answered, and learnt within a moment.
 

@@ -9,6 +9,7 @@ from anyio import CapacityLimiter, to_thread
 from fastapi import APIRouter, Request, Response
 from starlette.types import Scope
 
+from service.api.access.scopes import PREDICT, needs
 from service.api.dependencies import LoadedModelsDep, PredictionsDep
 from service.api.errors import responses
 from service.api.route import JSON, OCTETS, Reply, Route, hot_route, is_json, media_type
@@ -44,6 +45,7 @@ async def _echo(scope: Scope, body: bytes) -> Reply | None:
     return Reply(body, JSON if is_json(scope) else OCTETS)
 
 
+@needs(PREDICT)
 async def echo(request: Request) -> Response:
     """Answer the body as it came, on the way that a query takes, limits and all: JSON as such, anything else as octets,
     so that nobody's page seems to be the service's.
@@ -107,6 +109,7 @@ async def _revised(
     return await reached(loaded, model, request.version, request.alias, request.min_revision)
 
 
+@needs(PREDICT)
 async def predict(
     loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.PredictRequest
 ) -> Response:
@@ -128,6 +131,7 @@ hot.add_api_route(
 
 
 @router.post("/{model}/evaluate", summary="Compare a model with a data set", responses=_LATE)
+@needs(PREDICT)
 async def evaluate(
     loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.EvaluateRequest
 ) -> schema.EvaluateResponse:
@@ -137,6 +141,7 @@ async def evaluate(
 
 
 @router.post("/{model}/trace", summary="Follow a model along a data set", responses=responses(DamagedDataError))
+@needs(PREDICT)
 async def trace_model(
     loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.TraceRequest
 ) -> schema.TraceResponse:
@@ -155,6 +160,7 @@ async def trace_model(
     tags=["models"],
     responses=responses(NotFoundError, UnreadableVersionError, DamagedDataError),
 )
+@needs(PREDICT)
 async def compare(
     loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.CompareRequest
 ) -> schema.CompareResponse:

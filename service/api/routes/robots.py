@@ -7,6 +7,7 @@ from typing import Annotated
 from anyio import to_thread
 from fastapi import APIRouter, Query, Request, Response, status
 
+from service.api.access.scopes import READ, TRAIN, needs
 from service.api.dependencies import PageQuery, StorageDep
 from service.api.errors import responses
 from service.api.limits.upload import Kinds, receive
@@ -38,6 +39,7 @@ router = APIRouter(prefix="/v1/robots", tags=["robots"], responses=responses(Inv
     ),
     openapi_extra=UPLOAD_BODY,
 )
+@needs(TRAIN)
 async def upload(
     request: Request,
     response: Response,
@@ -53,24 +55,28 @@ async def upload(
 
 
 @router.get("", summary="List uploaded robots, newest first")
+@needs(READ)
 def list_robots(storage: StorageDep, page: PageQuery) -> RobotPage:
     """One page of uploaded robots with their joints."""
     return store.page(storage.database, page)
 
 
 @router.get("/profiles", summary="List the robots known by name")
+@needs(READ)
 def profiles() -> ProfileList:
     """Joints, limits and the meaning of effort of each. Uploads may name any as their robot, jobs those with a URDF."""
     return ProfileList(items=store.list_profiles())
 
 
 @router.get("/profiles/{name}", summary="One robot known by name, or uploaded", responses=responses(NotFoundError))
+@needs(READ)
 def profile(storage: StorageDep, name: str) -> RobotProfile:
     """Joints, limits and the meaning of effort of a robot, by its name or the id of an uploaded URDF."""
     return store.show_profile(storage.database, name)
 
 
 @router.get("/{robot}", summary="One uploaded robot", responses=responses(NotFoundError))
+@needs(READ)
 def show(storage: StorageDep, robot: str) -> Robot:
     """Name, joints and hash of an uploaded URDF."""
     return store.show(storage.database, robot)
@@ -82,6 +88,7 @@ def show(storage: StorageDep, robot: str) -> Robot:
     summary="Delete an uploaded robot",
     responses=responses(NotFoundError, ConflictError),
 )
+@needs(TRAIN)
 def delete(storage: StorageDep, robot: str) -> None:
     """Delete an uploaded URDF. Models trained with it keep their copy."""
     store.delete(storage.database, robot)

@@ -11,6 +11,7 @@ from fastapi import APIRouter
 from starlette.types import Receive, Scope, Send
 from uvicorn.protocols.utils import ClientDisconnected
 
+from service.api.access.scopes import ADMIN, PREDICT, Rule
 from service.api.server.connections import CONNECTION, StreamProtocol
 from service.api.stream.session import Conversation, Echo, Session
 from service.contract.models import ALIAS
@@ -57,6 +58,7 @@ class EchoRoute:
     """ASGI application of the echo. path: its address, by which metrics and logs name it."""
 
     path = ECHO_PATH
+    rule = Rule(PREDICT, lasting=True)
 
     def __init__(self, streams: Streams) -> None:
         self.streams = streams
@@ -94,6 +96,8 @@ class StreamRoute(EchoRoute):
 
 class NoRoute:
     """ASGI application of all other addresses, which Starlette would refuse without a word. To be the last."""
+
+    rule = Rule(ADMIN)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Refuse to talk: raise NotFoundError."""

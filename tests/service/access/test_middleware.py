@@ -8,6 +8,7 @@ import pytest
 from service.api.access import keys
 from service.api.access.keys import Keyring
 from service.api.access.middleware import KEY_ID, MOST_KNOWN, KeyAccess, LocalAccess
+from service.app import create_app
 from tests.service.access.conftest import REFRESH_S, bearer
 from tests.service.data import error
 
@@ -104,7 +105,7 @@ def events(database, app, revoked=None):
     """Ask for events of an application; return what was sent, and the ASGI scope."""
     row, secret = keys.create(database, "test", ["read"], None)
     headers = [(b"authorization", b"Bearer " + secret.encode())]
-    scope = {"type": "http", "method": "GET", "path": EVENTS, "query_string": b"", "headers": headers}
+    scope = {"type": "http", "method": "GET", "path": EVENTS, "query_string": b"", "headers": headers, "app": create_app()}
     sent = []
 
     async def send(message):

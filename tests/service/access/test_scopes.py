@@ -3,18 +3,21 @@
 import re
 
 import pytest
+from fastapi import FastAPI
 
-from service.api.access.scopes import ADMIN, LASTING, LONGEST_PATH, OPEN, SCOPES, TABLE, WEBSOCKET, rule_of
+from service.api.access.scopes import ADMIN, LONGEST_PATH, SCOPES, WEBSOCKET, Rules
 from service.api.oip.rpc.methods import METHODS as CALLS
-from service.api.stream import routes as stream
+from service.app import create_app
+from service.foundation.settings import Settings
 from tests.service.access.conftest import bearer
 from tests.service.data import error
 
-HTTP = sorted(route for route in TABLE if route[0] != WEBSOCKET)
-METHODS = ("get", "post", "put", "patch", "delete")
-PAGES = {"/", "/dashboard/{file:path}", "/docs", "/docs/oauth2-redirect", "/static-offline-docs/{file:path}"}
-PAGES |= {"/guide", "/guide/{page}", "/guide/files/{name}", "/openapi.json"}
-"""Open routes that the OpenAPI document leaves out."""
+RULES: Rules = create_app(Settings(grpc_port=0)).state.rules
+HTTP = sorted(
+    (method, path)
+    for (method, path), rule in RULES.table.items()
+    if method != WEBSOCKET and rule.scope is not None and path not in CALLS
+)
 
 
 def address(path: str) -> str:
@@ -22,26 +25,33 @@ def address(path: str) -> str:
     return re.sub(r"\{\w+\}", "0", path)
 
 
-def test_every_route_is_in_the_table_and_nothing_else(api):
-    documented = {
-        (method.upper(), path)
-        for path, operations in api.get("/openapi.json").json()["paths"].items()
-        for method in operations
-        if method in METHODS
+def test_a_route_that_does_not_say_what_it_needs_stops_the_start():
+    app = FastAPI(docs_url=None, redoc_url=None)
+    app.get("/v1/forgotten")(lambda: None)
+    with pytest.raises(RuntimeError, match=r"the route /v1/forgotten does not say which scope it needs"):
+        Rules(app.routes)
+
+
+def test_changes_are_for_those_who_may_make_them():
+    """What a key that may only read cannot do: nothing but questions."""
+    assert {rule.scope for rule in RULES.table.values()} == {None, *SCOPES}
+    assert {path for (method, path), rule in RULES.table.items() if rule.scope == "read" and method != "GET"} == {
+        f"/inference.GRPCInferenceService/{name}" for name in ("ServerMetadata", "ModelReady", "ModelMetadata")
     }
-    streams = {(WEBSOCKET, stream.PATH), (WEBSOCKET, stream.ECHO_PATH)}
-    assert not set(TABLE) & OPEN
-    calls = {("POST", path) for path in CALLS}
-    assert documented | streams | calls == set(TABLE) | {route for route in OPEN if route[1] not in PAGES}
-    assert set(TABLE.values()) == set(SCOPES)
-    assert set(TABLE) > LASTING
+    assert {path for (_, path), rule in RULES.table.items() if rule.scope is None} >= {"/", "/docs", "/health/live"}
+    assert {path for (_, path), rule in RULES.table.items() if rule.lasting} == {
+        "/v1/echo/stream",
+        "/v1/jobs/{job}/events",
+        "/v1/models/{model}/live",
+        "/v1/models/{model}/stream",
+    }
 
 
 @pytest.mark.parametrize("scope", SCOPES)
 def test_a_key_may_do_what_its_scope_allows_and_nothing_else(guarded, scope):
     assert len(HTTP) > 40
     for method, path in HTTP:
-        needed = TABLE[method, path]
+        needed = RULES.table[method, path].scope
         answer = guarded.api.request(method, address(path), headers=bearer(guarded.secrets[scope]))
         if scope in (needed, ADMIN):
             assert answer.status_code not in (401, 403), (method, path, answer.text)
@@ -93,8 +103,8 @@ def test_routes_that_are_not_in_the_table_are_for_admins_only(guarded):
 
 
 def test_head_needs_what_get_needs():
-    assert rule_of("HEAD", "/v1/models") == rule_of("GET", "/v1/models")
-    assert rule_of("HEAD", "/v1/models").scopes == ("read",)
+    assert RULES.of("HEAD", "/v1/models") == RULES.of("GET", "/v1/models")
+    assert RULES.of("HEAD", "/v1/models").scope == "read"
 
 
 def test_the_document_says_which_scope_an_operation_needs(api, guarded):
@@ -103,8 +113,9 @@ def test_the_document_says_which_scope_an_operation_needs(api, guarded):
         scheme = document["components"]["securitySchemes"]["key"]
         assert (scheme["type"], scheme["scheme"]) == ("http", "bearer")
         assert all(f"`{scope}`" in scheme["description"] for scope in SCOPES)
-    for (method, path), scope in TABLE.items():
-        if method != WEBSOCKET and path not in CALLS:
+    for method, path in HTTP:
+        scope = RULES.table[method, path].scope
+        if path in free["paths"]:
             operations = [document["paths"][path][method.lower()] for document in (free, locked)]
             assert [each["security"] for each in operations] == [[{}, {"key": [scope]}], [{"key": [scope]}]]
             assert all(each["description"].endswith(f"Scope: `{scope}`.") for each in operations)

@@ -13,6 +13,7 @@ from starlette.routing import BaseRoute, Match
 from starlette.types import Receive, Scope, Send
 
 from service import __version__
+from service.api.access.scopes import PREDICT, READ, Rule
 from service.api.oip import dataplane, schema
 from service.api.oip.rpc.definition import SERVICE, message
 from service.api.oip.rpc.messages import InferRequest, Message, decode, encode
@@ -31,12 +32,18 @@ class Method(NamedTuple):
 
     path: str
     answer: Answerer
+    rule: Rule
 
 
 class Methods(BaseRoute):
     """The route of all methods; path: none of its own."""
 
     path = ""
+
+    @property
+    def calls(self) -> dict[str, Rule]:
+        """What each method needs, by its path."""
+        return {path: method.rule for path, method in METHODS.items()}
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:
         """Whether a scope is that of a call of one of the methods."""
@@ -110,13 +117,13 @@ def _model(scope: Scope, sent: Any, name: str, version: str) -> tuple[str, str |
 
 
 METHODS = {
-    path: Method(path, answer)
-    for path, answer in (
-        (f"/{SERVICE}/ServerLive", _server_live),
-        (f"/{SERVICE}/ServerReady", _server_ready),
-        (f"/{SERVICE}/ServerMetadata", _server_metadata),
-        (f"/{SERVICE}/ModelReady", _model_ready),
-        (f"/{SERVICE}/ModelMetadata", _model_metadata),
-        (f"/{SERVICE}/ModelInfer", _model_infer),
+    f"/{SERVICE}/{name}": Method(f"/{SERVICE}/{name}", answer, Rule(scope))
+    for name, answer, scope in (
+        ("ServerLive", _server_live, None),
+        ("ServerReady", _server_ready, None),
+        ("ServerMetadata", _server_metadata, READ),
+        ("ModelReady", _model_ready, READ),
+        ("ModelMetadata", _model_metadata, READ),
+        ("ModelInfer", _model_infer, PREDICT),
     )
 }
