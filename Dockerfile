@@ -5,7 +5,7 @@ FROM python:3.11-slim AS sources
 RUN apt-get update && apt-get install --yes --no-install-recommends binutils libgomp1
 WORKDIR /src
 COPY .ci .ci
-COPY pyproject.toml hatch_build.py README.md LICENSE ./
+COPY pyproject.toml hatch_build.py mkdocs.yml README.md LICENSE ./
 COPY clients/python clients/python
 COPY lipcore lipcore
 COPY service service

@@ -87,7 +87,7 @@ image:
 image-serve:
 	docker build --target serve -t lipserve:serve .
 
-# the documentation as a site, build/site
+# the documentation as a site, service/api/guide/site: what the service shows below /guide
 docs: install
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 

@@ -1,12 +1,18 @@
-"""Gets the parts of Plotly's JavaScript that the dashboard draws with into wheels and checkouts, from npm: PyPI has it
-as a whole only, in a large package. Where npm cannot be reached, that package, `plotly`, becomes a dependency instead,
-and the service sends its file."""
+"""Adds to wheels and checkouts what the service shows and the repository does not hold.
+
+The guide is the documentation as a site, built by MkDocs as mkdocs.yml says. A build that warns fails.
+
+The parts of Plotly's JavaScript that the dashboard draws with come from npm: PyPI has it as a whole only, in a large
+package. If npm cannot be reached, that package, `plotly`, becomes a dependency instead, and the service sends its file.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import os
+import subprocess
+import sys
 import tarfile
 import urllib.request
 from base64 import b64encode
@@ -25,13 +31,18 @@ REGISTRY = os.environ.get("NPM_CONFIG_REGISTRY", "https://registry.npmjs.org").r
 SECONDS = 30
 INSTEAD = "plotly>=6.1,<8"
 FOLDER = Path("service/api/dashboard/bundles")
+SITE = Path("service/api/guide/site")
+"""`site_dir` of mkdocs.yml."""
 
 
-class Bundles(BuildHookInterface[Any]):
+class Files(BuildHookInterface[Any]):
     """Runs before a wheel is made, of editable installations too, which find the files in the checkout."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        """Fetch what is not there yet, and let the wheel hold it."""
+        """Build the guide, fetch the bundles that are not there yet, and let the wheel hold both."""
+        environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+        subprocess.run([sys.executable, "-m", "mkdocs", "build"], cwd=self.root, env=environment, check=True)
+        build_data["artifacts"].append(f"/{SITE}/**")
         folder = Path(self.root) / FOLDER
         try:
             for name in SHA512:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from service.api.guide.routes import anchor
 from service.api.limits.requests import body_limit, body_limits
 from service.api.openapi import METHODS
 from service.app import create_app
@@ -31,6 +30,11 @@ def document() -> str:
     return HEAD + "\n".join([*_contents(api), *_routes(api), *_schemas(api)]).rstrip() + "\n"
 
 
+def _anchor(heading: str) -> str:
+    """What GitHub and MkDocs link a heading by."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
 def _operations(api: Document) -> dict[str, list[tuple[str, str, Document]]]:
     """Operations by tag, in the order of their paths: (method, path, operation)."""
     found: dict[str, list[tuple[str, str, Document]]] = {}
@@ -46,7 +50,7 @@ def _contents(api: Document) -> Iterator[str]:
     yield from ("| route | what it does |", "| --- | --- |")
     for operations in _operations(api).values():
         for method, path, operation in operations:
-            yield f"| [`{method} {path}`](#{anchor(f'{method} {path}')}) | {_cell(operation.get('summary', ''))} |"
+            yield f"| [`{method} {path}`](#{_anchor(f'{method} {path}')}) | {_cell(operation.get('summary', ''))} |"
     yield ""
 
 
@@ -104,7 +108,7 @@ def _type(schema: Document) -> str:
     """A schema in a few words, with links to the types that it is made of."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
-        return f"[{name}](#{anchor(name)})"
+        return f"[{name}](#{_anchor(name)})"
     for several in ("anyOf", "oneOf", "allOf"):
         if several in schema:
             return " or ".join(dict.fromkeys(_type(each) for each in schema[several]))

@@ -131,8 +131,9 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
         message = f"no route {request.method} {readable(request.url.path[:200])}: /docs lists all"
     answer = _answer(request.scope, error.status_code, codes.get(error.status_code, "http_error"), message)
     answer.headers.update(error.headers or {})
-    if error.status_code == 405:  # Starlette names the methods of one route, but others have the same path
-        answer.headers["allow"] = ", ".join(_methods(request))
+    # Starlette names the methods of one route, but others have the same path; it knows those of a folder
+    if error.status_code == 405 and (methods := _methods(request)):
+        answer.headers["allow"] = ", ".join(methods)
     return answer
 
 

@@ -64,8 +64,8 @@ class Guarded:
 
 
 def policy(page: bytes) -> str:
-    """The policy of a page: of the scripts that stand in it each runs as it is, by its sha256."""
-    hashes = (b64encode(hashlib.sha256(each).digest()).decode() for each in _SCRIPT.findall(page))
+    """The policy of one or more pages: of the scripts that stand in them each runs as it is, by its sha256."""
+    hashes = (b64encode(hashlib.sha256(each).digest()).decode() for each in sorted(set(_SCRIPT.findall(page))))
     return POLICY.format(scripts="".join(f" 'sha256-{each}'" for each in hashes))
 
 

@@ -83,6 +83,7 @@
     if (!below) continue;
     let opacity = 1;
     for (let at = node; at; at = at.parentElement) opacity *= Number(getComputedStyle(at).opacity);
+    if (opacity === 0) continue;
     const ink = rgba(style.color);
     ink[3] *= opacity;
     const [light, dark] = [luminance(over(ink, below)), luminance(below)].sort((a, b) => b - a);

@@ -68,8 +68,8 @@ def routes(dashboard: Dashboard) -> Iterator[dict[str, str]]:
             "robots": "#/live",
             "live-quiet": f"#/live/{dashboard.model}",
             "live": f"#/live/{MODEL}",
-            "guide": "/guide",
-            "guide-page": "/guide/first-model",
+            "guide": "/guide/",
+            "guide-page": "/guide/first-model/",
         }
 
 

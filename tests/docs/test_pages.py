@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import typer
 
-from service.api.guide.routes import anchor
 from service.cli.main import app
 from tests.docs.blocks import ROOT, all_pages, blocks, pages, prose
 
@@ -16,6 +15,11 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 WIDEST, MOST_WORDS = 120, 15_000
 """Characters of a line of prose, tables and code aside, and words of all pages written by hand, as `wc -w` counts."""
 BOXES = re.compile(r"^#+ +(.*?)\s*$", re.MULTILINE)
+
+
+def anchor(heading: str) -> str:
+    """What GitHub links a heading by."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
 def anchors(page: Path) -> set[str]:

@@ -121,9 +121,9 @@ def test_the_wheel_of_the_service_serves_its_model_pages_and_guide(server):
     answer = server.client.post("/v1/models/panda-sim/predict", json={"q": zeros, "dq": zeros, "ddq": zeros})
     assert len(answer.json()["tau"]) == len(zeros)
     assert server.client.get("/openapi.json").json()["info"]["version"] == __version__
-    for page, shown in {"/": "LIPServe", "/guide/operations": "Leave it running"}.items():
+    for page, shown in {"/": "LIPServe", "/guide/operations/": "Leave it running"}.items():
         assert shown in server.client.get(page).text
-    assert server.client.get("/guide/files/screenshots--live.webp").headers["content-type"] == "image/webp"
+    assert server.client.get("/guide/screenshots/live.webp").headers["content-type"] == "image/webp"
 
 
 @pytest.mark.skipif("torch" in BASE, reason="torch is part of the base")

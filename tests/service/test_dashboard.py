@@ -24,6 +24,11 @@ def test_every_file_is_served_as_what_it_is_and_once(api, file):
     assert (again.status_code, again.content) == (304, b"")
 
 
+def test_files_are_only_read(api):
+    answer = api.post("/dashboard/style.css")
+    assert (answer.status_code, answer.headers["allow"]) == (405, "GET, HEAD")
+
+
 def test_no_file_names_another_host():
     for file in FILES:
         result = set(re.findall(r"(?:https?:)?//[a-z0-9.-]+\.[a-z]{2,}", (STATIC / file).read_text()))

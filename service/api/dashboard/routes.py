@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from fastapi import FastAPI
-from starlette.datastructures import MutableHeaders
 from starlette.responses import FileResponse, Response
 from starlette.staticfiles import StaticFiles
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import Scope
 
 from service.api.dashboard import plotly
 
@@ -31,7 +31,7 @@ def install(app: FastAPI) -> None:
     """Add the dashboard to an application. It needs no key: its pages ask for one where the API does."""
     app.add_api_route("/", page, include_in_schema=False)
     plotly.install(app, HEADERS)
-    app.mount(FILES, StaticPages(STATIC))
+    app.mount(FILES, StaticPages(STATIC, HEADERS))
 
 
 async def page() -> Response:
@@ -39,18 +39,15 @@ async def page() -> Response:
     return FileResponse(STATIC / "index.html", headers=HEADERS)
 
 
-class StaticPages:
-    """Files of one folder with the headers of the dashboard."""
+class StaticPages(StaticFiles):
+    """Files of one folder, all with the same headers."""
 
-    def __init__(self, folder: Path) -> None:
-        self._files: ASGIApp = StaticFiles(directory=folder)
+    def __init__(self, folder: Path, headers: Mapping[str, str], html: bool = False) -> None:
+        super().__init__(directory=folder, html=html, check_dir=False)
+        self._headers = headers
 
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a file, 304 where the browser has it; raise HTTPException where there is none."""
-
-        async def with_headers(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).update(HEADERS)
-            await send(message)
-
-        await self._files(scope, receive, with_headers)
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        """Return a file, or 304 if the browser has it; raise HTTPException if there is none."""
+        response = await super().get_response(path, scope)
+        response.headers.update(self._headers)
+        return response

@@ -74,7 +74,7 @@ def test_links_and_own_pages_are_followed(api):
     link = {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}
     own = {"Sec-Fetch-Site": "same-origin", "Sec-Fetch-Mode": "cors", "Sec-Fetch-Dest": "empty"}
     for headers in (link, own, {"Sec-Fetch-Site": "none", "Sec-Fetch-Mode": "navigate"}):
-        answer = api.get("/guide", headers=headers)
+        answer = api.get("/", headers=headers)
         assert answer.status_code == 200
         assert "access-control-allow-origin" not in answer.headers
     error(api.post("/v1/echo", content=b"1", headers=link), 403, "forbidden")
