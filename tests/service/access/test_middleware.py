@@ -105,7 +105,14 @@ def events(database, app, revoked=None):
     """Ask for events of an application; return what was sent, and the ASGI scope."""
     row, secret = keys.create(database, "test", ["read"], None)
     headers = [(b"authorization", b"Bearer " + secret.encode())]
-    scope = {"type": "http", "method": "GET", "path": EVENTS, "query_string": b"", "headers": headers, "app": create_app()}
+    scope = {
+        "type": "http",
+        "method": "GET",
+        "path": EVENTS,
+        "query_string": b"",
+        "headers": headers,
+        "app": create_app(),
+    }
     sent = []
 
     async def send(message):
