@@ -16,7 +16,7 @@ FROM sources AS build-serve
 RUN .ci/install-image ./clients/python '.'
 
 FROM sources AS build-full
-RUN .ci/install-image ./clients/python '.[train,robots,ingest,cluster,grpc,signing]'
+RUN .ci/install-image ./clients/python '.[train,robots,ingest,cluster,grpc]'
 
 # the system, without what installs packages, Python's or Debian's, and without Perl: a layer can only add, so it is
 # copied as it is in the end

@@ -36,7 +36,6 @@ EXTRAS = {
     "ingest": Extra("read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra)", ("pyarrow",)),
     "cluster": Extra("share PostgreSQL, S3 and a Dask cluster", ("psycopg", "s3fs", "distributed")),
     "grpc": Extra("answer over gRPC", ("grpc", "google.protobuf")),
-    "signing": Extra("sign archives and check their signatures", ("cryptography",)),
     "opentelemetry": Extra("send traces", ("opentelemetry.exporter.otlp.proto.http",)),
     "plot": Extra("draw pictures", ("matplotlib",)),
 }

@@ -44,7 +44,7 @@ from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
 from service.learning.metrics import Learning
 from service.learning.refresh import attach
-from service.models import deletion, registry, signing
+from service.models import deletion, registry
 from service.models.loaded import LoadedModels
 from service.replication import Replication
 from service.runtime.confinement import protections
@@ -74,7 +74,6 @@ def create_app(settings: Settings | None = None) -> FastAPI:
     settings = settings or Settings()
     stopping, meters = Stopping(), Meters(settings.max_metric_models)
     calls = rpc.check_installed(settings)
-    signing.check_installed(settings)
     keyring = Keyring(settings.keys_refresh_s, settings.max_request_burst) if settings.keys_needed else None
 
     @asynccontextmanager

@@ -181,7 +181,7 @@ def record(desk: Desk, turn: int) -> None:
 
 
 def archive(desk: Desk, turn: int) -> None:
-    """Export what was learnt, signed, import it as another model, and delete that; the same of a URDF."""
+    """Export what was learnt, import it as another model, and delete that; the same of a URDF."""
     content = desk.ask("GET", f"/v1/models/{ARM}/export")
     kind = {"content-type": "application/x-tar"}
     desk.ask("POST", "/v1/models/import?name=copy&promotion=always", 201, content=content, headers=kind)

@@ -32,7 +32,6 @@ from benchmarks.soak.resources import WARMING, Growth, Look, ResourceWatch, grow
 from lipcore.warm_up import warm_up
 from service.api.access import keys
 from service.contract.observations import LearningOptions
-from service.models import signing
 from service.storage.database import Database
 
 MOTION_S = 600.0
@@ -108,14 +107,12 @@ def run(options: Options, console: Console) -> Results:
         base, _ = train(scene.history(50.0, 10.0), scene.arm.joint_types, FIT, "rigid-body")
         lipcore.save(base, folder / "model")
         install(home, folder / "model", {ARM: LEARNING, LOOP: LEARNING}, base.n_joints)
-        signer = signing.signer_of(signing.make_key(folder / "signing.pem"))
         with closing(Database(home)) as database:
             _, key = keys.create(database, "soak", ["admin"], None, max_requests_per_s=1e6)
-        signed = {"signing_key_file": folder / "signing.pem", "trusted_signers": signer, "require_signed": True}
         clock = Clock(round(3600 * options.hours))
         samples = scene.more(MOTION_S)
         retained = {"observation_retention_bytes": RETAINED_S * days.FRAMES * ROW_BYTES}
-        with serving(home, {**SETTINGS, **retained, **signed}) as bed:
+        with serving(home, {**SETTINGS, **retained}) as bed:
             day = Day(clock, Tally(), bed.tcp, bed.client.url, key, samples, options.rate)
             began = time.monotonic()
             http = httpx.Client(base_url=day.url, headers=day.headers, timeout=120.0)

@@ -6,7 +6,6 @@ import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from datetime import UTC, datetime, timedelta
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,11 +15,10 @@ from rich.table import Column, Table
 
 from service.api.access import keys
 from service.api.access.scopes import SCOPES
-from service.cli.consoles import CommandError, note, out, print_json, print_result
+from service.cli.consoles import note, out, print_json
 from service.cli.options import Json, group
 from service.foundation.errors import InvalidRequestError
 from service.foundation.settings import Settings
-from service.models import signing
 from service.storage.database import ApiKeyRow, Database
 from service.storage.storage import HomeError, usable
 
@@ -99,22 +97,6 @@ def revoke(
         print_json(_document(row))
         return
     note(f"{row.id} is revoked; a running service refuses it after {settings.keys_refresh_s:g} s")
-
-
-@app.command("signing")
-def signing_(
-    file: Annotated[Path, typer.Argument(help="File of the private key, for LIPSERVE_SIGNING_KEY_FILE.")],
-    as_json: Json = False,
-) -> None:
-    """Make a key that exported archives are signed with, and print its public part, for LIPSERVE_TRUSTED_SIGNERS.
-
-    Of a file that is there only the public part is printed.
-    """
-    if find_spec("cryptography") is None:
-        raise CommandError(f"signing needs {signing.MISSING}")
-    made = not file.exists()
-    signer = signing.signer_of(signing.make_key(file) if made else signing.read_key(file))
-    print_result({"signer": signer, "made": made}, as_json, signer)
 
 
 @contextmanager

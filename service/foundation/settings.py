@@ -16,8 +16,6 @@ CONNECTIONS = 20
 
 MiB = 1024 * 1024
 Count = Annotated[int, Field(ge=1)]
-SIGNER = "^ed25519:[A-Za-z0-9+/]{43}=$"
-"""A public key that archives are signed with: base64 of its 32 bytes."""
 
 
 def _octal(mode: object) -> object:
@@ -328,28 +326,6 @@ class Settings(BaseSettings):
         description="Reverse proxies whose X-Forwarded-For names the client: addresses or networks, with commas.",
     )
 
-    signing_key_file: Path | None = Field(
-        None,
-        description="File with the private key that exported archives are signed with, as `lipserve keys signing` "
-        "makes one. Needs `lipserve[signing]`.",
-    )
-    trusted_signers: str = Field(
-        "",
-        pattern=f"^({SIGNER[1:-1]}( *, *{SIGNER[1:-1]})*)?$",
-        description="Public keys of those whose archives are taken where a signature is required, ed25519:…, with "
-        "commas.",
-    )
-    require_signed: bool = Field(
-        False,
-        description="Import only archives that a trusted signer has signed. A broken signature is always refused.",
-    )
-
-    @model_validator(mode="after")
-    def _signed_by_somebody(self) -> Self:
-        if self.require_signed and not self.trusted_signers:
-            raise ValueError("require_signed is true, expected trusted_signers too, whose archives are taken")
-        return self
-
     @model_validator(mode="after")
     def _shared_together(self) -> Self:
         if (self.database_url is None) != (self.files_url is None):
@@ -363,11 +339,6 @@ class Settings(BaseSettings):
         if self.grpc_port and self.grpc_port == self.port:
             raise ValueError(f"grpc_port is {self.grpc_port}, expected another port than that of HTTP")
         return self
-
-    @property
-    def signers(self) -> tuple[str, ...]:
-        """Those of `trusted_signers`."""
-        return tuple(each.strip() for each in self.trusted_signers.split(",") if each.strip())
 
     @property
     def keys_needed(self) -> bool:

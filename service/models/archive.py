@@ -18,11 +18,10 @@ from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, TENSORS, ModelFormatError
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 from service.foundation.errors import InvalidRequestError, UnreadableVersionError, invalid_request, problem
-from service.models import registry, signing
+from service.models import registry
 from service.models.archive_reading import BLOCK, CHECKSUMS, EXPORT, FORMAT, FORMAT_VERSION, padding
 from service.models.lineage import software
 from service.models.loaded import LoadedModels
-from service.models.signing import SIGNATURE
 from service.storage.database import VersionRow, now
 
 MEDIA_TYPE = "application/x-tar"
@@ -79,9 +78,7 @@ def export(
     }
     files = {EXPORT: _json(about), **files}
     sums = _json({name: persistence.sha256(content) for name, content in files.items()})
-    key = loaded.storage.settings.signing_key_file
-    signed = {} if key is None else {SIGNATURE: _json(signing.sign(signing.read_key(key), sums))}
-    file = _packed(loaded, {CHECKSUMS: sums, **signed, **files})
+    file = _packed(loaded, {CHECKSUMS: sums, **files})
     return Exported(f"{row.model}-v{row.version}{suffix}.tar", file.tell(), _pieces(file))
 
 

@@ -52,13 +52,12 @@ def add(loaded: LoadedModels, upload: Path, name: str | None, promotion: Promoti
     """
     settings = loaded.storage.settings
     cage.run("service.models.archive_reading:try_out", type(None), upload, settings, settings=settings, field="archive")
-    about, files, signer = archive_reading.read(upload, settings)
+    about, files = archive_reading.read(upload, settings)
     manifest = _checked(files, settings)
     model = name or about.model
-    signed = {} if signer is None else {"signed_by": signer}
     manifest["lineage"] = {
         **manifest["lineage"],
-        "imported": [*manifest["lineage"].get("imported", []), {**about.model_dump(), "imported_at": now(), **signed}],
+        "imported": [*manifest["lineage"].get("imported", []), {**about.model_dump(), "imported_at": now()}],
     }
     files[MANIFEST] = persistence.manifest_bytes(manifest)
     loaded.storage.disk.require(sum(map(len, files.values())))

@@ -20,10 +20,10 @@ from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, Limits, ModelFormat
 from service.contract.models import ModelName
 from service.foundation.errors import InvalidDataError, invalid_data, problem
 from service.foundation.settings import Settings
-from service.models import signing
-from service.models.signing import SIGNATURE, Signature
 
 EXPORT, CHECKSUMS = "export.json", "checksums.json"
+SIGNATURE = "signature.json"
+"""In archives that earlier builds have signed; it is ignored."""
 MEMBERS = (EXPORT, CHECKSUMS, MANIFEST, TENSORS, ROBOT, SIGNATURE)
 OPTIONAL = frozenset({ROBOT, SIGNATURE})
 FORMAT, FORMAT_VERSION = "lipserve-archive", 1
@@ -117,9 +117,9 @@ def _header(header: bytes) -> tuple[str, int]:
     return name, info.size
 
 
-def read(upload: Path, settings: Settings) -> tuple[About, dict[str, bytes], str | None]:
-    """Where an archive comes from, the files of its model by name, which have their checksums, and who has signed
-    these, None: nobody; raise InvalidDataError naming the member that is wrong and what is wrong with it."""
+def read(upload: Path, settings: Settings) -> tuple[About, dict[str, bytes]]:
+    """Where an archive comes from, and the files of its model by name, which have their checksums; raise
+    InvalidDataError naming the member that is wrong and what is wrong with it."""
     limits = {
         EXPORT: SMALL,
         CHECKSUMS: SMALL,
@@ -135,13 +135,8 @@ def read(upload: Path, settings: Settings) -> tuple[About, dict[str, bytes], str
     for name in MEMBERS:
         if name not in files and name not in OPTIONAL:
             raise invalid_data(name, "missing", "a file of that name in the archive")
-    try:
-        signature = Signature.model_validate(_json(SIGNATURE, files.pop(SIGNATURE))) if SIGNATURE in files else None
-    except ValidationError as error:
-        raise invalid_member(SIGNATURE, error) from None
-    checksums = files.pop(CHECKSUMS)
-    signer = signing.verify(settings, signature, checksums)
-    sums = _json(CHECKSUMS, checksums)
+    files.pop(SIGNATURE, None)
+    sums = _json(CHECKSUMS, files.pop(CHECKSUMS))
     if not isinstance(sums, dict) or sums.keys() != files.keys():
         given = f"of {', '.join(map(strict_json.quote, sums))}" if isinstance(sums, dict) else strict_json.quote(sums)
         raise invalid_data(CHECKSUMS, given, f"the sha256 of each of {', '.join(files)}")
@@ -149,7 +144,7 @@ def read(upload: Path, settings: Settings) -> tuple[About, dict[str, bytes], str
         if persistence.sha256(content) != sums[name]:
             raise invalid_data(name, "not what its sha256 in checksums.json says", "an undamaged file")
     try:
-        return About.model_validate(_json(EXPORT, files.pop(EXPORT))), files, signer
+        return About.model_validate(_json(EXPORT, files.pop(EXPORT))), files
     except ValidationError as error:
         raise invalid_member(EXPORT, error) from None
 
@@ -169,7 +164,7 @@ def limits_of(settings: Settings) -> Limits:
 def try_out(upload: Path, settings: Settings) -> None:
     """Read an archive and all that its model is made of; raise InvalidDataError. For a process that may come to harm:
     it keeps nothing, and who has called it reads what has been read well."""
-    _, files, _ = read(upload, settings)
+    _, files = read(upload, settings)
     try:
         persistence.parse(files, limits_of(settings))
     except ModelFormatError as error:

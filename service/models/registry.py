@@ -100,9 +100,9 @@ def publish(
 
 
 def _origin(manifest: dict[str, Any], job: str | None) -> dict[str, Any]:
-    """What the audit log says of a new version: of an imported one also where it comes from, and who has signed it."""
+    """What the audit log says of a new version: of an imported one also where it comes from."""
     imported = manifest["lineage"].get("imported", []) if job is None else []
-    source = {name: imported[-1].get(name) for name in ("model", "version", "signed_by")} if imported else {}
+    source = {name: imported[-1].get(name) for name in ("model", "version")} if imported else {}
     return {"estimator": manifest["estimator"], "job": job, **({"imported": source} if source else {})}
 
 

@@ -18,7 +18,7 @@ ANSWER_BYTES = 32 * 1024 * 1024
 """Largest answer: names and facts, as numbers come in files."""
 OUTPUT_BYTES = 4096
 """Most that is kept of what a confined process, or a library in it, writes to stdout and stderr."""
-OF_READERS = ("max_", "min_", "require_signed", "trusted_signers")
+OF_READERS = ("max_", "min_")
 """How the settings begin that readers need. No secret does."""
 ERRORS = {each.code: each for each in (InvalidDataError, InvalidRequestError, StorageFullError, TooLargeError)}
 """What a function may raise, by code; and MissingExtraError, OSError."""

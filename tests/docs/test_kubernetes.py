@@ -202,7 +202,7 @@ def test_one_service_has_one_writer_and_keeps_its_disk():
     dockerfile = (ROOT / "Dockerfile").read_text("utf-8")
     assert "LIPSERVE_HOME=/data" in dockerfile
     assert "--uid 10001" in dockerfile
-    assert "[train,robots,ingest,cluster,grpc,signing]" in dockerfile
+    assert "[train,robots,ingest,cluster,grpc]" in dockerfile
 
 
 def test_only_members_reach_the_cluster():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from service.models import lineage
-from tests.service.archives.packing import exported, pack, send, unpack, vouched
+from tests.service.archives.packing import MANIFEST, exported, pack, send, unpack, vouched, with_json
 from tests.service.data import service_of, stream
 
 
@@ -61,6 +61,25 @@ def test_imported_version_tells_where_it_comes_from(api, trained, archive):
     again = send(api, exported(api, "told", version=1), name="told").json()
     assert [each["model"] for each in again["lineage"]["imported"]] == [trained.name, "told"]
     assert again["version"] == 2
+
+
+def test_archive_that_an_earlier_build_signed_is_imported_without_its_signature(api, archive):
+    signature = b'{"algorithm": "ed25519", "signer": "ed25519:AAAA", "signature": "of something else"}'
+    answer = send(api, pack({"signature.json": signature, **unpack(archive)}), name="signed")
+    assert answer.status_code == 201, answer.text
+    assert "signed_by" not in answer.json()["lineage"]["imported"][0]
+    assert set(unpack(exported(api, "signed", version=1))) == set(unpack(archive))
+
+
+def test_lineage_that_names_a_signer_is_read_and_handed_on(api, archive):
+    signer = "ed25519:11qYAYKxCrfVS/7TyWQHOg7hcvPapiMlrwIaaPcHURo="
+    before = [{"model": "arm", "version": 3, "signed_by": signer}]
+    files = with_json(unpack(archive), MANIFEST, lambda manifest: manifest["lineage"].update(imported=before))
+    send(api, pack(files), name="once-signed")
+    version = api.get("/v1/models/once-signed/versions/1").json()
+    assert version["lineage"]["imported"][0] == before[0]
+    again = send(api, exported(api, "once-signed", version=1), name="again").json()
+    assert again["lineage"]["imported"][0] == before[0]
 
 
 def test_archive_says_the_name_of_its_model(api, archive):

@@ -69,7 +69,6 @@ def stored(home: Path) -> dict[str, bytes]:
 
 COPIES = """
 store("snap_1")
-from service.models.signing import make_key
 from service.storage.backup import backup, restore
 from service.storage.files.objects import Mounted
 root = home.parents[2]
@@ -77,7 +76,6 @@ root = home.parents[2]
 Mounted(root).put(root / "file", "store/versions/mv_1/file")
 backup(home, root / "backup")
 restore(home.parents[1] / "again" / "home", root / "backup")
-make_key(root / "key")
 """
 
 
@@ -91,7 +89,6 @@ def test_what_is_first_stored_in_a_new_home_is_there_and_so_are_copies_of_it(tmp
         assert stored(root / "disk" / "again" / "home") == {"snap_1": CONTENT}
         restore(root / "once more", root / "backup")
         assert stored(root / "once more") == {"snap_1": CONTENT}
-        assert (root / "key").read_bytes().endswith(b"-----END PRIVATE KEY-----\n")
         assert (root / "store" / "versions" / "mv_1" / "file").read_bytes() == b"shared"
 
 
