@@ -1,5 +1,6 @@
 """What a service does with the home it finds: sweep what was interrupted, keep what was finished, lock it."""
 
+import errno
 import fcntl
 import json
 import os
@@ -15,7 +16,7 @@ from service.foundation.settings import Settings
 from service.models import registry
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files
-from service.storage.storage import HomeInUseError, hold_home
+from service.storage.storage import HomeError, HomeInUseError, hold_home
 from tests.service.data import ADDRESS, DEADLINE, QUICK, ended, error, job, stream, train, upload
 from tests.service.warm import Served
 
@@ -143,19 +144,13 @@ def test_a_second_service_on_the_same_home_is_refused(second_start):
         pass
 
 
-def test_deleting_the_lock_file_admits_no_second_service(tmp_path):
-    with hold_home(tmp_path / "home"):
-        (tmp_path / "home" / ".lock").unlink()
-        with pytest.raises(HomeInUseError):
-            hold_home(tmp_path / "home")
-    hold_home(tmp_path / "home").close()
+def test_a_folder_that_cannot_be_locked_is_no_home(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.EBADF, "Bad file descriptor")
 
-
-def test_a_service_of_an_earlier_release_keeps_its_home(tmp_path):
-    with (tmp_path / ".lock").open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)  # which is all that it locks
-        with pytest.raises(HomeInUseError):
-            hold_home(tmp_path)
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(HomeError, match="may write to and lock: Bad file descriptor"):
+        hold_home(tmp_path)
 
 
 def test_a_new_home_is_its_owners_alone(tmp_path):

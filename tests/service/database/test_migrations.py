@@ -1,8 +1,9 @@
-"""Databases of earlier releases: brought up to date with all that is in them, whoever comes first."""
+"""Databases of release 0.2.0 are brought up to date with all that is in them, whoever comes first; older ones are
+refused."""
 
+import re
 import sqlite3
 from contextlib import closing
-from pathlib import Path
 
 import pytest
 from alembic.autogenerate import compare_metadata
@@ -12,33 +13,25 @@ from sqlalchemy import inspect, select
 
 from service.learning.ingest.judging import ContactGate
 from service.learning.streams import Streams
-from service.storage.database import (
-    Base,
-    Database,
-    JobRow,
-    LearnerRow,
-    ModelRow,
-    ServingRow,
-    SnapshotRow,
-    VersionRow,
-    migrations,
-)
-from service.storage.database.migrations import HEAD
+from service.storage.database import Base, Database, LearnerRow, ServingRow, migrations
+from service.storage.database.migrations import HEAD, DatabaseVersionError
 from tests.service.database.starting import check_starts_together
 from tests.service.learning import batches
+from tests.service.upgrades.test_homes import unpacked
 
-BEFORE = (Path(__file__).parent / "before_migrations.sql").read_text()
 FILE = "lipserve.sqlite3"
 
 
 @pytest.fixture
-def earlier(home):
-    """A home whose database an earlier release has made."""
-    home.mkdir()
-    connection = sqlite3.connect(home / FILE)
-    connection.executescript(BEFORE)
-    connection.close()
-    return home
+def earlier(tmp_path):
+    """A home that release 0.2.0 has made."""
+    return unpacked(tmp_path / "earlier")
+
+
+def execute(home, *statements):
+    """Change the database of a home; return the rows of the last statement."""
+    with closing(sqlite3.connect(home / FILE)) as connection, connection:
+        return [connection.execute(each).fetchall() for each in statements][-1]
 
 
 def test_the_last_revision_is_what_the_release_needs():
@@ -55,18 +48,24 @@ def test_migrations_end_in_the_tables_of_the_release(request, which):
     database.close()
 
 
-def test_what_an_earlier_release_stored_is_kept(earlier):
+def test_a_model_without_a_serving_version_serves_its_newest(earlier):
+    execute(earlier, "DELETE FROM serving", "DELETE FROM learners")
     database = Database(earlier)
     with database.session() as session:
-        assert session.scalars(select(VersionRow.version)).all() == [1, 2, 3]
-        assert session.scalars(select(ModelRow.last_version)).all() == [3]
-        [job] = session.scalars(select(JobRow))
-        assert (job.id, job.state, job.history, job.retry_of) == ("job_1", "queued", [], None)
-        assert session.scalars(select(SnapshotRow.sha256)).all() == [None]
-        [serving], [learner] = session.scalars(select(ServingRow)), session.scalars(select(LearnerRow))
-        assert (serving.model, serving.version) == (learner.model, learner.version) == ("arm", 3)
-        assert learner.role == "serving"
+        chosen = select(ServingRow.model, ServingRow.version).order_by(ServingRow.model)
+        assert session.execute(chosen).all() == [("bodies", 1), ("chain", 2)]
+        learning = select(LearnerRow.model, LearnerRow.version, LearnerRow.role).order_by(LearnerRow.model)
+        assert session.execute(learning).all() == [("bodies", 1, "serving"), ("chain", 2, "serving")]
     database.close()
+
+
+@pytest.mark.parametrize("change", ["DROP TABLE alembic_version", "UPDATE alembic_version SET version_num = '0003'"])
+def test_a_database_of_a_release_before_is_refused_as_it_is(earlier, change):
+    execute(earlier, change)
+    before = execute(earlier, "SELECT sql FROM sqlite_master")
+    with pytest.raises(DatabaseVersionError, match=re.escape("start that release on it once (pip install")):
+        Database(earlier)
+    assert execute(earlier, "SELECT sql FROM sqlite_master") == before
 
 
 def test_what_reports_and_events_said_of_streams_becomes_their_records(tmp_path):
@@ -85,11 +84,9 @@ def test_what_reports_and_events_said_of_streams_becomes_their_records(tmp_path)
     batches.write(database, batches.batch(1, stream_id="later", report=report | {"payload": watch}))  # 3
     batches.note(database, "payload", {"stream_id": "robot-1", "body": None})  # 4
     database.close()
-    with closing(sqlite3.connect(tmp_path / FILE)) as connection:
-        for change in ("streams DROP COLUMN record", "learning DROP COLUMN payload", "events DROP COLUMN clock"):
-            connection.execute(f"ALTER TABLE {change}")
-        connection.execute("UPDATE alembic_version SET version_num = '0006'")
-        connection.commit()
+    added = ("streams DROP COLUMN record", "learning DROP COLUMN payload", "events DROP COLUMN clock")
+    changes = (f"ALTER TABLE {each}" for each in added)
+    execute(tmp_path, *changes, "UPDATE alembic_version SET version_num = '0006'")
     database = Database(tmp_path)
     with database.session() as session:
         known = Streams.restored(session, batches.MODEL)
@@ -103,17 +100,12 @@ def test_what_reports_and_events_said_of_streams_becomes_their_records(tmp_path)
 
 
 def test_a_migration_that_fails_leaves_everything_as_it_was(earlier):
-    connection = sqlite3.connect(earlier / FILE)
-    connection.execute("CREATE TABLE api_keys (something TEXT)")  # in the way of a later step
-    connection.close()
-    with pytest.raises(Exception, match="api_keys"):
+    execute(earlier, "ALTER TABLE events ADD COLUMN clock REAL")  # in the way of a later step
+    before = execute(earlier, "SELECT sql FROM sqlite_master")
+    with pytest.raises(Exception, match="clock"):
         Database(earlier)
-    connection = sqlite3.connect(earlier / FILE)
-    tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    assert "alembic_version" not in tables
-    assert "aliases" not in tables
-    assert connection.execute("SELECT COUNT(*) FROM versions").fetchone() == (3,)
-    connection.close()
+    assert execute(earlier, "SELECT sql FROM sqlite_master") == before
+    assert execute(earlier, "SELECT version_num FROM alembic_version") == [("0004",)]
 
 
 def test_processes_that_start_together_migrate_once(earlier):

@@ -29,6 +29,6 @@ def furnished(recording: Recording) -> dict[str, Any]:
 
 
 def earlier(recording: Recording, folder: Path) -> dict[str, Any]:
-    """Give a recording a home of release 0.1.0; return what it holds once it is brought up to date."""
+    """Give a recording a home of release 0.2.0; return what it holds once it is brought up to date."""
     shutil.move(unpacked(folder), recording.home)
     return known(Path(shutil.copytree(recording.home, folder / "migrated")))

@@ -2,15 +2,17 @@
 
 Run it with that release on the path, OLD being its checkout, and pack what a backup would hold:
 
-    PYTHONPATH=OLD:OLD/clients/python python make_home.py home home-0.1.0.json
-    tar -C home -cJf home-0.1.0.tar.xz lipserve.sqlite3 datasets versions $(cd home && ls learning/*.safetensors)
+    PYTHONPATH=OLD:OLD/clients/python python make_home.py home home-0.2.0.json
+    tar -C home -cJf home-0.2.0.tar.xz lipserve.sqlite3 datasets versions $(cd home && ls learning/*.safetensors)
 
-It uses nothing of this release but the routes, which are the same.
+It uses nothing of this release but routes and commands, which are the same.
 """
 
 import io
 import json
+import os
 import sqlite3
+import subprocess
 import sys
 import time
 from contextlib import closing
@@ -23,10 +25,8 @@ from fastapi.testclient import TestClient
 import lipserve
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
-from service.api.access import keys
 from service.app import create_app
 from service.foundation.settings import Settings
-from service.storage.database import Database
 
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations": 4}
 MODELS = (("chain", "lip-chain"), ("chain", "lip-chain"), ("bodies", "rigid-body"))
@@ -102,14 +102,13 @@ def main(home: Path, target: Path) -> None:
         answers["chain@production"] = asked(named)
         models = {model: asked(api.get(f"/v1/models/{model}")) for model in REVISIONS}
         time.sleep(1.0)
-    database = Database.of(settings)
-    row, secret = keys.create(database, "arm 1", ["read", "predict"], None)
-    database.close()
+    command = [sys.executable, "-m", "service", "keys", "create", "--name=arm 1", "--scope=read,predict", "--json"]
+    key = json.loads(subprocess.check_output(command, env={**os.environ, "LIPSERVE_HOME": str(home)}))
     with closing(sqlite3.connect(home / "lipserve.sqlite3", isolation_level=None)) as connection:
         for statement in ("VACUUM", "PRAGMA wal_checkpoint(TRUNCATE)"):
             connection.execute(statement)
     told = {"release": lipserve.__version__, "queries": queries, "answers": answers, "dataset": dataset}
-    told |= {"models": models, "key": {"id": row.id, "secret": secret}}
+    told |= {"models": models, "key": {"id": key["id"], "secret": key["key"]}}
     target.write_text(json.dumps({**told, "lessons": [lesson(number) for number in range(LESSONS)]}) + "\n")
 
 

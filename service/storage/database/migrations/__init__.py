@@ -8,12 +8,12 @@ from typing import Any
 
 import sqlalchemy as sa
 
-HEAD = "0008"
-"""The revision that this release needs."""
+FIRST, HEAD = "0004", "0008"
+"""The revision of release 0.2.0, the oldest that is upgraded, and the one that this release needs."""
 
 
 class DatabaseVersionError(RuntimeError):
-    """The database is of a later release, which this one does not know how to read."""
+    """The database is of a later release, or of one before 0.2.0: this one cannot read it."""
 
 
 def migrate(engine: sa.Engine, lock: Callable[[sa.Connection, None], None]) -> None:
@@ -34,7 +34,7 @@ def migrate(engine: sa.Engine, lock: Callable[[sa.Connection, None], None]) -> N
 
 
 def revision(connection: sa.Connection) -> str | None:
-    """The revision of a database; None of a new one and of those from before there were revisions."""
+    """The revision of a database; None of a new one and of the first releases."""
     if not sa.inspect(connection).has_table("alembic_version"):
         return None
     number: str | None = connection.scalar(sa.text("SELECT version_num FROM alembic_version"))
@@ -49,6 +49,11 @@ def _upgrade(connection: sa.Connection, prior: str | None) -> None:
     config = Config()
     config.set_main_option("script_location", str(Path(__file__).parent).replace("%", "%%"))
     config.attributes["connection"] = connection
+    if prior < FIRST if prior else sa.inspect(connection).has_table("models"):
+        raise DatabaseVersionError(
+            "the database is older than release 0.2.0: start that release on it once (pip install 'lipserve==0.2.0'), "
+            "then this one"
+        )
     known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
     if prior is not None and prior not in known:
         raise DatabaseVersionError(
