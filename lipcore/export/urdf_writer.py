@@ -119,17 +119,15 @@ def urdf_of_parameters(
     """URDF of the `parameters` that a version's manifest reports, with its physically possible bodies.
 
     joint_names and training_range: the manifest's, in the order of the data. Raise ValueError for a model without rigid
-    bodies or whose geometry is not known.
+    bodies.
     """
     if "inertia" not in parameters:
         raise ValueError("the model has no rigid bodies, so no masses: a URDF needs the estimator 'rigid-body'")
-    if "geometry" not in parameters:
-        raise ValueError("the model does not hold where its joints lie: train it again to have a URDF written of it")
     n = len(joint_names)
     geometry, order = read_geometry(parameters["geometry"], n, plausible=True)
     places, bodies = parameters["geometry"]["joints"], parameters["inertia"]["bodies"]
     friction, ranges = parameters["friction"], training_range
-    rotor = parameters["rotor"]["mean"] if "rotor" in parameters else [0.0] * n
+    rotor = parameters["rotor"]["mean"]
 
     def chain(values: Any) -> Array:
         return np.asarray(values, np.float64)[order]

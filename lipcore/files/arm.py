@@ -19,7 +19,7 @@ from lipcore.vocabulary import GEOMETRY_MODES, JOINT_TYPES, GeometryMode, JointT
 
 GEOMETRY_ENTRIES = ("mode", "gravity", "order", "joints")
 JOINT_ENTRIES = ("joint", "type", "rotation", "translation", "axis", "across", "turn_std", "shift_std", "undetermined")
-BODY_ENTRIES = ("joint", "mean", "std", "plausible")
+BODY_ENTRIES = ("joint", "mean", "std", "plausible", "undetermined")
 MASSES = {"mass": (), "first_moment": (3,), "inertia": (6,)}
 """Entries of a body's ten parameters and their shapes."""
 PREFIX = "arm/"
@@ -41,17 +41,16 @@ _TENSORS = {
 
 def check_inertia(inertia: Any, n: int) -> None:
     """Raise ValueError unless this is the entry `inertia` of n bodies; the message names what is wrong."""
-    check_keys("inertia", inertia, ("mean_is_plausible", "bodies"), ("plausible_deviation",))
-    if "plausible_deviation" in inertia:
-        numbers("inertia.plausible_deviation", inertia["plausible_deviation"], (n,))
+    check_keys("inertia", inertia, ("mean_is_plausible", "plausible_deviation", "bodies"))
+    numbers("inertia.plausible_deviation", inertia["plausible_deviation"], (n,))
     for index, body in enumerate(check_list("inertia.bodies", inertia["bodies"], n)):
         where = f"inertia.bodies[{index}]"
-        check_keys(where, body, BODY_ENTRIES, ("undetermined",))
+        check_keys(where, body, BODY_ENTRIES)
         for key in ("mean", "std", "plausible"):
             check_keys(f"{where}.{key}", body[key], MASSES)
             for name, shape in MASSES.items():
                 numbers(f"{where}.{key}.{name}", body[key][name], shape)
-        _check_words(f"{where}.undetermined", body.get("undetermined", []), tuple(MASSES))
+        _check_words(f"{where}.undetermined", body["undetermined"], tuple(MASSES))
 
 
 def check_rotor(rotor: Any, n: int) -> None:
@@ -165,7 +164,7 @@ def read_arm(tensors: Mapping[str, Array], joint_types: Sequence[JointType], mod
     try:
         parts = {name: tensors[f"{PREFIX}{name}"] for name in (*_GEOMETRY_TENSORS, *_ARM_TENSORS, "order")}
     except KeyError as error:
-        raise ValueError(f"tensor {error} is missing: the model is of an earlier release, train it again") from None
+        raise ValueError(f"tensor {error} is missing") from None
     order = parts.pop("order").astype(np.int64)
     if order.shape != (len(joint_types),) or sorted(order.tolist()) != list(range(len(joint_types))):
         raise ValueError(f"tensor 'arm/order' is {order.tolist()}, expected each joint once")

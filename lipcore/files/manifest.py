@@ -184,18 +184,17 @@ def _check_training_torque(name: str, value: Any, n: int) -> None:
 
 
 def _check_parameters(name: str, value: Any, n: int) -> None:
-    check_keys(name, value, ("friction",), ("inertia", "rotor", "geometry"))
+    arm = ("inertia", "rotor", "geometry") if isinstance(value, dict) and "inertia" in value else ()
+    check_keys(name, value, ("friction", *arm))
     check_keys(f"{name}.friction", value["friction"], FRICTION_TERMS, (STRIBECK,))
     for term, figures in value["friction"].items():
         check_keys(f"{name}.friction.{term}", figures, ("mean", "std"))
         for key, numbers in figures.items():
             check_numbers(f"{name}.friction.{term}.{key}", numbers, (n,))
     try:
-        if "inertia" in value:
+        if arm:
             check_inertia(value["inertia"], n)
-        if "rotor" in value:
             check_rotor(value["rotor"], n)
-        if "geometry" in value:
             for plausible in (False, True):
                 read_geometry(value["geometry"], n, plausible)
     except ValueError as error:
@@ -292,11 +291,11 @@ REQUIRED: dict[str, Check] = {
     "training_range": _check_range,
     "lineage": _check_lineage,
     "tensors": _check_tensors,
-}
-OPTIONAL: dict[str, Check] = {
     "parameters": _check_parameters,
     "warnings": _check_warnings,
     "hyperparameters": _check_hyperparameters,
+}
+OPTIONAL: dict[str, Check] = {
     "robot": _check_robot,
     "selection": _check_selection,
     "conformal": _check_conformal,

@@ -310,8 +310,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: Rigi
         conformal=Conformal(**manifest["conformal"]) if "conformal" in manifest else None,
         training_torque=manifest.get("training_torque"),
     )
-    stated = manifest.get("hyperparameters")
-    if stated is not None and stated != {name: value.tolist() for name, value in params.items()}:
+    if manifest["hyperparameters"] != {name: value.tolist() for name, value in params.items()}:
         raise ModelFormatError("hyperparameters are not those of the tensors")
     if not np.allclose(model.noise_std, manifest["noise_std"], rtol=SAME, atol=0):
         raise ModelFormatError(f"noise_std is not that of the tensors, {model.noise_std.tolist()}")

@@ -56,8 +56,8 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Array]:
     if FLOOR in tensors and bool((tensors[FLOOR] < 0).any()):
         raise _bad(f"tensor {FLOOR!r} has a number below zero, expected variances")
     if MISFIT in tensors:
-        rest, slow, lasting, *usual = tensors[MISFIT]
-        variances, motion = np.stack([rest, lasting]), np.stack([slow, *usual])
+        rest, slow, lasting, speed, acceleration = tensors[MISFIT]
+        variances, motion = np.stack([rest, lasting]), np.stack([slow, speed, acceleration])
         if bool((variances < 0).any() or (motion <= 0).any()):
             raise _bad(f"tensor {MISFIT!r} has a number below zero, expected variances, speeds and accelerations")
     return tensors
@@ -137,6 +137,6 @@ def _check_sizes(entries: dict[str, Entry], n: int, limits: Limits) -> None:
     if entries[A].shape != (b[0] * (b[0] + 1) // 2,):
         length = b[0] * (b[0] + 1) // 2
         raise _bad(f"{A} has shape {entries[A].shape}, expected M (M + 1) / 2 numbers, {length}, as {B} has {b[0]}")
-    for name, shapes in ((FLOOR, ((n,),)), (MISFIT, ((5, n), (4, n)))):
-        if name in entries and entries[name].shape not in shapes:
-            raise _bad(f"tensor {name!r} has shape {entries[name].shape}, expected {shapes[0]}")
+    for name, shape in ((FLOOR, (n,)), (MISFIT, (5, n))):
+        if name in entries and entries[name].shape != shape:
+            raise _bad(f"tensor {name!r} has shape {entries[name].shape}, expected {shape}")

@@ -112,12 +112,11 @@ def load(base: TorqueModel, payload: bytes) -> OnlineModel:
     """
     try:
         tensors = {name: value.copy() for name, value in load_tensors(payload).items()}
-        # weights: written by earlier releases; they are solved for, and to the last bit with as many threads only
-        same = any(np.array_equal(tensors["base"], each) for each in (_trained(base), base.posterior.weights))
+        same = np.array_equal(tensors["base"], _trained(base))
         forgetting_s, since, reference = tensors["numbers"].tolist()
         regimes = {name: _regime(tensors, name) for name in REGIMES if f"{name}/numbers" in tensors}
         walk_s, walk_since = tensors["walk"].tolist() if "walk" in tensors else (ABSENT, ABSENT)
-    except (KeyError, SafetensorError, RuntimeError, TypeError) as error:
+    except (KeyError, SafetensorError, RuntimeError, TypeError, ValueError) as error:
         raise ValueError(f"these bytes are no state of an online model: {error}") from error
     if not same:
         raise ValueError("the state is of another version")
@@ -154,13 +153,13 @@ def _sums(statistics: Statistics) -> dict[str, Array]:
 
 
 def _regime(tensors: dict[str, Array], name: str) -> Regime:
-    begins, samples, *at = tensors[f"{name}/numbers"].tolist()
+    begins, samples, at = tensors[f"{name}/numbers"].tolist()
     epochs = tensors[f"{name}/epochs"].tolist() if f"{name}/epochs" in tensors else []
     return Regime(
         begins,
         tensors[f"{name}/centre"],
         _statistics(tensors, name, samples),
-        round(at[0]) if at else -1,  # earlier releases have written none
+        round(at),
         tuple(
             Epoch(round(number), _statistics(tensors, f"{name}/{place}", each))
             for place, (number, each) in enumerate(epochs)

@@ -30,8 +30,6 @@ NATS = 10.0
 """What more variance at low speed has to gain to be kept."""
 CHANCE = 1.5
 """Variance over that of white noise, as estimated, that chance explains."""
-NEVER = 1e100
-"""Usual acceleration of versions that know none, rad/s² (m/s²)."""
 LEAST_SHARE = 0.01
 """Of the mean square: variance that is left to faster motion at least."""
 STEPS = 30
@@ -64,9 +62,8 @@ class Misfit:
 
     @classmethod
     def unpacked(cls, values: Array) -> Misfit:
-        """From what `packed` returns, (5, n), or its first four rows, as earlier releases have stored."""
-        known = [*values, np.full_like(values[0], NEVER)]
-        return cls(*known[:5])
+        """From what `packed` returns, (5, n)."""
+        return cls(*values)
 
     def packed(self) -> Array:
         """Its fields one below the other, (5, n)."""

@@ -158,8 +158,7 @@ def _print(dataset: Dataset) -> None:
         echo(f"  {in_shell(line)}")
     for table in tables.report_tables(report, dataset.joint_names):
         out.print(table)
-    if report.excitation is not None:
-        echo(f"  {report.excitation.text}")
+    echo(f"  {report.excitation.text}")
     for line in report.warnings:
         out.print(f"[yellow]warning:[/yellow] {escape(in_shell(line))}", highlight=False)
     for line in report.advice:

@@ -55,7 +55,7 @@ def judged(quality: HeldOutQuality | None) -> tuple[str, str]:
 
 
 def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, Sequence[float | None]]) -> Table:
-    """Figures per joint, as an evaluation or a version's lineage tells them; older lineages have fewer."""
+    """Figures per joint, as an evaluation or a version's lineage tells them; that of an import may have fewer."""
     table = Table("joint", "nMSE", "RMSE N·m", "in 95 %", "known to be", "width N·m", "NLPD nats", title=title)
     columns = [figures.get(name) or [None] * len(joint_names) for name in FIGURES]
     for joint, nmse, rmse, coverage, low, high, count, width, nlpd in zip(joint_names, *columns, strict=True):
@@ -149,24 +149,23 @@ def overview(report: DatasetReport) -> Iterator[str]:
     rate = NOTHING if report.rate_hz is None else f"{report.rate_hz:.4g} Hz"
     parts, gaps = counted(report.episodes, "episode"), counted(report.gaps, "gap")
     yield f"{report.rows:,} of {report.rows_uploaded:,} rows are samples, in {parts}, at {rate}"
-    if (timing := report.timing) is not None and timing.jitter_p99 is not None:
-        yield f"jitter: 99 % of the steps within {percent(timing.jitter_p99, 1)} of the usual one; {gaps}"
+    if report.timing.jitter_p99 is not None:
+        yield f"jitter: 99 % of the steps within {percent(report.timing.jitter_p99, 1)} of the usual one; {gaps}"
 
 
 def report_tables(report: DatasetReport, joint_names: Sequence[str]) -> Iterator[Table]:
     """What is known of each joint: motion, torque, and what the data tell of it."""
     yield _joints(report, joint_names)
-    if report.excitation is not None:
-        yield _friction(report.excitation.joints)
+    yield _friction(report.excitation.joints)
     if report.against_robot is not None:
         yield _against(report.against_robot)
 
 
 def _joints(report: DatasetReport, joint_names: Sequence[str]) -> Table:
     table = Table("joint", "q", "|dq|", "|ddq|", "tau N·m", "noise N·m", "lag ms", "of range", title="signals")
-    limits = {each.joint: each for each in report.limits or ()}
-    noise = {each.joint: each for each in report.noise or ()}
-    lag = {each.joint: each for each in report.lag or ()}
+    limits = {each.joint: each for each in report.limits}
+    noise = {each.joint: each for each in report.noise}
+    lag = {each.joint: each for each in report.lag}
     for index, joint in enumerate(joint_names):
         low, high = ({name: each[side][index] for name, each in report.ranges.items()} for side in ("min", "max"))
         known = noise.get(joint)

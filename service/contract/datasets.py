@@ -1,4 +1,4 @@
-"""Data sets and their reports as the API shows them. Sections are null in reports that older releases wrote."""
+"""Data sets and their reports as the API shows them."""
 
 from __future__ import annotations
 
@@ -191,26 +191,24 @@ class DatasetReport(BaseModel):
         description="White noise on the torque per joint, as prepared, N·m; as recorded: see noise"
     )
     warnings: list[str]
-    reading: list[str] = Field([], description="What was found while the file was read, and what columns were taken as")
+    reading: list[str] = Field(description="What was found while the file was read, and what columns were taken as")
     source: dict[str, Any] | None = Field(None, description="What the file's columns were taken as, in figures")
-    recipe: dict[str, Any] | None = Field(None, description="The choices that the preparation was made with")
-    steps: list[dict[str, Any]] = Field([], description="The steps of `preparation` with their parameters")
+    recipe: dict[str, Any] = Field(description="The choices that the preparation was made with")
+    steps: list[dict[str, Any]] = Field(description="The steps of `preparation` with their parameters")
     joint_types: list[JointType] | None = Field(
         None, description="Of the robot's joints: what a training job takes where it says nothing else"
     )
     robot: str | None = Field(None, description="Robot whose limits the data were compared with")
     upload_sha256: str | None = Field(None, description="Hash of the uploaded file; null for those of earlier releases")
-    timing: Timing | None = None
-    saturation: list[JointSaturation] | None = None
-    limits: list[JointLimits] | None = None
-    lag: list[Lag] | None = Field(None, description="All joints together first, then joint by joint")
-    noise: list[JointNoise] | None = None
-    excitation: Excitation | None = None
+    timing: Timing
+    saturation: list[JointSaturation]
+    limits: list[JointLimits]
+    lag: list[Lag] = Field(description="All joints together first, then joint by joint")
+    noise: list[JointNoise]
+    excitation: Excitation
     against_robot: AgainstRobot | None = Field(None, description="Null without a robot's URDF")
-    remedies: list[Remedy] = Field(
-        [], description="What `warnings` and `advice` say of the upload's options, to act on"
-    )
-    advice: list[str] = Field([], description="What to record next, or to correct, one sentence each")
+    remedies: list[Remedy] = Field(description="What `warnings` and `advice` say of the upload's options, to act on")
+    advice: list[str] = Field(description="What to record next, or to correct, one sentence each")
 
 
 class Dataset(BaseModel):

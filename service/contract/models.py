@@ -87,10 +87,8 @@ class HeldOutQuality(BaseModel):
     samples: int = Field(description="Samples that the figures are of")
     nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
     coverage: list[float | None] = Field(description="Share of measurements inside the 95 % interval")
-    coverage_low: list[float] | None = Field(
-        None, description="Lower end of the coverage's confidence interval; null for versions of earlier releases"
-    )
-    coverage_high: list[float] | None = Field(None, description="Its upper end")
+    coverage_low: list[float] = Field(description="Lower end of the coverage's confidence interval")
+    coverage_high: list[float] = Field(description="Its upper end")
 
 
 class Version(BaseModel):
@@ -108,10 +106,9 @@ class Version(BaseModel):
     training_range: dict[str, dict[str, list[float]]] = Field(description="Where the samples lie that it stands on")
     options: dict[str, Any]
     fit: dict[str, Any] = Field(description="What the fit reported")
-    compact: dict[str, Any] | None = Field(
-        None,
+    compact: dict[str, Any] = Field(
         description="Size of the served posterior, and how far it deviates from the exact one: `mean_rms`, `mean_max`, "
-        "`std_max` in standard deviations of the function, at `queries` motions; null for versions of model format 2",
+        "`std_max` in standard deviations of the function, at `queries` motions"
     )
     calibration: dict[str, Any] = Field(
         description="`function_std_factor`: what `tau_std` was multiplied by so that intervals hold on unseen motion"
@@ -120,13 +117,11 @@ class Version(BaseModel):
         None,
         description="What `blocks` of the training, left out in turn, say of its intervals: `scale`, the factor on the "
         "half width of each joint's, and `guaranteed`, the share of measurements that they hold then, at least; null "
-        "for versions of earlier releases",
+        "for the shipped model",
     )
-    hyperparameters: dict[str, Any] | None = Field(
-        None, description="Hyperparameters by name, mostly logarithms; null for versions of earlier releases"
-    )
+    hyperparameters: dict[str, Any] = Field(description="Hyperparameters by name, mostly logarithms")
     warnings: list[str] = Field(
-        [], description="What to be careful with: what the recording leaves open of a learnt arm, and how its fit ended"
+        description="What to be careful with: what the recording leaves open of a learnt arm, and how its fit ended"
     )
     lineage: dict[str, Any] = Field(
         description="Data sets with their hashes, when and with which `software` it was trained, and how well it fits "
@@ -140,8 +135,7 @@ class Version(BaseModel):
         None, description="How the estimator was chosen; null where it was named when the training was asked for"
     )
     robot: dict[str, Any] | None = Field(None, description="The URDF of an estimator with rigid bodies, and its prior")
-    parameters: dict[str, Any] | None = Field(
-        None,
+    parameters: dict[str, Any] = Field(
         description="`friction`; of rigid bodies also `inertia`, `rotor` and `geometry`, with standard deviations and "
         "with what torque does not tell (`undetermined`). `geometry.joints` run from base to tip, `geometry.order` "
         "names the model's joint at each place; all else is in the order of the model's joints",

@@ -139,7 +139,7 @@ class PredictResponse(BaseModel):
     guaranteed: list[float] | None = Field(
         None,
         description="Share of measurements that left-out blocks of the training guarantee for the 95 % interval, per "
-        "joint, for motion of that kind: less where there are fewer than 19; null for versions of earlier releases",
+        "joint, for motion of that kind: less where there are fewer than 19; null for the shipped model",
     )
     covariance: list[list[float]] | list[list[list[float]]] | None = Field(None, description="(N·m)², where asked for")
     components: dict[ComponentName, ComponentValues] | None = Field(

@@ -8,10 +8,6 @@ from sqlalchemy import bindparam, select
 from sqlalchemy.orm import Session
 
 from service.contract.observations import (
-    CONTACT_THRESHOLD,
-    FORGETTING_S,
-    FRICTION_WALK_S,
-    TORQUE_LIMIT,
     LearningOptions,
 )
 from service.foundation.errors import invalid_request, not_found
@@ -25,24 +21,7 @@ _SET = select(LearningRow.options, LearningRow.held).where(LearningRow.model == 
 def options(session: Session, model: str) -> LearningOptions:
     """What is set for a model, the defaults where nothing is."""
     row = fetch(session, _SET, model=model).first()
-    return LearningOptions() if row is None else LearningOptions(**within_bounds(row.options))
-
-
-def within_bounds(stored: dict[str, Any]) -> dict[str, Any]:
-    """Options of a model, those that an earlier release took beyond today's bounds at the bound that is nearest."""
-
-    def near(value: float, bounds: tuple[float, float]) -> float:
-        return min(max(value, bounds[0]), bounds[1])
-
-    kept = dict(stored)
-    if (threshold := stored.get("contact_threshold")) is not None:
-        kept["contact_threshold"] = near(threshold, CONTACT_THRESHOLD)
-    if (limits := stored.get("torque_limits")) is not None:
-        kept["torque_limits"] = [near(each, TORQUE_LIMIT) for each in limits]
-    for name, bounds in (("forgetting_s", FORGETTING_S), ("friction_walk_s", FRICTION_WALK_S)):
-        if (seconds := stored.get(name)) is not None:
-            kept[name] = near(seconds, bounds)
-    return kept
+    return LearningOptions() if row is None else LearningOptions(**row.options)
 
 
 def set_options(database: Database, model: str, chosen: LearningOptions, n_joints: int, received: float) -> None:

@@ -171,9 +171,7 @@ def write_urdf(loaded: LoadedModels, model: str, version: int | None, alias: str
     row = _find(loaded, model, version, alias)
     name, manifest = f"{row.model}-v{row.version}", row.manifest
     try:
-        text = urdf_of_parameters(
-            manifest.get("parameters", {}), manifest["joint_names"], manifest["training_range"], name
-        )
+        text = urdf_of_parameters(manifest["parameters"], manifest["joint_names"], manifest["training_range"], name)
     except ValueError as error:
         item = problem("version", row.version, "a version with rigid bodies that holds where its joints lie")
         message = f"version {row.version} of model {row.model!r} cannot be written as a URDF: {error}"

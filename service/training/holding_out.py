@@ -213,8 +213,8 @@ def _first(row: DatasetRow, asked: Holdout, entire: bool, stretches: list[list[i
     if not _is_timed(row):
         return SetSplit(row.id, asked, entire, UNTIMED_GUARD, "rows", stretches)
     guard = asked.guard_s
-    if guard is None:  # one period of the low-pass that it was prepared with, where it says so
-        cutoff = (row.report.get("recipe") or {}).get("cutoff_hz")
+    if guard is None:  # one period of the low-pass that it was prepared with, if it was
+        cutoff = row.report["recipe"]["cutoff_hz"]
         guard = GUARD_S if cutoff is None else 1.0 / float(cutoff)
     return SetSplit(row.id, asked, entire, guard, "s", stretches)
 

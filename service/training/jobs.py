@@ -371,8 +371,7 @@ def retry(queue: JobQueue, job: str, named: Identity | None = None) -> Job:
         if again is not None:
             return refresh(queue, row.model, again["trigger"], row.id, named)
         request = JobRequest.model_validate(
-            # older ones lack some; those that lack a hold-out held nothing out
-            {"holdout": None} | {name: row.request[name] for name in JobRequest.model_fields if name in row.request}
+            {name: row.request[name] for name in JobRequest.model_fields if name in row.request}
         )
         return create(queue, request, retry_of=row.id, named=named)
     except NotFoundError as error:

@@ -14,7 +14,7 @@ from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, copy_model, load, save, train
-from lipcore.data.motion import Array, Motion
+from lipcore.data.motion import Array
 from lipcore.files import persistence
 from lipcore.files.strict_json import MAX_DEPTH, StrictJsonError, quote, read
 from lipcore.robots.library import load_robot
@@ -126,13 +126,11 @@ def test_tampered_tensors_are_refused(folder: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "copy").exists()
 
 
-def test_a_misfit_of_the_last_release_knows_no_accelerations(folder: Path) -> None:
-    """It has four rows: variance grows with speed alone."""
-    rest, slow, lasting, speed = rows = np.array([[4.0, 1.0], [0.1, 0.2], [0.5, 0.0], [2.0, 3.0]])
-    edit_tensors(folder, lambda tensors: tensors.update(misfit=rows))
-    dq = 3 * speed[None]
-    found = load(folder).posterior.misfit.variance(Motion(dq, dq, 100 * dq))
-    np.testing.assert_allclose(found, rest * np.exp(-((dq / slow) ** 2)) + 8 * lasting)
+def test_a_misfit_without_accelerations_is_refused(folder: Path) -> None:
+    """As releases before 0.2.0 stored it."""
+    edit_tensors(folder, lambda tensors: tensors.update(misfit=np.ones((4, 2))))
+    with pytest.raises(ModelFormatError, match=r"tensor 'misfit' has shape \(4, 2\), expected \(5, 2\)"):
+        load(folder)
 
 
 def test_file_that_cannot_be_read_is_named(folder: Path) -> None:

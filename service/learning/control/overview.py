@@ -78,8 +78,8 @@ def page(learners: Learners, part: Page) -> OverviewPage:
 
 def sketch(manifest: dict[str, Any]) -> ArmSketch | None:
     """The learnt arm of a version, None where its estimator knows none. Centres are first moment over mass."""
-    parameters = manifest.get("parameters") or {}
-    if "geometry" not in parameters or "inertia" not in parameters:
+    parameters = manifest["parameters"]
+    if "inertia" not in parameters:
         return None
     geometry, bodies = parameters["geometry"], parameters["inertia"]["bodies"]
     joints = []

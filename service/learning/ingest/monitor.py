@@ -144,7 +144,7 @@ class Monitor:
         for event in _batches(session, model, EventRow.number > self.number):
             held = self.held
             self._remember(event, True)
-            decided |= held and not (event.report or {}).get("waited", True)
+            decided |= held and not (event.report or {})["waited"]
             self.number = event.number
             streams.add(event.stream_id or "")
         for stream_id, number, kind in others:
@@ -206,12 +206,12 @@ class Monitor:
         held = intervals.held(report)
         for window in self.windows:
             window.add(record, _counts(report), event.received, held)
-        if self.held and not report.get("waited", True):
+        if self.held and not report["waited"]:
             self.decided()
         self.held, waits = report["held"], report["held"] or report["open"]
-        departure = report.get("departure")  # not in what an earlier release has logged
+        departure = report["departure"]
         self._departure = None if departure is None else Departure.from_json(departure)
-        at = report.get("until", event.last)
+        at = report["until"]
         if at is None or not recent:
             return
         if record is not None:

@@ -80,11 +80,12 @@ def with_payload(files: Mapping[str, bytes], payload: bytes) -> Files:
 
 
 def with_tensors(files: Mapping[str, bytes], change: Callable[[dict[str, np.ndarray]], object]) -> Files:
-    """The members with other tensors; the manifest no longer tells hyperparameters."""
+    """The members with other tensors, and a manifest that tells their hyperparameters."""
     tensors = load_tensors(files[TENSORS])
     change(tensors)
+    params = {name.partition("/")[2]: value.tolist() for name, value in tensors.items() if name.startswith("params/")}
     changed = with_payload(files, save_tensors(tensors))
-    return with_json(changed, MANIFEST, lambda manifest: manifest.pop("hyperparameters", None))
+    return with_json(changed, MANIFEST, lambda manifest: manifest.update(hyperparameters=params))
 
 
 def with_header(files: Mapping[str, bytes], change: Callable[[dict[str, Any]], Any]) -> Files:

@@ -144,9 +144,15 @@ NAMES = {"joint_names": list(REVERSED), "joint_types": ["revolute"] * 7}
 
 
 def version(parameters, **given) -> Version:
-    nothing = ("training_range", "options", "fit", "calibration", "lineage")
+    nothing = ("training_range", "options", "fit", "compact", "calibration", "hyperparameters", "lineage")
     known = {"model": "m", "version": 1, "created_at": "2026-01-01T00:00:00+00:00", "job": None, "estimator": "lip"}
-    known |= {**NAMES, "torque_convention": "gravity_included", "noise_std": [0.1] * 7, "parameters": parameters}
+    known |= {
+        **NAMES,
+        "torque_convention": "gravity_included",
+        "noise_std": [0.1] * 7,
+        "parameters": parameters,
+        "warnings": [],
+    }
     return Version(**{**known, **{name: {} for name in nothing}, **given})
 
 
@@ -189,16 +195,8 @@ def test_text_and_html_show_every_joint_and_what_torque_does_not_tell(arm):
     assert arm.as_dict()["frames"]["mode"] == "learn"
 
 
-def test_versions_of_earlier_releases(robot):
-    report = parameters_of(robot)
-    del report["inertia"]["plausible_deviation"]
-    old = read_arm(version({name: report[name] for name in ("friction", "inertia")}))
-    assert old.frames is None
-    assert old.joint_names == REVERSED
-    assert "rotor" not in str(old)
-    assert "torque off N·m" not in str(old)
-    assert read_arm(version({"friction": report["friction"]})) is None
-    assert read_arm(version(None)) is None
+def test_a_version_without_rigid_bodies_has_no_arm(robot):
+    assert read_arm(version({"friction": parameters_of(robot)["friction"]})) is None
 
 
 def test_friction_of_slow_joints_is_shown_where_it_was_learnt(robot, arm):
@@ -216,4 +214,4 @@ def test_a_version_is_printed_with_its_warnings_and_its_arm(robot):
     lines = str(known).splitlines()
     assert lines[:2] == [f"m version 1: rigid-body, 7 joints: {', '.join(REVERSED)}", "careful: joint 3 hardly moved"]
     assert str(known.arm) in str(known)
-    assert str(version(None)).endswith(REVERSED[-1])
+    assert str(version({"friction": {}})).endswith(REVERSED[-1])

@@ -285,22 +285,22 @@ class DatasetReport(Record, frozen=True, kw_only=True):
     ranges: dict[str, dict[str, list[float]]]
     torque_noise_estimate: list[float]
     warnings: list[str]
-    reading: list[str] = field(default_factory=list)
+    reading: list[str]
     source: dict[str, Any] | None = None
-    recipe: dict[str, Any] | None = None
-    steps: list[dict[str, Any]] = field(default_factory=list)
+    recipe: dict[str, Any]
+    steps: list[dict[str, Any]]
     joint_types: list[Literal["revolute", "prismatic"]] | None = None
     robot: str | None = None
     upload_sha256: str | None = None
-    timing: Timing | None = None
-    saturation: list[JointSaturation] | None = None
-    limits: list[JointLimits] | None = None
-    lag: list[Lag] | None = None
-    noise: list[JointNoise] | None = None
-    excitation: Excitation | None = None
+    timing: Timing
+    saturation: list[JointSaturation]
+    limits: list[JointLimits]
+    lag: list[Lag]
+    noise: list[JointNoise]
+    excitation: Excitation
     against_robot: AgainstRobot | None = None
-    remedies: list[Remedy] = field(default_factory=list)
-    advice: list[str] = field(default_factory=list)
+    remedies: list[Remedy]
+    advice: list[str]
 
 
 class Dataset(Record, frozen=True, kw_only=True):

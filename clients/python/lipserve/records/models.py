@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from msgspec import field
-
 from lipserve.records import Record
 
 
@@ -15,15 +13,15 @@ class HeldOutQuality(Record, frozen=True, kw_only=True):
     samples: Samples that the figures are of
     nmse: Mean squared error / variance of the measured torque
     coverage: Share of measurements inside the 95 % interval
-    coverage_low: Lower end of the coverage's confidence interval; null for versions of earlier releases
+    coverage_low: Lower end of the coverage's confidence interval
     coverage_high: Its upper end
     """
 
     samples: int
     nmse: list[float | None]
     coverage: list[float | None]
-    coverage_low: list[float] | None = None
-    coverage_high: list[float] | None = None
+    coverage_low: list[float]
+    coverage_high: list[float]
 
 
 class Promotion(Record, frozen=True, kw_only=True):
@@ -132,12 +130,12 @@ class Version(Record, frozen=True, kw_only=True):
     training_range: Where the samples lie that it stands on
     fit: What the fit reported
     compact: Size of the served posterior, and how far it deviates from the exact one: `mean_rms`, `mean_max`, `std_max`
-        in standard deviations of the function, at `queries` motions; null for versions of model format 2
+        in standard deviations of the function, at `queries` motions
     calibration: `function_std_factor`: what `tau_std` was multiplied by so that intervals hold on unseen motion
     conformal: What `blocks` of the training, left out in turn, say of its intervals: `scale`, the factor on the half
-        width of each joint's, and `guaranteed`, the share of measurements that they hold then, at least; null for
-        versions of earlier releases
-    hyperparameters: Hyperparameters by name, mostly logarithms; null for versions of earlier releases
+        width of each joint's, and `guaranteed`, the share of measurements that they hold then, at least; null for the
+        shipped model
+    hyperparameters: Hyperparameters by name, mostly logarithms
     warnings: What to be careful with: what the recording leaves open of a learnt arm, and how its fit ended
     lineage: Data sets with their hashes, when and with which `software` it was trained, and how well it fits them
         (`training_metrics`); also the version of another unit that it started from (`base`), and of an imported version
@@ -162,16 +160,16 @@ class Version(Record, frozen=True, kw_only=True):
     training_range: dict[str, dict[str, list[float]]]
     options: dict[str, Any]
     fit: dict[str, Any]
-    compact: dict[str, Any] | None = None
+    compact: dict[str, Any]
     calibration: dict[str, Any]
     conformal: dict[str, Any] | None = None
-    hyperparameters: dict[str, Any] | None = None
-    warnings: list[str] = field(default_factory=list)
+    hyperparameters: dict[str, Any]
+    warnings: list[str]
     lineage: dict[str, Any]
     promotion: Promotion | None = None
     selection: Selection | None = None
     robot: dict[str, Any] | None = None
-    parameters: dict[str, Any] | None = None
+    parameters: dict[str, Any]
 
 
 class AliasMove(Record, frozen=True, kw_only=True):

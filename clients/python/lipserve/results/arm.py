@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,17 +44,16 @@ class Frames(Plain):
 class Arm(Plain):
     """What a version has learnt of an arm of n joints, base to tip; `print` shows it as tables.
 
-    frames: where the joints lie, None where a version does not say; mass, mass_std: (n) kg; centre, centre_std: (n, 3)
-    m, centres of mass in the joints' own frames, first moment over mass, their deviations to first order; rotor,
-    rotor_std: (n) kg·m² (kg), NaN where a version does not say; deviation: (n) N·m (N), root mean square by which the
-    torque of these bodies differs from what was learnt, NaN where a version does not say; friction: by `viscous`,
-    `coulomb`, `offset` and, where it was learnt, `stribeck` means and standard deviations, (n) each; undetermined: what
-    torque does not tell of each joint and its body.
+    frames: where the joints lie; mass, mass_std: (n) kg; centre, centre_std: (n, 3) m, centres of mass in the joints'
+    own frames, first moment over mass, their deviations to first order; rotor, rotor_std: (n) kg·m² (kg); deviation:
+    (n) N·m (N), root mean square by which the torque of these bodies differs from what was learnt; friction: by
+    `viscous`, `coulomb`, `offset` and, where it was learnt, `stribeck` means and standard deviations, (n) each;
+    undetermined: what torque does not tell of each joint and its body.
     """
 
     joint_names: tuple[str, ...]
     joint_types: tuple[str, ...]
-    frames: Frames | None
+    frames: Frames
     mass: Array
     mass_std: Array
     centre: Array
@@ -68,30 +67,28 @@ class Arm(Plain):
     def tables(self) -> dict[str, Columns]:
         """The tables by their titles: columns of texts, a row a joint."""
         names, undetermined = list(self.joint_names), [", ".join(each) or "-" for each in self.undetermined]
-        out: dict[str, Columns] = {}
-        if self.frames is not None:
-            out["where the joints lie, all at zero, in the base's frame"] = {
-                "joint": names,
-                "type": list(self.joint_types),
-                "axis": [_vector(each) for each in self.frames.axis],
-                "place m": [_vector(each) for each in self.frames.place],
-                "turn std °": [_list(np.degrees(each)) for each in self.frames.turn_std],
-                "shift std mm": [_list(1000 * np.array(each)) for each in self.frames.shift_std],
-            }
-        rotors = {} if np.isnan(self.rotor).all() else {"rotor kg·m²": _pairs(self.rotor, self.rotor_std)}
-        known = not np.isnan(self.deviation).all()
-        deviations = {"torque off N·m": [f"{each:.2g}" for each in self.deviation]} if known else {}
-        out["what the joints carry, in their own frames"] = {
+        frames = {
+            "joint": names,
+            "type": list(self.joint_types),
+            "axis": [_vector(each) for each in self.frames.axis],
+            "place m": [_vector(each) for each in self.frames.place],
+            "turn std °": [_list(np.degrees(each)) for each in self.frames.turn_std],
+            "shift std mm": [_list(1000 * np.array(each)) for each in self.frames.shift_std],
+        }
+        bodies = {
             "joint": names,
             "mass kg": _pairs(self.mass, self.mass_std),
             **{f"centre {axis} m": _pairs(self.centre[:, k], self.centre_std[:, k]) for k, axis in enumerate("xyz")},
-            **rotors,
-            **deviations,
+            "rotor kg·m²": _pairs(self.rotor, self.rotor_std),
+            "torque off N·m": [f"{each:.2g}" for each in self.deviation],
             "torque does not tell": undetermined,
         }
         terms = {head: _pairs(*self.friction[name]) for name, head in FRICTION.items() if name in self.friction}
-        out["friction"] = {"joint": names, **terms}
-        return out
+        return {
+            "where the joints lie, all at zero, in the base's frame": frames,
+            "what the joints carry, in their own frames": bodies,
+            "friction": {"joint": names, **terms},
+        }
 
     def __str__(self) -> str:
         return "\n\n".join([*(text_table(title, columns) for title, columns in self.tables().items()), *LIMITS])
@@ -118,28 +115,26 @@ class Version(models.Version, frozen=True, kw_only=True):
 
 def read_arm(version: models.Version) -> Arm | None:
     """The arm of a version; None where its estimator has no rigid bodies."""
-    parameters = version.parameters or {}
+    parameters = version.parameters
     if "inertia" not in parameters:
         return None
-    shape = parameters.get("geometry")
-    order = list(range(len(version.joint_names))) if shape is None else shape["order"]
+    shape, rotor = parameters["geometry"], parameters["rotor"]
+    order = shape["order"]
     bodies = [parameters["inertia"]["bodies"][joint] for joint in order]
     mass, mass_std = (array([body[kind]["mass"] for body in bodies]) for kind in ("plausible", "std"))
     moment, moment_std = (array([body[kind]["first_moment"] for body in bodies]) for kind in ("plausible", "std"))
     centre = moment / mass[:, None]
-    rotor = parameters.get("rotor", {"mean": [np.nan] * len(order), "std": [np.nan] * len(order)})
-    places: Sequence[Mapping[str, Any]] = [{}] * len(order) if shape is None else shape["joints"]
     return Arm(
         joint_names=tuple(version.joint_names[joint] for joint in order),
         joint_types=tuple(version.joint_types[joint] for joint in order),
-        frames=None if shape is None else _frames(shape),
+        frames=_frames(shape),
         mass=mass,
         mass_std=mass_std,
         centre=centre,
         centre_std=np.hypot(moment_std, centre * mass_std[:, None]) / mass[:, None],
         rotor=array(rotor["mean"])[order],
         rotor_std=array(rotor["std"])[order],
-        deviation=array(parameters["inertia"].get("plausible_deviation", [np.nan] * len(order)))[order],
+        deviation=array(parameters["inertia"]["plausible_deviation"])[order],
         friction={
             name: (
                 array(parameters["friction"][name]["mean"])[order],
@@ -149,8 +144,8 @@ def read_arm(version: models.Version) -> Arm | None:
             if name in parameters["friction"]
         },
         undetermined=tuple(
-            (*place.get("undetermined", ()), *(word.replace("_", " ") for word in body.get("undetermined", ())))
-            for place, body in zip(places, bodies, strict=True)
+            (*place["undetermined"], *(word.replace("_", " ") for word in body["undetermined"]))
+            for place, body in zip(shape["joints"], bodies, strict=True)
         ),
     )
 

@@ -36,7 +36,7 @@ function listed(datasets) {
       { label: "Findings", cell: (row) => findings(row.report) },
       { label: "Samples", numeric: true, cell: (row) => count(row.report.rows) },
       { label: "Rate, Hz", numeric: true, cell: (row) => number(row.report.rate_hz, 4) },
-      { label: "Length", numeric: true, cell: (row) => seconds(row.report.timing?.duration_s) },
+      { label: "Length", numeric: true, cell: (row) => seconds(row.report.timing.duration_s) },
       { label: "Joints", numeric: true, cell: (row) => row.joint_names.length },
       { label: "Robot", cell: (row) => row.report.robot ?? "–" },
       { label: "Uploaded", cell: (row) => h("time", { datetime: row.created_at, title: when(row.created_at) }, ago(row.created_at)) },

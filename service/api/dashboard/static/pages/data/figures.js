@@ -3,13 +3,12 @@
 import { jointVar } from "../../colours.js";
 import { h } from "../../dom.js";
 import { count, number, percent, seconds, shortNames } from "../../format.js";
-import { badge, card, empty, facts, table } from "../../ui.js";
+import { badge, card, facts, table } from "../../ui.js";
 import { prose, sentences } from "./prose.js";
 
 /** Rate, jitter and gaps, and how far the torque lags behind the motion. */
 export function timingTab({ report, joint_names: joints }) {
-  const found = [timing(report), lag(report.lag, joints)].filter(Boolean);
-  return found.length ? h("div", { class: "grid wide" }, found) : empty("The report has no figures of timing.");
+  return h("div", { class: "grid wide" }, timing(report), lag(report.lag, joints));
 }
 
 /** How far joints were moved, against what they can do. */
@@ -46,7 +45,6 @@ function bar(share, text = percent(share, 0)) {
 }
 
 function motion(found, joints) {
-  if (!found) return null;
   const whole = found.whole;
   return card(
     "How the joints were moved",
@@ -78,7 +76,6 @@ function motion(found, joints) {
 }
 
 function friction(found, joints) {
-  if (!found) return null;
   const weight = (name) => (row) => {
     const { verdict, std, value, implausible } = row[name];
     const figure = value == null ? "" : ` ${number(value, 2)}`;
@@ -119,7 +116,7 @@ function againstRobot(found, joints) {
 }
 
 function limits(rows, joints) {
-  if (!rows?.some((row) => [row.range_used, row.speed_used, row.torque_used].some((share) => share !== null))) return null;
+  if (!rows.some((row) => [row.range_used, row.speed_used, row.torque_used].some((share) => share !== null))) return null;
   const used = (share, beyond) => (row) => {
     return row[beyond] > 0 ? badge(`${percent(row[share], 0)}, beyond in ${percent(row[beyond], 2)}`, "bad") : bar(row[share]);
   };
@@ -157,7 +154,6 @@ function ranges(report, joints) {
 }
 
 function noise(report, joints) {
-  const rows = report.noise ?? joints.map((joint, index) => ({ joint, torque: report.torque_noise_estimate[index], torque_share: null, velocity: null }));
   return card(
     "Noise",
     table(
@@ -168,14 +164,13 @@ function noise(report, joints) {
         { label: "Velocity, per s", numeric: true, cell: (row) => number(row.velocity, 2) },
         { label: "of its spread", numeric: true, cell: (row) => percent(row.velocity_share) },
       ],
-      rows,
-      { caption: report.noise ? "Standard deviation of white noise, as recorded" : "Standard deviation of white noise on the torque, as prepared" },
+      report.noise,
+      { caption: "Standard deviation of white noise, as recorded" },
     ),
   );
 }
 
 function lag(rows, joints) {
-  if (!rows?.length) return null;
   const known = rows.filter((row) => row.seconds !== null);
   const why = new Map();
   for (const row of rows.filter((each) => each.seconds === null)) why.set(row.reason, [...(why.get(row.reason) ?? []), row]);
@@ -200,7 +195,6 @@ function lag(rows, joints) {
 
 function timing(report) {
   const found = report.timing;
-  if (!found) return null;
   return card(
     "Timing",
     facts([
@@ -225,7 +219,6 @@ function timing(report) {
 }
 
 function saturation(rows, joints) {
-  if (!rows?.length) return null;
   return card(
     "Signs of saturation",
     table(

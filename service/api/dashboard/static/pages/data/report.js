@@ -7,17 +7,15 @@ import { card, facts } from "../../ui.js";
 import { prose, warned } from "./prose.js";
 
 const CONVENTIONS = { gravity_included: "gravity included", gravity_compensated: "gravity compensated" };
-const PARTIAL = "This report was made by an older release of LIPServe, without advice and further figures.";
 const FIRST = 3; // pieces of advice that are seen at once
 
 /** Warnings, and what to do about the recording, the most important first. */
 export function toDo({ report, joint_names: joints }) {
   const [first, rest] = [report.advice.slice(0, FIRST), report.advice.slice(FIRST)];
   const list = (texts, start) => h("ol", { class: "advice", start: String(start) }, texts.map((text) => h("li", {}, concerned(text, joints))));
-  const good = report.excitation !== null ? "✓ Nothing: the recording is good to train on." : PARTIAL;
   const made = card(
     "What to do about it",
-    first.length ? list(first, 1) : h("p", {}, good),
+    first.length ? list(first, 1) : h("p", {}, "✓ Nothing: the recording is good to train on."),
     rest.length ? h("details", {}, h("summary", {}, `${rest.length} more, less important`), list(rest, FIRST + 1)) : null,
   );
   made.classList.add("todo");
@@ -40,7 +38,7 @@ function concerned(text, joints) {
 export function about({ report, joint_names: joints, ...dataset }) {
   const line = [
     `${counted(report.rows, "sample")} of ${counted(joints.length, "joint")}`,
-    report.timing?.duration_s == null ? null : seconds(report.timing.duration_s),
+    report.timing.duration_s === null ? null : seconds(report.timing.duration_s),
     report.rate_hz === null ? "rate not known" : `${number(report.rate_hz, 4)}\u00a0Hz`,
     report.episodes === 1 ? null : counted(report.episodes, "episode"),
     CONVENTIONS[dataset.torque_convention] ?? dataset.torque_convention,

@@ -21,7 +21,7 @@ export function moving(place, name, pose, signal) {
     left = new AbortController();
     made = null;
     const found = await shown(name, number, signal);
-    if (!found?.parameters?.geometry || !drawable()) return replace(place);
+    if (!found?.parameters.geometry || !drawable()) return replace(place);
     const figure = h("div", { style: `height: ${HEIGHT}px` });
     replace(place, card("The arm", figure, explained(`At the positions of the newest row; the joint that is shown large is thick. ${CANNOT}`)));
     watch.disconnect();

@@ -14,9 +14,8 @@ const DEGREES = 180 / Math.PI;
 /** The tab. */
 export async function arm(view, { name, version }, { signal }) {
   const { parameters } = version;
-  if (!parameters?.geometry || !parameters.inertia) {
-    const why = parameters?.inertia ? "It was trained before geometries were learnt: train it again." : "Its estimator has no rigid bodies: train one with the estimator rigid-body.";
-    replace(view, empty(`This version has no arm to draw. ${why}`));
+  if (!parameters.inertia) {
+    replace(view, empty("This version has no arm to draw. Its estimator has no rigid bodies: train one with the estimator rigid-body."));
     return;
   }
   const place = h("div", {}), start = middle(version.training_range);

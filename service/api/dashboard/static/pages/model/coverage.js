@@ -7,7 +7,7 @@ import { badge, card } from "../../ui.js";
 
 const NARROW = 0.9, DUE = 0.95, WIDE = 0.99;
 
-/** Words and sign of a badge for one joint of figures: {coverage, coverage_low, coverage_high}; older ones lack bounds. */
+/** Words and sign of a badge for one joint of figures: {coverage, coverage_low, coverage_high}; those of an import may lack bounds. */
 export function coverageVerdict(figures, joint) {
   const share = figures.coverage[joint];
   const [low, high] = [figures.coverage_low?.[joint] ?? share, figures.coverage_high?.[joint] ?? share];
@@ -21,7 +21,7 @@ export function narrowJoints(figures) {
   return figures.coverage.map((_share, joint) => joint).filter((joint) => coverageVerdict(figures, joint)[1] === "bad");
 }
 
-/** The bounds of one joint's coverage, and of how many independent errors; a dash where older figures lack them. */
+/** The bounds of one joint's coverage, and of how many independent errors; a dash where those of an import lack them. */
 export function known(figures, joint) {
   if (!figures.independent) return "–";
   const [low, high] = [figures.coverage_low[joint], figures.coverage_high[joint]].map((each) => percent(each, 0));

@@ -49,8 +49,7 @@ function part(name, index, trace, joint, x) {
 }
 
 function frictionCard({ joint_names: names, joint_types: types, parameters }) {
-  const friction = parameters?.friction;
-  if (!friction) return card("Friction parameters", h("p", { class: "muted" }, "This version has none."));
+  const { friction } = parameters;
   const value = (term) => (joint) => {
     const { mean, std } = friction[term];
     const vague = Math.abs(mean[joint]) < 2 * std[joint];
@@ -74,7 +73,7 @@ function frictionCard({ joint_names: names, joint_types: types, parameters }) {
 
 function bodiesCard({ joint_names: names, parameters }) {
   const short = shortNames(names);
-  const inertia = parameters?.inertia;
+  const { inertia } = parameters;
   if (!inertia) return null;
   const columns = [
     { label: "Joint that moves the body", cell: (body) => short[names.indexOf(body.joint)] },

@@ -39,7 +39,7 @@ export function datasetChoice(datasets, preselected, onchange) {
       { label: "Recording", value: (row) => row.name, cell: (row) => link(row.name, `#/data/${row.id}`) },
       { label: "Robot", value: (row) => row.report.robot, cell: (row) => row.report.robot ?? "–" },
       { label: "Samples", numeric: true, value: (row) => row.report.rows, first: "descending", cell: (row) => count(row.report.rows) },
-      { label: "Length", numeric: true, value: (row) => row.report.timing?.duration_s, first: "descending", cell: (row) => seconds(row.report.timing?.duration_s) },
+      { label: "Length", numeric: true, value: (row) => row.report.timing.duration_s, first: "descending", cell: (row) => seconds(row.report.timing.duration_s) },
       { label: "Episodes", numeric: true, value: (row) => row.report.episodes, cell: (row) => count(row.report.episodes) },
       { label: "Joints", numeric: true, value: (row) => row.joint_names.length, cell: (row) => row.joint_names.length },
       { label: "Uploaded", value: (row) => row.created_at, first: "descending", cell: (row) => h("time", { datetime: row.created_at, title: when(row.created_at) }, ago(row.created_at)) },
