@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import load as load_tensors
+from safetensors.numpy import save as save_tensors
 
 from lipcore import FitOptions, ModelFormatError, TorqueModel, load, save, train
 from lipcore.data.motion import Motion
@@ -288,7 +290,9 @@ def test_state_of_another_version_or_damaged_is_refused(base: TorqueModel, rows:
     other = replace(base, posterior=replace(base.posterior, weights=base.posterior.weights + 1, statistics=moved))
     with pytest.raises(ValueError, match="another version"):
         transfer.load(other, payload)
-    for broken in (b"", payload[:-10], b"x" * 100, payload[:8] + b"[" + payload[9:]):
+    tensors = load_tensors(payload)
+    old = save_tensors({**tensors, "now/numbers": tensors["now/numbers"][:2]})  # as releases before 0.2.0 wrote it
+    for broken in (b"", payload[:-10], b"x" * 100, payload[:8] + b"[" + payload[9:], old):
         with pytest.raises(ValueError, match=r"no state|expected|another"):
             transfer.load(base, broken)
 

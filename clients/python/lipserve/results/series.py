@@ -45,7 +45,7 @@ class Prediction(Plain):
     revision: online updates applied to the version; tau: mean; tau_std: standard deviation of the function, which grows
     where the model knows little; noise_std: (n) of a measurement around the function; scale: (n) factor on the half
     width of intervals that streams need at the moment, None of an earlier service; guaranteed: (n) share of
-    measurements that left-out blocks of the training guarantee for intervals of 95 %, None of an earlier release;
+    measurements that left-out blocks of the training guarantee for intervals of 95 %, None of the shipped model;
     covariance: (…, n, n) (N·m)² of the function between joints, where asked for; components: by name, where asked for;
     fallback: share of the fallback in each torque, shaped as `tau`, None if all are zero. Where it is 1, `tau` is
     gravity, offset and friction only, or the training's mean: the training does not determine the torque there.
