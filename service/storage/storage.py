@@ -80,21 +80,26 @@ class HomeInUseError(HomeError):
 
 
 def hold_home(home: Path) -> ExitStack:
-    """Hold the home for this process; the lock ends with the process, however it ends. Raise HomeError.
+    """Hold the home for this process; the locks end with the process, however it ends. Raise HomeError.
 
-    The folder itself is locked: a file in it could be deleted, and made again by a second service.
+    The folder itself is locked: a file in it could be deleted, and made again by a second service. The file is locked
+    too, because NFS and others lock no folders.
     """
     with ExitStack() as held:
         try:
             make_folder(home, 0o700)
             folder = os.open(home, os.O_RDONLY | os.O_DIRECTORY)
             held.callback(os.close, folder)
-            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            message = f"another service uses {home}: stop it, or set LIPSERVE_HOME to another folder"
-            raise HomeInUseError(message) from None
+            file = held.enter_context((home / ".lock").open("w"))
         except OSError as error:
             raise HomeError(_unusable(home, error)) from error
+        for each, needed in ((folder, False), (file, True)):
+            try:
+                fcntl.flock(each, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError as error:
+                if needed or isinstance(error, BlockingIOError):
+                    message = f"another service uses {home}: stop it, or set LIPSERVE_HOME to another folder"
+                    raise HomeInUseError(message) from None
         return held.pop_all()
 
 
@@ -143,7 +148,7 @@ def _damage(settings: Settings) -> str | None:
 
 
 def _unusable(home: Path, error: OSError) -> str:
-    return f"home is {str(home)!r}, expected a folder that the service may write to and lock: {error.strerror or error}"
+    return f"home is {str(home)!r}, expected a folder that the service may write to: {error.strerror or error}"
 
 
 def _unusable_files(settings: Settings, error: OSError) -> str:
