@@ -30,7 +30,7 @@ class Extra:
 
 
 EXTRAS = {
-    "train": Extra("train the estimators se, gip and lse, and train on a GPU", ("torch",)),
+    "train": Extra("train the estimators se, gip and lse, on a GPU if there is one", ("torch",)),
     "robots": Extra("use URDFs", ("pinocchio",)),
     "sim": Extra("simulate robots and know them by name", ("pinocchio",), ROBOTS_DATA),
     "ingest": Extra("read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra)", ("pyarrow",)),

@@ -39,7 +39,8 @@ CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", *ROBOT_ESTIMATORS)
 """What may be asked for: `auto`, and the estimators of `lipcore.estimators.catalogue`."""
 
 DIFFERENTIATED = ("se", "gip", "lse")
-"""Estimators that torch differentiates as they are trained: the extra `train`. What they answer needs none."""
+"""Estimators that torch differentiates as they are trained, on a GPU if there is one: the extra `train`. What they
+answer needs none."""
 
 GeometryMode = Literal["learn", "calibrate", "fixed"]
 GEOMETRY_MODES: tuple[GeometryMode, ...] = get_args(GeometryMode)

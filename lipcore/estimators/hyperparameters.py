@@ -99,15 +99,16 @@ def fit(
     cancelled: Cancelled | None = None,
     stretches: Samples | None = None,
     begin: Params | None = None,
+    device: Place = "cpu",
 ) -> Fit:
     """Fit hyperparameters to samples; on_progress after every iteration, `cancelled` asked at every evaluation.
 
     stretches: contiguous samples that tell the white noise, where `samples` are thinned; begin: hyperparameters that
-    are known better than the kernel's own start.
+    are known better than the kernel's own start; device: to compute on, see `FitOptions.place`.
     Raise FitCancelledError when `cancelled` answers true, NotPositiveDefiniteError where no hyperparameters give a
     covariance that can be factored.
     """
-    device, motion, tau = options.place(), samples.motion(), samples.tau
+    motion, tau = samples.motion(), samples.tau
     floor = np.log(noise.floor(samples))
     start = kernel.initial(motion, tau)
     start["noise.log_std"] = np.log(noise.start(samples, stretches))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Literal, get_args
 
-from lipcore.vocabulary import GEOMETRY_MODES, PRIORS, Place, Prior
+from lipcore.vocabulary import DIFFERENTIATED, GEOMETRY_MODES, PRIORS, Place, Prior
 
 Standing = Literal["auto", "all", "chosen"]
 GeometryOption = Literal["auto", "learn", "calibrate", "fixed"]
@@ -24,7 +24,8 @@ class FitOptions:
     hyperparameter_samples: samples that hyperparameters are fitted on; posterior_samples: samples the posterior is
     conditioned on, where there are more the most spread-out ones; starts: points that the search for hyperparameters is
     tried from, the best of which is followed; tied: links share kernel shapes (see LipKernel);
-    device: "cpu", "cuda" or "auto"; prior: of the masses of rigid bodies, those of the "urdf" or "zero";
+    device: "cpu", "cuda" (`se`, `gip` and `lse` alone), or "auto": a GPU for these, if there is one;
+    prior: of the masses of rigid bodies, those of the "urdf" or "zero";
     geometry: of rigid bodies, "learn", "calibrate" (around the URDF), "fixed" (as the URDF has it), or "auto":
     calibrated where there is a robot, else learnt; search_seconds: time limit of the search for a geometry;
     compact_tolerance: largest deviation of the compact posterior from the exact one, in standard deviations;
@@ -71,9 +72,18 @@ class FitOptions:
         if self.prior not in PRIORS:
             raise ValueError(f"prior is {self.prior!r}, expected one of {', '.join(PRIORS)}")
 
-    def place(self) -> Place:
-        """The device to fit on; raise ValueError for `cuda` where there is none, or where torch is not installed."""
-        if self.device == "cpu":
+    def check_device(self, estimator: str) -> None:
+        """Raise ValueError if `device` is "cuda" and the estimator gains nothing from a GPU."""
+        if self.device == "cuda" and estimator not in DIFFERENTIATED:
+            raise ValueError(
+                f"device is 'cuda', but the compiled code of {estimator!r} is faster on the CPU: leave `device` out. "
+                f"Only {', '.join(DIFFERENTIATED)} use a GPU."
+            )
+
+    def place(self, estimator: str) -> Place:
+        """Return the device to fit an estimator on; raise ValueError as `check_device`, or if "cuda" finds no GPU."""
+        self.check_device(estimator)
+        if self.device == "cpu" or estimator not in DIFFERENTIATED:
             return "cpu"
         if _cuda():
             return "cuda"

@@ -70,9 +70,13 @@ class Basis:
 
     def uncovered(self, query: Motion, features: Array) -> Array:
         """Variance k(x, x) − φᵀφ that the basis leaves open at N queries, (N, n). features: φ(x), (M, N n)."""
+        return self._open(self.prior(query), features)
+
+    def prior(self, query: Motion) -> Array:
+        """Prior variance of the nonlinear term's torques at N queries, (N, n), zero without one."""
         if self.term is None:
             return np.zeros_like(query.q)
-        return self._open(self.term.variance(self.params, query).diagonal(axis1=1, axis2=2), features)
+        return np.ascontiguousarray(self.term.variance(self.params, query).diagonal(axis1=1, axis2=2))
 
     def features_and_uncovered(self, query: Motion) -> tuple[Array, Array]:
         """`features` (M, N n) and `uncovered` (N, n) of N queries, for few of them at a time: compiled, on the CPU."""

@@ -7,8 +7,7 @@ torques of a chunk; the third adds to the sum by BLAS's `syrk`, which computes o
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,7 @@ import numpy as np
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array, Samples
-from lipcore.kernels.base import PairKernel, Params, TorqueKernel
+from lipcore.kernels.base import TorqueKernel
 from lipcore.kernels.fast.compile import compiled
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
@@ -54,7 +53,7 @@ class Total:
 class Summing:
     """How samples are summed up for a posterior: its kernel, basis, noise and misfit.
 
-    device: what computes all but the sum.
+    device: what computes all but the sum; a GPU for `se`, `gip` and `lse` alone.
     """
 
     kernel: TorqueKernel
@@ -62,14 +61,11 @@ class Summing:
     noise_variance: Array
     misfit: Misfit
     device: Place
-    prior: Callable[[Motion], Array] = field(repr=False)
 
     @classmethod
     def of(cls, posterior: CompactPosterior, device: Place = "cpu") -> Summing:
         """For a posterior, on a device."""
-        basis = posterior.basis
-        prior = _nothing if basis.term is None else _prior(basis.term, basis.params, basis.inducing)
-        return cls(posterior.kernel, basis, posterior.noise_variance, posterior.misfit, device, prior)
+        return cls(posterior.kernel, posterior.basis, posterior.noise_variance, posterior.misfit, device)
 
     def add(self, total: Total, samples: Samples, weights: Array | None = None) -> None:
         """Add samples to a total. weights: (N,), one for each, all equal where None."""
@@ -89,7 +85,7 @@ class Summing:
             noise = self.misfit.of_row(self.noise_variance, motion.dq)
             piece = out[start * n : (start + len(motion)) * n]
             self._features(motion, piece)
-            weigh(piece, first, self.prior(motion), noise, weights[part], residual, total.b)
+            weigh(piece, first, self.basis.prior(motion), noise, weights[part], residual, total.b)
         return out
 
     def _features(self, motion: Motion, out: Array) -> None:
@@ -117,23 +113,6 @@ class Summing:
         from lipcore.posterior.on_device import DeviceBasis  # noqa: PLC0415 - it imports torch
 
         return DeviceBasis(self.basis, self.device)
-
-
-def _prior(term: PairKernel, params: Params, inducing: Motion) -> Callable[[Motion], Array]:
-    """Prior variances of a term's torques, (N, n): compiled, as a by-product of meeting one inducing sample."""
-    cross = term.cross(params, inducing[:1])
-
-    def variances(motion: Motion) -> Array:
-        blocks = np.empty((len(motion), 2, motion.n_joints, motion.n_joints))
-        cross.fill_many(motion.arrays(), blocks)
-        return np.ascontiguousarray(blocks[:, 1].diagonal(axis1=1, axis2=2))
-
-    return variances
-
-
-def _nothing(motion: Motion) -> Array:
-    """The linear terms' own features leave nothing open."""
-    return np.zeros(motion.q.shape)
 
 
 @compiled

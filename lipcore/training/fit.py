@@ -77,7 +77,16 @@ def fit_estimator(
         params = {} if learnt is None else learnt.params
         start = {key: value for key, value in params.items() if key != "noise.log_std"}
         fewer = options if learnt is None else independent_samples(options, learnt)
-        fitted = fit(estimator.kernel, samples, fewer, task.on_progress, task.cancelled, task.stretches, start)
+        fitted = fit(
+            estimator.kernel,
+            samples,
+            fewer,
+            task.on_progress,
+            task.cancelled,
+            task.stretches,
+            start,
+            options.place(name),
+        )
         used = samples.rows(fitted.rows)
         compression, stands_on, conformal = compact(task, estimator, fitted.params, used, misfit)
         report = {**asdict(fitted.report), **stands_on}

@@ -88,4 +88,5 @@ def fit_model(task: Task, estimator: str = DEFAULT_ESTIMATOR, geometries: Sequen
     """
     if task.sibling is None:
         check_estimator(estimator, task.joint_types, task.robot, task.options)
+    task.options.check_device(estimator)
     return choose(task) if estimator == AUTO else fit_estimator(task, estimator, geometries=geometries)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.estimators.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
-from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, ROBOT_ESTIMATORS, JointType
+from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, DIFFERENTIATED, ROBOT_ESTIMATORS, JointType
 from service.contract.models import VERSION, HeldOutQuality, Holdout, ModelName
 from service.contract.states import JobState, PromotionOption
 from service.foundation.fields import LONGEST, MOST_NAMED
@@ -42,7 +42,9 @@ class Options(BaseModel):
     search_seconds: float = Field(
         _DEFAULTS.search_seconds, gt=0, le=MOST_SECONDS, description="Time limit of the search for a geometry, s"
     )
-    device: Literal["auto", "cpu", "cuda"] = "auto"
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto", description=f"Only {', '.join(DIFFERENTIATED)} use a GPU: `auto` if there is one, `cuda` always"
+    )
     compact_tolerance: float = Field(
         _DEFAULTS.compact_tolerance,
         gt=0,

@@ -16,7 +16,7 @@ from lipcore.estimators.catalogue import UnknownEstimatorError, check_estimator
 from lipcore.estimators.options import FitOptions
 from lipcore.robots.library import ROBOTS
 from lipcore.vocabulary import AUTO, CHOICES, DIFFERENTIATED, ROBOT_ESTIMATORS
-from service.contract.jobs import Job, JobDraft, JobPage, JobRequest, Options
+from service.contract.jobs import Job, JobDraft, JobPage, JobRequest
 from service.contract.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
 from service.datasets import store
 from service.foundation.errors import (
@@ -78,7 +78,7 @@ def check(queue: JobQueue, draft: JobDraft) -> None:
     if draft.datasets:
         _checked(queue, draft)
         return
-    _check_options(draft.options, queue.settings)
+    _check_options(draft, queue.settings)
     if draft.base is not None:
         registry.named(queue.database, draft.base)
     if draft.estimator not in CHOICES:
@@ -93,7 +93,7 @@ def check(queue: JobQueue, draft: JobDraft) -> None:
 
 def _checked(queue: JobQueue, request: JobRequest) -> tuple[list[DatasetRow], list[str], VersionRow | None]:
     """The data sets of a request, the types of their joints, and the version to start from."""
-    _check_options(request.options, queue.settings)
+    _check_options(request, queue.settings)
     if len(request.datasets) > queue.settings.max_job_datasets:
         raise invalid_request("datasets", len(request.datasets), f"at most {queue.settings.max_job_datasets}")
     rows = [store.find(queue.database, dataset) for dataset in request.datasets]
@@ -239,7 +239,7 @@ def _check_estimator(database: Database, request: JobRequest, joint_names: list[
 
 def _check_extra(request: JobRequest) -> None:
     """Raise MissingExtraError where the training process would."""
-    if request.estimator in DIFFERENTIATED or request.options.device == "cuda":
+    if request.estimator in DIFFERENTIATED:
         extras.check("train")
 
 
@@ -256,11 +256,16 @@ def _check_base(base: VersionRow, request: JobRequest, data: DatasetRow, joint_t
         raise invalid_request(error.field, error.value, error.expected) from None
 
 
-def _check_options(options: Options, settings: Settings) -> None:
+def _check_options(request: JobRequest, settings: Settings) -> None:
+    options = request.options
     for name in ("hyperparameter_samples", "posterior_samples", "max_inducing_outputs"):
         most = getattr(settings, name if name.startswith("max_") else f"max_{name}")
         if getattr(options, name) > most:
             raise invalid_request(f"options.{name}", getattr(options, name), f"at most {most}")
+    try:
+        FitOptions(**options.model_dump()).check_device(request.estimator)
+    except ValueError as error:
+        raise InvalidRequestError(str(error), [problem("options.device", options.device, "auto or cpu")]) from None
 
 
 def represent(row: JobRow) -> Job:
@@ -328,13 +333,16 @@ def add_refresh(
     if not kept and rows < settings.min_samples:
         raise ConflictError(_nothing(version, rows, left_out, settings.min_samples))
     made_by = None if version.job is None else session.scalar(select(JobRow).where(JobRow.id == version.job))
+    options = manifest["options"]
+    if manifest["estimator"] not in DIFFERENTIATED:  # earlier releases trained every estimator on a GPU
+        options = {**options, "device": "auto"}
     request = {
         "model": model,
         "datasets": [row.id for row in kept],
         "estimator": manifest["estimator"],
         "joint_types": manifest["joint_types"],
         "robot": made_by.request.get("robot") if made_by is not None and "robot" in manifest else None,
-        "options": manifest["options"],
+        "options": options,
         "refresh": {"version": version.version, "through": through, "trigger": trigger},
     }
     return add(session, settings, model, request, retry_of, named)

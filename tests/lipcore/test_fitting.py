@@ -1,5 +1,6 @@
 """Fitting: progress, cancellation, noise, options, devices, and the best of several starts."""
 
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -10,7 +11,7 @@ from scipy.optimize import minimize
 from lipcore.data.samples import Array, Samples
 from lipcore.estimators import hyperparameters as fitting
 from lipcore.estimators import options
-from lipcore.estimators.catalogue import make_estimator
+from lipcore.estimators.catalogue import ESTIMATORS, make_estimator
 from lipcore.estimators.hyperparameters import Fit, FitCancelledError, FitProgress, fit
 from lipcore.estimators.options import FitOptions
 from lipcore.posterior import exact as evidence
@@ -141,22 +142,29 @@ def test_bad_option_is_named(name: str, value: object) -> None:
         FitOptions(**{name: value})
 
 
-def test_cuda_where_there_is_none_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(options, "_cuda", lambda: False)
+def test_only_estimators_without_compiled_code_use_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    for gpu in (True, False):
+        monkeypatch.setattr(options, "_cuda", lambda gpu=gpu: gpu)
+        for name in ("auto", *ESTIMATORS):
+            found = FitOptions(device="auto").place(name)
+            assert found == ("cuda" if gpu and name in ("se", "gip", "lse") else "cpu"), name
+            assert FitOptions(device="cpu").place(name) == "cpu"
     with pytest.raises(ValueError, match="device is 'cuda', but torch sees no CUDA device"):
-        fit_pendulum(pendulum(), replace(SMALL, device="cuda"))
-    assert FitOptions(device="auto").place() == "cpu"
+        train(pendulum(), ("revolute",) * 2, "se", replace(SMALL, device="cuda"))
+    for name in sorted({"auto", *ESTIMATORS} - {"se", "gip", "lse"}):
+        with pytest.raises(ValueError, match=f"'{re.escape(name)}' is faster on the CPU: leave `device` out"):
+            train(pendulum(), ("revolute",) * 2, name, replace(SMALL, device="cuda"))
 
 
-@pytest.mark.skipif(FitOptions(device="auto").place() == "cpu", reason="no CUDA device on this machine")
-@pytest.mark.parametrize("robot", ["double-pendulum", "tiago"])
-def test_fit_on_cuda_agrees_with_the_processor(robot: str) -> None:
-    arm = load_robot(robot)
+@pytest.mark.skipif(FitOptions(device="auto").place("se") == "cpu", reason="no CUDA device on this machine")
+@pytest.mark.parametrize("estimator", ["se", "gip", "lse"])
+def test_fit_on_cuda_agrees_with_the_processor(estimator: str) -> None:
+    arm = load_robot("tiago")
     samples = simulate(arm, Stream(n_samples=80, speed=10, noise=0.05), seed=1)
     unseen = simulate(arm, Stream(n_samples=50, speed=10, noise=0.0), seed=101)
     # few iterations: rounding differs, and L-BFGS amplifies it with every step
     options = replace(SMALL, max_iterations=5)
-    models = {d: train(samples, arm.joint_types, "lip-chain", replace(options, device=d)) for d in ("cpu", "cuda")}
+    models = {d: train(samples, arm.joint_types, estimator, replace(options, device=d)) for d in ("cpu", "cuda")}
     assert models["cuda"].fit["device"] == "cuda"
     assert models["cuda"].fit["objective"] == pytest.approx(models["cpu"].fit["objective"], rel=1e-6)
     answers = {d: m.predict(unseen.q, unseen.dq, unseen.ddq) for d, m in models.items()}

@@ -251,10 +251,11 @@ def test_the_fast_sum_is_that_of_the_statistics(estimator, samples):
     assert np.array_equal(total.packed(), total.a[np.triu_indices(len(a))])
 
 
-def test_the_form_of_other_devices_sums_alike(few, samples):
-    """Torch's form, which is for GPUs, here on the CPU."""
-    fast, slow = Total.empty(len(few.posterior.basis)), Total.empty(len(few.posterior.basis))
-    summing = Summing.of(few.posterior)
+def test_torch_sums_as_numpy_does(samples):
+    """What a GPU computes, here on the CPU."""
+    posterior = lipcore.train(samples, TWO, "se", FitOptions(**QUICK, statistics="chosen", device="cpu")).posterior
+    fast, slow = Total.empty(len(posterior.basis)), Total.empty(len(posterior.basis))
+    summing = Summing.of(posterior)
     summing.add(fast, samples)
     found = summing._elsewhere(slow, samples, np.ones(len(samples)))
     np.testing.assert_allclose(np.triu(found.T @ found), fast.a, rtol=1e-8, atol=1e-8 * np.abs(fast.a).max())

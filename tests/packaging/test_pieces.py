@@ -122,12 +122,11 @@ def test_a_urdf_names_its_extra(server):
 
 
 @pytest.mark.skipif("torch" not in HIDDEN, reason="torch is part of the base")
-@pytest.mark.parametrize("wish", [{"estimator": "se"}, {"options": {"device": "cuda"}}])
-def test_training_that_differentiates_names_its_extra(client, wish, tmp_path):
+def test_training_that_differentiates_names_its_extra(client, tmp_path):
     np.savez(tmp_path / "two.npz", **recording())
     data = client.upload(tmp_path / "two.npz").id
     with pytest.raises(ApiError, match=r"pip install 'lipserve\[train\]'") as caught:
-        client.train("two", [data], **wish)
+        client.train("two", [data], estimator="se")
     assert (caught.value.status, caught.value.code) == (501, "not_installed")
 
 

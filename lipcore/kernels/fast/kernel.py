@@ -27,7 +27,7 @@ class Driver(NamedTuple):
 
 
 class CompiledKernel(PairKernel):
-    """A pair kernel whose Gram matrices and gradients are compiled. Of tensors, its formula makes them."""
+    """A pair kernel whose Gram matrices, gradients and covariances with a query equal its formula, compiled."""
 
     driver: ClassVar[Driver]
     joint_types: tuple[JointType, ...]
@@ -42,13 +42,18 @@ class CompiledKernel(PairKernel):
 
     def gram(self, params: Params, x: Motion, y: Motion) -> Array:
         """Covariance of all torques of x with all of y: (N n, M n)."""
-        return self._gram(params, x, y, symmetric=False) if isinstance(x.q, np.ndarray) else super().gram(params, x, y)
+        return self._gram(params, x, y, symmetric=False)
 
     def symmetric_gram(self, params: Params, x: Motion) -> Array:
         """Covariance of all torques of x with each other, (N n, N n), exactly symmetric."""
-        if not isinstance(x.q, np.ndarray):
-            return super().symmetric_gram(params, x)
         return self._gram(params, x, x, symmetric=True)
+
+    def variance(self, params: Params, x: Motion) -> Array:
+        """Prior covariance of the torques at each sample, (N, n, n): what `cross` makes of a query with itself."""
+        cross = self.cross(params, x[:1])
+        out = np.empty((len(x), cross.size + 1, self.n_joints, self.n_joints))
+        cross.fill_many(x.arrays(), out)
+        return out[:, -1]
 
     def gradient(self, params: Params, x: Motion, weight: Array) -> dict[str, Array]:
         """Derivative of Σ weight ∘ gram(x, x) by each hyperparameter: compiled by `hyper`, the rest by its adjoint."""

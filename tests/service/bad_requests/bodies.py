@@ -122,7 +122,7 @@ TRAINING = [
     *option("starts", 0, 21),
     *option("tied", "true", 1),
     *option("prior", "none"),
-    *option("device", "gpu"),
+    *option("device", "gpu", "cuda"),  # the second: `auto` tries none that gains from a GPU
     *option("compact_tolerance", "0.1", True, 0, 1.1, NAN),
     *option("max_inducing_outputs", 0, "all"),
     *option("statistics", "some", True),

@@ -4,12 +4,13 @@ import time
 from datetime import UTC, datetime
 
 import pytest
+from sqlalchemy import select
 
 from lipserve.states import CANCELLED, FAILED, RUNNING
 from service.journal import log
 from service.learning import refresh
 from service.learning.learner.publication import Published
-from service.storage.database import AlarmRow, JobRow, now
+from service.storage.database import AlarmRow, JobRow, VersionRow, now
 from service.training import planned_fit, worker
 from tests.service.data import QUICK, arrays, ended, running, stream, train, upload
 from tests.service.learning.lessons import LESSON, Pupil, answered
@@ -79,6 +80,19 @@ def test_a_second_refresh_waits_for_the_first(waiting, pupil):
     assert job["id"] in said["message"]
     cancel(pupil, job)
     cancel(pupil, answered_202(pupil))
+
+
+def test_a_refresh_leaves_out_a_gpu_that_the_estimator_no_longer_uses(waiting, pupil):
+    """Earlier releases trained every estimator with `device: "cuda"`."""
+    pupil.teach(0, 1, 2)
+    with waiting.service.database.transaction() as session:
+        version = session.scalars(select(VersionRow).where(VersionRow.model == pupil.model)).one()
+        version.manifest = {**version.manifest, "options": {**version.manifest["options"], "device": "cuda"}}
+    job = answered_202(pupil)
+    with waiting.service.database.session() as session:
+        row = session.scalars(select(JobRow).where(JobRow.id == job["id"])).one()
+        assert row.request["options"]["device"] == "auto"
+    cancel(pupil, job)
 
 
 def answered_202(pupil):
