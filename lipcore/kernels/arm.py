@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from array_api_compat import array_namespace
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
@@ -29,6 +30,8 @@ SCALES = 4
 
 class ArmKernel(LinearKernel):
     """tau = Y(θ) π + r ∘ ddq + J (δθ) + Σ c_k δ_k around an arm, J = ∂(Y π)/∂θ.
+
+    Y π is `newton_euler.rigid_body_torque`. Its features, their derivatives and energies equal the formula, compiled.
 
     Weights: π, ten parameters a body (10 n,), and rotor inertias r (n,), in the order of the data's joints; steps of
     the geometry (g,), base to tip; and those of the alternative arms δ_k (K,), see `MixtureKernel`. Standard deviations
@@ -91,8 +94,10 @@ class ArmKernel(LinearKernel):
 
     def variances(self, params: Params) -> Array:
         """Prior variances of the weights: (p,)."""
-        std = self._unit * np.exp(params["rigid_body.log_scale"][self._kinds])
-        return np.square(np.concatenate([std, self._rest]))
+        scale = params["rigid_body.log_scale"]
+        xp = array_namespace(scale)
+        std = xp.asarray(self._unit) * xp.exp(scale[self._kinds])
+        return xp.square(xp.concat([std, xp.asarray(self._rest)]))
 
     def variances_adjoint(self, params: Params, slopes: Array) -> dict[str, Array]:
         """Derivatives by the scales, given those by the variances, (p,)."""
@@ -117,7 +122,7 @@ class ArmKernel(LinearKernel):
 
 
 class ArmRegressor(Regressor):
-    """Features of `ArmKernel`, compiled."""
+    """Features of `ArmKernel`, one query at a time."""
 
     def __init__(self, kernel: ArmKernel) -> None:
         arm = kernel.arm

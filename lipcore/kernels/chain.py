@@ -14,13 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from array_api_compat import array_namespace, device
+from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion, check_joint_types
-from lipcore.kernels.base import Params, State, on_last_diagonal
+from lipcore.kernels.base import Params, State, on_diagonal
 from lipcore.kernels.energy import PRIOR_STD as WEIGHTS_PRIOR_STD
 from lipcore.kernels.energy import (
     initial_weights,
@@ -32,7 +33,7 @@ from lipcore.kernels.energy import (
 from lipcore.kernels.fast.chain import chain_cross, chain_gradient, chain_gram, chain_size
 from lipcore.kernels.fast.kernel import CompiledKernel, Driver
 from lipcore.kernels.fast.pairs import Hyper
-from lipcore.kernels.polynomial import BaseKernels, Derivatives, base_kernels, chain_sum
+from lipcore.kernels.polynomial import Product, base_kernels
 from lipcore.vocabulary import JointType
 
 SHARE = 2 / 3
@@ -58,9 +59,11 @@ class ChainKernel(CompiledKernel):
 
     def blocks(self, params: Params, x: State, y: State) -> Array:
         """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
-        chain = _Chain.build(self._base(params["chain.logits"], x, y), self.weights(params), x, y)
-        kinetic = array_namespace(x.q).moveaxis(chain.blocks(), (-2, -1), (0, 1))
-        return potential_blocks(self.potential(params, x, y)) + kinetic
+        links = self._links(params, x, y)
+        total = array_namespace(x.q).zeros_like(links[-1][0].mixed)
+        for link, (potential, kinetic) in enumerate(links, 1):
+            total[:link, :link] += potential_blocks(potential) + kinetic.blocks()
+        return total
 
     def hyper(self, params: Params) -> Hyper:
         """Shares (1, n, 3) of the base kernels, scales of the potentials (n,) and velocity weights (n, n)."""
@@ -77,23 +80,21 @@ class ChainKernel(CompiledKernel):
             **velocity_adjoint(hyper.weights, slopes.weights),
         }
 
-    def potential(self, params: Params, x: State, y: State) -> Derivatives:
-        """Kernel of the potential energy V and its derivatives."""
-        scales = params["potential.log_scales"]
-        return chain_sum(self._base(params["chain.logits"], x, y), array_namespace(scales).exp(scales))
-
     def energies(self, params: Params, x: State, y: State) -> Array:
         """Covariance of the kinetic and the potential energy at x with torque j at y: (2, n, *batch), J·N·m."""
-        potential = potential_energy_torque(self.potential(params, x, y))
-        chain = _Chain.build(self._base(params["chain.logits"], x, y), self.weights(params), x, y)
-        xp = array_namespace(potential)
-        return xp.stack([xp.moveaxis(chain.energy_torque(), -1, 0), potential])
+        links = self._links(params, x, y)
+        xp = array_namespace(x.q)
+        total = xp.stack([xp.zeros_like(links[-1][0].right)] * 2)
+        for link, (potential, kinetic) in enumerate(links, 1):
+            total[0, :link] += kinetic.energy_torque()
+            total[1, :link] += potential_energy_torque(potential)
+        return total
 
     def energy_covariance(self, params: Params, x: State, y: State) -> Array:
         """Covariance of the kinetic energies at x and y, Σ_l h_l², and of the potential ones: (2, *batch), J²."""
-        chain = _Chain.build(self._base(params["chain.logits"], x, y), self.weights(params), x, y)
-        h = (chain.weights * chain.r * (chain.v * chain.v2)[..., None, :]).sum(-1)
-        return array_namespace(h).stack([(h * h).sum(-1), self.potential(params, x, y).value])
+        links = self._links(params, x, y)
+        kinetic = sum(form.value * form.value for _, form in links)
+        return array_namespace(x.q).stack([kinetic, sum(potential.value for potential, _ in links)])
 
     def weights(self, params: Params) -> Array:
         """Velocity weights w_{l,a} as a lower triangular matrix (n, n)."""
@@ -114,13 +115,23 @@ class ChainKernel(CompiledKernel):
         """How far the weights may stray from their pattern, and the pattern from its start."""
         return dict(PRIOR_STD)
 
-    def _base(self, logits: Array, x: State, y: State) -> BaseKernels:
-        return base_kernels(self._shares(logits), self.joint_types, x.q, y.q)
+    def _links(self, params: Params, x: State, y: State) -> list[tuple[Product, LinkForm]]:
+        """Kernel s_l Π_{b≤l} p_b of each link's potential, and the form h_l of its kinetic energy, base to tip."""
+        xp, weights = array_namespace(x.q), self.weights(params)
+        base = base_kernels(self._shares(params["chain.logits"]), self.joint_types, x.q, y.q)
+        scales = xp.exp(params["potential.log_scales"])
+        links = []
+        for link in range(self.n_joints):
+            m = link + 1
+            potential = Product(base, range(m), scales[link], m)
+            columns = [Product(base, range(a + 1, m), weights[link, a], m) for a in range(m)]
+            links.append((potential, LinkForm(columns, x.first(m), y.first(m))))
+        return links
 
     def _shares(self, logits: Array) -> Array:
         xp = array_namespace(logits)
         alpha = 1 / (1 + xp.exp(-logits))
-        revolute = xp.asarray(self._revolute(), device=device(logits))
+        revolute = xp.asarray(self._revolute())
         return xp.stack([1 - alpha, alpha, xp.where(revolute, alpha, xp.zeros_like(alpha))], axis=1)
 
     def _revolute(self) -> NDArray[np.bool_]:
@@ -128,109 +139,60 @@ class ChainKernel(CompiledKernel):
 
 
 @dataclass(frozen=True)
-class _Chain:
-    """h_l and what Lagrange's equations need of it. Vectors over joints: (*batch, n); matrices: (*batch, n, n).
+class LinkForm:
+    """h = Σ_a c_a(q, q') v_a v'_a of a link with m joints, whose square is the kernel of its kinetic energy.
 
-    weights: w (l, a). r, r1, r2, r12: R_{l,a}, its time derivative along the first argument, along the second, and
-    along both. m, m1, m2: the products between two joints, M_{i,a} = Π_{a<b<i} p_b, likewise.
+    columns: c_a = w_a R_a of its m columns; x, y: the two arguments, m joints.
     """
 
-    v: Array
-    a: Array
-    v2: Array
-    a2: Array
-    left: Array
-    right: Array
-    mixed: Array
-    weights: Array
-    r: Array
-    r1: Array
-    r2: Array
-    r12: Array
-    m: Array
-    m1: Array
-    m2: Array
+    columns: Sequence[Product]
+    x: State
+    y: State
 
-    @classmethod
-    def build(cls, base: BaseKernels, weights: Array, x: State, y: State) -> _Chain:
-        """Products of the base kernels along the chain, link by link."""
-        xp = array_namespace(base.value)
-        p, left, right, mixed = base.value, base.left, base.right, base.mixed
-        v, a, v2, a2 = (xp.broadcast_to(part, p.shape) for part in (x.v, x.a, y.v, y.a))
-        p1, p2, p12 = left * v, right * v2, mixed * v * v2
-        n, one, zero = p.shape[0], xp.ones_like(p[:1]), xp.zeros_like(p)
-        row = [one, zero[:1], zero[:1], zero[:1]]
-        rows = [[xp.concat([part, zero[1:]]) for part in row]]
-        for b in range(1, n):
-            r, r1, r2, r12 = row
-            grown = [
-                r * p[b],
-                r1 * p[b] + r * p1[b],
-                r2 * p[b] + r * p2[b],
-                r12 * p[b] + r1 * p2[b] + r2 * p1[b] + r * p12[b],
-            ]
-            row = [xp.concat([part, new]) for part, new in zip(grown, (one, *[zero[:1]] * 3), strict=True)]
-            rows.append([xp.concat([part, zero[b + 1 :]]) for part in row])
-        full = [xp.moveaxis(xp.stack([link[k] for link in rows]), (0, 1), (-2, -1)) for k in range(4)]
-        between = [xp.concat([xp.zeros_like(part[..., :1, :]), part[..., :-1, :]], axis=-2) for part in full[:3]]
-        v, a, v2, a2, left, right, mixed = (xp.moveaxis(part, 0, -1) for part in (v, a, v2, a2, left, right, mixed))
-        return cls(v, a, v2, a2, left, right, mixed, weights, *full, *between)
+    @cached_property
+    def c(self) -> Array:
+        """c_a, (m, *batch)."""
+        return array_namespace(self.x.q).stack([each.value for each in self.columns])
 
-    def blocks(self) -> Array:
-        """T'_j T_i Σ_l h_l², with T_i = d/dt ∂/∂v_i − ∂/∂q_i: (*batch, n, n).
+    @cached_property
+    def right(self) -> Array:
+        """∂c_a/∂q'_j, (j, a, *batch)."""
+        return array_namespace(self.x.q).stack([each.right for each in self.columns], axis=1)
 
-        For one link, with e_i = T_i h, f_j = T'_j h, u_i = ∂h/∂v_i and dots and primes for time derivatives along the
-        first and second argument:
-
-            2 [e fᵀ + e' (∂'_v h)ᵀ + u ḟᵀ + u' (∂'_v ḣ)ᵀ + h T'e + h' ∂'_v e + ḣ T'u + ḣ' ∂'_v u]
-        """
-        xp, w, r, r1, r2 = array_namespace(self.r), self.weights, self.r, self.r1, self.r2
-        v, a, v2, a2 = (part[..., None, :] for part in (self.v, self.a, self.v2, self.a2))
-        g, g1, g2, g12 = w * r, w * r1, w * r2, w * self.r12
-        gv, gv2 = g * v, g * v2
-        ga_v, ga_v2 = g * a + g1 * v, g * a2 + g2 * v2  # time derivatives of gv and gv2
-        h, dh = (gv * v2).sum(-1), (ga_v * v2).sum(-1)
-        dh2 = (ga_v2 * v).sum(-1)
-        ddh = (ga_v * a2 + (g2 * a + g12 * v) * v2).sum(-1)
-        before, before1, before2 = self._before()
-
-        left, right, mixed = (part[..., None, :] for part in (self.left, self.right, self.mixed))
-        e = g1 * v2 - left * r * before
-        f = g2 * v - right * r * before
-        e2 = g1 * a2 + g12 * v2 - (mixed * v2 * r + left * r2) * before - left * r * before2
-        f1 = g2 * a + g12 * v - (mixed * v * r + right * r1) * before - right * r * before1
-        rank_one = xp.concat([e, e2, gv2, ga_v2], axis=-2).mT @ xp.concat([f, gv, f1, ga_v], axis=-2)
-
-        # sums over links of the parts of T'e, ∂'_v e and T'u off the diagonal: joint i of R, joint j of w
-        hr, hw = h[..., None] * r, xp.broadcast_to(w, r.shape)
-        rw, cross = hr.mT @ hw, hr.mT @ before
-        lower = (h[..., None] * r2 + dh2[..., None] * r).mT @ hw
-        upper = (h[..., None] * r1 + dh[..., None] * r).mT @ hw
-        left_i, right_i, mixed_i = (part[..., :, None] for part in (self.left, self.right, self.mixed))
-        v_i, v2_i = self.v[..., :, None], self.v2[..., :, None]
-        below = left_i * right * self.m * cross - v * (
-            (mixed_i * v2_i * rw + left_i * lower) * self.m + left_i * rw * self.m2
-        )
-        above = right_i * left * self.m * cross - v2 * (
-            (mixed_i * v_i * rw + right_i * upper) * self.m + right_i * rw * self.m1
-        )
-        diagonal = (h[..., None] * g12 + dh2[..., None] * g1 + dh[..., None] * g2 + ddh[..., None] * g).sum(
-            -2
-        ) + self.mixed * xp.linalg.diagonal(cross)
-        return 2 * (rank_one + below + above.mT + on_last_diagonal(diagonal))
+    @property
+    def value(self) -> Array:
+        """h, (*batch)."""
+        return (self.c * self.x.v * self.y.v).sum(0)
 
     def energy_torque(self) -> Array:
-        """T'_j Σ_l h_l²: covariance of the kinetic energy at x with torque j at y, (*batch, n)."""
-        v, v2, a2 = (part[..., None, :] for part in (self.v, self.v2, self.a2))
-        g, g2 = self.weights * self.r, self.weights * self.r2
-        f = g2 * v - self.right[..., None, :] * self.r * self._before()[0]
-        h, dh2 = (g * v * v2).sum(-1), ((g * a2 + g2 * v2) * v).sum(-1)
-        return 2 * (dh2[..., None] * g * v + h[..., None] * f).sum(-2)
+        """ℒ'_j h² = 2 (h f_j + h' ∂h/∂v'_j): covariance of the energy at x with torque j at y, (m, *batch)."""
+        c, right, v, v2, a2 = self.c, self.right, self.x.v, self.y.v, self.y.a
+        c2 = (right * v2[:, None]).sum(0)
+        f = c2 * v - (right * v * v2).sum(1)
+        h2 = ((c2 * v2 + c * a2) * v).sum(0)
+        return 2 * (self.value * f + h2 * c * v)
 
-    def _before(self) -> tuple[Array, Array, Array]:
-        """∂h_l/∂p_i over R_{l,i}: Σ_{a<i} w_{l,a} v_a v'_a M_{i,a}, (*batch, l, i), and its time derivatives."""
-        w = self.weights
-        vv, av, va = ((s * t)[..., None, :] for s, t in ((self.v, self.v2), (self.a, self.v2), (self.v, self.a2)))
-        both = w * vv
-        before = both @ self.m.mT
-        return before, (w * av) @ self.m.mT + both @ self.m1.mT, (w * va) @ self.m.mT + both @ self.m2.mT
+    def blocks(self) -> Array:
+        """ℒ_i ℒ'_j h², (m, m, *batch): eq. 11 of docs/method.md, line by line."""
+        xp, c, right = array_namespace(self.x.q), self.c, self.right
+        left = xp.stack([each.left for each in self.columns], axis=1)
+        mixed = xp.stack([each.mixed for each in self.columns], axis=2)
+        v, a, v2, a2 = self.x.v, self.x.a, self.y.v, self.y.a
+        # derivatives in time along the first argument (1), the second (2) and both (12)
+        c1, c2 = (left * v[:, None]).sum(0), (right * v2[:, None]).sum(0)
+        left2, right1 = (mixed * v2[:, None]).sum(1), (mixed * v[:, None, None]).sum(0)
+        c12 = (left2 * v[:, None]).sum(0)
+        h, h1 = self.value, ((c1 * v + c * a) * v2).sum(0)
+        h2, h12 = ((c2 * v2 + c * a2) * v).sum(0), ((c12 * v + c2 * a) * v2 + (c1 * v + c * a) * a2).sum(0)
+
+        u, u2 = c * v2, c2 * v2 + c * a2
+        w, w1 = c * v, c1 * v + c * a
+        e, f = c1 * v2 - (left * v * v2).sum(1), c2 * v - (right * v * v2).sum(1)
+        e2 = c12 * v2 + c1 * a2 - (left2 * v * v2 + left * v * a2).sum(1)
+        f1 = c12 * v + c2 * a - (right1 * v * v2 + right * a * v2).sum(1)
+
+        turned, turned1 = (xp.moveaxis(each, 1, 0) for each in (right, right1))
+        x = on_diagonal(c12) - left2 * v - turned1 * v2[:, None] + (mixed * v * v2).sum(2)
+        y, z = on_diagonal(c1) - left * v, on_diagonal(c2) - turned * v2[:, None]
+        rank_one = e[:, None] * f + e2[:, None] * w + u[:, None] * f1 + u2[:, None] * w1
+        return 2 * (rank_one + h * x + h2 * y + h1 * z + h12 * on_diagonal(c))

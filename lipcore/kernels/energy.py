@@ -8,20 +8,20 @@ energies, pooled so that little data cannot overfit them.
 from __future__ import annotations
 
 import numpy as np
-from array_api_compat import array_namespace, device
+from array_api_compat import array_namespace
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Array
 from lipcore.kernels.base import Params, State, on_diagonal
-from lipcore.kernels.polynomial import Derivatives
+from lipcore.kernels.polynomial import Product
 
 
-def potential_blocks(position: Derivatives) -> Array:
+def potential_blocks(position: Product) -> Array:
     """Torque covariance of V with kernel K(q, q'): ∂²K/∂q_i∂q'_j, (n, n, *batch)."""
     return position.mixed
 
 
-def kinetic_blocks(position: Derivatives, weights: Array, x: State, y: State) -> Array:
+def kinetic_blocks(position: Product, weights: Array, x: State, y: State) -> Array:
     """Torque covariance of T with kernel K(q, q') h², h = Σ_a w_a v_a v'_a: (n, n, *batch).
 
     Primes mark the second argument. With A = Σ ∂_iK v_i, B = Σ ∂'_jK v'_j, C = vᵀHv' (each carries the factor K),
@@ -51,12 +51,12 @@ def kinetic_blocks(position: Derivatives, weights: Array, x: State, y: State) ->
     return block + on_diagonal(diagonal)
 
 
-def potential_energy_torque(position: Derivatives) -> Array:
+def potential_energy_torque(position: Product) -> Array:
     """Covariance of V at x with its torque j at y: ∂K/∂q'_j, (n, *batch)."""
     return position.right
 
 
-def kinetic_energy_torque(position: Derivatives, weights: Array, x: State, y: State) -> Array:
+def kinetic_energy_torque(position: Product, weights: Array, x: State, y: State) -> Array:
     """Covariance of T at x with its torque j at y: 2 (B h + K h') w v − h² ∂'K, (n, *batch)."""
     w = weights.reshape((weights.shape[0],) + (1,) * (x.q.ndim - 1))
     wv = w * x.v
@@ -87,8 +87,8 @@ def velocity_weights(params: Params, n: int) -> Array:
     model too sure of itself.
     """
     scale, gap, deviation = (params[f"kinetic.log_{name}"] for name in ("scale", "gap", "deviation"))
-    xp, place = array_namespace(scale), device(scale)
-    lower, between, number = (xp.asarray(each, device=place) for each in _triangle(n))
+    xp = array_namespace(scale)
+    lower, between, number = (xp.asarray(each) for each in _triangle(n))
     pattern = params["kinetic.log_link"][:, None] + params["kinetic.log_joint"] + scale
     log_weights = pattern + (xp.take(gap, between) + xp.take(deviation, number)).reshape((n, n))
     return xp.where(lower, xp.exp(log_weights), xp.zeros_like(log_weights))

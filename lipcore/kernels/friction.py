@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from array_api_compat import array_namespace
 
 from lipcore.data.motion import Array, Motion
 from lipcore.kernels.base import LinearKernel, Params, Regressor
-from lipcore.kernels.fast.compile import brief, compiled
+from lipcore.kernels.fast.friction import friction_queries, friction_query
 
 SIGN_WIDTH = 0.02
 """Velocity over which the Coulomb sign turns over, rad/s (m/s): tanh(dq / width) avoids a jump at standstill."""
@@ -54,7 +55,8 @@ class FrictionKernel(LinearKernel):
 
     def variances(self, params: Params) -> Array:
         """Prior variances of the weights: (f n,)."""
-        return np.exp(2 * params["friction.log_std"]).reshape(-1)
+        log_std = params["friction.log_std"]
+        return array_namespace(log_std).exp(2 * log_std).reshape(-1)
 
     def variances_adjoint(self, params: Params, slopes: Array) -> dict[str, Array]:
         """Derivatives by the standard deviations' logarithms, given those by the variances, (f n,)."""
@@ -69,37 +71,15 @@ class FrictionKernel(LinearKernel):
 
 
 class FrictionRegressor(Regressor):
-    """Features of `FrictionKernel`, compiled."""
+    """Features of `FrictionKernel` of a query: equal to the formula, compiled."""
 
     def __init__(self, n_joints: int, terms: int) -> None:
         self.n_joints, self.size = n_joints, terms * n_joints
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (f n, n)."""
-        _friction_rows(motion, SIGN_WIDTH, STRIBECK_SPEED, out)
+        friction_query(motion, SIGN_WIDTH, STRIBECK_SPEED, out)
 
     def fill_many(self, motions: Array, out: Array, first: int) -> None:
         """Write Φᵀ of N queries; see `Regressor.fill_many`."""
-        _friction_queries(motions, SIGN_WIDTH, STRIBECK_SPEED, out, first, first + self.size)
-
-
-@brief
-def _friction_rows(motion: Array, width: float, speed: float, out: Array) -> None:
-    """Rows f j to f j + f − 1 of `out`, (f n, n), f = 3 or 4: joint j's dq, s = tanh(dq / width), 1 and, where f = 4,
-    s exp(−(dq / speed)²) in column j, else zero."""
-    out[:] = 0.0
-    terms = out.shape[0] // motion.shape[1]
-    for joint in range(motion.shape[1]):
-        velocity, first = motion[1, joint], terms * joint
-        sign = np.tanh(velocity / width)
-        out[first, joint] = velocity
-        out[first + 1, joint] = sign
-        out[first + 2, joint] = 1.0
-        if terms == 4:
-            out[first + 3, joint] = sign * np.exp(-((velocity / speed) ** 2))
-
-
-@compiled
-def _friction_queries(motions: Array, width: float, speed: float, out: Array, first: int, last: int) -> None:
-    for k in range(motions.shape[0]):
-        _friction_rows(motions[k], width, speed, out[k, first:last])
+        friction_queries(motions, SIGN_WIDTH, STRIBECK_SPEED, out, first, first + self.size)

@@ -101,7 +101,7 @@ class Geometry:
 
     @cached_property
     def constants(self) -> Array:
-        """The geometry as `kernels.compiled.arm_recursion` reads it: (n, CONSTANTS)."""
+        """The geometry as `kernels.fast.arm_recursion` reads it: (n, CONSTANTS)."""
         return self._constants(self.rotation, self.translation)
 
     def moved_constants(self, step: Array) -> Array:
@@ -116,7 +116,7 @@ class Geometry:
     def _constants(self, rotation: Array, translation: Array) -> Array:
         n = self.n_joints
         out = np.zeros((n, CONSTANTS))
-        out[:, TURN:PLACE] = (rotation[:, None] @ self._parts).reshape(n, -1)
+        out[:, TURN:PLACE] = (rotation[:, None] @ self.turn_parts).reshape(n, -1)
         out[:, PLACE:AXIS] = translation
         out[:, AXIS:ACROSS] = (rotation @ self.axis[..., None])[..., 0]
         out[:, ACROSS:KIND] = (self.across @ rotation.mT).reshape(n, -1)
@@ -125,7 +125,7 @@ class Geometry:
         return out
 
     @cached_property
-    def _parts(self) -> Array:
+    def turn_parts(self) -> Array:
         """What times 1, sin q and cos q add up to exp(q axis×), to the identity of a prismatic joint: (n, 3, 3, 3)."""
         along, one = self.axis[:, :, None] * self.axis[:, None], np.eye(3)
         parts = np.stack([along, skew(self.axis), one - along], axis=1)

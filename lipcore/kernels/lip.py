@@ -22,7 +22,7 @@ from lipcore.kernels.energy import (
 from lipcore.kernels.fast.kernel import CompiledKernel, Driver
 from lipcore.kernels.fast.lip import lip_cross, lip_gradient, lip_gram, lip_size
 from lipcore.kernels.fast.pairs import Hyper
-from lipcore.kernels.polynomial import Derivatives, base_kernels, product
+from lipcore.kernels.polynomial import Product, base_kernels
 from lipcore.vocabulary import JointType
 
 
@@ -79,17 +79,17 @@ class LipKernel(CompiledKernel):
             **velocity_adjoint(hyper.weights, slopes.weights),
         }
 
-    def potential(self, params: Params, x: State, y: State) -> Derivatives:
+    def potential(self, params: Params, x: State, y: State) -> Product:
         """Kernel of the potential energy V and its derivatives."""
         base = base_kernels(shares(params["potential.logits"]), self.joint_types, x.q, y.q)
         scale = params["potential.log_scale"]
-        return product(base, array_namespace(scale).exp(scale))
+        return Product(base, range(self.n_joints), array_namespace(scale).exp(scale), self.n_joints)
 
-    def kinetic(self, params: Params, link: int, x: State, y: State) -> Derivatives:
+    def kinetic(self, params: Params, link: int, x: State, y: State) -> Product:
         """Position factor of the kinetic energy kernel of `link` (1-based) and its derivatives."""
         logits = params["kinetic.logits"][:link] if self.tied else params[f"kinetic.{link}.logits"]
         base = base_kernels(shares(logits), self.joint_types[:link], x.q[:link], y.q[:link])
-        return product(base.squared(), array_namespace(logits).ones_like(logits[0, 0]))
+        return Product(base.squared(), range(link), array_namespace(logits).ones_like(logits[0, 0]), link)
 
     def energies(self, params: Params, x: State, y: State) -> Array:
         """Covariance of the kinetic and the potential energy at x with torque j at y: (2, n, *batch), J·N·m."""

@@ -12,13 +12,14 @@ from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.base import LinearKernel, Params, Regressor
 from lipcore.kernels.fast.arm import arm_differences
-from lipcore.kernels.fast.compile import compiled
+from lipcore.kernels.fast.friction import linear_features
 from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED
 
 
 class MixtureKernel(LinearKernel):
     """tau = Σ c_k δ_k, where δ_k = τ_k − τ_0 is the torque of arm k less that of the first.
 
+    τ_k = Y(θ_k) π_k + r_k ∘ ddq + P f_k, with `newton_euler.rigid_body_torque` and `friction_features`; compiled.
     With c one of the K others or none, by their probabilities p, c has mean p and covariance C = diag p − p pᵀ = L Lᵀ,
     so that the sum has the mean and the variance of the mixture of arms. The features are Lᵀ δ, whose weights L⁻¹ c,
     (K,), are independent with variance one, or a larger one where a few arms stand for many.
@@ -45,7 +46,7 @@ class MixtureKernel(LinearKernel):
         """Φᵀ of N motions (N, 3, n): (N, K, n)."""
         out = np.empty((len(motions), self.size, self.n_joints))
         linear = np.empty((len(motions), *self._arms[-1].shape[1:]))
-        _linear_features(motions, SIGN_WIDTH, STRIBECK_SPEED, linear)
+        linear_features(motions, SIGN_WIDTH, STRIBECK_SPEED, linear)
         arm_differences(*self._arms, self._order, motions, linear, out)
         return out
 
@@ -83,15 +84,3 @@ class MixtureRegressor(Regressor):
     def fill_many(self, motions: Array, out: Array, first: int) -> None:
         """Write Φᵀ of N queries; see `Regressor.fill_many`."""
         out[:, first : first + self.size] = self._kernel.rows(motions)
-
-
-@compiled
-def _linear_features(motions: Array, width: float, speed: float, out: Array) -> None:
-    """ddq and friction's features, see `FrictionKernel`, of each joint, (N, n, 4 or 5), for motions (N, 3, n)."""
-    for k in range(motions.shape[0]):
-        for j in range(motions.shape[2]):
-            velocity = motions[k, 1, j]
-            sign = np.tanh(velocity / width)
-            out[k, j, 0], out[k, j, 1], out[k, j, 2], out[k, j, 3] = motions[k, 2, j], velocity, sign, 1.0
-            if out.shape[2] > 4:
-                out[k, j, 4] = sign * np.exp(-((velocity / speed) ** 2))

@@ -17,6 +17,8 @@ from lipcore.kernels.fast.views import Memory
 class PayloadKernel(LinearKernel):
     """tau = b(θ) π, b = ∂(Y π)/∂π of an arm's last link.
 
+    Y π is `newton_euler.rigid_body_torque`; b equals its derivative, compiled.
+
     Where the geometry θ is learnt, what a step of it makes of the payload's torque belongs to the arm's own weights,
     which are linearised with the payload in their parameters (`ArmKernel`).
 
@@ -61,7 +63,7 @@ class PayloadKernel(LinearKernel):
 
 
 class PayloadRegressor(Regressor):
-    """Features of `PayloadKernel`, compiled."""
+    """Features of `PayloadKernel`, one query at a time."""
 
     def __init__(self, kernel: PayloadKernel) -> None:
         self.n_joints, self.size = kernel.n_joints, PARAMETERS

@@ -9,25 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-from array_api_compat import array_namespace, device
+from array_api_compat import array_namespace
 
 from lipcore.data.motion import Array
 from lipcore.vocabulary import JointType
-
-
-@dataclass(frozen=True)
-class Derivatives:
-    """A kernel K(q, q') over n joints with the derivatives that Lagrange's equations need.
-
-    value: (*batch); left: ∂K/∂q_i, right: ∂K/∂q'_j, both (n, *batch); mixed: ∂²K/∂q_i∂q'_j, (n, n, *batch).
-    """
-
-    value: Array
-    left: Array
-    right: Array
-    mixed: Array
 
 
 @dataclass(frozen=True)
@@ -45,6 +33,54 @@ class BaseKernels:
         return BaseKernels(p * p, 2 * p * self.left, 2 * p * self.right, 2 * (p * self.mixed + self.left * self.right))
 
 
+@dataclass(frozen=True)
+class Product:
+    """K(q, q') = s Π_b p_b of some joints b, with the derivatives that Lagrange's equations need.
+
+    base: base kernels of at least m joints; joints: those of the product; scale: s, (); size: m, the joints derived by.
+    """
+
+    base: BaseKernels
+    joints: range
+    scale: Array
+    size: int
+
+    @cached_property
+    def value(self) -> Array:
+        """K, (*batch)."""
+        return self._derivative()
+
+    @cached_property
+    def left(self) -> Array:
+        """∂K/∂q_i, (m, *batch)."""
+        return self._stack([self._derivative(left=i) for i in range(self.size)])
+
+    @cached_property
+    def right(self) -> Array:
+        """∂K/∂q'_j, (m, *batch)."""
+        return self._stack([self._derivative(right=j) for j in range(self.size)])
+
+    @cached_property
+    def mixed(self) -> Array:
+        """∂²K/∂q_i∂q'_j, (m, m, *batch)."""
+        joints = range(self.size)
+        return self._stack([self._stack([self._derivative(i, j) for j in joints]) for i in joints])
+
+    def _derivative(self, left: int | None = None, right: int | None = None) -> Array:
+        """K, derived by q of joint `left` and by q' of joint `right`: s times a product of p_b or its derivatives."""
+        nothing = array_namespace(self.base.value).zeros_like(self.base.value[0])
+        if not all(joint in self.joints for joint in (left, right) if joint is not None):
+            return nothing
+        total = self.scale + nothing
+        for b in self.joints:
+            part = self.base.mixed if left == right == b else self.base.left if left == b else self.base.value
+            total = total * (self.base.right if right == b != left else part)[b]
+        return total
+
+    def _stack(self, parts: list[Array]) -> Array:
+        return array_namespace(self.scale).stack(parts)
+
+
 def base_kernels(shares: Array, joint_types: Sequence[JointType], q: Array, q2: Array) -> BaseKernels:
     """Base kernels of all joints of the paper, TR2023-063.
 
@@ -57,7 +93,7 @@ def base_kernels(shares: Array, joint_types: Sequence[JointType], q: Array, q2: 
         return _revolute(sigma, alpha, beta, q, q2)
     # computed for every joint, then chosen: robots that mix the two types are small
     kinds = np.array([kind == "prismatic" for kind in joint_types]).reshape(dims)
-    prismatic = xp.asarray(kinds, device=device(q))
+    prismatic = xp.asarray(kinds)
     straight, round_ = _prismatic(sigma + beta, alpha, q, q2), _revolute(sigma, alpha, beta, q, q2)
     return BaseKernels(
         *(
@@ -79,28 +115,3 @@ def _revolute(sigma: Array, alpha: Array, beta: Array, q: Array, q2: Array) -> B
 def _prismatic(sigma: Array, alpha: Array, q: Array, q2: Array) -> BaseKernels:
     slope = alpha * array_namespace(q).ones_like(q * q2)
     return BaseKernels(sigma + slope * q * q2, slope * q2, slope * q, slope)
-
-
-def product(base: BaseKernels, scale: Array) -> Derivatives:
-    """scale Π_b p_b with derivatives. scale: ()."""
-    xp = array_namespace(scale)
-    none = xp.zeros(len(base.value) - 1, dtype=scale.dtype, device=device(scale))
-    return chain_sum(base, xp.concat([none, scale[None]]))
-
-
-def chain_sum(base: BaseKernels, scales: Array) -> Derivatives:
-    """Σ_l s_l Π_{b≤l} p_b with derivatives, from tip to base: K ← p_b (s_b + K). scales: s, (n,)."""
-    xp, last = array_namespace(base.value), base.value.shape[0] - 1
-    scale = scales[last]
-    value = scale * base.value[last]
-    left, right, mixed = scale * base.left[last:], scale * base.right[last:], scale * base.mixed[last:, None]
-    for b in range(last - 1, -1, -1):
-        p, lead, trail, both = base.value[b], base.left[b], base.right[b], base.mixed[b]
-        inner = scales[b] + value
-        upper = xp.concat([(inner * both)[None], right * lead], axis=0)
-        lower = xp.concat([(left * trail)[:, None], mixed * p], axis=1)
-        mixed = xp.concat([upper[None], lower], axis=0)
-        left = xp.concat([(inner * lead)[None], left * p], axis=0)
-        right = xp.concat([(inner * trail)[None], right * p], axis=0)
-        value = inner * p
-    return Derivatives(value, left, right, mixed)

@@ -150,12 +150,6 @@ def test_features_of_a_learnt_geometry_are_those_of_the_lagrangian(kinds: str) -
     turned = np.empty_like(asked)
     turned[:, :, order] = asked
     rows = kernel.rows(turned)
-    out = np.full((len(turned), 13, n), np.nan)
-    kernel.regressor().fill_many(turned, out, 2)
-    np.testing.assert_allclose(out[:, 2:12], rows, rtol=1e-12, atol=1e-12)
-    assert np.isnan(out[:, [0, 1, 12]]).all()
-    kernel.regressor().fill(turned[0], out[1, 2:12])
-    np.testing.assert_allclose(out[1, 2:12], rows[0], rtol=1e-12, atol=1e-12)
     alone = np.zeros((n, 10))
     alone[-1] = carried
     for found, motion in zip(rows, asked, strict=True):

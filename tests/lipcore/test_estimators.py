@@ -249,14 +249,11 @@ def test_parameters(plain: TorqueModel, corrected: TorqueModel) -> None:
         assert np.array_equal(weights.scale, more.scale)  # the prior's own
 
 
-def test_it_is_saved_and_loaded(corrected: TorqueModel, samples: Samples, tmp_path: Path) -> None:
+def test_its_factor_is_saved_and_loaded(corrected: TorqueModel, tmp_path: Path) -> None:
     manifest = save(corrected, tmp_path / "model")
     assert manifest["calibration"] == {"function_std_factor": FACTOR}
     again = load(tmp_path / "model")
     assert again.calibration == corrected.calibration
-    query = samples.q, samples.dq, samples.ddq
-    for name in ("tau", "tau_std", "covariance", "noise_std"):
-        assert np.array_equal(getattr(again.predict(*query), name), getattr(corrected.predict(*query), name)), name
     # what a model was saved with counts, not what its estimator has by now
     assert calibrate(corrected.estimator.name).function_std_factor != FACTOR
 

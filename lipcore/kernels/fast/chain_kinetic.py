@@ -1,7 +1,6 @@
 """Kinetic energies of the chain: block of the Gram matrix, docs/method.md (11) summed over links, and the way back.
 
-(11) as `ChainKernel` writes it, with all quotients multiplied out: four rank-one terms a link, and what couples two
-joints by the sums R, S and C of `chain_sums`.
+Four rank-one terms a link, and the other terms of all links together, by the sums R, S and C of `chain_sums`.
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from lipcore.kernels.fast.lanes import Lanes, spread
 
 @inlined
 def couple(x: Array, y: Array, base: Array, sums: Sums, out: Array) -> None:
-    """Write half of the block but the rank-one terms: `below`, `above` and `diagonal` of `ChainKernel`."""
+    """Write h X + h' Y + ḣ Z + ḣ' diag(c) of (11), summed over links: half of the block but the rank-one terms."""
     _, r, _, s, c = sums
     for i in range(base.shape[0]):
         left, right, mixed, v, v2 = base[i, LEFT], base[i, RIGHT], base[i, MIXED], x[V, i], y[V, i]

@@ -10,7 +10,7 @@ from lipcore.kernels.fast.joints import Array
 
 @compiled
 def local_cross(anchors: Array, rate: Array, scale: Array, sign_width: float, motions: Array, out: Array) -> None:
-    """Write what `Cross.fill_many` asks for.
+    """Write what `Cross.fill_many` asks for: equal to the formula of `LocalKernel`, compiled.
 
     anchors: (S, 4 n), inputs of the inducing samples over their lengthscales; rate: (4 n,), one over these; scale:
     (n,), s² (N·m)².
