@@ -66,9 +66,7 @@ def _of_arm(arm: Arm) -> None:
         kernel.regressor().fill(motion.arrays()[0], np.empty((kernel.size, arm.n_joints)))
     payload = PayloadKernel(arm, np.ones(PARAMETERS))
     payload.features(motion)
-    out = np.empty((1, PARAMETERS, arm.n_joints))
-    payload.regressor().fill(motion.arrays()[0], out[0])
-    payload.regressor().fill_many(motion.arrays(), out, 0)
+    payload.regressor().fill(motion.arrays()[0], np.empty((PARAMETERS, arm.n_joints)))
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.metrics import LEVEL, quantile
+from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.export.c_rest import Rest
 from lipcore.export.c_weights import Learnt, UnsupportedEstimatorError, axes_of, moved, regrouped
@@ -226,8 +227,7 @@ def _vectors(model: TorqueModel, learnt: Learnt) -> Array:
         mean, std, *_ = (_carrying(model, learnt) if carried else model).evaluator.many(q, dq, ddq)
         more = np.zeros_like(mean)
         if carried:
-            features = PayloadKernel(learnt.arm.arm, np.ones(PARAMETERS)).rows(np.stack(motion, axis=1))
-            more = np.einsum("nkj,k->nj", features, PAYLOAD.parameters)
+            more = PayloadKernel(learnt.arm.arm, np.ones(PARAMETERS)).features(Motion(q, dq, ddq)) @ PAYLOAD.parameters
         out.append(np.stack([*motion, mean + more, std], axis=1))
     return np.concatenate(out)
 

@@ -11,7 +11,6 @@ from lipcore.kernels.arm_prior import KINDS, Arm
 from lipcore.kernels.base import LinearKernel, Params, Regressor
 from lipcore.kernels.fast.arm import (
     arm_energies,
-    arm_features,
     arm_queries,
     arm_query,
     arm_size,
@@ -78,13 +77,7 @@ class ArmKernel(LinearKernel):
         for seen, features in self._recent:
             if seen.q is x.q and seen.dq is x.dq and seen.ddq is x.ddq:
                 return features
-        # contiguous each: machine code is compiled for the layout of an array
-        rows = np.empty((len(x), self.steps.stop, self.n_joints))
-        motions, arm = x.arrays(), self.arm
-        arm_features(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, motions, rows)
-        if self.others is not None:
-            rows = np.concatenate([rows, self.others.rows(motions)], axis=1)
-        features = np.ascontiguousarray(rows.transpose(0, 2, 1))
+        features = super().features(x)
         self._recent = ((x, features), *self._recent[: REMEMBERED - 1])
         return features
 

@@ -32,11 +32,10 @@ class Regressor(ABC):
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query `motion`, (3, n) its q, dq and ddq, into `out`, (p, n), C-contiguous."""
 
+    @abstractmethod
     def fill_many(self, motions: Array, out: Array, first: int) -> None:
         """`fill` for N queries, (N, 3, n), into the p rows of each of `out`, (N, …, n), from `first` on; the same
         numbers to the last bit."""
-        for motion, target in zip(motions, out, strict=True):
-            self.fill(motion, target[first : first + self.size])
 
 
 class Cross(ABC):
@@ -53,18 +52,13 @@ class Cross(ABC):
     size: int
 
     @abstractmethod
-    def fill(self, motion: Array, out: Array) -> None:
-        """Write the covariances of the query's torques into `out`, (S + 1, n, n) (N·m)².
-
-        motion: (3, n), the query's q, dq and ddq; not modified. out[s, i, j] becomes the covariance of torque i at
-        inducing sample s with torque j at the query, s < S, and out[S] that of the query's torques with each other,
-        symmetric.
-        """
-
     def fill_many(self, motions: Array, out: Array) -> None:
-        """`fill` for N queries: motions (N, 3, n), out (N, S + 1, n, n); the same numbers to the last bit."""
-        for motion, block in zip(motions, out, strict=True):
-            self.fill(motion, block)
+        """Write the covariances of the torques of N queries into `out`, (N, S + 1, n, n) (N·m)².
+
+        motions: (N, 3, n), q, dq and ddq of each; not modified. out[k, s, i, j] becomes the covariance of torque i at
+        inducing sample s with torque j at query k, s < S, and out[k, S] that of the query's torques with each other,
+        symmetric. A query is answered the same to the last bit whatever others there are.
+        """
 
 
 @dataclass(frozen=True)
@@ -201,13 +195,13 @@ class _FormulaCross(Cross):
         self._blocks, self._anchors = kernel.blocks, State.paired(inducing)
         self._params = {name: value.copy() for name, value in params.items()}
 
-    def fill(self, motion: Array, out: Array) -> None:
-        """Write the covariances of one query; see `Cross.fill`."""
-        query = motion[:, :, None]
+    def fill_many(self, motions: Array, out: Array) -> None:
+        """Write the covariances of N queries; see `Cross.fill_many`."""
         anchors = (self._anchors.q, self._anchors.v, self._anchors.a)
-        rows = State(*(np.concatenate(pair, axis=1) for pair in zip(anchors, query, strict=True)))
-        out[:] = self._blocks(self._params, rows, State(*query)).transpose(2, 0, 1)
-        out[-1] = 0.5 * (out[-1] + out[-1].T)
+        for query, block in zip(motions[..., None], out, strict=True):
+            rows = State(*(np.concatenate(pair, axis=1) for pair in zip(anchors, query, strict=True)))
+            block[:] = self._blocks(self._params, rows, State(*query)).transpose(2, 0, 1)
+            block[-1] = 0.5 * (block[-1] + block[-1].T)
 
 
 class LinearKernel(TorqueKernel):
@@ -217,12 +211,15 @@ class LinearKernel(TorqueKernel):
     """
 
     @abstractmethod
-    def features(self, x: Motion) -> Array:
-        """Φ at each sample: (N, n, p)."""
-
-    @abstractmethod
     def regressor(self) -> Regressor:
         """Φ of one query, for serving."""
+
+    def features(self, x: Motion) -> Array:
+        """Φ at each sample: (N, n, p)."""
+        regressor = self.regressor()
+        rows = np.empty((len(x), regressor.size, self.n_joints))
+        regressor.fill_many(x.arrays(), rows, 0)
+        return np.ascontiguousarray(rows.transpose(0, 2, 1))
 
     @abstractmethod
     def variances(self, params: Params) -> Array:

@@ -72,12 +72,8 @@ class _LocalCross(Cross):
         self._rate, self._scale = np.exp(-params["local.log_lengthscales"]), np.exp(params["local.log_scale"])
         self._anchors = scaled(params, inducing)
 
-    def fill(self, motion: Array, out: Array) -> None:
-        """Write the covariances of one query; see `Cross.fill`."""
-        self.fill_many(motion[None], out[None])
-
     def fill_many(self, motions: Array, out: Array) -> None:
-        """Write the covariances of several queries; see `Cross.fill_many`."""
+        """Write the covariances of N queries; see `Cross.fill_many`."""
         local_cross(self._anchors, self._rate, self._scale, SIGN_WIDTH, motions, out)
 
 

@@ -42,21 +42,9 @@ class MixtureKernel(LinearKernel):
             np.stack([np.concatenate([each.rotor[:, None], each.friction], axis=1) for each in arms]),
         )
 
-    def rows(self, motions: Array) -> Array:
-        """Φᵀ of N motions (N, 3, n): (N, K, n)."""
-        out = np.empty((len(motions), self.size, self.n_joints))
-        linear = np.empty((len(motions), *self._arms[-1].shape[1:]))
-        linear_features(motions, SIGN_WIDTH, STRIBECK_SPEED, linear)
-        arm_differences(*self._arms, self._order, motions, linear, out)
-        return out
-
-    def features(self, x: Motion) -> Array:
-        """Φ at each sample: (N, n, K)."""
-        return np.ascontiguousarray(self.rows(x.arrays()).transpose(0, 2, 1))
-
     def regressor(self) -> Regressor:
-        """The same features of one query, for serving."""
-        return MixtureRegressor(self)
+        """Φ of one query, for serving."""
+        return MixtureRegressor(self._arms, self._order)
 
     def variances(self, params: Params) -> Array:
         """Prior variances of the weights: (K,)."""
@@ -74,13 +62,18 @@ class MixtureKernel(LinearKernel):
 class MixtureRegressor(Regressor):
     """Features of `MixtureKernel`, one query at a time."""
 
-    def __init__(self, kernel: MixtureKernel) -> None:
-        self.n_joints, self.size, self._kernel = kernel.n_joints, kernel.size, kernel
+    def __init__(self, arms: tuple[Array, Array, Array, Array, Array], order: NDArray[np.int64]) -> None:
+        self.n_joints, self.size = len(order), len(arms[0])
+        self._arms, self._order = arms, order
 
     def fill(self, motion: Array, out: Array) -> None:
         """Write Φᵀ of the query, (K, n)."""
-        out[:] = self._kernel.rows(motion[None])[0]
+        self.fill_many(motion[None], out[None], 0)
 
     def fill_many(self, motions: Array, out: Array, first: int) -> None:
         """Write Φᵀ of N queries; see `Regressor.fill_many`."""
-        out[:, first : first + self.size] = self._kernel.rows(motions)
+        rows = np.empty((len(motions), self.size, self.n_joints))
+        linear = np.empty((len(motions), *self._arms[-1].shape[1:]))
+        linear_features(motions, SIGN_WIDTH, STRIBECK_SPEED, linear)
+        arm_differences(*self._arms, self._order, motions, linear, rows)
+        out[:, first : first + self.size] = rows

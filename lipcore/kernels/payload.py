@@ -32,16 +32,6 @@ class PayloadKernel(LinearKernel):
         first = PARAMETERS * int(arm.order[-1])
         self._last = slice(first, first + PARAMETERS)
 
-    def rows(self, motions: Array) -> Array:
-        """Φᵀ of N motions (N, 3, n): (N, 10, n)."""
-        out = np.empty((len(motions), PARAMETERS, self.n_joints))
-        self.regressor().fill_many(motions, out, 0)
-        return out
-
-    def features(self, x: Motion) -> Array:
-        """Φ at each sample: (N, n, 10)."""
-        return np.ascontiguousarray(self.rows(x.arrays()).transpose(0, 2, 1))
-
     def energy_features(self, x: Motion) -> Array:
         """Kinetic and potential energy per unit of each weight: (N, 2, 10) J."""
         none = np.zeros((self.n_joints, PARAMETERS))

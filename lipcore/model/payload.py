@@ -278,7 +278,7 @@ class Linearised:
         out = np.empty((len(features) + PARAMETERS, *base.shape))
         out[: places.start], out[places.stop : -PARAMETERS] = features[: places.start], features[places.stop :]
         out[places] = of_arm.transpose(2, 0, 1) * self.carrier.root[places][:, None, None]
-        out[-PARAMETERS:] = self._payload.rows(motion.arrays()).transpose(1, 0, 2)
+        out[-PARAMETERS:] = self._payload.features(motion).transpose(2, 0, 1)
         return out, base if centre is None else base + of_arm @ centre
 
     @cached_property

@@ -9,7 +9,7 @@ from torch.func import jacrev
 from lipcore.data.motion import Motion
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
-from lipcore.kernels.fast.arm import arm_energies, arm_features, arm_masses, arm_shapes, arm_torques
+from lipcore.kernels.fast.arm import arm_energies, arm_masses, arm_shapes, arm_torques
 from lipcore.kernels.geometry import Geometry, aligned, rotation_of, skew, turn_of
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import inverse_dynamics
@@ -209,20 +209,6 @@ def test_derivatives_by_geometry_are_those_of_the_lagrangian(kinds: str, gravity
         if geometry.size:
             slope = jacrev(lambda step, at=motion: lagrangian_torque(geometry, bodies, step, at))(nowhere)
             np.testing.assert_allclose(slopes, slope.numpy().T, rtol=0, atol=EXACT * np.abs(torque).max() * 10)
-
-
-def test_derivatives_in_the_order_of_other_data() -> None:
-    geometry, bodies, _ = arm("RPR", 6)
-    order, asked = np.array([2, 0, 1]), motions(3, 7)
-    straight, turned = np.empty((2, len(asked), geometry.size + 33, 3))
-    given = geometry.constants, geometry.gravity, bodies
-    arm_features(*given, np.arange(3), asked, straight)
-    arm_features(*given, order, np.ascontiguousarray(asked[:, :, np.argsort(order)]), turned)
-    for place, at in enumerate(order):
-        rows, its = slice(10 * at, 10 * at + 10), slice(10 * place, 10 * place + 10)
-        agree(turned[:, rows][:, :, order], straight[:, its])
-        agree(turned[:, 30 + at][:, order], straight[:, 30 + place])
-    agree(turned[:, 33:][:, :, order], straight[:, 33:])
 
 
 @pytest.mark.parametrize("kinds", CHAINS)

@@ -149,13 +149,13 @@ def test_features_of_a_learnt_geometry_are_those_of_the_lagrangian(kinds: str) -
     kernel = PayloadKernel(Arm(geometry.moved(step), order, "learn", bodies, bodies, *units), np.ones(10))
     turned = np.empty_like(asked)
     turned[:, :, order] = asked
-    rows = kernel.rows(turned)
+    rows = kernel.features(Motion.from_arrays(*turned.swapaxes(0, 1)))
     alone = np.zeros((n, 10))
     alone[-1] = carried
     for found, motion in zip(rows, asked, strict=True):
         expected = np.empty(n)
         expected[order] = lagrangian_torque(geometry, alone, step, motion)
-        np.testing.assert_allclose(carried @ found, expected, atol=1e-9 * np.abs(expected).max())
+        np.testing.assert_allclose(found @ carried, expected, atol=1e-9 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("body", [BODY, POINT, Body(1.0, np.zeros(3)), Body(0.3, np.ones(3), np.diag([0.0, 1.0, 1.0]))])

@@ -83,16 +83,6 @@ def arm_queries(memory: Array, order: Indices, motions: Array, out: Array, first
 
 
 @compiled
-def arm_features(
-    constants: Array, gravity: Array, parameters: Array, order: Indices, motions: Array, out: Array
-) -> None:
-    """`arm_rows` of N queries: motions (N, 3, n), out (N, p, n)."""
-    work, table = np.zeros((constants.shape[0] + 1, WORK)), np.zeros(TABLE)
-    for k in range(motions.shape[0]):
-        arm_rows(constants, gravity, parameters, order, motions[k], work, table, out[k])
-
-
-@compiled
 def arm_torques(
     constants: Array, gravity: Array, parameters: Array, order: Indices, motions: Array, out: Array
 ) -> None:

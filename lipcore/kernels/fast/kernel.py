@@ -92,12 +92,8 @@ class CompiledCross(Cross):
         work = 6 * self.n_joints + driver.size(self.n_joints)
         self._memory = Memory([columns(read_rows(inducing.arrays(), prismatic), 1), *hyper], work)
 
-    def fill(self, motion: Array, out: Array) -> None:
-        """Write the covariances of one query."""
-        self.fill_many(motion[None], out[None])
-
     def fill_many(self, motions: Array, out: Array) -> None:
-        """Write the covariances of N queries."""
+        """Write the covariances of N queries; see `Cross.fill_many`."""
         self._run(self._memory.flat, self._kernels, self._prismatic, motions, out)
 
 
