@@ -22,6 +22,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import lipcore
+from benchmarks.arms import another_unit, random_arm
 from benchmarks.studies.dirty_arms import CASES, RATE, recorded, recording, unseen
 from lipcore import FitOptions
 from lipcore.arm.learning import POLISHING
@@ -32,7 +33,7 @@ from lipcore.data.samples import Samples
 from lipcore.kernels.geometry import Geometry
 from lipcore.posterior.selection import spread_out
 from lipcore.robots.dirt import SPREAD, Dirt
-from lipcore.robots.library import Robot, another_unit, load_robot, pinocchio, random_arm
+from lipcore.robots.library import Robot, load_robot, pinocchio
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate, usual_torque
 from lipcore.training import auto, fit
 

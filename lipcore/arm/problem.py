@@ -116,10 +116,10 @@ class Problem:
         kept = {name: getattr(self, name)[rows] for name in ("motions", "tau", "counts", "friction")}
         return replace(self, **kept)
 
-    def recombined(self, count: int, seed: int = 0) -> Problem:
+    def recombined(self, count: int) -> Problem:
         """At most `count` motions whose position, velocity and acceleration are those of three samples, without torque:
         they lie where the robot has been, but were never seen."""
-        rng, size = np.random.default_rng(seed), min(count, len(self.tau))
+        rng, size = np.random.default_rng(0), min(count, len(self.tau))
         rows = rng.integers(len(self.tau), size=(3, size))
         motions = np.stack([self.motions[rows[part], part] for part in range(3)], axis=1)
         nothing = np.zeros((size, self.n_joints))

@@ -48,14 +48,14 @@ def coverage_interval(samples: Samples, answer: Answer) -> CoverageInterval:
     return CoverageInterval(independent, low, high)
 
 
-def clopper_pearson(share: Array, count: Array, level: float = LEVEL) -> tuple[Array, Array]:
+def clopper_pearson(share: Array, count: Array) -> tuple[Array, Array]:
     """Confidence interval of a probability of which a `share` of `count` independent trials came true, (n,) each.
 
-    With k = share · count and α = 1 - level: the quantiles α/2 of Beta(k, count - k + 1) and 1 - α/2 of
+    With k = share · count and α = 1 - LEVEL: the quantiles α/2 of Beta(k, count - k + 1) and 1 - α/2 of
     Beta(k + 1, count - k) (Clopper and Pearson 1934), also where counts are not integers.
     """
     hits = share * count
-    misses, tail = np.maximum(count - hits, 0.0), (1 - level) / 2
+    misses, tail = np.maximum(count - hits, 0.0), (1 - LEVEL) / 2
     some, others = np.maximum(hits, 1e-9), np.maximum(misses, 1e-9)  # where there are none, the bound is known
     low = np.where(hits > 1e-9, betaincinv(some, misses + 1, tail), 0.0)
     high = np.where(misses > 1e-9, betaincinv(hits + 1, others, 1 - tail), 1.0)

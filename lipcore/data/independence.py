@@ -17,14 +17,14 @@ expresses exactly, after 30 s at 1 kHz: where every row counted in full, 95 % in
 """
 
 
-def even_weights(time: Array, rate: float = INDEPENDENT_HZ) -> Array:
+def even_weights(time: Array) -> Array:
     """Weights of rows that a clock has spaced evenly, whatever a few of their times say: the same for all, (N,).
 
     time: (N,) s; not finite where not known. Rows without a spacing count in full.
     """
     steps = np.diff(time[np.isfinite(time)])
     rising = steps[steps > 0]
-    return np.full(len(time), min(1.0, rate * float(np.median(rising))) if len(rising) else 1.0)
+    return np.full(len(time), min(1.0, INDEPENDENT_HZ * float(np.median(rising))) if len(rising) else 1.0)
 
 
 def recording_weights(time: Array, episode: NDArray[np.int64], rate: float = INDEPENDENT_HZ) -> Array:

@@ -104,10 +104,10 @@ class Corrupt:
         return {"samples_corrupt": self.count, "corrupt": f"{why}; the first are rows {first}, counted from 0"}
 
 
-IMPOSSIBLE, ALONE = 0, 1
 REASONS = ("magnitude", "course")
 """Why a row is corrupt: a magnitude that no robot reaches, or a value that fits neither what went before nor what
 follows, while what it depends on goes on as usual."""
+ALONE = REASONS.index("course")
 Read = Callable[[str, int], Array]
 """Gives the column of a quantity of a joint, (N,)."""
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
 from lipcore.profiles import Profile
-from lipcore.robots.library import Robot
 from lipcore.vocabulary import JointType
 
 USUAL_SPEED: dict[str, float] = {"revolute": 1.0, "prismatic": 0.2}
@@ -66,13 +65,6 @@ class Limits:
         span = np.where(np.array(joint_types) == "prismatic", 0.5, np.pi)
         lower, upper = np.where(np.isfinite(lower), lower, -span), np.where(np.isfinite(upper), upper, span)
         return cls(tuple(joint_names), lower, upper, speed, acceleration, np.where(_given(torque), torque, np.inf))
-
-    @classmethod
-    def of_robot(cls, robot: Robot) -> Limits:
-        """Those of a URDF's Pinocchio model, which knows no accelerations; usual ones stand in where one is missing."""
-        unknown = np.full(robot.n_joints, np.nan)
-        torque = np.asarray(robot.model.effortLimit, dtype=np.float64)
-        return cls.known(robot.joint_names, robot.joint_types, robot.lower, robot.upper, robot.speed, unknown, torque)
 
     @classmethod
     def of_profile(cls, profile: Profile) -> Limits:

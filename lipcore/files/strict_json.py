@@ -12,6 +12,8 @@ from typing import Any, NoReturn
 
 MAX_DEPTH = 32
 """Objects and lists within one another: what is written again, checked or quoted recurses as deep."""
+MAX_QUOTE = 80
+"""Characters of a quoted value."""
 MAX_INTEGER = 2**63
 
 
@@ -44,10 +46,10 @@ def read(payload: bytes, most_bytes: int) -> Any:
     return value
 
 
-def quote(value: object, most: int = 80) -> str:
+def quote(value: object) -> str:
     """A value as a message quotes it: escaped, and cut where it is long."""
     text = ascii(value) if not isinstance(value, list | dict) else f"a {type(value).__name__} of {len(value)} entries"
-    return text if len(text) <= most else text[:most] + "…"
+    return text if len(text) <= MAX_QUOTE else text[:MAX_QUOTE] + "…"
 
 
 def _check_tree(root: Any) -> None:

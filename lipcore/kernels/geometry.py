@@ -102,27 +102,23 @@ class Geometry:
     @cached_property
     def constants(self) -> Array:
         """The geometry as `kernels.fast.arm_recursion` reads it: (n, CONSTANTS)."""
-        return self._constants(self.rotation, self.translation)
-
-    def moved_constants(self, step: Array) -> Array:
-        """`constants` of the geometry a step away, (g,) rad and m."""
-        return self._constants(*self._moved(step))
-
-    def moved(self, step: Array) -> Geometry:
-        """The geometry a step away, (g,) rad and m."""
-        rotation, translation = self._moved(step)
-        return replace(self, rotation=rotation, translation=translation)
-
-    def _constants(self, rotation: Array, translation: Array) -> Array:
         n = self.n_joints
         out = np.zeros((n, CONSTANTS))
-        out[:, TURN:PLACE] = (rotation[:, None] @ self.turn_parts).reshape(n, -1)
-        out[:, PLACE:AXIS] = translation
-        out[:, AXIS:ACROSS] = (rotation @ self.axis[..., None])[..., 0]
-        out[:, ACROSS:KIND] = (self.across @ rotation.mT).reshape(n, -1)
+        out[:, TURN:PLACE] = (self.rotation[:, None] @ self.turn_parts).reshape(n, -1)
+        out[:, PLACE:AXIS] = self.translation
+        out[:, AXIS:ACROSS] = (self.rotation @ self.axis[..., None])[..., 0]
+        out[:, ACROSS:KIND] = (self.across @ self.rotation.mT).reshape(n, -1)
         out[:, KIND] = [kind == "prismatic" for kind in self.joint_types]
         out[:, SCREWS] = self.screws
         return out
+
+    def moved(self, step: Array) -> Geometry:
+        """The geometry a step away, (g,) rad and m."""
+        numbers = np.zeros((self.n_joints, 1, 4))
+        numbers[:, 0][self._counted] = step
+        turn, shift = (numbers[..., part] @ self.across for part in (slice(0, 2), slice(2, 4)))
+        translation = self.translation + (self.rotation @ shift.mT)[..., 0]
+        return replace(self, rotation=self.rotation @ rotation_of(turn[:, 0]), translation=translation)
 
     @cached_property
     def turn_parts(self) -> Array:
@@ -133,14 +129,6 @@ class Geometry:
             if kind == "prismatic":
                 parts[j] = one, 0 * one, 0 * one
         return parts
-
-    def _moved(self, step: Array) -> tuple[Array, Array]:
-        """Rotation and translation a step away."""
-        numbers = np.zeros((self.n_joints, 1, 4))
-        numbers[:, 0][self._counted] = step
-        turn, shift = (numbers[..., part] @ self.across for part in (slice(0, 2), slice(2, 4)))
-        translation = self.translation + (self.rotation @ shift.mT)[..., 0]
-        return self.rotation @ rotation_of(turn[:, 0]), translation
 
     def towards(self, other: Geometry) -> Array:
         """The step, (g,), that leads to another geometry of the same joints, to first order in what lies between."""

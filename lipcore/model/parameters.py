@@ -137,7 +137,7 @@ def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> In
     options = [alone]
     if term.arm.steps:
         options.append(nearest_plausible(weights.mean, weights.scale, metric, term.n_joints, start))
-    asked = checks(posterior.basis.inducing, 0)
+    asked = checks(posterior.basis.inducing)
     torque = posterior.predict(asked, term).mean
     errors = [np.sqrt(np.mean((term.torque(option, asked) - torque) ** 2, axis=0)) for option in options]
     best = int(np.argmin([np.mean(error / np.maximum(torque.std(0), 1e-12)) for error in errors]))

@@ -49,7 +49,7 @@ def linearisation_error(model: TorqueModel) -> Array | None:
     if not isinstance(term, ArmKernel) or not term.arm.steps:
         return None
     arm, posterior, n = term.arm, model.posterior, term.n_joints
-    motion = checks(posterior.basis.inducing, 0, QUERIES)
+    motion = checks(posterior.basis.inducing, QUERIES)
     known, used = weight_posterior(posterior, term), term.steps.stop
     centre = known.mean.copy()
     centre[: PARAMETERS * n], centre[term.steps] = arm.parameters[arm.place].reshape(-1), 0.0
@@ -104,7 +104,7 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
 
 def _fallback(model: TorqueModel) -> list[str]:
     """Name the joints that fall back at most motions FARTHER and faster than those recombined from the basis' own."""
-    motion = checks(model.posterior.basis.inducing, 0, QUERIES)[-QUERIES // 2 :]
+    motion = checks(model.posterior.basis.inducing, QUERIES)[-QUERIES // 2 :]
     low, high = (np.array(model.training_range["q"][end]) for end in ("min", "max"))
     middle = 0.5 * (low + high)
     q = middle + FARTHER * (motion.q - middle)

@@ -52,12 +52,11 @@ class OnlineModel:
         base: TorqueModel,
         forgetting_s: float | None = None,
         since: float | None = None,
-        friction_walk_s: float | None = None,
     ) -> OnlineModel:
         """A version as trained, with nothing learnt yet.
 
         forgetting_s: time constant of forgetting, s, None for never; since: event time, s, from which on the version's
-        own samples are forgotten; friction_walk_s: time constant of friction that drifts, s, None where it does not.
+        own samples are forgotten.
         Raise ValueError for a wrong time, or a model that has learnt already.
         """
         _check(forgetting_s)
@@ -69,7 +68,7 @@ class OnlineModel:
         sums = Statistics(statistics.a, statistics.b - centre, 0.0)
         reference = -math.inf if since is None else since
         now = Regime(-math.inf, centre, sums)
-        return cls(base, forgetting_s, since, reference, None, now).with_walk(friction_walk_s)
+        return cls(base, forgetting_s, since, reference, None, now)
 
     @property
     def samples(self) -> float:

@@ -90,13 +90,13 @@ def compressed(
     return compress(exact, samples.tau, tolerance, most), exact.factor.jitter
 
 
-def compress(exact: ExactPosterior, tau: Array, tolerance: float, most: int, seed: int = 0) -> Compression:
+def compress(exact: ExactPosterior, tau: Array, tolerance: float, most: int) -> Compression:
     """Smallest compact posterior within `tolerance` of the exact one, or the best with `most` inducing outputs.
 
     tau: the (N, n) torques that the exact posterior is conditioned on.
     Outputs are taken in the order of pivoted Cholesky; how many, a bisection tells.
     """
-    check = checks(exact.motion, seed)
+    check = checks(exact.motion)
     calibration, exact = exact.std_factor, replace(exact, std_factor=1.0)
     expected = exact.predict(check)
     noise = np.exp(2 * exact.params["noise.log_std"]) + exact.factor.jitter
@@ -138,13 +138,13 @@ def linear(
     return Compression(posterior, Deviation(0.0, 0.0, 0.0, 0), tolerance, True)
 
 
-def checks(motion: Motion, seed: int, queries: int = QUERIES) -> Motion:
+def checks(motion: Motion, queries: int = QUERIES) -> Motion:
     """Motions to compare posteriors at: half of them training samples, half recombined from several.
 
     A recombined motion takes position, velocity and acceleration from three samples: it lies where the robot has been,
     but was never seen.
     """
-    draw, size = np.random.default_rng(seed), len(motion)
+    draw, size = np.random.default_rng(0), len(motion)
     seen = draw.permutation(size)[: queries // 2]
     rows = draw.integers(size, size=(3, queries - len(seen)))
     parts = ((motion.q, rows[0]), (motion.dq, rows[1]), (motion.ddq, rows[2]))

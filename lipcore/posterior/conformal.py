@@ -106,16 +106,14 @@ def _guarded(samples: Samples, first: int, last: int) -> slice:
     return slice(first - int(before.sum()), last + int(after.sum()))
 
 
-def _quantile(
-    score: Array, rows: NDArray[np.int64], level: float = LEVEL
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _quantile(score: Array, rows: NDArray[np.int64]) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Scale and guaranteed level of each joint, from scores (N, n) of B blocks of so many `rows` each.
 
-    With F_b(s) the share of a block's scores up to s, the least s >= 1 with Σ F_b(s) / (B + 1) >= level, or, where no
-    s has, with Σ F_b(s) / B >= level; guaranteed is Σ F_b(s) / (B + 1) at that s.
+    With F_b(s) the share of a block's scores up to s, the least s >= 1 with Σ F_b(s) / (B + 1) >= LEVEL, or, where no
+    s has, with Σ F_b(s) / B >= LEVEL; guaranteed is Σ F_b(s) / (B + 1) at that s.
     """
     count, weight = len(rows), np.repeat(1 / rows, rows)
-    needed = level * (count + 1 if level * (count + 1) <= count else count)
+    needed = LEVEL * (count + 1 if LEVEL * (count + 1) <= count else count)
     scale, guaranteed = [], []
     for column in score.T:
         order = np.argsort(column)

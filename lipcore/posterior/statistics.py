@@ -90,18 +90,6 @@ def collect(
     return Statistics(a, b, float(len(motion) if weights is None else weights.sum()))
 
 
-def update(
-    statistics: Statistics,
-    basis: Basis,
-    noise_variance: Array,
-    motion: Motion,
-    residual: Array,
-    weights: Array | None = None,
-) -> Statistics:
-    """Statistics with N more samples, arguments as of `collect`."""
-    return merge(statistics, collect(basis, noise_variance, motion, residual, weights))
-
-
 def merge(one: Statistics, other: Statistics) -> Statistics:
     """Statistics of the samples of both, from parts, streams or robots that share a basis."""
     return Statistics(one.a + other.a, one.b + other.b, one.samples + other.samples)

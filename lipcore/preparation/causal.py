@@ -8,9 +8,8 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.data.signals import ORDER
-from lipcore.preparation.filtering import QUANTITIES, Filters, Read, settle
-from lipcore.preparation.recipe import PreparationError, Recipe
-from lipcore.preparation.resampling import BLOCK, SAME_RATE
+from lipcore.preparation.filtering import QUANTITIES, Filters, Read
+from lipcore.preparation.resampling import BLOCK
 
 
 class CausalFilter:
@@ -109,49 +108,3 @@ class CausalFilter:
             for sign, taps in ((1, section[:3]), (-1, section[3:])):
                 late += sign * float(taps @ np.arange(3.0)) / float(taps.sum())
         return late
-
-
-class CausalPreparation:
-    """A recipe on a live stream of rows at `rate` Hz: what comes out is late by `delay_s`.
-
-    rate: Hz, of the rows, which count as evenly spaced; given: the quantities that rows have, q and tau among them.
-    The rate may be lowered by whole numbers. Raise PreparationError where the recipe is impossible at this rate.
-    """
-
-    def __init__(
-        self, rate: float, n_joints: int, recipe: Recipe | None = None, given: tuple[str, ...] = ("q", "dq", "tau")
-    ) -> None:
-        work = settle(rate, tuple(name for name in QUANTITIES if name in given), recipe or Recipe(form="causal"))
-        self._every = round(work.every)
-        if abs(work.every / self._every - 1) > SAME_RATE:
-            near = ", ".join(f"{rate / every:g}" for every in (self._every, self._every + 1))
-            raise PreparationError("rate", f"{rate / work.every:g} Hz", f"a whole part of {rate:g} Hz, such as {near}")
-        self._filter = CausalFilter(work, n_joints)
-        self._count = 0
-
-    @property
-    def delay_s(self) -> float:
-        """How long before the last row the moment was that an answer tells of, s: of motions well below the cut-off."""
-        return self._filter.delay_s
-
-    @property
-    def rate_hz(self) -> float:
-        """Of what comes out."""
-        return self._filter.work.rate / self._every
-
-    def reset(self) -> None:
-        """Forget the rows so far: after a gap, or before another recording."""
-        self._filter.reset()
-        self._count = 0
-
-    def step(self, row: Mapping[str, Array]) -> dict[str, Array] | None:
-        """One more row, (n,) a quantity; q, dq, ddq, tau, (n,) each, or None where nothing comes out with this row."""
-        prepared = self.batch({name: np.asarray(row[name])[None] for name in self._filter.work.given})
-        return {name: values[0] for name, values in prepared.items()} if len(prepared["q"]) else None
-
-    def batch(self, rows: Mapping[str, Array]) -> dict[str, Array]:
-        """Further rows, (N, n) a quantity; what `step` returns for each of them, (M, n) a quantity, M ≤ N."""
-        prepared = self._filter.batch(rows)
-        first = -self._count % self._every
-        self._count += len(prepared["q"])
-        return {name: values[first :: self._every] for name, values in prepared.items()}

@@ -62,7 +62,7 @@ class Plan:
     """What comes out of a recording, M samples, and how.
 
     t: (M,) s, the moments they tell of; counted from 0 where the recording has no times; episode: (M,) parts, from 0;
-    steps: what is done, see `steps`; recorded_rate, rate: Hz, before and after, None without times; delay_s: by which
+    steps: what is done, see `steps`; rate: Hz, None without times; delay_s: by which
     a live stream would have them late; gaps: where the recording is split; missing, first_missing (from 1), repeated:
     rows left out; edges: samples cut off.
     """
@@ -71,7 +71,6 @@ class Plan:
     episode: NDArray[np.int64]
     steps: list[record.Step]
     derived: tuple[str, ...]
-    recorded_rate: float | None
     rate: float | None
     cutoff: float | None
     delay_s: float
@@ -291,7 +290,6 @@ def _lay_out(
         np.repeat(np.arange(len(parts)), [len(each) for each in times]),
         steps,
         to_derive,
-        None if clock is None else 1 / clock.usual,
         rate,
         None if work is None else work.cutoff,
         late,

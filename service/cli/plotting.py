@@ -48,14 +48,14 @@ def draw_motion(path: Path, made: Plan) -> None:
     plt.close(figure)
 
 
-def draw_torque(path: Path, samples: Samples, answer: Prediction, level: float = 0.95) -> None:
-    """Draw each joint's measured torque, its prediction and the band that shall hold `level` of measurements."""
+def draw_torque(path: Path, samples: Samples, answer: Prediction) -> None:
+    """Draw each joint's measured torque, its prediction and its 95 % interval."""
     plt = pyplot()
-    lower, upper = answer.interval(level)
+    lower, upper = answer.interval()
     figure, axes = plt.subplots(samples.n_joints, 1, sharex=True, figsize=(9, 1.5 * samples.n_joints))
     for j, axis in enumerate(np.atleast_1d(axes)):
         axis.fill_between(
-            samples.t, lower[:, j], upper[:, j], color="tab:blue", alpha=0.25, lw=0, label=f"{percent(level)} interval"
+            samples.t, lower[:, j], upper[:, j], color="tab:blue", alpha=0.25, lw=0, label="95 % interval"
         )
         axis.plot(samples.t, answer.tau[:, j], color="tab:blue", lw=1, label="predicted")
         axis.plot(samples.t, samples.tau[:, j], ".", color="black", ms=1.5, label="measured")

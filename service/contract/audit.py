@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from pydantic import BaseModel, Field
 
@@ -21,7 +21,6 @@ Change = Literal[
     "payload declared",
     "stream deleted",
 ]
-CHANGES: tuple[str, ...] = get_args(Change)
 
 
 class AuditEntry(BaseModel):

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 
 ARRAYS = ("t", "episode", "q", "dq", "ddq", "tau")
-BLOCK = 1 << 20
 ROWS = 1 << 14
 """Rows that chosen ones are read out of at a time."""
 _HEADER = 8

@@ -9,6 +9,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from benchmarks.arms import random_arm
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save, train
 from lipcore.arm import learning
 from lipcore.data.motion import Motion
@@ -20,7 +21,7 @@ from lipcore.kernels.geometry import Geometry
 from lipcore.model.parameters import friction_coefficients, report
 from lipcore.model.warnings import REFIT_ERROR, linearisation_error, warnings
 from lipcore.online.learner import OnlineModel
-from lipcore.robots.library import Robot, random_arm
+from lipcore.robots.library import Robot
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 from tests.lipcore.arm_oracles import arm, as_rows, followed
 from tests.lipcore.test_arm_model import errors

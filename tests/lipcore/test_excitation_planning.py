@@ -31,7 +31,9 @@ def robot():
 
 @pytest.fixture(scope="module")
 def limits(robot):
-    return replace(Limits.of_robot(robot), torque=np.array([np.inf, np.inf])).within(0.5, 1.0)
+    unknown = np.full(2, np.nan)
+    known = robot.joint_names, robot.joint_types, robot.lower, robot.upper, robot.speed
+    return Limits.known(*known, unknown, unknown).within(0.5, 1.0)
 
 
 @pytest.fixture(scope="module")

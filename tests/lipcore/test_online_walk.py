@@ -40,7 +40,7 @@ def rows() -> Rows:
 
 
 def walking(base: TorqueModel, time_s: float) -> OnlineModel:
-    return OnlineModel.start(base, since=BEGAN, friction_walk_s=time_s)
+    return OnlineModel.start(base, since=BEGAN).with_walk(time_s)
 
 
 def friction_of(base: TorqueModel) -> np.ndarray:

@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from lipcore.robots.library import ROBOTS, Robot, another_unit, load_robot
+from benchmarks.arms import another_unit
+from lipcore.robots.library import ROBOTS, Robot, load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
 
 

@@ -14,9 +14,10 @@ from lipcore.estimators.options import FitOptions
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.posterior.basis import Basis
-from lipcore.posterior.linalg import NotPositiveDefiniteError, eigen
+from lipcore.posterior.linalg import NotPositiveDefiniteError, eigen, mirror
 from lipcore.posterior.statistics import (
     Statistics,
+    add_to,
     collect,
     decay,
     empty,
@@ -24,7 +25,6 @@ from lipcore.posterior.statistics import (
     learnt_root,
     merge,
     solve,
-    update,
 )
 from lipcore.posterior.summing import Summing, Total
 from lipcore.training.conditioning import condition
@@ -79,7 +79,7 @@ def test_all_at_once_in_parts_in_any_order_and_one_by_one_are_the_same(
         rows = np.array(order[first:last])
         parts = merge(collect(basis, NOISE, motion[rows], residual[rows]), parts)
     for k in order:
-        one_by_one = update(one_by_one, basis, NOISE, motion[k : k + 1], residual[k : k + 1])
+        one_by_one = merge(one_by_one, collect(basis, NOISE, motion[k : k + 1], residual[k : k + 1]))
     assert same(parts, whole)
     assert same(one_by_one, whole)
 

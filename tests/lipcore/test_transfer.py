@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.arms import another_unit
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
 from lipcore.estimators.base import BaseMismatchError, RobotKind, check_base
 from lipcore.kernels.arm import ArmKernel
 from lipcore.model.sibling import arm_as_expected, arm_of_sibling
-from lipcore.robots.library import Robot, another_unit
+from lipcore.robots.library import Robot
 from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
 from tests.choosing import slow
 from tests.lipcore.arm_oracles import arm, followed, motions, pendulum_from_its_tip

@@ -32,15 +32,17 @@ COLLINEAR = 0.99
 SHORT_S = 60.0
 TOGETHER = 0.5
 """Independent motions, as a share of the joints, below which joints count as moving together."""
+MAX_LISTED = 8
+"""Names in a sentence."""
 STANDING = 0.5
 """Share of samples at standstill from which on it is said."""
 
 
-def listed(names: Iterable[str], most: int = 8) -> str:
+def listed(names: Iterable[str]) -> str:
     """Names as in a sentence; of many only the first."""
     parts = list(names)
-    if len(parts) > most:
-        parts = [*parts[:most], f"{len(parts) - most} more"]
+    if len(parts) > MAX_LISTED:
+        parts = [*parts[:MAX_LISTED], f"{len(parts) - MAX_LISTED} more"]
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
 
 

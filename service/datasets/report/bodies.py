@@ -144,11 +144,11 @@ class Against:
         """Mean logarithm of the errors."""
         return float(np.log(self.errors + FLOOR).mean())
 
-    def steady(self, joint: int, part: int, least: float = 3.0) -> bool:
-        """Whether a factor, of gravity (0) or the rest (1), is told from 0 by so many standard deviations, and its
+    def steady(self, joint: int, part: int) -> bool:
+        """Whether a factor, of gravity (0) or the rest (1), is told from 0 by three standard deviations, and its
         torque is a visible part of the joint's."""
         value, std = ((self.gravity, self.gravity_std), (self.inertia, self.inertia_std))[part]
-        return bool(abs(value[joint]) > least * std[joint] and abs(value[joint]) * self.visible[joint, part] > VISIBLE)
+        return bool(abs(value[joint]) > 3 * std[joint] and abs(value[joint]) * self.visible[joint, part] > VISIBLE)
 
 
 VISIBLE = 0.2

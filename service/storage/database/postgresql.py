@@ -103,7 +103,7 @@ class Postgresql:
         self.engine.dispose()
         self._turns.dispose()
 
-    def damage(self, most: int = 1) -> list[str]:
+    def damage(self) -> list[str]:
         """Nothing: PostgreSQL looks after itself (its checksums, `pg_amcheck`)."""
         return []
 
