@@ -164,7 +164,7 @@ def test_a_walk_ends_with_the_friction_of_then(base: TorqueModel, rows: Rows) ->
 
 
 def test_state_survives_bytes_and_adding_in_place_gives_the_same_bits(base: TorqueModel, rows: Rows) -> None:
-    usual = OnlineModel.start(base, 50.0, BEGAN, 10.0)
+    usual = OnlineModel.start(base, 50.0, BEGAN).with_walk(10.0)
     own = usual.detached()
     for part in np.array_split(np.arange(len(rows)), 8):
         usual, own = usual.learn(rows.take(part)), own.learn(rows.take(part), own=True)
