@@ -14,10 +14,9 @@ from lipcore.estimators.options import FitOptions
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.posterior.basis import Basis
-from lipcore.posterior.linalg import NotPositiveDefiniteError, eigen, mirror
+from lipcore.posterior.linalg import NotPositiveDefiniteError, eigen
 from lipcore.posterior.statistics import (
     Statistics,
-    add_to,
     collect,
     decay,
     empty,
