@@ -15,16 +15,16 @@ from threadpoolctl import threadpool_limits
 
 from service import __version__
 from service.api import errors, metrics, openapi, requests
-from service.api.access.keys import Keyring
+from service.api.access.keys import REFRESH_S, Keyring
 from service.api.access.middleware import KeyAccess, LocalAccess
 from service.api.access.scopes import Rules
 from service.api.dashboard import routes as dashboard
 from service.api.guide import routes as guide
-from service.api.limits.requests import BodyLimit, Gate, RateLimit, Turns, body_limits
+from service.api.limits.requests import MAX_REQUESTS, PATIENCE, BodyLimit, Gate, RateLimit, Turns, body_limits
 from service.api.metrics import System, Traffic
 from service.api.oip import routes as oip
 from service.api.oip import rpc
-from service.api.requests import RequestContext, RequestLog
+from service.api.requests import MAX_REFUSALS_PER_S, RequestContext, RequestLog
 from service.api.routes import (
     audit,
     datasets,
@@ -48,6 +48,7 @@ from service.models import deletion, registry
 from service.models.loaded import LoadedModels
 from service.replication import Replication
 from service.runtime.confinement import protections
+from service.runtime.process import SERVING_THREADS
 from service.storage.audit import cleaned
 from service.storage.files.store import start_sweeping
 from service.storage.storage import Storage, hold_home, look_database, look_files, look_home
@@ -72,15 +73,15 @@ Errors are `{"error": {code, message, detail}}`, below /v2 `{"error": message}` 
 def create_app(settings: Settings | None = None) -> FastAPI:
     """Build the application. Nothing is opened before it starts."""
     settings = settings or Settings()
-    stopping, meters = Stopping(), Meters(settings.max_metric_models)
+    stopping, meters = Stopping(), Meters()
     calls = rpc.check_installed(settings)
-    keyring = Keyring(settings.keys_refresh_s, settings.max_request_burst) if settings.keys_needed else None
+    keyring = Keyring(REFRESH_S, settings.max_request_burst) if settings.keys_needed else None
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
         lock = hold_home(settings.home)
         storage, jobs, learners = await to_thread.run_sync(_open, settings)
-        threadpool_limits(settings.serving_threads)  # of BLAS, whose libraries the models have brought in
+        threadpool_limits(SERVING_THREADS)  # of BLAS, whose libraries the models have brought in
         _share(app, storage, jobs, learners)
         replication = Replication(learners) if storage.database.shared else None
         try:
@@ -161,9 +162,9 @@ def _add_middleware(
     app.add_middleware(
         BodyLimit,
         limits=body_limits(settings),
-        seconds=settings.body_s,
-        bytes_per_s=settings.body_bytes_per_s,
-        at_once=max(1, settings.max_requests // 4),
+        seconds=PATIENCE.body_s,
+        bytes_per_s=PATIENCE.body_bytes_per_s,
+        at_once=MAX_REQUESTS // 4,
     )
     if settings.max_requests_per_s is not None:
         app.add_middleware(RateLimit, per_s=settings.max_requests_per_s, burst=settings.max_request_burst)
@@ -171,9 +172,9 @@ def _add_middleware(
         app.add_middleware(LocalAccess)
     else:
         app.add_middleware(KeyAccess, keyring=keyring)
-    app.add_middleware(Gate, most=settings.max_requests)
+    app.add_middleware(Gate, most=MAX_REQUESTS)
     quiet = (str(getattr(route, "path", "")) for route in hot)
-    log = RequestLog(quiet, settings.log_slow_s, settings.log_refusals_per_s)
+    log = RequestLog(quiet, settings.log_slow_s, MAX_REFUSALS_PER_S)
     app.add_middleware(RequestContext, meters=meters, log=log, tracing=settings.opentelemetry)  # the outermost
 
 

@@ -35,7 +35,7 @@ LATE, TWICE = 0.2, 0.2
 """Shares of batches that are sent after a later one, and a second time."""
 GAP = 0.02
 """Longest pause between two batches, s."""
-SETTINGS = {"publish_every_s": 0.05, "snapshot_every_s": 0.3, "max_snapshots": 4, "log_level": "error"}
+SETTINGS = {"publish_every_s": 0.005, "max_snapshots": 4, "log_level": "error"}
 """Of the service: revisions and snapshots follow each other fast enough to be hit."""
 DATABASE = "lipserve.sqlite3"
 _RECOVERY = 60.0

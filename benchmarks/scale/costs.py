@@ -88,7 +88,7 @@ class Subject:
 
 def run(engines: Engines, batches: int, queries: int, seed: int, console: Console) -> Part:
     """Measure two services in turn: one on PostgreSQL and S3, one alone on SQLite."""
-    settings = {"snapshot_every_s": 2.0, "max_loaded_models": COPIES + 2, "max_learning_models": COPIES + 2}
+    settings = {"max_loaded_models": COPIES + 2}
     services = [engines.service(settings), engines.alone(settings)]
     subjects = [Subject(each, ready(each), engines if each is services[0] else None) for each in services]
     query = streams.stream(50, seed + 4, rate=1.0)

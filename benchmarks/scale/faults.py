@@ -37,7 +37,7 @@ GAP = 0.02
 """Longest pause between two batches, s."""
 JOB = {"hyperparameter_samples": 100, "posterior_samples": 200, "max_iterations": 150, "starts": 1}
 """A job that runs long enough to be hit."""
-SETTINGS = {"snapshot_every_s": 1.0, "replica_lost_s": 3.0, "log_level": "critical"}
+SETTINGS = {"publish_every_s": 0.02, "replica_lost_s": 3.0, "log_level": "critical"}
 """Errors are made here on purpose: what they say of them would only hide the tally."""
 _PATIENCE = 120.0
 

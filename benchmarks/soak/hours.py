@@ -36,17 +36,7 @@ from service.storage.database import Database
 
 MOTION_S = 600.0
 """Of the arm, repeated all day."""
-SHORTER = 20.0
-"""By which the service's own times are divided, as the day is."""
-SETTINGS = {
-    "snapshot_every_s": 30.0 / SHORTER,
-    "quality_windows_s": json.dumps([60.0 / SHORTER, 600.0 / SHORTER, 3600.0 / SHORTER]),
-    "refresh_pause_s": 600.0 / SHORTER,
-    "max_refreshed_versions": 3,
-    "promotion_patience_s": 3600.0 / SHORTER,
-    "keys": "on",
-    "max_loaded_models": 8,
-}
+SETTINGS = {"keys": "on", "max_loaded_models": 8}
 """Of the service."""
 RETAINED_S, ROW_BYTES = 2400, 250
 """Seconds of the loop for which its log is kept, less than a tenth of eight hours; and roughly what a row takes."""

@@ -16,6 +16,11 @@ from lipcore.vocabulary import CODES, LEARNT
 Codes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
+MAX_GAP_S = 1.0
+"""Step of time within a batch that is taken for a jump, s."""
+STATIONARY_SPEED = 1e-3
+"""Speed of all joints, rad/s or m/s, below which a row tells of stiction only."""
+
 
 @dataclass(frozen=True)
 class RowLimits:
@@ -33,8 +38,8 @@ class RowLimits:
     velocity: float
     acceleration: float
     torque: Array | None
-    max_gap_s: float | None
-    stationary_speed: float
+    max_gap_s: float | None = MAX_GAP_S
+    stationary_speed: float = STATIONARY_SPEED
     saturation_share: float = 0.98
 
 

@@ -11,7 +11,7 @@ from fastapi import Depends, Header, Query, Request
 from service.foundation.errors import invalid_request
 from service.learning.learners import Learners
 from service.models.loaded import LoadedModels
-from service.storage.rows import HEADER, USUAL, Page
+from service.storage.rows import HEADER, MAX_PAGE, USUAL, Page
 from service.storage.storage import Storage
 from service.telemetry.meters import Meters
 from service.telemetry.readiness import Readiness, Stopping
@@ -48,15 +48,13 @@ StoppingDep = Annotated[Stopping, Depends(of_app("stopping"))]
 
 
 def _page(
-    request: Request,
     limit: Annotated[int | None, Query(ge=1, description=f"Most items of this page; {USUAL} by default")] = None,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
 ) -> Page:
-    most = request.app.state.storage.settings.max_page
     if limit is None:
-        limit = min(USUAL, most)
-    if limit > most:
-        raise invalid_request("limit", limit, f"at most {most}")
+        limit = min(USUAL, MAX_PAGE)
+    if limit > MAX_PAGE:
+        raise invalid_request("limit", limit, f"at most {MAX_PAGE}")
     if cursor is not None and not (cursor.isascii() and cursor.isdigit() and len(cursor) < 18):
         raise invalid_request("cursor", cursor, "the next_cursor of a page")
     return Page(after=None if cursor is None else int(cursor), limit=limit)

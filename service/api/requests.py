@@ -53,6 +53,8 @@ logger = logging.getLogger(__name__)
 
 SHOWN = 200
 """Characters of an address that are logged."""
+MAX_REFUSALS_PER_S = 10
+"""Refused requests of one route and code that are logged in a second; the others are counted."""
 
 
 class RequestLog:

@@ -16,7 +16,7 @@ from rich.table import Column, Table
 from service.api.access import keys
 from service.api.access.scopes import SCOPES
 from service.cli.consoles import note, out, print_json
-from service.cli.options import Json, group
+from service.cli.options import Json, group, settings_of
 from service.foundation.errors import InvalidRequestError
 from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, Database
@@ -64,7 +64,7 @@ def create(
     where = settings.home if settings.database_url is None else "the database LIPSERVE_DATABASE_URL"
     note(
         f"{row.id} may {', '.join(row.scopes)} {until}; a service that runs on {where} knows it after "
-        f"{settings.keys_refresh_s:g} s"
+        f"{keys.REFRESH_S:g} s"
     )
 
 
@@ -91,17 +91,17 @@ def revoke(
     as_json: Json = False,
 ) -> None:
     """End a key for good. A running service refuses it, and closes its streams, within a second or so."""
-    with _database() as (database, settings):
+    with _database() as (database, _):
         row = keys.revoke(database, key)
     if as_json:
         print_json(_document(row))
         return
-    note(f"{row.id} is revoked; a running service refuses it after {settings.keys_refresh_s:g} s")
+    note(f"{row.id} is revoked; a running service refuses it after {keys.REFRESH_S:g} s")
 
 
 @contextmanager
 def _database() -> Iterator[tuple[Database, Settings]]:
-    settings = Settings()
+    settings = settings_of()
     with usable(settings), closing(Database.of(settings)) as database:
         yield database, settings
 

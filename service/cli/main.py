@@ -87,6 +87,7 @@ class Commands(LazyGroup):
     entries = {  # noqa: RUF012 - declared by the group
         "serve": Entry("service.cli.serve", "Serve models and run training jobs.", RUN),
         "worker": Entry("service.cli.worker", "Run jobs of services on a Dask cluster.", RUN),
+        "settings": Entry("service.cli.settings", "List all settings: values, defaults, units.", RUN),
         "status": Entry("service.cli.status", "Whether a service is ready, and what is not installed there.", RUN),
         "open": Entry("service.cli.open", "Print the address of the dashboard.", RUN),
         "demo": Entry(

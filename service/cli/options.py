@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import os
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -11,7 +13,11 @@ from pydantic import ValidationError
 from lipserve.address import URL_VARIABLE
 from service.cli import connecting
 from service.cli.consoles import CommandError
+from service.foundation.environment import check_environment
 from service.foundation.settings import Settings
+from service.telemetry import logs
+
+logger = logging.getLogger(__name__)
 
 ROBOTS = [
     *("panda", "ur3", "ur5", "ur10", "xarm7", "kinova", "z1", "so100", "so101", "baxter-left", "baxter-right"),
@@ -84,10 +90,20 @@ def alone() -> typer.Typer:
 def settings_of(**given: Any) -> Settings:
     """Settings, those that are given and else those of the environment; raise CommandError."""
     try:
+        check_environment(os.environ)
         return Settings(**{name: value for name, value in given.items() if value is not None})
     except ValidationError as error:
         faults = (f"{'.'.join(map(str, each['loc'])) or 'settings'}: {each['msg']}" for each in error.errors())
         raise CommandError("; ".join(faults)) from None
+    except ValueError as error:
+        raise CommandError(str(error)) from None
+
+
+def start_logs(settings: Settings) -> None:
+    """Log as the settings say from now on, and warn of variables that were removed."""
+    logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
+    for warning in check_environment(os.environ):
+        logger.warning(warning)
 
 
 def numbers(option: str, text: str) -> list[float]:

@@ -207,10 +207,10 @@ def recorded(path: Path, seconds: float | None = None) -> Motion:
 
 def _staged(path: Path, folder: Path) -> tuple[Staged, TorqueConvention]:
     """Columns of a recording in a folder, and what its torque is."""
-    settings, options = Settings(home=folder, min_samples=FEWEST, max_home_bytes=None), UploadOptions()
+    settings, options = Settings(home=folder, max_home_bytes=None), UploadOptions()
     disk = Disk(settings)
     with open_table(path, None, options.read, settings) as table:
-        recording = read(table, folder, options, None, settings, disk)
+        recording = read(table, folder, options, None, settings, disk, FEWEST)
     return prepare(recording.staged, folder, options.recipe, FEWEST, disk).staged, recording.torque_convention
 
 

@@ -10,12 +10,11 @@ import uvicorn
 
 from service.api.oip import rpc
 from service.api.server import sockets
-from service.api.server.connections import StreamProtocol, guarded
+from service.api.server.connections import MAX_FRAME_BYTES, StreamProtocol, guarded
 from service.app import create_app
-from service.cli.options import alone, settings_of
+from service.cli.options import alone, settings_of, start_logs
 from service.runtime.allocator import keep_little
 from service.storage.storage import HomeError, check_home
-from service.telemetry import logs
 
 app = alone()
 ERRORS = (HomeError,)
@@ -32,7 +31,7 @@ def serve(
     settings = settings_of(host=host, port=port, grpc_port=grpc_port, uds=uds)
     sockets.check_port(settings.host, settings.port)
     keep_little()
-    logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
+    start_logs(settings)
     check_home(settings)  # before the app opens it for good: what is wrong is said without a traceback
     served = create_app(settings)
     rpc.check_port(settings)
@@ -45,10 +44,10 @@ def serve(
         loop="uvloop",
         http=guarded(settings),
         ws=StreamProtocol,
-        ws_max_size=settings.max_stream_frame_bytes,
+        ws_max_size=MAX_FRAME_BYTES,
         ws_per_message_deflate=False,
         timeout_keep_alive=settings.keep_alive_s,
-        timeout_graceful_shutdown=settings.drain_s,
+        timeout_graceful_shutdown=sockets.DRAIN_S,
         forwarded_allow_ips=settings.trusted_proxies,
     )
     sockets.serve(config, settings.uds, settings.uds_mode, served.state.stopping, settings.stop_notice_s)

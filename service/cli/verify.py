@@ -18,16 +18,17 @@ from lipcore.files import persistence
 from lipcore.files.probing import probe
 from lipcore.online import transfer as state
 from service.cli.consoles import echo, err, print_json
-from service.cli.options import Json, alone
+from service.cli.options import Json, alone, settings_of
 from service.foundation.errors import DamagedDataError
 from service.foundation.settings import Settings
 from service.foundation.text import counted
 from service.journal.log import decode
 from service.models import registry
+from service.runtime.process import SERVING_THREADS
 from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
 from service.storage.database.engine import FILE
 from service.storage.files import Files, FilesUnreachableError
-from service.storage.storage import HomeError, usable
+from service.storage.storage import WAIT_S, HomeError, usable
 
 FAULTS = 20
 """Faults of the database that are told, at most."""
@@ -68,8 +69,8 @@ def verify_home(settings: Settings) -> Verified:
     """
     if settings.database_url is None and not (settings.home / FILE).is_file():
         raise FileNotFoundError(f"home is {str(settings.home)!r}, expected a folder with the database of a service")
-    threadpool_limits(settings.serving_threads)
-    database = Database.of(settings, settings.database_timeout_s)
+    threadpool_limits(SERVING_THREADS)
+    database = Database.of(settings, WAIT_S)
     try:
         with Files.fresh(settings) as files:
             return _verify(database, files)
@@ -208,7 +209,7 @@ ERRORS = (HomeError,)
 @app.command()
 def verify(as_json: Json = False) -> None:
     """Read everything that the home LIPSERVE_HOME stores and report what is damaged; also while the service runs."""
-    settings = Settings()
+    settings = settings_of()
     with usable(settings):
         findings = verify_home(settings)
     if as_json:

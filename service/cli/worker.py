@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 from service.cli.consoles import CommandError
-from service.cli.options import alone, settings_of
+from service.cli.options import alone, settings_of, start_logs
 from service.runtime.process import THREAD_VARIABLES
-from service.telemetry import logs
 
 app = alone()
 
@@ -27,7 +26,7 @@ def worker(
     settings = settings_of()
     if settings.cluster is None:
         raise CommandError("LIPSERVE_CLUSTER is not set, expected the address of a scheduler such as tcp://host:8786")
-    logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
+    start_logs(settings)
     # before numerics are imported: they start their threads then
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(settings.training_threads)))
     from service.training import hosting  # noqa: PLC0415

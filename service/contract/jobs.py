@@ -12,6 +12,8 @@ from service.contract.models import VERSION, HeldOutQuality, Holdout, ModelName
 from service.contract.states import JobState, PromotionOption
 from service.foundation.fields import LONGEST, MOST_NAMED
 
+MAX_OPTIONS = {"hyperparameter_samples": 500, "posterior_samples": 1000, "max_inducing_outputs": 4000}
+"""Max values of options of a fit. Its time grows with the cube of the samples, that of an answer with the outputs."""
 _DEFAULTS, _HOLDOUT = FitOptions(), Holdout()
 
 

@@ -20,6 +20,7 @@ from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
 from service.contract.datasets import MOST_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
 from service.contract.states import ACTIVE
+from service.datasets.mapping.checks import MIN_SAMPLES
 from service.datasets.mapping.reading import Recording
 from service.datasets.options import UploadOptions
 from service.datasets.report.making import make_report
@@ -60,7 +61,7 @@ def add(
         arguments = upload, kind, options, robot, disk.usage(), folder, settings
         recording = cage.run(READER, Recording, *arguments, settings=settings, folder=folder)
         raw = Staged.of_others(folder, recording.joint_names, recording.lengths, disk)
-        prepared = prepare(raw, folder, options.recipe, settings.min_samples, disk)
+        prepared = prepare(raw, folder, options.recipe, MIN_SAMPLES, disk)
         gravity = recording.torque_convention == "gravity_included"
         report = make_report(
             raw, prepared, profile, recording.noted, settings, options.recipe, gravity, recording.facts

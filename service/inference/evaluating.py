@@ -18,14 +18,17 @@ from service.contract import predictions as schema
 from service.contract.models import Evaluation, HoldoutLineage
 from service.datasets import store
 from service.foundation.errors import DamagedDataError, invalid_request
-from service.inference.predicting import check_offered
+from service.inference.predicting import MAX_COMPONENT_BATCH, check_offered
 from service.models import registry
-from service.models.evaluation import evaluation
+from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation
 from service.models.loaded import LoadedModels, Served
 from service.storage import sample_file
 from service.storage.database import DatasetRow
 from service.training import holding_out, repeating
 from service.training.holding_out import CannotHoldOutError, SetSplit
+
+MAX_TRACE_POINTS = 2000
+"""Rows of one trace of a model along a data set."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class Measured:
 def measured(loaded: LoadedModels, dataset: str, *versions: Served) -> Measured:
     """Read a data set for these versions; raise NotFoundError, or InvalidRequestError where it is of other joints."""
     row = fitting(loaded, dataset, *versions)
-    used = store.samples(loaded.files, row, loaded.storage.settings.max_evaluation_samples)
+    used = store.samples(loaded.files, row, MAX_EVALUATION_SAMPLES)
     return Measured(row.id, row.sha256, row.rows, used)
 
 
@@ -52,7 +55,7 @@ def held_out(loaded: LoadedModels, dataset: str, served: Served) -> Measured:
     row = fitting(loaded, dataset, served)
     with _splitting():
         split = _split_of(loaded, row, served)
-        used = store.samples(loaded.files, row, loaded.storage.settings.max_evaluation_samples, split.held_out)
+        used = store.samples(loaded.files, row, MAX_EVALUATION_SAMPLES, split.held_out)
     return Measured(row.id, row.sha256, split.rows, used)
 
 
@@ -176,9 +179,8 @@ Rows = NDArray[np.int64]
 def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> schema.TraceResponse:
     """Follow a model along a data set or what it has held out of it. Raise InvalidRequestError, NotFoundError or
     DamagedDataError. Not for the event loop."""
-    most = loaded.storage.settings.max_trace_points
-    if request.points > most:
-        raise invalid_request("points", request.points, f"at most {most}")
+    if request.points > MAX_TRACE_POINTS:
+        raise invalid_request("points", request.points, f"at most {MAX_TRACE_POINTS}")
     served = loaded.get(model, request.version, request.alias)
     offered = dynamics.available(served.model.estimator)
     check_offered(served.model, request.components)
@@ -213,7 +215,7 @@ def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> sch
         noise_std=predicted.noise_std.tolist(),
         scale=predicted.scale.tolist(),
         offered=[name for name in get_args(schema.TraceComponent) if name in offered],
-        components=_components(served, samples, request.components, loaded.storage.settings.max_component_batch),
+        components=_components(served, samples, request.components, MAX_COMPONENT_BATCH),
         in_training=_in_training(loaded, dataset, request.part, served),
     )
 

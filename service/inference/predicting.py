@@ -25,6 +25,8 @@ from service.foundation.json_text import each_once
 from service.models.loaded import LoadedModels, Served
 
 Array = NDArray[np.float64]
+MAX_BATCH, MAX_COMPONENT_BATCH = 1000, 100
+"""Queries of one prediction request, and of one that asks for components."""
 QUANTITIES = ("q", "dq", "ddq", "tau")
 
 
@@ -243,11 +245,11 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model
     single = request.q.ndim == 1
-    check_components(known, request, settings.max_component_batch)
+    check_components(known, request, MAX_COMPONENT_BATCH)
     parts = check_shapes(request, known)
     query = Query(np.stack([np.atleast_2d(values) for values in parts]), single)
-    if (count := query.values.shape[1]) > settings.max_batch:
-        raise invalid_request("q", f"{count} queries", f"at most {settings.max_batch} in one request")
+    if (count := query.values.shape[1]) > MAX_BATCH:
+        raise invalid_request("q", f"{count} queries", f"at most {MAX_BATCH} in one request")
     query.check(served.model.position_limits(settings.max_position))
 
     known = carrying(served, request.payload)

@@ -414,7 +414,7 @@ def _make_room(session: Session, model: str, most: int, received: float) -> None
     if abs((oldest.received or 0.0) - received) < IN_USE_S:
         raise BusyError(
             f"model {model!r} has {known} sources of observations in use, the most it may have: go on with one of "
-            "their stream_ids, or raise LIPSERVE_MAX_OBSERVATION_STREAMS"
+            "their stream_ids"
         )
     session.delete(oldest)
     session.flush()

@@ -40,6 +40,8 @@ MOST_WAITING = 100
 """Batches that wait for their turn; more are refused, as their rows fill the memory."""
 RESTART_S = 10.0
 """Time in s within which a learner process that died should have been started again, or one that stands still go on."""
+MAX_LAG_S = 30.0
+"""Time in s for which observations may wait to be learnt before readiness warns of it."""
 
 
 class IngestThreads:
@@ -134,7 +136,7 @@ class Learners:
         self.process = LearnerProcess(settings, self._receive)
         loaded.learn_from(self.process.wake)
         loaded.when_deleted.append(self.forget)
-        self.live = Feed(settings)
+        self.live = Feed()
         self._intake = Intake(loaded, self._monitor, self.monitors, self.process.wake, self.live.note)
         self._intake.check_clock_at_start()
         self.weighing = self._intake.weighing
@@ -213,7 +215,7 @@ class Learners:
             return "failed", f"has not got on for {silent_s:.0f} s: observations are stored, but not learnt"
         behind, stands = self._behind()
         waited = lasting(stands, "lag")
-        if waited is not None and waited > self.settings.learner_lag_s:
+        if waited is not None and waited > MAX_LAG_S:
             return "warning", f"runs, but {behind} events wait, of which it has learnt none for {waited:.0f} s"
         return "ok", "runs"
 
@@ -255,7 +257,7 @@ class Learners:
             if known is not None and known.joint_names == served.model.joint_names:
                 return known
             with self.database.session() as session:
-                monitor = Monitor.rebuilt(session, served.name, served.model.joint_names, self.settings, time.time())
+                monitor = Monitor.rebuilt(session, served.name, served.model.joint_names, time.time())
             if known is not None:
                 monitor.lock = known.lock  # batches of a model are logged one at a time, whatever its joints
             self._monitors[served.name] = monitor

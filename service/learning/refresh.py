@@ -17,11 +17,11 @@ from service.contract.jobs import Job
 from service.contract.learning import AlarmKind
 from service.contract.states import ACTIVE
 from service.foundation.errors import BusyError, ConflictError
-from service.foundation.settings import Settings
 from service.foundation.text import percent
 from service.journal import log
 from service.journal.alarms import raise_alarm
 from service.learning import owner
+from service.learning.learner.follower import NOVELTY_ROWS
 from service.learning.learner.publication import Published
 from service.learning.learners import Learners
 from service.models import registry
@@ -37,11 +37,27 @@ LEAST_S = MIN_BLOCKS * BLOCK_S / COMPARED
 """Seconds of observations after which a version may be refreshed by itself: enough to compare both on COMPARED."""
 
 
+@dataclass(frozen=True)
+class RefreshRule:
+    """When a version is refreshed by itself.
+
+    novelty_share: share of the last NOVELTY_ROWS rows beyond the basis. linearisation_error: error of a learnt arm's
+    linearisation; 1: as large as stated. pause_s: shortest time between two refreshes.
+    """
+
+    novelty_share: float = 0.2
+    linearisation_error: float = 0.5
+    pause_s: float = 600.0
+
+
+RULE = RefreshRule()
+
+
 def attach(learners: Learners, queue: JobQueue) -> None:
     """Let versions be refreshed by themselves; once, before the first observation is taken."""
 
     def published(message: Published) -> None:
-        consider(learners.settings, learners.database, queue, message)
+        consider(learners.database, queue, message)
 
     learners.when_published.append(published)
 
@@ -55,23 +71,23 @@ class Reason:
     evidence: dict[str, Any]
 
 
-def consider(settings: Settings, database: Database, queue: JobQueue, published: Published) -> Job | None:
+def consider(database: Database, queue: JobQueue, published: Published) -> Job | None:
     """Queue a refresh, with an alarm, where there is a reason for one; None where not.
 
     Not while learning is held or a refresh is under way, and not before a pause has passed since the last one, which
     doubles with every refresh of the same version. Where it is impossible, or its owner does not want it, an alarm says
     so once a version. Not for the event loop.
     """
-    reasons = list(_reasons(settings, published))
+    reasons = list(_reasons(published))
     if not reasons:
         return None
     model = published.model
     with database.session() as session:
-        if not _is_due(session, settings, published):
+        if not _is_due(session, published):
             return None
     version = registry.find(database, model, published.version)
     with database.transaction() as session:
-        if not _is_due(session, settings, published):  # another thread may have been faster
+        if not _is_due(session, published):  # another thread may have been faster
             return None
         if not owner.options(session, model).auto_refresh:
             for each in reasons:
@@ -79,7 +95,7 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
             return None
         why = reasons[0]
         try:
-            job = jobs.add_refresh(session, settings, version, why.trigger)
+            job = jobs.add_refresh(session, version, why.trigger)
         except ConflictError as error:
             text = f"{why.text}, but it cannot be refreshed: {error.message}"
             _raise_once(session, model, "refresh", text, why.evidence)
@@ -92,7 +108,7 @@ def consider(settings: Settings, database: Database, queue: JobQueue, published:
     return jobs.represent(job)
 
 
-def _is_due(session: Session, settings: Settings, published: Published) -> bool:
+def _is_due(session: Session, published: Published) -> bool:
     """Whether a refresh may be queued or an alarm be raised now."""
     model, version = published.model, published.version
     serving = session.get(ServingRow, model)
@@ -107,7 +123,7 @@ def _is_due(session: Session, settings: Settings, published: Published) -> bool:
         return False
     ended = [datetime.fromisoformat(job.finished_at or job.created_at).timestamp() for job in before]
     earlier = sum(job.request["refresh"]["version"] == version for job in before)
-    pause = settings.refresh_pause_s * 2 ** min(max(earlier - 1, 0), MOST_DOUBLINGS)
+    pause = RULE.pause_s * 2 ** min(max(earlier - 1, 0), MOST_DOUBLINGS)
     return not ended or time.time() - max(ended) >= pause
 
 
@@ -132,26 +148,26 @@ def _raise_once(session: Session, model: str, kind: AlarmKind, message: str, evi
         raise_alarm(session, model, kind, message, evidence)
 
 
-def _reasons(settings: Settings, published: Published) -> Iterator[Reason]:
+def _reasons(published: Published) -> Iterator[Reason]:
     """What the revision shows that a refresh mends: motion beyond the basis, an arm that has left its linearisation."""
     named = f"version {published.version} of model {published.model!r}"
     revision = {"version": published.version, "revision": published.revision}
     share = published.novel_share
-    if share > settings.novelty_share:
-        text = f"{percent(share)} of the last {settings.novelty_rows} samples lie beyond what {named} can learn"
+    if share > RULE.novelty_share:
+        text = f"{percent(share)} of the last {NOVELTY_ROWS} samples lie beyond what {named} can learn"
         figures: dict[str, Any] = {
             "novel_share": share,
-            "threshold": settings.novelty_share,
-            "rows": settings.novelty_rows,
+            "threshold": RULE.novelty_share,
+            "rows": NOVELTY_ROWS,
             "novel_rows_since_start": published.novel_rows,
         }
         yield Reason("novelty", text, {**revision, **figures})
     errors = published.linearisation or (0.0,)
-    if max(errors) > settings.linearisation_error:
+    if max(errors) > RULE.linearisation_error:
         text = (
             f"the arm of {named} has moved from where its torque is linear: {percent(max(errors))} of the stated error"
         )
-        by_joint = {"linearisation_error": list(errors), "threshold": settings.linearisation_error}
+        by_joint = {"linearisation_error": list(errors), "threshold": RULE.linearisation_error}
         yield Reason("linearisation", text, {**revision, **by_joint})
 
 

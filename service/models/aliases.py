@@ -13,6 +13,9 @@ from service.models.loaded import LoadedModels
 from service.models.registry import SERVING
 from service.storage.database import AliasMoveRow, AliasRow, ServingRow, VersionRow, now
 
+MAX_MOVES = 20
+"""Last moves of an alias that an answer lists."""
+
 
 def page(loaded: LoadedModels, model: str) -> AliasList:
     """Every alias of a model, `serving` first; raise NotFoundError."""
@@ -28,7 +31,7 @@ def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> 
 
     The version is in memory and warm before the alias moves: queries follow by one assignment, those in flight keep
     what answered them. Raise InvalidRequestError where not exactly one of version and alias is named, NotFoundError,
-    ConflictError beyond `max_aliases` and for a version of another robot, UnreadableVersionError. Not for the event
+    ConflictError beyond MAX_ALIASES and for a version of another robot, UnreadableVersionError. Not for the event
     loop.
     """
     if (request.version is None) == (request.alias is None):
@@ -151,13 +154,15 @@ def names(session: Session, model: str) -> list[str]:
 
 
 def _check_room(loaded: LoadedModels, session: Session, model: str, alias: str) -> None:
-    most, known = loaded.storage.settings.max_aliases, names(session, model)
-    if alias not in known and len(known) >= most:
-        raise ConflictError(f"model {model!r} has {most} aliases, the most it may have: remove one first")
+    known = names(session, model)
+    if alias not in known and len(known) >= registry.MAX_ALIASES:
+        raise ConflictError(
+            f"model {model!r} has {registry.MAX_ALIASES} aliases, the most it may have: remove one first"
+        )
 
 
 def _show(loaded: LoadedModels, session: Session, model: str, alias: str) -> Alias:
-    past = _history(session, model, alias, loaded.storage.settings.max_alias_moves)
+    past = _history(session, model, alias, MAX_MOVES)
     if alias == SERVING:
         version = session.get_one(ServingRow, model).version
         changed_at = past[0].at if past else session.get_one(VersionRow, (model, version)).created_at

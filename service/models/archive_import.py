@@ -17,6 +17,7 @@ from lipcore.files.probing import probe
 from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings
+from service.contract.jobs import MAX_OPTIONS
 from service.contract.models import Promotion, Version
 from service.contract.states import PromotionOption
 from service.foundation.errors import invalid_data
@@ -34,12 +35,6 @@ from service.storage.files import new_id
 logger = logging.getLogger(__name__)
 
 OTHERS = Acceptance(unknown=("it was imported beside other versions",))
-OPTION_LIMITS = {
-    "hyperparameter_samples": "max_hyperparameter_samples",
-    "posterior_samples": "max_posterior_samples",
-    "max_inducing_outputs": "max_inducing_outputs",
-}
-"""Options of a fit, and the settings that limit them: a refresh trains with those of the version."""
 
 
 def add(loaded: LoadedModels, upload: Path, name: str | None, promotion: PromotionOption | None = None) -> Version:
@@ -133,7 +128,6 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
 
 
 def _check_options(options: Mapping[str, Any], settings: Settings) -> None:
-    for name, setting in OPTION_LIMITS.items():
-        most = getattr(settings, setting)
+    for name, most in MAX_OPTIONS.items():
         if options.get(name, 0) > most:
             raise ModelFormatError(f"options.{name} is {options[name]}, expected at most {most}")

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from lipcore.files import persistence, strict_json
 from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, Limits, ModelFormatError
+from service.contract.jobs import MAX_OPTIONS
 from service.contract.models import ModelName
 from service.foundation.errors import InvalidDataError, invalid_data, problem
 from service.foundation.settings import Settings
@@ -43,6 +44,11 @@ _KINDS = {
 SMALL = 64 * 1024
 """Most bytes of the members that only describe the others."""
 MANIFEST_BYTES = 1024 * 1024
+MAX_ARCHIVE_BYTES, MAX_URDF_BYTES = 128 * 1024 * 1024, 2 * 1024 * 1024
+"""Largest archive of a version, and largest URDF in it or uploaded."""
+MAX_TORQUES = 10_000
+"""Torques, samples times joints, that an imported version may stand on. Reading it takes memory that grows with the
+square: 0.8 GB here."""
 
 
 class About(BaseModel):
@@ -125,8 +131,8 @@ def read(upload: Path, settings: Settings) -> tuple[About, dict[str, bytes]]:
         CHECKSUMS: SMALL,
         SIGNATURE: SMALL,
         MANIFEST: MANIFEST_BYTES,
-        TENSORS: settings.max_archive_bytes,
-        ROBOT: settings.max_urdf_bytes,
+        TENSORS: MAX_ARCHIVE_BYTES,
+        ROBOT: MAX_URDF_BYTES,
     }
     try:
         files = members(upload, limits)
@@ -153,11 +159,11 @@ def limits_of(settings: Settings) -> Limits:
     """How large a model may be that is imported."""
     return Limits(
         joints=settings.max_joints,
-        inducing_samples=settings.max_posterior_samples,
-        inducing_torques=settings.max_archive_torques,
-        inducing_outputs=settings.max_inducing_outputs,
+        inducing_samples=MAX_OPTIONS["posterior_samples"],
+        inducing_torques=MAX_TORQUES,
+        inducing_outputs=MAX_OPTIONS["max_inducing_outputs"],
         manifest_bytes=MANIFEST_BYTES,
-        robot_bytes=settings.max_urdf_bytes,
+        robot_bytes=MAX_URDF_BYTES,
     )
 
 

@@ -34,6 +34,8 @@ from service.storage.files import Files
 
 logger = logging.getLogger(__name__)
 
+MAX_REFRESHED = 10
+"""Versions of a model kept of those that automatic refreshes made and nothing needs."""
 OF_MODEL = (AliasMoveRow, AliasRow, ServingRow, LearnerRow, LearningRow, StreamRow, EventRow, AlarmRow, SnapshotRow)
 """Tables of what belongs to a model, beside its versions. Jobs and data sets keep their history."""
 
@@ -63,14 +65,13 @@ def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
 
 
 def delete_refreshed(loaded: LoadedModels, model: str) -> None:
-    """Delete the versions that automatic refreshes have made, but the newest `max_refreshed_versions`, those that
+    """Delete the versions that automatic refreshes have made, but the newest MAX_REFRESHED, those that
     something needs and the one that a rollback of `serving` returns to. Not for the event loop."""
     with loaded.database.session() as session:
         trigger = JobRow.request["refresh"]["trigger"].as_string()
         by_itself = (VersionRow.model == model, trigger != "asked")  # of what is no refresh it is NULL
         made = select(VersionRow.version).join(JobRow, JobRow.id == VersionRow.job).where(*by_itself)
-        most = loaded.storage.settings.max_refreshed_versions
-        older = list(session.scalars(made.order_by(VersionRow.version.desc()).offset(most)))
+        older = list(session.scalars(made.order_by(VersionRow.version.desc()).offset(MAX_REFRESHED)))
         move = aliases.standing(session, model, registry.SERVING)
     for version in older:
         if move is None or version != move.before:

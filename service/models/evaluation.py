@@ -16,6 +16,8 @@ from service.foundation.fields import finite
 
 FEWEST_EPISODES, MOST_EPISODES = 5, 200
 """Episodes stand for stretches where there are so many; fewer make no box plot, more are mostly a few samples long."""
+MAX_EVALUATION_SAMPLES = 5000
+"""Samples of one evaluation; more are thinned evenly."""
 EQUAL = 10
 
 

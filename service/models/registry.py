@@ -39,6 +39,8 @@ logger = logging.getLogger(__name__)
 SHIPPED = "panda-sim"
 SERVING = "serving"
 """The alias that every model has: the version that answers where none is named."""
+MAX_ALIASES = 100
+"""Aliases of one model, `serving` aside."""
 
 
 _VERSION = select(VersionRow.version).where(

@@ -53,6 +53,8 @@ ENVIRONMENT = {
     "ARROW_DEFAULT_MEMORY_POOL": "system",
 }
 KEPT_VARIABLES = ("LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "TZ")
+CPU_SHARE = 0.5
+"""Processor time that reading one upload may take, in shares of its time."""
 _making = threading.Lock()
 
 
@@ -76,7 +78,7 @@ def run(
     the function raises of `ERRORS`, MissingExtraError and OSError; InvalidDataError where it reached a limit or
     crashed, TooLargeError where that is one of size; UnexpectedReaderError for any other error of the function.
     """
-    limits = settings.parser_memory_bytes, settings.parser_cpu_s, settings.parser_s, settings.max_unpacked_bytes
+    limits = settings.parser_memory_bytes, cpu_s(settings), settings.parser_s, settings.max_unpacked_bytes
     paths = [os.fspath(each) for each in arguments if isinstance(each, Path)]
     write = [] if folder is None else [os.fspath(folder)]
     encoded = msgspec.Raw(msgspec.msgpack.encode(arguments, enc_hook=plain))
@@ -139,11 +141,16 @@ def _hand_over(call: Call, connection: socket.socket, process: Any) -> None:
                 raise
 
 
+def cpu_s(settings: Settings) -> int:
+    """Processor time in s that reading one upload may take."""
+    return max(1, round(CPU_SHARE * settings.parser_s))
+
+
 def _beyond(limit: str, field: str, settings: Settings) -> ServiceError:
     """The error of a file that takes more than a limit."""
     of = {
         "memory": ("memory", f"{settings.parser_memory_bytes} bytes", "LIPSERVE_PARSER_MEMORY_BYTES"),
-        "processor": ("processor time", f"{settings.parser_cpu_s} s", "LIPSERVE_PARSER_CPU_S"),
+        "processor": ("processor time", f"{cpu_s(settings)} s", "LIPSERVE_PARSER_S"),
         "time": ("time", f"{settings.parser_s:g} s", "LIPSERVE_PARSER_S"),
         "files": ("open files", f"{OPEN_FILES}", None),
         "size": ("space", f"{settings.max_unpacked_bytes} bytes", "LIPSERVE_MAX_UNPACKED_BYTES"),

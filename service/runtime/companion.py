@@ -26,6 +26,8 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.5, 30.0
 """Seconds until a process that died is started again: each time twice as long, unless it lived for LONGEST_PAUSE."""
 END_SECONDS = 5.0
 """Longest wait for the process to end what it does and end."""
+QUIET_S, STEP_S = 45.0, 900.0
+"""Seconds in which the process neither ends a step nor computes, and of one step, after which it is replaced."""
 BEAT, BEAT_S = "beat", 1.0
 """What the process says after a step, and how often it says so at most, s."""
 Work = dict[Hashable, list[Any]]
@@ -154,11 +156,10 @@ class Companion:
     def _listen(self, connection: Connection, process: BaseProcess) -> None:
         """Pass on the messages of the process until it ends; kill it if it hangs."""
         pids = () if process.pid is None else (process.pid,)
-        quiet_s, step_s = self.settings.learner_heartbeat_s, self.settings.learner_step_s
-        progress = self._progress = Progress(lambda: pids, quiet_s, step_s)
+        progress = self._progress = Progress(lambda: pids, QUIET_S, STEP_S)
         while True:
             try:
-                message = connection.recv() if connection.poll(min(LOOK_S, quiet_s / 4)) else None
+                message = connection.recv() if connection.poll(min(LOOK_S, QUIET_S / 4)) else None
             except (EOFError, OSError):
                 return
             if message is None:

@@ -28,7 +28,7 @@ from lipcore.extras import need
 from service.foundation.settings import Settings
 from service.runtime import remote
 from service.runtime.process import Place, start_process
-from service.runtime.progress import LOOK_S, Progress
+from service.runtime.progress import HEARTBEAT_S, LOOK_S, Progress
 from service.telemetry import logs
 
 P = ParamSpec("P")
@@ -99,9 +99,7 @@ class Processes(Executor):
             initargs=(Place(settings.training_threads, log=logs.current()),),
         )
         self._pool = self._new()
-        self._progress = Progress(
-            lambda: [each.pid for each in self._processes() if each.pid], settings.job_heartbeat_s, inf
-        )
+        self._progress = Progress(lambda: [each.pid for each in self._processes() if each.pid], HEARTBEAT_S, inf)
         self._looked = time.monotonic()
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
@@ -117,7 +115,7 @@ class Processes(Executor):
         return future
 
     def look(self) -> None:
-        """End all processes where none of them has got on for `job_heartbeat_s` while work waits: one that others wait
+        """End all processes where none of them has got on for HEARTBEAT_S while work waits: one that others wait
         for hangs. To be asked often."""
         if time.monotonic() - self._looked < LOOK_S / 4:
             return

@@ -35,6 +35,8 @@ THREAD_VARIABLES = (
     "VECLIB_MAXIMUM_THREADS",
     "NUMBA_NUM_THREADS",
 )
+SERVING_THREADS = 1
+"""Threads of BLAS for one prediction: a prediction is too short to be shared, and others want the cores."""
 
 
 @dataclass(frozen=True)

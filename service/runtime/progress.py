@@ -12,6 +12,8 @@ import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+HEARTBEAT_S = 60.0
+"""Seconds without progress after which a process that computes is killed: such a step takes seconds."""
 LOOK_S = 1.0
 """Seconds between two looks; more than twice as many count as so many: who looks may have stood still as well."""
 TICK_S = 0.01

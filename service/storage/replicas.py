@@ -26,6 +26,8 @@ from service.storage.files.local import write_durably
 logger = logging.getLogger(__name__)
 
 IDENTITY = "replica"
+BEATS = 10
+"""Signs of life in the time after which a service counts as lost."""
 KEPT_S = 3600.0
 """Seconds for which a service that is gone is remembered."""
 _SECONDS = cast(func.extract("epoch", func.clock_timestamp()), Float)
@@ -34,11 +36,13 @@ _SECONDS = cast(func.extract("epoch", func.clock_timestamp()), Float)
 class Replicas:
     """A service among those that share its database; a thread gives its signs of life until it is closed.
 
-    id: of this service, the same again after a restart on the same home, so that it knows its own jobs.
+    id: of this service, the same again after a restart on the same home, so that it knows its own jobs; beat_s: seconds
+    between two signs of life.
     """
 
     def __init__(self, settings: Settings, database: Database) -> None:
         self.settings, self.database = settings, database
+        self.beat_s = settings.replica_lost_s / BEATS
         self.id = identity(settings.home) if database.shared else "alone"
         self._started = now()
         self._since, self._last = float("inf"), -float("inf")  # monotonic, s: no sign was missed since; the last one
@@ -100,7 +104,7 @@ class Replicas:
         return bool(changed)
 
     def _run(self) -> None:
-        while not self._closing.wait(self.settings.replica_beat_s):
+        while not self._closing.wait(self.beat_s):
             try:
                 self._beat()
             except Exception as error:

@@ -20,6 +20,8 @@ from service.foundation.errors import ConflictError, problem
 from service.storage.database import AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow
 from service.telemetry.logs import KEY_ID, asked
 
+MAX_PAGE = 100
+"""Items of one page of a list, at most."""
 USUAL = 50
 Row = TypeVar("Row", AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow)
 

@@ -22,6 +22,9 @@ from service.storage.database.migrations import DatabaseVersionError
 from service.storage.disk import Disk
 from service.storage.files import Files, FilesUnreachableError
 
+WAIT_S = 10.0
+"""Longest wait in s of a request for another writer of the database; then it gets a 503."""
+
 
 @dataclass(frozen=True)
 class Storage:
@@ -35,7 +38,7 @@ class Storage:
     @classmethod
     def open(cls, settings: Settings) -> Storage:
         """Open, or make, what the settings name."""
-        return cls(settings, Database.of(settings, settings.database_timeout_s), Files.of(settings), Disk(settings))
+        return cls(settings, Database.of(settings, WAIT_S), Files.of(settings), Disk(settings))
 
 
 WRITE_S = 2.0
@@ -138,7 +141,7 @@ def usable(settings: Settings) -> Iterator[None]:
 
 def _damage(settings: Settings) -> str | None:
     """What is wrong with the database, None where it is whole."""
-    database = Database.of(settings, settings.database_timeout_s)
+    database = Database.of(settings, WAIT_S)
     try:
         with database.transaction():  # a database that can only be read is of no use either
             pass

@@ -21,6 +21,8 @@ BOUNDS = (
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "PATCH", "OPTIONS", "WEBSOCKET"})
 OTHER = "other"
 """Stands for methods that there are not, and for models beyond those that are told apart."""
+MAX_MODELS = 200
+"""Models that metrics of requests and streams tell apart; the others are counted together."""
 
 
 class Durations:
@@ -102,7 +104,7 @@ class StreamMeter:
 class Meters:
     """All that one service counts since it started. most_models: how many models are told apart."""
 
-    def __init__(self, most_models: int = 200) -> None:
+    def __init__(self, most_models: int = MAX_MODELS) -> None:
         self.requests = RequestMeter(most_models)
         self._streams: dict[str, StreamMeter] = {}
 

@@ -19,6 +19,8 @@ logger = logging.getLogger(__name__)
 
 LOOK_S = 0.4
 """Seconds between two looks at the jobs that somebody follows."""
+MAX_FOLLOWERS = 100
+"""Streams of jobs' events at a time; more are answered 429."""
 
 
 class Feed(Counted):

@@ -95,7 +95,7 @@ class Host:
     def __init__(self, settings: Settings, database: Database, function: Callable[[Settings, str], None]) -> None:
         self.settings, self.database, self.function = settings, database, function
         self.files = Files.of(settings)
-        self.settler = Settler(settings, database, self.files)
+        self.settler = Settler(database, self.files)
         place = training_place(settings)
         if settings.training_cpus is None:  # nothing is served here that a CPU is to be left to
             place = replace(place, cpus=None)

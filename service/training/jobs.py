@@ -16,9 +16,10 @@ from lipcore.estimators.catalogue import UnknownEstimatorError, check_estimator
 from lipcore.estimators.options import FitOptions
 from lipcore.robots.library import ROBOTS
 from lipcore.vocabulary import AUTO, CHOICES, DIFFERENTIATED, ROBOT_ESTIMATORS
-from service.contract.jobs import Job, JobDraft, JobPage, JobRequest
+from service.contract.jobs import MAX_OPTIONS, Job, JobDraft, JobPage, JobRequest
 from service.contract.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
 from service.datasets import store
+from service.datasets.mapping.checks import MIN_SAMPLES
 from service.foundation.errors import (
     BusyError,
     ConflictError,
@@ -29,7 +30,6 @@ from service.foundation.errors import (
     problem,
 )
 from service.foundation.fields import first_repeat
-from service.foundation.settings import Settings
 from service.journal import log
 from service.models import registry
 from service.models.loaded import LoadedModels
@@ -41,6 +41,10 @@ from service.telemetry.logs import KEY_ID, asked, request_id
 from service.training import holding_out, lifecycle, refresh_data
 from service.training.queue import JobQueue
 
+MAX_DATASETS = 100
+"""Data sets of one training job."""
+MAX_QUEUED = 100
+"""Jobs that may wait; more are answered 429."""
 USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
 """Seconds after which who finds the queue full may try again: where nothing is known of the jobs that run, and most."""
 
@@ -61,7 +65,7 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
             content["base"] = f"{base.model}:{base.version}"
             if not registry.exists(session, base.model, base.version):  # deleted since it was checked
                 raise not_found("version", base.version)
-        job = add(session, queue.settings, request.model, content, retry_of, named)
+        job = add(session, request.model, content, retry_of, named)
         present = set(session.scalars(select(DatasetRow.id).where(DatasetRow.id.in_(ids))))
         for dataset in ids:
             if dataset not in present:  # deleted since it was checked
@@ -78,7 +82,7 @@ def check(queue: JobQueue, draft: JobDraft) -> None:
     if draft.datasets:
         _checked(queue, draft)
         return
-    _check_options(draft, queue.settings)
+    _check_options(draft)
     if draft.base is not None:
         registry.named(queue.database, draft.base)
     if draft.estimator not in CHOICES:
@@ -93,16 +97,16 @@ def check(queue: JobQueue, draft: JobDraft) -> None:
 
 def _checked(queue: JobQueue, request: JobRequest) -> tuple[list[DatasetRow], list[str], VersionRow | None]:
     """The data sets of a request, the types of their joints, and the version to start from."""
-    _check_options(request, queue.settings)
-    if len(request.datasets) > queue.settings.max_job_datasets:
-        raise invalid_request("datasets", len(request.datasets), f"at most {queue.settings.max_job_datasets}")
+    _check_options(request)
+    if len(request.datasets) > MAX_DATASETS:
+        raise invalid_request("datasets", len(request.datasets), f"at most {MAX_DATASETS}")
     rows = [store.find(queue.database, dataset) for dataset in request.datasets]
     joint_types = _check_joints(request, rows)
     kind = RobotKind(tuple(rows[0].joint_names), tuple(joint_types), rows[0].torque_convention)
     with queue.database.session() as session:
         registry.check_robot(session, request.model, kind)
     if request.holdout is not None:
-        holding_out.check(rows, request.holdout, queue.settings.min_samples)
+        holding_out.check(rows, request.holdout, MIN_SAMPLES)
     if queue.settings.cluster is None:  # else its workers have what it takes, or say so
         _check_extra(request)
     if request.base is None:
@@ -122,7 +126,6 @@ def done_before(database: Database, named: Identity | None) -> Job | None:
 
 def add(
     session: Session,
-    settings: Settings,
     model: str,
     request: dict[str, Any],
     retry_of: str | None = None,
@@ -130,7 +133,7 @@ def add(
 ) -> JobRow:
     """Add a queued job, to be handed to the queue once the session has committed; raise BusyError for a full queue."""
     waiting = session.scalar(select(func.count()).select_from(JobRow).where(JobRow.state == QUEUED)) or 0
-    if waiting >= settings.max_queued_jobs:
+    if waiting >= MAX_QUEUED:
         raise BusyError(
             f"{waiting} jobs are waiting already, the most that may: try again later",
             headers={"Retry-After": str(_seconds_to_wait(session))},
@@ -190,7 +193,7 @@ def _existing(row: JobRow | None, job: str) -> JobRow:
 
 
 def cancel(queue: JobQueue, job: str) -> Job:
-    """Cancel a job: at once while it waits; while it runs within `job_cancel_grace_s`, with or without its consent.
+    """Cancel a job: at once while it waits; while it runs within `JobLimits.cancel_s`, with or without its consent.
     Raise NotFoundError, ConflictError where it has ended."""
     queue.stop(job)  # before anything is written, for which its process may hold the lock
     with queue.database.transaction() as session:
@@ -256,10 +259,9 @@ def _check_base(base: VersionRow, request: JobRequest, data: DatasetRow, joint_t
         raise invalid_request(error.field, error.value, error.expected) from None
 
 
-def _check_options(request: JobRequest, settings: Settings) -> None:
+def _check_options(request: JobRequest) -> None:
     options = request.options
-    for name in ("hyperparameter_samples", "posterior_samples", "max_inducing_outputs"):
-        most = getattr(settings, name if name.startswith("max_") else f"max_{name}")
+    for name, most in MAX_OPTIONS.items():
         if getattr(options, name) > most:
             raise invalid_request(f"options.{name}", getattr(options, name), f"at most {most}")
     try:
@@ -307,14 +309,13 @@ def refresh(
     with queue.database.transaction() as session:
         if (before := done(session, JobRow, named)) is not None:
             return represent(before)
-        job = add_refresh(session, queue.settings, version, trigger, retry_of, named)
+        job = add_refresh(session, version, trigger, retry_of, named)
     queue.submit(job.id)
     return represent(job)
 
 
 def add_refresh(
     session: Session,
-    settings: Settings,
     version: VersionRow,
     trigger: Trigger,
     retry_of: str | None = None,
@@ -330,8 +331,8 @@ def add_refresh(
     scope = refresh_data.scope_of(session, model, through)
     kept, left_out = refresh_data.split_datasets(session, scope, manifest["lineage"])
     rows = refresh_data.rows_within(session, model, scope)
-    if not kept and rows < settings.min_samples:
-        raise ConflictError(_nothing(version, rows, left_out, settings.min_samples))
+    if not kept and rows < MIN_SAMPLES:
+        raise ConflictError(_nothing(version, rows, left_out, MIN_SAMPLES))
     made_by = None if version.job is None else session.scalar(select(JobRow).where(JobRow.id == version.job))
     options = manifest["options"]
     if manifest["estimator"] not in DIFFERENTIATED:  # earlier releases trained every estimator on a GPU
@@ -345,7 +346,7 @@ def add_refresh(
         "options": options,
         "refresh": {"version": version.version, "through": through, "trigger": trigger},
     }
-    return add(session, settings, model, request, retry_of, named)
+    return add(session, model, request, retry_of, named)
 
 
 def _nothing(version: VersionRow, rows: int, left_out: list[dict[str, str]], least: int) -> str:

@@ -10,7 +10,7 @@ from lipcore.model.torque_model import TorqueModel
 from service.contract.models import Evaluation
 from service.foundation.fields import finite
 from service.foundation.settings import Settings
-from service.models.evaluation import evaluation
+from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation
 from service.models.lineage import answer_of, figures
 from service.training import repeating
 from service.training.material import Material
@@ -22,7 +22,7 @@ def judged_figures(settings: Settings, model: TorqueModel, material: Material) -
 
     If a last fit follows, these are also what can be computed no more after it: fields of a `HoldoutLineage`.
     """
-    table, most = material.held_out, settings.max_evaluation_samples
+    table, most = material.held_out, MAX_EVALUATION_SAMPLES
     assert table is not None  # something was held out
     samples = table.thinned(most)
     repeats = repeating.look(material.table.parts, samples, model.joint_types)

@@ -16,6 +16,7 @@ from sqlalchemy.orm import Session
 
 from service.contract.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDED, JobState
 from service.foundation.settings import Settings
+from service.runtime.progress import HEARTBEAT_S
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files, new_id
 
@@ -57,6 +58,23 @@ LINGER_S = 10.0
 """Seconds that a process may take to tidy up after the end of its job."""
 AWAY_S = 0.5
 """Seconds by which the host of a process on another machine, which judges it too, is waited for."""
+
+
+@dataclass(frozen=True)
+class JobLimits:
+    """How often a job is started, and how long its process may take.
+
+    attempts: starts before an interruption fails the job. start_s: until the process is ready. heartbeat_s: without
+    progress. cancel_s: until it obeys a cancel.
+    """
+
+    attempts: int = 3
+    start_s: float = 120.0
+    heartbeat_s: float = HEARTBEAT_S
+    cancel_s: float = 1.0
+
+
+LIMITS = JobLimits()
 
 
 @dataclass(frozen=True)
@@ -127,16 +145,16 @@ class Hand:
             late = clock - self.done >= LINGER_S
             return Ended(self.job, "lingering", "the process did not go on after its end") if late else None
         if self.stopped is not None:
-            if clock - self.stopped < settings.job_cancel_grace_s:
+            if clock - self.stopped < LIMITS.cancel_s:
                 return None
-            message = f"the training process did not stop within {settings.job_cancel_grace_s:g} s and was ended"
+            message = f"the training process did not stop within {LIMITS.cancel_s:g} s and was ended"
             return Ended(self.job, "cancelled", message)
         if self.ran is None:
-            if self.away or clock - self.since < settings.job_start_s:
+            if self.away or clock - self.since < LIMITS.start_s:
                 return None
-            return Ended(self.job, "not_started", f"no training process was ready within {settings.job_start_s:g} s")
-        if clock - self.beat_at >= settings.job_heartbeat_s:
-            message = f"the training process gave no sign of life for {settings.job_heartbeat_s:g} s and was ended"
+            return Ended(self.job, "not_started", f"no training process was ready within {LIMITS.start_s:g} s")
+        if clock - self.beat_at >= LIMITS.heartbeat_s:
+            message = f"the training process gave no sign of life for {LIMITS.heartbeat_s:g} s and was ended"
             return Ended(self.job, "silent", message)
         if clock - self.ran >= settings.max_job_s:
             return Ended(self.job, "too_long", f"it ran for {settings.max_job_s:g} s, the longest that a job may")
@@ -196,12 +214,11 @@ class Settler:
 
     def __init__(
         self,
-        settings: Settings,
         database: Database,
         files: Files,
         mine: Callable[[str | None], bool] = lambda _: True,
     ) -> None:
-        self.settings, self.database, self.files, self.mine = settings, database, files, mine
+        self.database, self.files, self.mine = database, files, mine
         self._starts: dict[str, int] = {}
 
     def settle(self, ended: Ended) -> Settled:
@@ -231,11 +248,11 @@ class Settler:
             fail(row, "too_long", ended.message)
             return Settled()
         if row.state == RUNNING:
-            return Settled(again=queue_again(row, ended.message, self.settings.max_job_attempts))
+            return Settled(again=queue_again(row, ended.message, LIMITS.attempts))
         if ended.why == "returned":  # it was queued again while it ran
             return Settled(again=True)
         starts = self._starts.get(ended.job, 0)
-        if starts + 1 >= self.settings.max_job_attempts:
+        if starts + 1 >= LIMITS.attempts:
             message = f"{ended.message}: no training process could be started for it, {starts + 1} times"
             fail(row, "interrupted", message)
             return Settled()

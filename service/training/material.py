@@ -16,12 +16,15 @@ from lipcore.data.splits import Mask
 from lipcore.kernels.arm_prior import Arm
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.sibling import arm_as_expected, arm_of_sibling
+from lipcore.online.gates import MAX_GAP_S
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
 from service.contract.models import Holdout, HoldoutLineage
+from service.datasets.mapping.checks import MIN_SAMPLES
 from service.foundation.settings import Settings
 from service.journal import log
 from service.models import registry
+from service.models.evaluation import MAX_EVALUATION_SAMPLES
 from service.models.lineage import named
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, VersionRow
@@ -33,6 +36,8 @@ from service.training.refresh_data import Logged, Scope, Unlearnt
 from service.training.repeating import unrepeated
 from service.training.table import Table, TablePart, opened
 
+MAX_REFRESH_SAMPLES = 200_000
+"""Logged samples that a refresh learns from."""
 CANDIDATES = 20_000
 """Rows that a fit chooses from: of more, so many of them, thinned evenly."""
 
@@ -153,21 +158,21 @@ def observed(settings: Settings, database: Database, files: Files, model: str, r
     base, lineage = files.load_version(version.folder, version.checksums), version.manifest["lineage"]
 
     def read(scope: Scope, most: int, above: int = 0) -> Logged:
-        return refresh_data.read_log(database, model, base.joint_names, scope, most, settings.max_time_gap_s, above)
+        return refresh_data.read_log(database, model, base.joint_names, scope, most, MAX_GAP_S, above)
 
-    logged = judged = read(within, settings.max_refresh_samples)
+    logged = judged = read(within, MAX_REFRESH_SAMPLES)
     parts = opened(files, rows)
     divided = holding_out.hold_out_again(rows, [part.clock() for part in parts], version.manifest["lineage"])
     corrupt = [sound(part) for part in parts]
     parts = [replace(part, factor=_aged(part.row, within)) for part in parts]
     table, held_out, every = _tables(parts, divided, corrupt)
-    if not table.parts and logged.rows < settings.min_samples:
-        raise NothingToLearnError(f"the log has {logged.rows} rows to train on, expected {settings.min_samples}")
-    newest, before = read(within, settings.max_evaluation_samples, after), Logged(None, 0)
+    if not table.parts and logged.rows < MIN_SAMPLES:
+        raise NothingToLearnError(f"the log has {logged.rows} rows to train on, expected {MIN_SAMPLES}")
+    newest, before = read(within, MAX_EVALUATION_SAMPLES, after), Logged(None, 0)
     unlearnt = None
     if newest.samples is not None:
-        before = read(replace(within, through=after), settings.max_refresh_samples)
-        if len(table) + before.rows >= settings.min_samples:
+        before = read(replace(within, through=after), MAX_REFRESH_SAMPLES)
+        if len(table) + before.rows >= MIN_SAMPLES:
             unlearnt, judged = Unlearnt(after, newest.samples), before
             every = table if every is None else every
     log_lineage: dict[str, Any] = {"through": within.through, "rows": 0, "found": logged.rows}

@@ -62,12 +62,12 @@ def settle(session: Session, model: str, judged: Promotion, option: PromotionOpt
     return Promotion(answers=False, passed=False, serving=serving, reason=reason)
 
 
-def wait(session: Session, model: str, version: int, most_aliases: int) -> None:
+def wait(session: Session, model: str, version: int) -> None:
     """Let a version wait that was just added as a candidate: it learns nothing and is in no contest, as whoever looks
     at it says what becomes of it. The alias `candidate` points to it, where there is room for that."""
     session.get_one(LearnerRow, (model, version)).role = "dismissed"
     known = aliases.names(session, model)
-    if CANDIDATE in known or len(known) < most_aliases:
+    if CANDIDATE in known or len(known) < registry.MAX_ALIASES:
         aliases.point(session, model, CANDIDATE, version)
 
 

@@ -55,10 +55,10 @@ class JobQueue:
         self.problem: str | None = None
         """Why training processes cannot be started, None while they can as far as is known."""
         self.replicas = Replicas(settings, database)
-        self._settler = Settler(settings, database, storage.files, self.replicas.mine)
+        self._settler = Settler(database, storage.files, self.replicas.mine)
         self.cluster: Cluster | None = None
         self._slots = self._places()
-        self._reconcile_s = settings.replica_beat_s if database.shared else RECONCILE_S
+        self._reconcile_s = self.replicas.beat_s if database.shared else RECONCILE_S
         self._hands: list[Hand] = []
         self._waiting: dict[str, float] = {}  # when each may be handed out, monotonic, in the order of coming
         self._settling: set[str] = set()
@@ -79,7 +79,7 @@ class JobQueue:
         self._inbox.put(partial(self._wait, job))
 
     def stop(self, job: str) -> None:
-        """End the process that runs a job, if one does, unless it ends within `job_cancel_grace_s`: it is cancelled."""
+        """End the process that runs a job, if one does, unless it ends within `JobLimits.cancel_s`: it is cancelled."""
         self._inbox.put(partial(self._stop, job))
 
     @property
@@ -122,7 +122,7 @@ class JobQueue:
     def _is_ready(self, row: JobRow) -> bool:
         if row.state == QUEUED and not row.cancel_requested:
             return True
-        return queue_again(row, "the service was killed while it ran", self.settings.max_job_attempts)
+        return queue_again(row, "the service was killed while it ran", lifecycle.LIMITS.attempts)
 
     # the watcher: all below until the clerk runs in its thread alone
 
@@ -246,7 +246,7 @@ class JobQueue:
         """See to a job that runs, but not in a process of this service. ours: not taken over just now."""
         if not ours:
             self._pass_on(Ended(row.id, "ended", "the service that had it run is gone"))
-        elif _age(row.heartbeat_at) > self.settings.job_heartbeat_s:
+        elif _age(row.heartbeat_at) > lifecycle.LIMITS.heartbeat_s:
             self._pass_on(Ended(row.id, "ended", "no process runs it"))
 
     def _settled(self, job: str, settled: Settled) -> None:

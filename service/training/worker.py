@@ -21,6 +21,7 @@ from service.contract.states import CANCELLED, FAILED, QUEUED, RUNNING, SUCCEEDE
 from service.foundation.errors import NotInstalledError, ServiceError, StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.models import registry
+from service.models.evaluation import MAX_EVALUATION_SAMPLES
 from service.models.lineage import MOST_SAMPLES, figures, software
 from service.runtime.allocator import give_back
 from service.runtime.executors import ClusterUnavailableError
@@ -85,7 +86,7 @@ def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
         if row is None or row.state != QUEUED:
             return None
         row.attempts += 1
-        lifecycle.enter(row, RUNNING, f"started: attempt {row.attempts} of at most {settings.max_job_attempts}")
+        lifecycle.enter(row, RUNNING, f"started: attempt {row.attempts} of at most {lifecycle.LIMITS.attempts}")
         row.started_at = row.heartbeat_at = now()
         row.progress = {"stage": "loading"}
         return Claim(job, row.attempts, row.model, row.request)
@@ -93,7 +94,7 @@ def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
 
 def _train(settings: Settings, database: Database, files: Files, claim: Claim) -> None:
     try:
-        with Pulse(database, lambda session: _own(session, claim), claim.model, settings.job_heartbeat_s) as pulse:
+        with Pulse(database, lambda session: _own(session, claim), claim.model, lifecycle.LIMITS.heartbeat_s) as pulse:
             if claim.request.get("refresh") is None:
                 material = recorded(settings, database, files, claim.request)
             else:
@@ -135,7 +136,7 @@ def _version(
         pulse.stage("evaluating")
         lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(settings, trained, material)}
     judged, learnt = _judged(settings, database, files, claim, material, trained, lineage), material
-    judged_on = _judged_on(settings, material)
+    judged_on = _judged_on(material)
     if last is not None and judged_on is not None:
         trained = last.last(settings, trained, judged_on, pulse)
         if REFIT_ERROR not in trained.fit:
@@ -157,11 +158,11 @@ def _option(settings: Settings, claim: Claim) -> PromotionOption:
     return option
 
 
-def _judged_on(settings: Settings, material: Material) -> Samples | None:
+def _judged_on(material: Material) -> Samples | None:
     """What a version is judged on before it learns it: of a refresh the newest logged rows, else what was held out."""
     if material.unlearnt is not None:
         return material.unlearnt.samples
-    return None if material.held_out is None else material.held_out.thinned(settings.max_evaluation_samples)
+    return None if material.held_out is None else material.held_out.thinned(MAX_EVALUATION_SAMPLES)
 
 
 def _judged(
@@ -177,7 +178,7 @@ def _judged(
     refreshes."""
     refresh = claim.request.get("refresh")
     if refresh is None:
-        judged_on, option = _judged_on(settings, material), _option(settings, claim)
+        judged_on, option = _judged_on(material), _option(settings, claim)
         return promotion.judge(database, files, claim.model, trained, judged_on, lineage, option)
     with database.session() as session:
         serving = session.get_one(VersionRow, (claim.model, refresh["version"]))
@@ -201,7 +202,7 @@ def _publish(
         waits = not judged.answers
         version = registry.publish(session, claim.model, folder, manifest, claim.job, candidate=waits, promotion=judged)
         if waits:
-            promotion.wait(session, claim.model, version, settings.max_aliases)
+            promotion.wait(session, claim.model, version)
         return version, f" and {'waits as candidate' if waits else 'answers'}: {judged.reason}"
     if refresh_data.taken_back(session, claim.model, refresh["through"], material.seen):
         raise TakenBackError("part of what was observed has been taken back while it was trained on: refresh again")

@@ -154,8 +154,7 @@ def test_a_loop_goes_on_through_a_restart(driver, tmp_path):
 
 def test_keys(driver, tmp_path):
     motions = panda_rows(1)
-    settings = {"LIPSERVE_KEYS": "on", "LIPSERVE_KEYS_REFRESH_S": "0.05"}
-    with Server(tmp_path / "home", warm=True, **settings) as server:
+    with Server(tmp_path / "home", warm=True, LIPSERVE_KEYS="on") as server:
         database = Database.of(Settings(home=server.home))
         _, secret = keys.create(database, "controller", ("predict",), None)
         database.close()

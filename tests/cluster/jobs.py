@@ -12,7 +12,7 @@ from service.training import jobs
 from tests.cluster.servers import Shared
 from tests.service.jobs.conftest import Seen, new_row
 
-LOST = {"replica_beat_s": 0.2, "replica_lost_s": 1.0}
+LOST = {"replica_lost_s": 1.0}
 
 
 def _request(do, options=None):

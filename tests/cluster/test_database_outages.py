@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Iterator
+from unittest.mock import patch
 
 import httpx
 import pytest
@@ -24,8 +25,11 @@ ARM = "arm"
 @pytest.fixture
 def service(shared) -> Iterator[Pair]:
     """A service with settings under which a test need not wait."""
-    settings = shared.settings(publish_every_s=0.02, database_timeout_s=2.0)
-    with TestClient(create_app(settings), ADDRESS, raise_server_exceptions=False) as client:
+    settings = shared.settings(publish_every_s=0.02)
+    with (
+        patch("service.storage.storage.WAIT_S", 2.0),
+        TestClient(create_app(settings), ADDRESS, raise_server_exceptions=False) as client,
+    ):
         yield Pair((client,), train(shared.folder / "trained"))
 
 

@@ -44,7 +44,7 @@ def test_without_a_scheduler_there_is_no_executor(shared):
     assert not lost(ValueError("wrong"))
 
 
-LOST_SOON = {"LIPSERVE_REPLICA_BEAT_S": "0.3", "LIPSERVE_REPLICA_LOST_S": "2"}
+LOST_SOON = {"LIPSERVE_REPLICA_LOST_S": "2"}
 LONG = {"hyperparameter_samples": 150, "posterior_samples": 60, "max_iterations": 200}
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 import yaml
 
+from service.api.server.sockets import DRAIN_S
 from service.app import create_app
 from service.foundation.settings import Settings
 from tests.docs.blocks import ROOT
@@ -152,7 +153,7 @@ def test_containers_have_settings_commands_and_limits_that_there_are(entry, name
             assert create_app().state.rules.of("GET", asked["path"]).scope is None  # a probe has no key
             assert ports.get(asked["port"], asked["port"]) == PORT
     if "terminationGracePeriodSeconds" in pod:
-        assert pod["terminationGracePeriodSeconds"] > settings.stop_notice_s + settings.drain_s
+        assert pod["terminationGracePeriodSeconds"] > settings.stop_notice_s + DRAIN_S
 
 
 @pytest.mark.parametrize("entry", ENTRIES)

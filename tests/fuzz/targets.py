@@ -25,16 +25,7 @@ from service.robots.caged import read_urdf
 from service.storage.disk import Usage
 
 MiB = 1024 * 1024
-SETTINGS = Settings(
-    min_samples=10,
-    max_samples=5000,
-    max_columns=200,
-    max_zip_members=50,
-    max_unpacked_bytes=16 * MiB,
-    max_bag_part_bytes=4 * MiB,
-    max_json_bytes=MiB,
-    max_json_line_bytes=64 * 1024,
-)
+SETTINGS = Settings(max_samples=5000, max_unpacked_bytes=16 * MiB)
 USAGE = Usage(0, 1 << 40, None, 0)
 JOINTS = 2
 """Of the models whose tensors are read."""

@@ -40,10 +40,8 @@ SEED = int(os.environ.get("LIPSERVE_HISTORY_SEED", str(time.time_ns() % 10**6) i
 """Of what clients ask and who is disturbed when; another one each time in long runs."""
 EVERY_S = min(SECONDS / 3, 5.0)
 """Seconds between two disturbances, about."""
-HASTE = {"LIPSERVE_DATABASE_TIMEOUT_S": "2", "LIPSERVE_REPLICA_BEAT_S": "0.3", "LIPSERVE_REPLICA_LOST_S": "3"}
+HASTE = {"LIPSERVE_REPLICA_LOST_S": "3"}
 """Of services that others are to give up soon."""
-PATIENT = {"LIPSERVE_KEYS": "on", "LIPSERVE_MAX_JOB_ATTEMPTS": "1000"}
-"""Of all: a job is not to fail because of what is done to the services."""
 
 
 class Bed:
@@ -62,7 +60,7 @@ class Bed:
 
     def start(self, home: Path, port: int, clock: Clock, **more: str) -> Server:
         """A service; its client has the key."""
-        server = Server(home, port=port, **{**PATIENT, **clock.environment, **more})
+        server = Server(home, port=port, **{"LIPSERVE_KEYS": "on", **clock.environment, **more})
         server.client.headers.update(self.headers)
         return server
 
@@ -122,7 +120,9 @@ class Bed:
             made = Counter(row.job for row in session.query(VersionRow).filter(VersionRow.model == WORK))
         for each in done:
             assert made[each["id"]] == (each["state"] == "succeeded"), each
-        assert not [each for each in done if each["state"] == "failed"], done
+        failed = [each for each in done if each["state"] == "failed"]
+        # of what is done to the services, a job may be interrupted more often than it is started
+        assert {each["error"]["code"] for each in failed} <= {"interrupted"}, done
 
 
 class Expected:

@@ -4,13 +4,16 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from fastapi.testclient import TestClient
 
 import lipcore
 from lipcore import Samples, TorqueModel
+from service.api.limits import requests
 from service.app import create_app
+from service.contract.jobs import MAX_OPTIONS
 from service.foundation.settings import Settings
 from service.models import registry
 from tests.service import backend
@@ -26,20 +29,22 @@ for name, value in (("TRAINING_NICENESS", "0"), ("LEARNER_NICENESS", "0"), ("TRA
 LIMITS = {
     "max_upload_bytes": 200_000,
     "max_unpacked_bytes": 400_000,
-    "max_urdf_bytes": 5_000,
-    "max_archive_bytes": 100_000,
     "max_request_bytes": 20_000,
     "max_joints": 8,
     "max_samples": 500,
-    "max_batch": 20,
-    "max_evaluation_samples": 50,
-    "max_page": 3,
-    "max_job_datasets": 2,
-    "max_queued_jobs": 2,
-    "max_hyperparameter_samples": 30,
-    "max_posterior_samples": 40,
 }
 """Limits small enough to be exceeded."""
+BODY_LIMITS = {"MAX_URDF_BYTES": 5_000, "MAX_ARCHIVE_BYTES": 100_000}
+"""The same of constants that an application is made with."""
+CONSTANTS = {
+    "service.inference.predicting.MAX_BATCH": 20,
+    "service.inference.evaluating.MAX_EVALUATION_SAMPLES": 50,
+    "service.api.dependencies.MAX_PAGE": 3,
+    "service.training.jobs.MAX_DATASETS": 2,
+    "service.training.jobs.MAX_QUEUED": 2,
+    "service.training.jobs.MAX_OPTIONS": {**MAX_OPTIONS, "hyperparameter_samples": 30, "posterior_samples": 40},
+}
+"""The same of constants that requests are checked by."""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -76,13 +81,17 @@ def api(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
 @pytest.fixture(scope="session")
 def strict_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestClient]:
     """A service with small limits."""
-    with TestClient(create_app(Settings(home=tmp_path_factory.mktemp("strict"), **LIMITS)), ADDRESS) as client:
+    with patch.multiple(requests, **BODY_LIMITS):
+        app = create_app(Settings(home=tmp_path_factory.mktemp("strict"), **LIMITS))
+    with TestClient(app, ADDRESS) as client:
         yield client
 
 
 @pytest.fixture
-def strict(strict_service: TestClient) -> Iterator[TestClient]:
+def strict(strict_service: TestClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
     """The service with small limits, empty of data sets at the start of every test."""
+    for place, value in CONSTANTS.items():
+        monkeypatch.setattr(place, value)
     yield strict_service
     while left := strict_service.get("/v1/datasets").json()["items"]:
         for dataset in left:

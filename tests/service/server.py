@@ -5,9 +5,10 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import httpx
 
@@ -20,14 +21,21 @@ class Server:
     """`lipserve serve` on a home; settings are environment variables.
 
     warm: forked from a process that has imported it already, for a service that is shared and nothing else; port: to
-    listen on, a free one where None; log: what it prints goes there, beside the home where None.
+    listen on, a free one where None; log: what it prints goes there, beside the home where None; constants: of a warm
+    one, by module and name.
     """
 
     patience = DEADLINE
     """Seconds that it may take to start."""
 
     def __init__(
-        self, home: Path, warm: bool = False, port: int | None = None, log: Path | None = None, **settings: str
+        self,
+        home: Path,
+        warm: bool = False,
+        port: int | None = None,
+        log: Path | None = None,
+        constants: Mapping[str, Any] | None = None,
+        **settings: str,
     ) -> None:
         self.home, self.log = home, home.with_name(home.name + ".log") if log is None else log
         self.port = free_port() if port is None else port
@@ -35,7 +43,9 @@ class Server:
         self.client = httpx.Client(base_url=self.url, timeout=DEADLINE)
         arguments = ["serve", "--port", str(self.port)]
         environment = {**os.environ, "LIPSERVE_HOME": str(home), **backend.environment(home), **settings}
-        self.process = Served(arguments, environment, self.log) if warm else self._spawned(arguments, environment)
+        self.process = (
+            Served(arguments, environment, self.log, constants) if warm else self._spawned(arguments, environment)
+        )
         try:
             eventually(self._ready, self.patience)
         except BaseException:

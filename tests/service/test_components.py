@@ -11,7 +11,8 @@ from lipcore.model import dynamics
 from service.contract.predictions import PredictRequest
 from service.foundation.settings import Settings
 from service.inference import predicting
-from tests.service.data import error, service_of
+from service.inference.predicting import MAX_COMPONENT_BATCH
+from tests.service.data import error
 
 NAMES = list(dynamics.COMPONENTS)
 SHAPES = {"inertia_matrix": (2, 2), "kinetic_energy": (), "potential_energy": ()}
@@ -73,7 +74,7 @@ def test_requests_that_are_refused(api, trained, motion, request_, field, value)
 
 
 def test_batches_with_components_are_smaller(api, trained, motion):
-    limit = service_of(api).settings.max_component_batch
+    limit = MAX_COMPONENT_BATCH
     assert limit == 100
     many = {name: np.repeat(values[:1], limit + 1, axis=0) for name, values in motion.items()}
     reply = refused(api, trained.name, many, components=["gravity"])

@@ -16,6 +16,7 @@ from tritonclient.grpc.service_pb2_grpc import GRPCInferenceServiceStub
 from tritonclient.utils import InferenceServerException
 
 from service import __version__
+from service.api.limits.requests import ClientPatience
 from service.api.oip.query import PARTS
 from service.api.oip.rpc.messages import MOST
 from tests.service.data import DEADLINE, eventually
@@ -55,12 +56,13 @@ class Calls:
 @pytest.fixture(scope="module")
 def calls(tmp_path_factory) -> Iterator[Calls]:
     port = free_port()
-    limits = {"LIPSERVE_MAX_REQUEST_BYTES": str(MOST_BYTES), "LIPSERVE_BODY_S": str(BODY_S)}
-    limits["LIPSERVE_LOG_REFUSALS_PER_S"] = "1000"  # every one of them
+    settings = {"LIPSERVE_MAX_REQUEST_BYTES": str(MOST_BYTES), "LIPSERVE_LOG_FORMAT": "json"}
+    # every refusal is logged
+    limits = {"service.app.PATIENCE": ClientPatience(body_s=BODY_S), "service.app.MAX_REFUSALS_PER_S": 1000}
     home = tmp_path_factory.mktemp("grpc") / "home"
     address = f"127.0.0.1:{port}"
     with (
-        Server(home, warm=True, LIPSERVE_GRPC_PORT=str(port), LIPSERVE_LOG_FORMAT="json", **limits) as server,
+        Server(home, warm=True, constants=limits, LIPSERVE_GRPC_PORT=str(port), **settings) as server,
         triton.InferenceServerClient(address) as client,
         grpc.insecure_channel(address) as channel,
     ):

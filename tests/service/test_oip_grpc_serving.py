@@ -13,6 +13,7 @@ from tritonclient.grpc import service_pb2 as published
 from tritonclient.grpc.service_pb2_grpc import GRPCInferenceServiceStub
 
 from lipcore.extras import EXTRAS, Extra, MissingExtraError
+from service.api.limits.requests import ClientPatience
 from service.app import create_app
 from service.foundation.settings import Settings
 from tests.service.data import DEADLINE
@@ -92,8 +93,10 @@ def heard(connection: socket.socket) -> bytes:
 
 
 def test_connections_beyond_the_most_there_may_be_and_those_that_say_nothing(tmp_path):
-    port, limits = free_port(), {"LIPSERVE_MAX_CONNECTIONS": "3", "LIPSERVE_HEADER_S": "1"}
-    with Server(tmp_path / "home", warm=True, LIPSERVE_GRPC_PORT=str(port), **limits), ExitStack() as stack:
+    soon = {"service.api.oip.rpc.listening.PATIENCE": ClientPatience(header_s=1.0)}
+    port, settings = free_port(), {"LIPSERVE_MAX_CONNECTIONS": "3"}
+    server = Server(tmp_path / "home", warm=True, constants=soon, LIPSERVE_GRPC_PORT=str(port), **settings)
+    with server, ExitStack() as stack:
         silent = [stack.enter_context(socket.create_connection(("127.0.0.1", port), DEADLINE)) for _ in range(4)]
         assert sum(bool(heard(each)) for each in silent) == 3  # HTTP/2's server speaks first
         for each in silent:

@@ -1,11 +1,17 @@
 """Settings: environment variables, checked, with what is wrong named."""
 
+import os
+import re
+import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
-from service.foundation.settings import CHECKOUT_MODELS, Settings, is_loopback
+from service.foundation.environment import REMOVED, check_environment
+from service.foundation.settings import CHECKOUT_MODELS, Settings, describe, is_loopback
 
 
 @pytest.fixture(autouse=True)
@@ -70,7 +76,6 @@ def test_hosts_beyond_loopback_need_keys(host, loopback):
     [
         ("port", "70000"),
         ("log_level", "loud"),
-        ("min_samples", "9"),
         ("training_niceness", "20"),
         ("keys", "off"),
         ("uds_mode", "rw-rw----"),
@@ -78,10 +83,6 @@ def test_hosts_beyond_loopback_need_keys(host, loopback):
         ("max_velocity", "1e308"),
         ("max_acceleration", "5e-324"),
         ("max_position", "0"),
-        ("max_time_gap_s", "inf"),
-        ("stationary_speed", "2"),
-        ("contact_patience_s", "nan"),
-        ("linearisation_error", "1e9"),
     ],
 )
 def test_wrong_values_are_named(monkeypatch, name, text):
@@ -91,6 +92,85 @@ def test_wrong_values_are_named(monkeypatch, name, text):
     assert [item["loc"] for item in caught.value.errors()] == [(name,)]
 
 
-def test_every_setting_is_described():
-    plain = {name for name, field in Settings.model_fields.items() if not field.description}
-    assert plain <= {"log_level"}
+def test_there_are_few_settings_and_each_has_a_meaning():
+    found = describe(Settings())
+    assert len(found) <= 63
+    assert all(each.meaning.endswith(".") for each in found)
+    assert {each.unit for each in found if each.variable.endswith("_S")} == {"s", "1/s"}
+    assert {each.unit for each in found if each.variable.endswith("_BYTES")} == {"bytes"}
+
+
+def test_a_setting_is_shown_as_the_environment_has_it_without_passwords():
+    url = "postgresql://me:se@cret@host/name?password=secret&sslmode=require"
+    settings = Settings(uds_mode="600", keep_alive_s=9, opentelemetry=True, database_url=url, files_url="s3://here/me")
+    shown = {each.variable: each.value for each in describe(settings)}
+    assert shown["LIPSERVE_DATABASE_URL"] == "postgresql://me:***@host/name?password=***&sslmode=require"
+    assert (shown["LIPSERVE_UDS_MODE"], shown["LIPSERVE_KEEP_ALIVE_S"]) == ("600", "9")
+    assert (shown["LIPSERVE_OPENTELEMETRY"], shown["LIPSERVE_UDS"]) == ("true", "")
+
+
+def test_a_reference_page_lists_all_settings():
+    docs = CHECKOUT_MODELS.parent / "docs"
+    page = runpy.run_path(str(docs / "settings.py"))["page"]
+    assert (docs / "reference/settings.md").read_text() == page(), "run: python docs/settings.py"
+
+
+def test_settings_that_are_not_there_cannot_be_given():
+    with pytest.raises(ValidationError, match="max_columns"):
+        Settings(max_columns=5)
+
+
+@pytest.mark.parametrize(
+    ("variable", "message"),
+    [
+        ("LIPSERVE_PROT", "Unknown setting LIPSERVE_PROT. Did you mean LIPSERVE_PORT?"),
+        ("lipserve_log_levels", "Unknown setting LIPSERVE_LOG_LEVELS. Did you mean LIPSERVE_LOG_LEVEL?"),
+        ("LIPSERVE_42", "Unknown setting LIPSERVE_42."),
+    ],
+)
+def test_unknown_variables_are_named_with_the_nearest(variable, message):
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
+        check_environment({variable: "1"})
+
+
+def test_variables_of_clients_tests_and_kubernetes_are_known():
+    services = {
+        "LIPSERVE_DB_SERVICE_HOST": "10.0.0.7",
+        "LIPSERVE_DB_SERVICE_PORT": "5432",
+        "LIPSERVE_DB_PORT": "tcp://…",
+    }
+    assert check_environment({"LIPSERVE_URL": "", "LIPSERVE_API_KEY": "", "LIPSERVE_SCREENSHOTS": "", **services}) == []
+    del services["LIPSERVE_DB_SERVICE_HOST"]
+    with pytest.raises(ValueError, match="LIPSERVE_DB_PORT"):
+        check_environment(services)
+
+
+def test_removed_variables_are_no_settings_and_what_replaces_them_is_one():
+    names = {name.upper() for name in Settings.model_fields}
+    assert names.isdisjoint(REMOVED)
+    replacing = {name for text in REMOVED.values() for name in re.findall("LIPSERVE_([A-Z_]+)", text)}
+    assert replacing <= names
+
+
+def started(home, **variables):
+    """The exit code and the log of a service that stops as soon as its settings are read: its home is a file."""
+    home.touch()
+    given = {"LIPSERVE_HOME": str(home), **variables}
+    command = [sys.executable, "-m", "service", "serve", "--port", "0"]
+    done = subprocess.run(
+        command, env={**os.environ, **given}, capture_output=True, text=True, check=False, timeout=120
+    )
+    return done.returncode, done.stderr
+
+
+def test_a_start_stops_at_an_unknown_variable(tmp_path):
+    code, log = started(tmp_path / "home", LIPSERVE_PROT="9000")
+    assert (code, log) == (1, "error: Unknown setting LIPSERVE_PROT. Did you mean LIPSERVE_PORT?\n")
+
+
+def test_a_start_warns_once_of_a_removed_variable_and_knows_those_of_clients(tmp_path):
+    variables = {"LIPSERVE_MAX_COLUMNS": "50", "LIPSERVE_URL": "http://127.0.0.1:1", "LIPSERVE_API_KEY": "lip_key"}
+    code, log = started(tmp_path / "home", **variables)
+    assert (code, log.count("LIPSERVE_MAX_COLUMNS was removed: the limit is now fixed at 2000 columns.")) == (1, 1)
+    assert "Unknown setting" not in log
+    assert "home" in log.splitlines()[-1]

@@ -7,11 +7,13 @@ import time
 from functools import wraps
 from time import perf_counter
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 from anyio import to_thread
 
+from service.api.limits.requests import ClientPatience
 from service.api.stream.session import Session
 from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
@@ -300,12 +302,13 @@ async def test_an_acknowledgement_waits_for_the_answer_that_is_being_written():
 
 @played
 async def test_who_does_not_read_acknowledgements_is_cut_off():
-    async with Talk(stream_flush_rows=1, stream_write_s=0.01) as talk:
-        talk.learners.open.clear()
-        await talk.teach(1)
-        talk.passing["text"].clear()
-        talk.learners.open.set()
-        await asyncio.wait_for(talk.aborted.wait(), DEADLINE)
+    with patch("service.api.stream.session.PATIENCE", ClientPatience(frame_s=0.01)):
+        async with Talk(stream_flush_rows=1) as talk:
+            talk.learners.open.clear()
+            await talk.teach(1)
+            talk.passing["text"].clear()
+            talk.learners.open.set()
+            await asyncio.wait_for(talk.aborted.wait(), DEADLINE)
 
 
 @played

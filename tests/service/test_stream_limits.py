@@ -10,6 +10,7 @@ from websockets.client import ClientProtocol
 from websockets.exceptions import InvalidStatus
 from websockets.uri import parse_uri
 
+from service.api.limits.requests import ClientPatience
 from tests.service.data import DEADLINE, eventually
 from tests.service.server import Server
 from tests.service.streams import dial, hello
@@ -22,7 +23,8 @@ MiB = 1024 * 1024
 def bounded(tmp_path_factory):
     """A server with room for two streams, which soon gives up those that do not read."""
     home = tmp_path_factory.mktemp("bounded")
-    with Server(home, warm=True, LIPSERVE_MAX_STREAMS="2", LIPSERVE_STREAM_WRITE_S="1.0") as started:
+    soon = {"service.api.stream.session.PATIENCE": ClientPatience(frame_s=1.0)}
+    with Server(home, warm=True, constants=soon, LIPSERVE_MAX_STREAMS="2") as started:
         yield started
 
 

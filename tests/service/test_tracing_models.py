@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tests.service.data import arrays, error, npz, post, service_of, stream, train, upload
+from service.inference.predicting import MAX_COMPONENT_BATCH
+from tests.service.data import arrays, error, npz, post, stream, train, upload
 
 PARTS = ["inertial", "coriolis", "gravity", "friction"]
 
@@ -66,7 +67,7 @@ def test_rows_are_thinned_evenly(api, trained, unseen, points):
 def test_components_are_computed_a_batch_at_a_time(strict):
     """More rows than one request of queries with components may have."""
     dataset = upload(strict, stream("panda", 120, motion="middle"))["id"]
-    assert service_of(strict).settings.max_component_batch < 120
+    assert MAX_COMPONENT_BATCH < 120
     answer = traced(strict, "panda-sim", dataset, components=["friction"])
     some = traced(strict, "panda-sim", dataset, components=["friction"], start=90, stop=110)
     assert np.shape(answer["components"]["friction"]["mean"]) == (120, 7)

@@ -116,13 +116,22 @@ def _shim() -> SimpleNamespace:
 
 
 class Served:
-    """`lipserve` with arguments, in a process of its own that is used like `subprocess.Popen`. log: of its output."""
+    """`lipserve` with arguments, in a process of its own that is used like `subprocess.Popen`. log: of its output;
+    constants: of the service, by module and name, that it has other values of."""
 
-    def __init__(self, arguments: Sequence[str], environment: dict[str, str], log: Path) -> None:
+    def __init__(
+        self,
+        arguments: Sequence[str],
+        environment: dict[str, str],
+        log: Path,
+        constants: Mapping[str, Any] | None = None,
+    ) -> None:
         context = _context()
         forkserver.ensure_running()
         address = forkserver._forkserver._forkserver_address  # type: ignore[attr-defined]
-        self._process = context.Process(target=_serve, args=(list(arguments), environment, log, address))
+        self._process = context.Process(
+            target=_serve, args=(list(arguments), environment, log, address, constants or {})
+        )
         self._process.start()
         assert self._process.pid is not None
         self.pid = self._process.pid
@@ -147,7 +156,9 @@ class Served:
         self.send_signal(signal.SIGTERM)
 
 
-def _serve(arguments: list[str], environment: dict[str, str], log: Path, address: str) -> None:
+def _serve(
+    arguments: list[str], environment: dict[str, str], log: Path, address: str, constants: Mapping[str, Any]
+) -> None:
     os.environ.clear()
     os.environ.update(environment)
     with log.open("ab") as file:
@@ -159,6 +170,9 @@ def _serve(arguments: list[str], environment: dict[str, str], log: Path, address
     for module in STARTERS:
         import_module(module).multiprocessing = _shim()  # type: ignore[attr-defined]
     import_module("service.runtime.cage").start = _start  # type: ignore[attr-defined]
+    for place, value in constants.items():
+        module, _, name = place.rpartition(".")
+        vars(import_module(module))[name] = value
     current_process().name = "MainProcess"  # as logs have it
     sys.argv = ["lipserve", *arguments]
     from service.__main__ import main

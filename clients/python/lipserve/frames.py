@@ -91,8 +91,8 @@ the source of torques to learn from, in up to 64 letters, digits, dots, undersco
 first. What this stream_id's arm carries is part of its answers with or without `payload`.
 
 The service reads no further while an answer waits to be written, so a client that sends but does not read is slowed
-down by its own socket, and cut off when it reads nothing for LIPSERVE_STREAM_WRITE_S. A frame beyond
-LIPSERVE_MAX_STREAM_FRAME_BYTES ends the connection with code 1009, LIPSERVE_STREAM_IDLE_S without a frame with 1000, a
+down by its own socket, and cut off when it reads nothing for 10 s. A frame of more than 64 KiB
+ends the connection with code 1009, LIPSERVE_STREAM_IDLE_S without a frame with 1000, a
 service that stops with 1001, an API key that is revoked or expires with 1008. A connection that cannot be had is
 refused before the upgrade, in HTTP, with an error of the same shape: 401 (no API key where one is needed), 403 (a key
 without the scope `predict` or, with stream_id, `update`; a web page of another site), 404, 422 (a wrong parameter), 429

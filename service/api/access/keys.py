@@ -34,6 +34,8 @@ SLOWEST, FASTEST = 1e-3, 1e6
 """Requests per s that a key may be limited to."""
 GIVEN = re.compile(rf"{PREFIX}[A-Za-z0-9_-]{{43,200}}")
 """A key that was made elsewhere: 43 letters of base64 are the 32 bytes of ours."""
+REFRESH_S = 1.0
+"""Seconds after which a running service knows of keys that another process made or revoked."""
 
 
 LONGEST_BURST_S = 10.0

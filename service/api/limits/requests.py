@@ -19,20 +19,43 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.api.errors import refuse
 from service.foundation.errors import BusyError, RateLimitedError
 from service.foundation.settings import Settings
+from service.models.archive_reading import MAX_ARCHIVE_BYTES, MAX_URDF_BYTES
 from service.telemetry.logs import KEY_ID
 
 OTHER_BYTES = 256 * 1024
 """Largest body where neither motions nor files are sent: a list of a thousand names, each as long as may be."""
 LOOK_S = 0.5
 """Longest time in s between two looks at the bodies that are waited for."""
+MAX_REQUESTS = 256
+"""Max requests at a time; a quarter as many may wait for the bodies of one client. More are answered 429."""
+
+
+@dataclass(frozen=True)
+class ClientPatience:
+    """How long the service waits for a slow client, before it closes the connection.
+
+    header_s: for a request's line and headers, of at most `header_bytes`. body_s: for a body, and one second more for
+    each `body_bytes_per_s` that came. answer_s: until the client reads any of its answer. frame_s: until it reads an
+    answer of a stream.
+    """
+
+    header_s: float = 10.0
+    header_bytes: int = 64 * 1024
+    body_s: float = 20.0
+    body_bytes_per_s: int = 1000
+    answer_s: float = 30.0
+    frame_s: float = 10.0
+
+
+PATIENCE = ClientPatience()
 
 
 def body_limits(settings: Settings) -> dict[str, int]:
     """Largest body in bytes, by path or by a path's last part; `*`: of every other path."""
     return {
         "/v1/datasets": settings.max_upload_bytes,
-        "/v1/robots": settings.max_urdf_bytes,
-        "/v1/models/import": settings.max_archive_bytes,
+        "/v1/robots": MAX_URDF_BYTES,
+        "/v1/models/import": MAX_ARCHIVE_BYTES,
         **dict.fromkeys(("predict", "observations", "infer", "echo"), settings.max_request_bytes),
         "*": min(OTHER_BYTES, settings.max_request_bytes),
     }
@@ -161,9 +184,7 @@ class Gate:
             await self.app(scope, receive, send)
             return
         if self.open >= self.most:
-            message = (
-                f"{self.open} requests are being answered, the most there may be (LIPSERVE_MAX_REQUESTS): try again"
-            )
+            message = f"{self.open} requests are being answered, the most there may be: try again"
             await refuse(BusyError(message, headers={"Retry-After": "1"}), scope, receive, send)
             return
         self.open += 1

@@ -18,7 +18,7 @@ from service.api.oip.tensors import Answer, Header, Message
 from service.api.route import Reply
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
-from service.inference.predicting import Query, check_answer
+from service.inference.predicting import MAX_BATCH, MAX_COMPONENT_BATCH, Query, check_answer
 from service.models.loaded import Served
 
 Array = NDArray[np.float64]
@@ -170,10 +170,10 @@ def _check_shape(
     if len(shape) not in (1, 2) or shape[-1] != n or shape[0] == 0:
         joints = ", ".join(model.joint_names)
         raise invalid_request(field, shape, f"[{n}] for one query or [N, {n}] for a batch: the joints are {joints}")
-    if len(shape) == 2 and shape[0] > settings.max_batch:
-        raise invalid_request(field, shape, f"at most {settings.max_batch} queries in one request")
-    if len(shape) == 2 and components and shape[0] > settings.max_component_batch:
-        expected = f"at most {settings.max_component_batch} queries in one request with components"
+    if len(shape) == 2 and shape[0] > MAX_BATCH:
+        raise invalid_request(field, shape, f"at most {MAX_BATCH} queries in one request")
+    if len(shape) == 2 and components and shape[0] > MAX_COMPONENT_BATCH:
+        expected = f"at most {MAX_COMPONENT_BATCH} queries in one request with components"
         raise invalid_request(field, shape, expected)
 
 

@@ -28,6 +28,7 @@ from service.models.loaded import LoadedModels
 from service.storage.database import JobRow
 from service.storage.rows import identity
 from service.training import jobs
+from service.training.feed import MAX_FOLLOWERS
 from service.training.queue import JobQueue
 
 
@@ -37,7 +38,7 @@ def _row(queue: JobQueueDep, job: str) -> JobRow:
 
 async def _followed(queue: JobQueueDep, row: Annotated[JobRow, Depends(_row)]) -> AsyncIterator[JobRow]:
     """The job at the start; one more is counted while the answer lasts."""
-    with queue.feed.one_more(queue.settings.max_job_followers):
+    with queue.feed.one_more(MAX_FOLLOWERS):
         yield row
 
 

@@ -15,6 +15,7 @@ from service.api.errors import responses
 from service.api.route import Route
 from service.foundation.errors import BusyError, InvalidRequestError, NotFoundError
 from service.learning.learners import Learners
+from service.learning.live.feed import MAX_FOLLOWERS
 from service.learning.live.look import LiveLook
 from service.telemetry.meters import Meters
 
@@ -25,7 +26,7 @@ def _name(learners: LearnersDep, model: str) -> str:
 
 async def _followed(learners: LearnersDep, name: Annotated[str, Depends(_name)]) -> AsyncIterator[str]:
     """The model's name; one more reader is counted while the answer lasts."""
-    with learners.live.one_more(learners.settings.max_live_followers):
+    with learners.live.one_more(MAX_FOLLOWERS):
         yield name
 
 
@@ -59,7 +60,7 @@ async def follow(
     """Server-sent events of what streams and batches bring with measured torque, predicted before it is learnt.
 
     `rows`, at most ten a second: `parts`, each of one stream and revision, with torque measured, mean, standard
-    deviations and code of some `LIPSERVE_LIVE_ROWS_PER_S` rows a second; all rows are counted by code. `status`, at the
+    deviations and code of some 50 rows a second; all rows are counted by code. `status`, at the
     start and about once a second: version, revision, counters, quality, latency of streams, alarms, and whether
     learning waits for a decision. `lost`: so many events were dropped because they were not read in time. The answer
     ends when the model is deleted or the service stops.

@@ -23,7 +23,7 @@ from websockets.frames import CloseCode
 from websockets.protocol import State
 
 from service.api.errors import refuse
-from service.api.limits.requests import HEALTH
+from service.api.limits.requests import HEALTH, PATIENCE, ClientPatience
 from service.api.server.room import Room
 from service.foundation.errors import BusyError, ErrorBody, ErrorResponse
 from service.foundation.settings import Settings
@@ -35,7 +35,7 @@ REFUSED = 64
 class GuardedProtocol(HttpToolsProtocol):
     """One HTTP connection, with limits. Times are looked at when something happens rarely, not with each request."""
 
-    settings: ClassVar[Settings]
+    patience: ClassVar[ClientPatience]
     room: ClassVar[Room]
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -59,7 +59,7 @@ class GuardedProtocol(HttpToolsProtocol):
         if beyond > 0:
             self.app = _Crowded(self.app, why)
             self.ws_protocol_class = None
-        self._head = self.loop.call_later(self.settings.header_s, self._late)
+        self._head = self.loop.call_later(self.patience.header_s, self._late)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Forget the connection."""
@@ -80,13 +80,13 @@ class GuardedProtocol(HttpToolsProtocol):
         if cycle is None or cycle.response_complete:
             # part of a line and of headers, or what is left of a body that was refused
             if self._head is None and not self.transport.is_closing():
-                self._head = self.loop.call_later(self.settings.header_s, self._late)
+                self._head = self.loop.call_later(self.patience.header_s, self._late)
         else:
             if self._head is not None:
                 self._cancel_head()
             if cycle is not self._known:
                 self._known, self._overhead = cycle, 0
-        if self._overhead > self.settings.max_header_bytes:
+        if self._overhead > self.patience.header_bytes:
             self._too_long()
 
     def on_headers_complete(self) -> None:
@@ -150,7 +150,7 @@ class GuardedProtocol(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         if self._overhead > 0 and self.cycle is None:
-            message = f"the request's line and headers did not come within {self.settings.header_s:g} s"
+            message = f"the request's line and headers did not come within {self.patience.header_s:g} s"
             self._say(HTTPStatus.REQUEST_TIMEOUT, "request_timeout", message)
         else:
             self.transport.close()
@@ -160,14 +160,14 @@ class GuardedProtocol(HttpToolsProtocol):
         if self.transport.is_closing():
             return
         if self.cycle is None or self.cycle.response_complete:
-            message = f"the request's line and headers have more than {self.settings.max_header_bytes} bytes"
+            message = f"the request's line and headers have more than {self.patience.header_bytes} bytes"
             self._say(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "too_large", message)
         else:
             self.transport.abort()
 
     def _watch_reading(self) -> None:
         self._left, self._resumed = self._waiting(), False
-        self._unread = self.loop.call_later(self.settings.answer_s, self._look_reading)
+        self._unread = self.loop.call_later(self.patience.answer_s, self._look_reading)
 
     def _look_reading(self) -> None:
         """Give up a client that has read nothing for a while; look again at one that reads slowly."""
@@ -210,13 +210,15 @@ class _Crowded:
         await refuse(BusyError(f"{self.why}: try again", headers=headers), scope, receive, send)
 
 
-def guarded(settings: Settings) -> type[GuardedProtocol]:
+def guarded(settings: Settings, patience: ClientPatience = PATIENCE) -> type[GuardedProtocol]:
     """Class of connections with the limits of the settings, for `uvicorn.Config(http=...)`."""
-    return type("GuardedProtocol", (GuardedProtocol,), {"settings": settings, "room": Room(settings)})
+    return type("GuardedProtocol", (GuardedProtocol,), {"patience": patience, "room": Room(settings)})
 
 
 CONNECTION = "lipserve.connection"
 """Key of the connection in the `state` of an ASGI scope."""
+MAX_FRAME_BYTES = 64 * 1024
+"""Largest frame that a stream reads."""
 FLUSH_SECONDS = 1.0
 CLOSE_SECONDS = 3.0
 """How long a client may take to answer a close before it is cut off."""

@@ -24,6 +24,8 @@ logger = logging.getLogger(__name__)
 
 BACKLOG = 128
 PROBE_SECONDS = 1.0
+DRAIN_S = 5
+"""Longest wait in s for answers in progress when the service stops."""
 
 
 class SocketError(OSError):

@@ -19,6 +19,7 @@ from starlette.types import Message, Receive, Send
 
 from lipcore.model.external import external
 from service.api.access.middleware import subprotocol_of
+from service.api.limits.requests import PATIENCE
 from service.api.server.connections import StreamProtocol
 from service.api.stream.learning import Learning, Taught
 from service.contract import frames
@@ -92,7 +93,7 @@ class Conversation(ABC):
             return
         with suppress(OSError, RuntimeError):  # gone, or closing, which uvicorn says in its own way
             try:
-                async with asyncio.timeout(self.settings.stream_write_s):
+                async with asyncio.timeout(PATIENCE.frame_s):
                     await self._write_texts()
             except TimeoutError:
                 self.connection.abort()
@@ -102,13 +103,13 @@ class Conversation(ABC):
             await self.send({"type": "websocket.send", "text": self._texts.popleft()})
 
     def _watch(self) -> None:
-        period = min(self.settings.stream_idle_s, self.settings.stream_write_s)
+        period = min(self.settings.stream_idle_s, PATIENCE.frame_s)
         self._timer = asyncio.get_running_loop().call_later(period, self._look)
 
     def _look(self) -> None:
         """End a connection that is idle or does not read. Looked at now and then: a timer a frame costs time."""
         waited = perf_counter() - self.left
-        if self._writing and waited >= self.settings.stream_write_s:
+        if self._writing and waited >= PATIENCE.frame_s:
             self.connection.abort()
         elif not self._writing and waited >= self.settings.stream_idle_s:
             self._closing = asyncio.get_running_loop().create_task(self._close_idle())

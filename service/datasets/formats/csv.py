@@ -198,7 +198,7 @@ def open_csv(path: Path, options: ReadOptions, settings: Settings, naming: Namin
         raise invalid_request(
             "column_names", ", ".join(options.column_names), "none, as the first line of the file holds names"
         )
-    names = checked_names(header.names, settings)
+    names = checked_names(header.names)
     with path.open("rb") as file:
         for _ in range(header.lines):
             file.readline()

@@ -71,7 +71,7 @@ def open_joined(path: Path, options: ReadOptions, settings: Settings) -> Iterato
             raise invalid_data(
                 "column_names", f"{len(left)} names too many", "one a column of the files that have no names"
             )
-        names = checked_names([part.table.names[i] for part in parts for i in part.kept], settings)
+        names = checked_names([part.table.names[i] for part in parts for i in part.kept])
         units = {name: unit for part in parts for name, unit in part.table.units.items()}
         joined = Table(names, iter(()), units=units, facts=facts)
         joined.blocks = _side_by_side(parts, len(names), joined)

@@ -15,13 +15,17 @@ import msgspec
 import numpy as np
 
 from lipcore.data.samples import Array
-from service.datasets.formats.table import SAME_LENGTH, Table, block_rows, checked_names, left_out
+from service.datasets.formats.table import MAX_COLUMNS, SAME_LENGTH, Table, block_rows, checked_names, left_out
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, TooLargeError, invalid_data
 from service.foundation.settings import Settings
 
 SAMPLE_ROWS = 1000
 """Rows that tell which columns there are."""
+MAX_BYTES = 32 * 1024 * 1024
+"""Largest JSON document, which is read as a whole; one object a line may be longer."""
+MAX_LINE_BYTES = 1024 * 1024
+"""Longest line of JSON, one object a line."""
 MAX_DEPTH = 10
 
 Place = tuple[str | int, ...]
@@ -129,9 +133,9 @@ class Rows:
         self._first = list(islice(rows, SAMPLE_ROWS))
         for number, row in enumerate(self._first, start=1):
             _check(row, number)
-        shape = Shape(self._first, 2 * settings.max_columns)
+        shape = Shape(self._first, 2 * MAX_COLUMNS)
         numbers, others = shape.columns()
-        self.names = checked_names(map(name_of, numbers), settings)
+        self.names = checked_names(map(name_of, numbers))
         self.facts = left_out([name_of(path) for path in others], "they hold no numbers, or lists of different lengths")
         self._plan = shape.plan(numbers)
 
@@ -222,9 +226,9 @@ def open_json_lines(path: Path, options: ReadOptions, settings: Settings) -> Ite
 @contextmanager
 def open_json(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
     """Open one JSON document as a table; raise InvalidDataError, or TooLargeError as it has to be in memory at once."""
-    if (size := path.stat().st_size) > settings.max_json_bytes:
+    if (size := path.stat().st_size) > MAX_BYTES:
         raise TooLargeError(
-            f"the JSON document has {size} bytes, expected at most {settings.max_json_bytes}: write one object a line "
+            f"the JSON document has {size} bytes, expected at most {MAX_BYTES}: write one object a line "
             "(NDJSON), which may be longer"
         )
     rows, joint_names, facts = _document(path.read_bytes())
@@ -233,7 +237,7 @@ def open_json(path: Path, options: ReadOptions, settings: Settings) -> Iterator[
 
 
 def _lines(path: Path, settings: Settings) -> Iterator[Any]:
-    most = settings.max_json_line_bytes
+    most = MAX_LINE_BYTES
     number = 0
     with path.open("rb") as file:
         while line := file.readline(most + 1):

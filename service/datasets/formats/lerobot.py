@@ -52,7 +52,7 @@ def open_lerobot(path: Path, options: ReadOptions, settings: Settings) -> Iterat
         features = info.get("features")
         reader = _Files(archive, files, path.parent, features if isinstance(features, dict) else {}, settings)
         with reader.opened(files[0]) as first:
-            columns = checked_names(first.names, settings)
+            columns = checked_names(first.names)
             facts = [f"LeRobot data set {_text(info, 'codebase_version')} of robot type {_text(info, 'robot_type')}"]
             facts += first.facts
             clock = _clock(columns, info, facts)

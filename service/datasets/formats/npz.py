@@ -15,7 +15,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from lipcore.data.samples import Array
-from service.datasets.formats.table import Table, block_rows, checked_names, first_line, left_out
+from service.datasets.formats.table import MAX_COLUMNS, Table, block_rows, checked_names, first_line, left_out
 from service.datasets.formats.zips import ERRORS, measure, open_zip
 from service.datasets.options import ReadOptions
 from service.foundation.errors import invalid_data
@@ -64,15 +64,15 @@ def open_npz(path: Path, options: ReadOptions, settings: Settings) -> Iterator[T
         for member in members:
             if "/" in member.filename or not member.filename.endswith(".npy"):
                 raise invalid_data("array", member.filename, "a plain name ending in .npy")
-        if len(members) > settings.max_columns:
-            raise invalid_data("array", f"{len(members)} arrays", f"at most {settings.max_columns}")
+        if len(members) > MAX_COLUMNS:
+            raise invalid_data("array", f"{len(members)} arrays", f"at most {MAX_COLUMNS}")
         measure(members, settings)
         arrays = {each.name: each for each in (_header(archive, member) for member in members)}
         rows = _rows(arrays)
         used, ignored = _choose(arrays, rows)
         joints = arrays.get("joint_names")
         step = None if "dt" not in arrays or "t" in arrays else _step(archive, arrays["dt"])
-        names = checked_names((["t"] if step else []) + [name for each in used for name in each.columns()], settings)
+        names = checked_names((["t"] if step else []) + [name for each in used for name in each.columns()])
         facts = left_out(ignored, f"they are not {rows} numbers, or rows of numbers")
         yield Table(
             names,

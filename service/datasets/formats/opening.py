@@ -13,7 +13,7 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.extras import need
 from service.datasets.formats.joined import tables_of
-from service.datasets.formats.json import decode, open_json, open_json_lines
+from service.datasets.formats.json import MAX_LINE_BYTES, decode, open_json, open_json_lines
 from service.datasets.formats.npz import open_npz
 from service.datasets.formats.table import Table
 from service.datasets.formats.zips import open_zip, root_of
@@ -192,7 +192,7 @@ def _kind(path: Path, kind: str | None, settings: Settings) -> str:
     if actual is not None:
         if (kind, actual) == ("json_lines", "json") and not _starts(path, b"["):
             with path.open("rb") as file:  # a damaged first line makes lines of JSON look like a document
-                line = file.readline(settings.max_json_line_bytes)
+                line = file.readline(MAX_LINE_BYTES)
                 return "json_lines" if len(line.strip()) > 1 and line.endswith(b"\n") and file.read(1) else actual
         return actual
     other = foreign(path)

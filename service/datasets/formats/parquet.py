@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from lipcore.data.samples import Array
 from service.datasets.formats.arrow import Node, plan
-from service.datasets.formats.table import Table, block_rows, checked_names, first_line, left_out, stacked
+from service.datasets.formats.table import MAX_COLUMNS, Table, block_rows, checked_names, first_line, left_out, stacked
 from service.datasets.options import ReadOptions
 from service.foundation.errors import TooLargeError, invalid_data
 from service.foundation.settings import Settings
@@ -36,7 +36,7 @@ def open_parquet(path: Path, options: ReadOptions, settings: Settings) -> Iterat
     """
     with path.open("rb") as file:
         source = ParquetSource(file, settings)
-        yield Table(checked_names(source.names, settings), source.blocks(), units=source.units, facts=source.facts)
+        yield Table(checked_names(source.names), source.blocks(), units=source.units, facts=source.facts)
 
 
 class ParquetSource:
@@ -54,7 +54,7 @@ class ParquetSource:
             if (size := sum(each.total_byte_size for each in groups)) > settings.max_unpacked_bytes:
                 raise TooLargeError(f"the file unpacks to {size} bytes, expected at most {settings.max_unpacked_bytes}")
             schema = self._file.schema_arrow
-            checked_names(schema.names, settings)
+            checked_names(schema.names)
             nested = [each.name for each in schema if pa.types.is_nested(_storage_type(each.type))]
             batches = self._file.iter_batches(SAMPLE_ROWS, columns=nested, use_threads=False) if nested else iter(())
             sample = next(batches, None)
@@ -69,7 +69,7 @@ class ParquetSource:
             first = pa.array([], _storage_type(column.type))
             if sample is not None and column.name in nested:
                 first = sample.column(column.name)
-            node = plan(column.name, column.type, first, settings.max_columns)
+            node = plan(column.name, column.type, first, MAX_COLUMNS)
             if node is None:
                 ignored.append(column.name)
                 continue

@@ -10,7 +10,6 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from service.foundation.errors import invalid_data
-from service.foundation.settings import Settings
 
 BLOCK_ROWS = 16_384
 """Most rows of a block: what is held in memory of a file, however long it is."""
@@ -18,6 +17,8 @@ BLOCK_BYTES = 16 * 1024 * 1024
 """Largest block: a file of many columns is read fewer rows at a time."""
 SAME_LENGTH = 0.9
 """Share of a list's rows that must be of one length: then another is an error, else the list is of no fixed shape."""
+MAX_COLUMNS = 2000
+"""Columns of a recording's file, lists taken apart."""
 
 
 @dataclass
@@ -42,7 +43,7 @@ def block_rows(columns: int) -> int:
     return max(1, min(BLOCK_ROWS, BLOCK_BYTES // (8 * max(columns, 1))))
 
 
-def checked_names(names: Iterable[str], settings: Settings) -> tuple[str, ...]:
+def checked_names(names: Iterable[str]) -> tuple[str, ...]:
     """The names of columns, stripped; raise InvalidDataError for one that is doubled or cannot be shown."""
     checked: dict[str, int] = {}
     for index, given in enumerate(names, start=1):
@@ -52,8 +53,8 @@ def checked_names(names: Iterable[str], settings: Settings) -> tuple[str, ...]:
         if name in checked:
             raise invalid_data(f"column {index}", name, "every column once")
         checked[name] = index
-    if len(checked) > settings.max_columns:
-        raise invalid_data("columns", len(checked), f"at most {settings.max_columns}")
+    if len(checked) > MAX_COLUMNS:
+        raise invalid_data("columns", len(checked), f"at most {MAX_COLUMNS}")
     return tuple(checked)
 
 

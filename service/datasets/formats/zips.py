@@ -18,6 +18,8 @@ from service.foundation.errors import ServiceError, TooLargeError, invalid_data
 from service.foundation.settings import Settings
 
 PIECE = 1024 * 1024
+MAX_MEMBERS = 20_000
+"""Files in an archive of recordings."""
 ERRORS = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError, ValueError)
 """What zipfile raises of a damaged archive: RuntimeError of a password, NotImplementedError of other compressions."""
 BAG_ENDINGS = (".db3", ".mcap", ".bag", ".db3.zstd", ".mcap.zstd")
@@ -36,8 +38,8 @@ def open_zip(path: Path, settings: Settings, expected: str) -> Iterator[zipfile.
             raise invalid_data("file", "no zip archive" if "not a zip file" in text else text, expected) from None
         with archive:
             members = archive.infolist()
-            if len(members) > settings.max_zip_members:
-                raise invalid_data("file", f"{len(members)} members", f"at most {settings.max_zip_members}")
+            if len(members) > MAX_MEMBERS:
+                raise invalid_data("file", f"{len(members)} members", f"at most {MAX_MEMBERS}")
             seen: set[str] = set()
             for member in members:
                 name = member.orig_filename

@@ -11,6 +11,8 @@ from lipcore.data.samples import Array
 from service.datasets.mapping.vocabulary import TURN
 from service.foundation.errors import InvalidDataError, invalid_data
 
+MIN_SAMPLES = 30
+"""Samples of a data set, at least."""
 CONSTANT = 1e-6
 """A joint whose positions span less than this (rad, m) has not moved."""
 MOVED = 0.01

@@ -52,7 +52,13 @@ class Read:
 
 
 def read(
-    table: Table, folder: Path, options: UploadOptions, robot: Profile | None, settings: Settings, disk: Disk | Room
+    table: Table,
+    folder: Path,
+    options: UploadOptions,
+    robot: Profile | None,
+    settings: Settings,
+    disk: Disk | Room,
+    min_samples: int = checks.MIN_SAMPLES,
 ) -> Read:
     """Read a table's columns to files in a folder; raise InvalidDataError, StorageFullError.
 
@@ -60,7 +66,7 @@ def read(
     the recording is prepared, as are those whose time was there in the row before.
     """
     mapped = resolve(table.names, table.units, table.joint_names, options, robot, settings.max_joints)
-    reader = _Reader(mapped, Staged(folder, mapped.joints, disk), settings)
+    reader = _Reader(mapped, Staged(folder, mapped.joints, disk), settings, min_samples)
     for block in table.blocks:
         reader.add(block)
     reader.finish()
@@ -87,8 +93,9 @@ def read(
 class _Reader:
     """Takes block after block; keeps of them what the checks at the end need."""
 
-    def __init__(self, mapped: ColumnMap, staged: Staged, settings: Settings) -> None:
-        self.mapped, self.staged, self.settings, self.rows = mapped, staged, settings, 0
+    def __init__(self, mapped: ColumnMap, staged: Staged, settings: Settings, min_samples: int) -> None:
+        self.mapped, self.staged, self.settings, self.min_samples = mapped, staged, settings, min_samples
+        self.rows = 0
         self.time = Seen(mapped.t[0].name) if mapped.t else None
         self.time_has_unit = any(each.unit is not None for each in mapped.t)
         self.clockwork = Clockwork(mapped.t[0].name if mapped.t else TIME)
@@ -119,7 +126,7 @@ class _Reader:
             del self.seen[quantity]
         missing = self.staged.missing()
         seen = [each for row in self.seen.values() for each in row] + ([self.time] if self.time else [])
-        checks.check_rows(len(missing), int(missing.sum()), self.clockwork.repeated, self.settings.min_samples, seen)
+        checks.check_rows(len(missing), int(missing.sum()), self.clockwork.repeated, self.min_samples, seen)
         if self.mapped.t:
             checks.check_time_unit(self.staged.read(TIME), self.time_has_unit, self.mapped.t[0].name)
         joints = list(zip(self.mapped.joints, self.seen["q"], strict=True))

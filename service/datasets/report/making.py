@@ -42,6 +42,8 @@ from service.datasets.report.signals import (
 from service.datasets.staging import EPISODE, QUANTITIES, Prepared, Staged, column
 from service.foundation.settings import Settings
 
+MAX_ROWS = 2000
+"""Rows of a data set that figures on several joints together are taken over."""
 UNSEEN = 1e-3
 """Share of a torque's spread below which a factor of it would be one of rounding."""
 
@@ -66,7 +68,7 @@ def make_report(
     limits = limits_of(profile, names)
     clock = look_at_clock(raw, recipe.gap_steps, prepared.repeated)
     recorded = _look_at_raw(raw, clock, limits)
-    samples = _look_at_samples(prepared, limits, settings.max_report_rows)
+    samples = _look_at_samples(prepared, limits, MAX_ROWS)
     upload, signals = Upload(names, gravity, source), Signals(*samples.motion, samples.tau)
     candidates, best = proposed(names, signals) if profile is None else ((), None)
     known = profile if best is None else profiles.profile(best)

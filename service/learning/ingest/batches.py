@@ -20,7 +20,6 @@ from lipcore.online.batch import Rows
 from lipcore.online.gates import check_rows
 from service.contract.observations import Derivation, ExpiredError, ObservationRequest, ObservationResponse, State
 from service.foundation.errors import ConflictError, invalid_request
-from service.foundation.settings import Settings
 from service.inference.predicting import QUANTITIES, check_shapes
 from service.journal import log
 from service.journal.log import NewBatch, StreamKind, check_kind
@@ -33,6 +32,8 @@ from service.learning.ingest.screening import Answered
 from service.models.loaded import Served
 from service.storage.database import EventRow
 
+MAX_ROWS = 5000
+"""Rows of one observation batch."""
 ONCE = "a sequence is used once, so a new run needs a stream_id of its own, or higher sequences"
 
 
@@ -40,7 +41,7 @@ def observe_batch(intake: Intake, model: str, request: ObservationRequest) -> Ob
     """Take a batch; once this returns it is durable. Raise NotFoundError, InvalidRequestError,
     ConflictError, ExpiredError, BusyError or StorageFullError."""
     served, received = intake.loaded.get(model, None), intake.arrival()
-    batch = measured(request, served.model, intake.settings)
+    batch = measured(request, served.model)
     content = digest(batch)
     monitor = intake.monitor(served)
     with intake.turn(monitor, model):
@@ -100,12 +101,12 @@ def _new(
     )
 
 
-def measured(request: ObservationRequest, model: TorqueModel, settings: Settings) -> Measured:
+def measured(request: ObservationRequest, model: TorqueModel) -> Measured:
     """Check a request's shapes and joints and bring its columns in order; raise InvalidRequestError."""
     check_shapes(request, model)
     rows = 1 if request.q.ndim == 1 else len(request.q)
-    if rows > settings.max_observation_rows:
-        raise invalid_request("q", f"{rows} rows", f"at most {settings.max_observation_rows} in one batch")
+    if rows > MAX_ROWS:
+        raise invalid_request("q", f"{rows} rows", f"at most {MAX_ROWS} in one batch")
     if request.t is not None and request.t.shape != (rows,):
         raise invalid_request("t", f"{len(request.t)} numbers long", f"{rows}, one a row of q")
     if request.t is None and request.ddq is None:

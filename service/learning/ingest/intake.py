@@ -41,6 +41,8 @@ logger = logging.getLogger(__name__)
 ACCEPTED = tuple(CODES.index(code) for code in ("learnt", "stationary", "payload"))
 """Codes of rows that are not kept out: the model, with the payload it knows of, is to explain them."""
 
+MAX_STREAMS = 1000
+"""Streams of a model; a new one takes the place of the longest silent."""
 RETAIN_EVERY = 200
 """Batches of a model after which its log is brought within its limits."""
 ROW_NUMBERS, NUMBER_BYTES = 6, 8
@@ -176,7 +178,7 @@ class Intake:
             record = None if verdict.record is None else verdict.record.to_json()
             judged = replace(batch, rows=verdict.rows, record=record)
             start = log.start_of(session, model, served.version)
-            event = log.append_batch(session, model, judged, self.settings.max_observation_streams)
+            event = log.append_batch(session, model, judged, MAX_STREAMS)
             event.rows = rows  # without those that had waited, which other batches count
             source = log.stream(session, model, stream_id)
             assert source is not None
@@ -241,7 +243,7 @@ class Intake:
             try:
                 retain(self.database, self.settings, model, time.time())
                 with self.turn(monitor, model), self.database.transaction(model) as session:
-                    monitor.streams.expire(session, model, time.time() - self.settings.stream_retention_s)
+                    monitor.streams.expire(session, model, time.time() - self.settings.observation_retention_s)
             except Exception as error:  # the batch is logged all the same
                 logger.error("the log of model %s was not brought within its limits", model, exc_info=error)
 

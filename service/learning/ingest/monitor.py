@@ -19,7 +19,6 @@ from lipcore.online.changes.departure import Departure
 from lipcore.online.changes.detectors import ChangeDetector
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
-from service.foundation.settings import Settings
 from service.journal import log
 from service.learning import intervals
 from service.learning.ingest.judging import Innovations, Watch
@@ -29,6 +28,10 @@ from service.learning.payloads import Payloads
 from service.learning.streams import Streams
 from service.storage.database import EventRow
 
+WINDOWS_S = (60.0, 600.0, 3600.0)
+"""Windows of the prequential quality, s."""
+CONTACT_PATIENCE_S = 2.0
+"""How long torques may be far off before it is no contact but a change of the robot, s."""
 PARTS = 60
 """Buckets of a window: its length is true to a sixtieth."""
 MOST_EVENTS = 3000
@@ -107,29 +110,27 @@ class Monitor:
     a payload on fewer rows then.
     """
 
-    def __init__(self, joint_names: tuple[str, ...], settings: Settings) -> None:
+    def __init__(self, joint_names: tuple[str, ...]) -> None:
         self.joint_names, self.lock = joint_names, threading.Lock()
         n = len(joint_names)
-        self.windows = tuple(Window(seconds, n) for seconds in settings.quality_windows_s)
+        self.windows = tuple(Window(seconds, n) for seconds in WINDOWS_S)
         self.counts: Counter[str] = Counter()
         self.held, self.number = False, 0
         self._since_due = 0
         self._detector, self._innovations = ChangeDetector(), Innovations.empty(n)
         self._departure: Departure | None = None
-        self.streams = Streams(settings.contact_patience_s)
+        self.streams = Streams(CONTACT_PATIENCE_S)
         self.payloads = Payloads(self.streams)
         self.payload_alarm_at = -np.inf
 
     @classmethod
-    def rebuilt(
-        cls, session: Session, model: str, joint_names: tuple[str, ...], settings: Settings, now: float
-    ) -> Monitor:
+    def rebuilt(cls, session: Session, model: str, joint_names: tuple[str, ...], now: float) -> Monitor:
         """The monitor of a model from its log and its streams' records. now: Unix time, s."""
-        made = cls(joint_names, settings)
+        made = cls(joint_names)
         made.number = log.newest(session, model)
         made.streams.read(session, model)
         made.payloads = Payloads.restored(session, model, made.streams)
-        since = now - max(*settings.quality_windows_s, DETECTOR_S)
+        since = now - max(*WINDOWS_S, DETECTOR_S)
         lately = (EventRow.received > since, EventRow.received <= now, EventRow.number <= made.number)
         events = list(_batches(session, model, *lately)) or list(_batches(session, model, most=1))
         for event in events:  # the last one in any case: how far learning has gone is not forgotten in a quiet hour

@@ -111,8 +111,6 @@ def limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> 
         settings.max_velocity,
         settings.max_acceleration,
         torque,
-        settings.max_time_gap_s,
-        settings.stationary_speed,
     )
 
 

@@ -30,6 +30,11 @@ from service.storage.files import Files
 
 logger = logging.getLogger(__name__)
 
+NOVELTY_ROWS = 2000
+"""Rows that the share of rows beyond the basis is taken over."""
+SNAPSHOT_PERIODS = 60
+"""Time between two snapshots of a version's state, in times of `publish_every_s`: 30 s by default."""
+
 
 class Novelty:
     """Counts the rows learnt that lie beyond a version's basis. window: number of rows that `share` is taken over."""
@@ -62,11 +67,12 @@ class Follower:
         self.database, self.files, self.settings = database, files, settings
         self.model, self.version, self.base = model, version, base
         self.disk = Disk(settings)
+        self.snapshot_every_s = SNAPSHOT_PERIODS * settings.publish_every_s
         with database.session() as session:
             self.start = log.start_of(session, model, version)
         # only what needs no learning: pages are taken one by one, and others have their turn in between
         self.known = restore(database, files, model, version, base, pages=0)
-        self.novelty = Novelty(settings.novelty_rows)
+        self.novelty = Novelty(NOVELTY_ROWS)
         self.woken, self.behind = True, True
         self.due = 0.0
         self._solved: tuple[OnlineModel, Array] | None = None
@@ -125,7 +131,7 @@ class Follower:
         """When the state is to be stored; infinity where it is stored or cannot be yet."""
         if self.number == self._stored:
             return np.inf
-        return self._stored_at + self.settings.snapshot_every_s
+        return self._stored_at + self.snapshot_every_s
 
     def store_in_turn(self) -> None:
         """Store the state, unless another service has stored what this version has learnt since it was due last. The
@@ -135,7 +141,7 @@ class Follower:
                 last = snapshots.last_stored(session, self.model, self.version)
             since = None if last is None or last[0] == self._snapshot else time.time() - last[1]
             # one from the future shows that clocks differ, or that one was set back: it says nothing of when
-            if since is not None and 0 <= since < self.settings.snapshot_every_s:
+            if since is not None and 0 <= since < self.snapshot_every_s:
                 self._stored_at = time.monotonic()
                 return
         self.store()

@@ -132,7 +132,7 @@ class Learner:
             self._failed[key] = (inf, pause)  # forgotten once it has published
 
     def _follow(self, key: Key) -> Follower:
-        while len(self.followers) >= self.settings.max_learning_models:
+        while len(self.followers) >= self.settings.max_loaded_models:
             self._drop(next(iter(self.followers)))
         row = registry.find(self.database, *key)
         base = self.files.load_version(row.folder, row.checksums)

@@ -24,7 +24,6 @@ from lipcore.online.learner import uncovered
 from lipcore.vocabulary import CODES, LEARNT
 from service.contract.learning import DECIMALS, LiveLost, LiveNovelty, LivePart, LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
-from service.foundation.settings import Settings
 from service.learning.ingest.deriving import EDGE
 from service.learning.ingest.intake import Judged
 from service.models.loaded import Served
@@ -34,6 +33,10 @@ logger = logging.getLogger(__name__)
 
 MOST_LOOKED = 20
 """Rows of a stream that are looked at for one status: 14 ms of a thread at a thousand inducing outputs."""
+MAX_FOLLOWERS = 20
+"""Readers that follow models live; more are answered 429."""
+ROWS_PER_S = 50
+"""Rows a second that those who follow a model are shown; all are counted."""
 
 
 FARTHEST = 1e6
@@ -177,9 +180,8 @@ class Feed(Counted):
     too_many = "models are followed {} times, the most there may be: close one, or try again later"
     headers: ClassVar = {"Retry-After": "5"}
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._rows_per_s = settings.live_rows_per_s
         self._followed: dict[str, Followed] = {}
         self.positions: dict[str, list[float]] = {}
 
@@ -201,7 +203,7 @@ class Feed(Counted):
         """Events of a model until the service closes or the model is deleted; a status comes first."""
         followed = self._followed.get(model)
         if followed is None or followed.over:
-            followed = self._followed[model] = Followed(model, look, self._rows_per_s)
+            followed = self._followed[model] = Followed(model, look, ROWS_PER_S)
             # in a context of its own, not that of the request that happens to be the first
             run = followed.run(closing)
             followed.task = asyncio.get_running_loop().create_task(run, context=Context())

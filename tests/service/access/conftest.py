@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from unittest.mock import patch
 
 import pytest
 from fastapi.testclient import TestClient
@@ -41,8 +42,9 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
     home = tmp_path_factory.mktemp("guarded")
     database = Database.of(Settings(home=home))
     secrets = {scope: keys.create(database, f"only {scope}", [scope], None)[1] for scope in SCOPES}
-    settings = Settings(home=home, keys="on", keys_refresh_s=REFRESH_S)
-    with TestClient(create_app(settings), "http://robot.example") as api:
+    with patch("service.app.REFRESH_S", REFRESH_S):
+        app = create_app(Settings(home=home, keys="on"))
+    with TestClient(app, "http://robot.example") as api:
         yield Guarded(api, secrets, database)
     database.close()
 

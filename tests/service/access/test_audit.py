@@ -63,7 +63,7 @@ def owned(tmp_path_factory):
     home = tmp_path_factory.mktemp("audited")
     database = Database.of(Settings(home=home))
     row, secret = keys.create(database, "owner", ["admin"], None)
-    settings = Settings(home=home, keys="on", keys_refresh_s=0.05, publish_every_s=0.02)
+    settings = Settings(home=home, keys="on", publish_every_s=0.02)
     with TestClient(create_app(settings), "http://robot.example", headers=bearer(secret)) as api:
         api.key = row.id
         publish(api, "arm")

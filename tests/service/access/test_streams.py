@@ -23,8 +23,10 @@ MOTION = np.zeros((3, 7))
 @pytest.fixture(scope="module")
 def locked(tmp_path_factory):
     """A server that asks for keys."""
-    settings = {"LIPSERVE_KEYS": "on", "LIPSERVE_KEYS_REFRESH_S": "0.05", "LIPSERVE_LOG_LEVEL": "debug"}
-    with Server(tmp_path_factory.mktemp("locked"), warm=True, **settings) as started:
+    settings = {"LIPSERVE_KEYS": "on", "LIPSERVE_LOG_LEVEL": "debug"}
+    with Server(
+        tmp_path_factory.mktemp("locked"), warm=True, constants={"service.app.REFRESH_S": 0.05}, **settings
+    ) as started:
         yield started
 
 

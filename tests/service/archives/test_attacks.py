@@ -24,7 +24,7 @@ from tests.service.archives.packing import (
     with_payload,
     with_tensors,
 )
-from tests.service.conftest import LIMITS
+from tests.service.conftest import BODY_LIMITS
 from tests.service.data import error
 
 EVERY = ("checksums.json", "export.json", MANIFEST, TENSORS)
@@ -326,8 +326,8 @@ def test_wrong_tensors(api, files, attack):
 
 
 def test_archive_beyond_the_limit(strict_service):
-    error(send(strict_service, bytes(LIMITS["max_archive_bytes"] + 1)), 413, "too_large")
-    error(send(strict_service, bytes(LIMITS["max_archive_bytes"])), 422, "invalid_data")
+    error(send(strict_service, bytes(BODY_LIMITS["MAX_ARCHIVE_BYTES"] + 1)), 413, "too_large")
+    error(send(strict_service, bytes(BODY_LIMITS["MAX_ARCHIVE_BYTES"])), 422, "invalid_data")
 
 
 def test_failure_while_it_is_published_leaves_nothing(api, files, monkeypatch):

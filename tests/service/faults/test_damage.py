@@ -39,7 +39,7 @@ class Lived:
 @contextmanager
 def running(home):
     """A service on a home."""
-    settings = Settings(home=home, publish_every_s=0.02, snapshot_every_s=0.02, max_page=100, learner_niceness=0)
+    settings = Settings(home=home, publish_every_s=0.02, learner_niceness=0)
     with TestClient(create_app(settings), ADDRESS, raise_server_exceptions=False) as api:
         yield api
 

@@ -8,6 +8,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from fastapi.testclient import TestClient
@@ -117,8 +118,11 @@ def test_errors_of_the_operating_system(number, expected):
 @pytest.fixture(scope="module")
 def service(tmp_path_factory) -> Iterator[TestClient]:
     """A service whose requests do not wait for the database for long."""
-    settings = Settings(home=tmp_path_factory.mktemp("storage"), database_timeout_s=0.1)
-    with TestClient(create_app(settings), "http://127.0.0.1", raise_server_exceptions=False) as api:
+    app = create_app(Settings(home=tmp_path_factory.mktemp("storage")))
+    with (
+        patch("service.storage.storage.WAIT_S", 0.1),
+        TestClient(app, "http://127.0.0.1", raise_server_exceptions=False) as api,
+    ):
         yield api
 
 
@@ -216,12 +220,13 @@ def test_no_service_starts_on_the_database_of_a_later_release(tmp_path):
         check_home(Settings(home=tmp_path))
 
 
-def test_no_service_starts_while_another_process_writes_all_the_time(tmp_path):
+def test_no_service_starts_while_another_process_writes_all_the_time(tmp_path, monkeypatch):
+    monkeypatch.setattr("service.storage.storage.WAIT_S", 0.1)
     Database(tmp_path).close()
     with closing(sqlite3.connect(tmp_path / FILE, isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
         with pytest.raises(HomeError, match="database is locked"):
-            check_home(Settings(home=tmp_path, database_timeout_s=0.1))
+            check_home(Settings(home=tmp_path))
     check_home(Settings(home=tmp_path))
 
 

@@ -36,12 +36,13 @@ class Fuzzed:
 @pytest.fixture(scope="module")
 def fuzzed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fuzzed]:
     """A service whose jobs stay queued: it is its answers that count."""
-    settings = Settings(home=tmp_path_factory.mktemp("fuzzed"), max_queued_jobs=10_000)
+    settings = Settings(home=tmp_path_factory.mktemp("fuzzed"))
     with (
         pytest.MonkeyPatch.context() as patch,
         TestClient(create_app(settings), ADDRESS, raise_server_exceptions=False) as client,
     ):
         patch.setattr(service_of(client).jobs, "submit", lambda job: None)
+        patch.setattr("service.training.jobs.MAX_QUEUED", 10_000)
         patch.setattr(metrics, "START_S", inf)  # it is ready although none of these jobs ever starts
         known = {
             "model": ["panda-sim"],

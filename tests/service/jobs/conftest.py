@@ -14,7 +14,8 @@ from service.storage.database import Database, JobRow, now
 from service.storage.disk import Disk
 from service.storage.files import Files
 from service.storage.storage import Storage
-from service.training import queue
+from service.training import lifecycle, queue
+from service.training.lifecycle import LIMITS, JobLimits
 from service.training.queue import JobQueue
 from tests.service.data import eventually
 
@@ -90,10 +91,10 @@ def bench(home, monkeypatch) -> Iterator[Callable[..., Bench]]:
     monkeypatch.setattr(queue, "WATCH_S", 0.05)
     with ExitStack() as stack:
 
-        def start(run: Callable[[Settings, str], None], **settings: Any) -> Bench:
+        def start(run: Callable[[Settings, str], None], limits: JobLimits = LIMITS, **settings: Any) -> Bench:
             monkeypatch.setattr(queue, "worker", SimpleNamespace(run=run))
-            # some are shorter than a user may choose
-            made = Bench(Settings(home=home, training_niceness=0).model_copy(update=settings))
+            monkeypatch.setattr(lifecycle, "LIMITS", limits)
+            made = Bench(Settings(home=home, training_niceness=0, **settings))
             stack.callback(made.database.close)
             stack.callback(made.queue.close)
             return made

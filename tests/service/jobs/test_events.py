@@ -10,7 +10,7 @@ from sqlalchemy import select
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.training import feed
-from service.training.feed import Feed
+from service.training.feed import MAX_FOLLOWERS, Feed
 from tests.service.data import error, queue, service_of, stream, upload
 from tests.service.jobs.conftest import new_row
 from tests.service.learning.following import followed
@@ -51,7 +51,7 @@ def test_a_job_is_followed_from_its_start_to_its_end(api, pendulum):
 def test_no_more_readers_than_may_be(no_worker, monkeypatch):
     name = queue(no_worker, "many", upload(no_worker, stream())["id"], options={**FEW})["id"]
     many = service_of(no_worker).jobs.feed
-    monkeypatch.setattr(many, "open", service_of(no_worker).settings.max_job_followers)
+    monkeypatch.setattr(many, "open", MAX_FOLLOWERS)
     answer = no_worker.get(f"/v1/jobs/{name}/events")
     error(answer, 429, "busy")
     assert int(answer.headers["retry-after"]) > 0

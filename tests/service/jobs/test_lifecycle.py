@@ -10,7 +10,7 @@ from service.training import lifecycle
 from service.training.lifecycle import LINGER_S, Ended, Facts, Hand, Settled, Settler
 from tests.service.jobs.conftest import new_row
 
-SETTINGS = Settings(job_cancel_grace_s=1.0, job_heartbeat_s=60.0, job_start_s=120.0, max_job_s=1000.0)
+SETTINGS = Settings(max_job_s=1000.0)
 
 
 def hand():
@@ -90,9 +90,7 @@ def settle(store, why="ended", message="the training process ended", **values):
     database, files = store
     with database.transaction() as session:
         session.add(new_row("x", **{"state": "running", "attempts": 1, **values}))
-    settled = Settler(Settings(home=files.versions.parent, max_job_attempts=2), database, files).settle(
-        Ended("job_x", why, message)
-    )
+    settled = Settler(database, files).settle(Ended("job_x", why, message))
     with database.session() as session:
         return settled, session.scalar(select(JobRow).where(JobRow.id == "job_x"))
 
@@ -101,7 +99,7 @@ def settle(store, why="ended", message="the training process ended", **values):
     ("values", "settled", "state", "code"),
     [
         ({}, Settled(again=True), "queued", None),
-        ({"attempts": 2}, Settled(), "failed", "interrupted"),
+        ({"attempts": 3}, Settled(), "failed", "interrupted"),
         ({"why": "too_long"}, Settled(), "failed", "too_long"),
         ({"why": "cancelled"}, Settled(), "cancelled", None),
         ({"cancel_requested": True}, Settled(), "cancelled", None),
@@ -133,9 +131,7 @@ def test_a_job_that_does_not_run_stays_as_it_is(store, values, settled):
 
 def test_one_that_is_not_there_is_nobody_s(store):
     database, files = store
-    assert (
-        Settler(Settings(home=files.versions.parent), database, files).settle(Ended("job_y", "ended", "")) == Settled()
-    )
+    assert Settler(database, files).settle(Ended("job_y", "ended", "")) == Settled()
 
 
 def test_what_a_job_did_not_publish_is_deleted_and_nothing_else(store):

@@ -1,6 +1,7 @@
 """The queue of jobs, with processes that hang, die and do not listen: every job ends or goes on."""
 
 from service.training import metrics, queue
+from service.training.lifecycle import JobLimits
 from tests.service.data import eventually
 from tests.service.jobs import workers
 from tests.service.jobs.conftest import messages_of
@@ -8,7 +9,7 @@ from tests.service.server import command
 
 
 def test_a_process_that_does_not_obey_a_cancel_is_ended_and_no_other_one(bench):
-    jobs = bench(workers.deaf, training_workers=2, job_cancel_grace_s=0.1)
+    jobs = bench(workers.deaf, JobLimits(cancel_s=0.1), training_workers=2)
     stubborn, other = jobs.submit("stubborn"), jobs.submit("other")
     first, beside = jobs.running(stubborn), jobs.running(other)
     jobs.cancel(stubborn)
@@ -24,7 +25,7 @@ def test_a_process_that_does_not_obey_a_cancel_is_ended_and_no_other_one(bench):
 
 
 def test_a_cancel_ends_a_suspended_process_that_holds_the_lock_of_the_database(bench):
-    jobs = bench(workers.frozen_with_the_lock, job_cancel_grace_s=0.1)
+    jobs = bench(workers.frozen_with_the_lock, JobLimits(cancel_s=0.1))
     job = jobs.submit("locked")
     eventually((jobs.settings.home / "locked").exists)
     jobs.running(job)  # reading needs no lock
@@ -34,7 +35,7 @@ def test_a_cancel_ends_a_suspended_process_that_holds_the_lock_of_the_database(b
 
 
 def test_a_process_without_a_sign_of_life_is_ended_and_its_job_started_again_but_not_for_ever(bench):
-    jobs = bench(workers.frozen, job_heartbeat_s=0.3, max_job_attempts=2)
+    jobs = bench(workers.frozen, JobLimits(heartbeat_s=0.3, attempts=2))
     seen = jobs.ended(jobs.submit("frozen"))
     assert (seen.state, seen.attempts, seen.error["code"]) == ("failed", 2, "interrupted")
     silent = "the training process gave no sign of life for 0.3 s and was ended"
@@ -44,7 +45,7 @@ def test_a_process_without_a_sign_of_life_is_ended_and_its_job_started_again_but
 
 
 def test_the_service_knows_of_a_process_that_is_silent(bench, monkeypatch):
-    jobs = bench(workers.frozen, job_heartbeat_s=1000.0)
+    jobs = bench(workers.frozen, JobLimits(heartbeat_s=1000.0))
     jobs.running(jobs.submit("frozen"))
     monkeypatch.setattr(metrics, "SILENT_S", 0.1)
     seen = eventually(lambda: (now := metrics.look(jobs.queue, lambda wrong: None))[0] == "warning" and now)
@@ -53,7 +54,7 @@ def test_the_service_knows_of_a_process_that_is_silent(bench, monkeypatch):
 
 def test_a_job_whose_process_cannot_start_fails_in_the_end_and_the_service_knows(bench, monkeypatch):
     monkeypatch.setattr("service.training.lifecycle.FIRST_PAUSE_S", 0.05)
-    jobs = bench(workers.stillborn, max_job_attempts=2)
+    jobs = bench(workers.stillborn, JobLimits(attempts=2))
     seen = jobs.ended(jobs.submit("stillborn"))
     assert (seen.state, seen.attempts, seen.error["code"]) == ("failed", 0, "interrupted")
     assert "exit code 3" in seen.error["message"]
@@ -101,7 +102,7 @@ def test_what_becomes_of_a_job_is_written_once_the_database_can_be(bench, monkey
 
 def test_jobs_that_nobody_has_are_found(bench, monkeypatch):
     monkeypatch.setattr(queue, "RECONCILE_S", 0.05)
-    jobs = bench(workers.well, job_heartbeat_s=30)
+    jobs = bench(workers.well, JobLimits(heartbeat_s=30))
     forgotten = jobs.add("forgotten")
     orphan = jobs.add("orphan", state="running", attempts=1, heartbeat_at="2020-01-01T00:00:00.000+00:00")
     assert jobs.ended(forgotten).state == "succeeded"
@@ -132,7 +133,7 @@ def test_jobs_are_handed_out_once_and_in_their_order(bench, monkeypatch):
 
 
 def test_a_queue_that_closes_hands_its_jobs_back_and_keeps_the_wish_to_cancel(bench):
-    jobs = bench(workers.deaf, training_workers=2, job_cancel_grace_s=60.0)
+    jobs = bench(workers.deaf, JobLimits(cancel_s=60.0), training_workers=2)
     back, unwanted = jobs.submit("back"), jobs.submit("unwanted")
     pids = [jobs.running(job).progress["process"] for job in (back, unwanted)]
     jobs.cancel(unwanted)

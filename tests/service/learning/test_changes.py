@@ -320,7 +320,7 @@ def beside(school, request):
     """Both monitors; of a model for each test."""
     pupil = school.enrol(request.node.name.replace("_", "-")[:60], **WATCHFUL, on_change="hold")
     monitor = school.service.learners.monitor(pupil.model)
-    return Beside(school, pupil, Monitor(monitor.joint_names, school.service.settings))
+    return Beside(school, pupil, Monitor(monitor.joint_names))
 
 
 def test_a_collision_a_change_and_a_decision(beside):
@@ -350,7 +350,7 @@ def test_a_monitor_of_a_service_that_starts_again_has_the_gates_as_they_were(bes
     service = beside.school.service
     with service.database.session() as session:
         names = beside.follower.joint_names
-        again = Monitor.rebuilt(session, beside.pupil.model, names, service.settings, time.time())
+        again = Monitor.rebuilt(session, beside.pupil.model, names, time.time())
     assert again.streams.get("arm").gate.patience.contacts > 0
     assert state(again) == state(service.learners.monitor(beside.pupil.model))
 

@@ -20,9 +20,10 @@ from tests.service.learning.pendulums import ARM, QUERIES, Arm, at_once, rows, s
 
 
 @pytest.fixture
-def arm(home):
+def arm(home, monkeypatch):
     """A model of one version, which is stored when it is asked to be."""
-    opened = Arm.open(home, snapshot_every_s=1e6, max_learning_models=2)
+    monkeypatch.setattr(following, "SNAPSHOT_PERIODS", 1e8)
+    opened = Arm.open(home, max_loaded_models=2)
     publication.clear(opened.files)
     yield opened
     opened.database.close()
@@ -223,8 +224,9 @@ def test_no_more_versions_are_kept_than_may_be_and_none_is_lost(arm, learner):
     assert stored(arm) == [1, 1, 2, 3]  # all of all at the end
 
 
-def test_snapshots_are_taken_now_and_then(home):
-    arm = Arm.open(home, snapshot_every_s=1e-6)
+def test_snapshots_are_taken_now_and_then(home, monkeypatch):
+    monkeypatch.setattr(following, "SNAPSHOT_PERIODS", 0)
+    arm = Arm.open(home)
     publication.clear(arm.files)
     learner = Learner(arm.database, arm.files, arm.settings)
     arm.batches(0, 1)

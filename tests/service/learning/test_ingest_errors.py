@@ -10,6 +10,7 @@ from lipcore.robots.urdf import RigidBody
 from service.contract.observations import LearningOptions
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
+from service.learning.ingest.batches import MAX_ROWS
 from service.learning.ingest.screening import limits
 from tests.service.learning.lessons import apart
 from tests.service.learning.recordings import batch, codes, learnt_from, logged, part, recording, send
@@ -68,8 +69,8 @@ def test_accelerations_or_times_are_needed(pupil, body):
     assert "times to derive them from" in said["message"]
 
 
-def test_too_many_rows(pupil, school):
-    most = school.service.settings.max_observation_rows
+def test_too_many_rows(pupil):
+    most = MAX_ROWS
     rows = [[0.1, 0.1]] * (most + 1)
     said = refused(pupil, batch(0, dict.fromkeys(("q", "dq", "ddq", "tau"), rows)))
     assert said["detail"] == [{"field": "q", "value": f"{most + 1} rows", "expected": f"at most {most} in one batch"}]
@@ -107,13 +108,12 @@ def test_batches_that_are_no_longer_kept_are_not_taken_for_new(school, body):
 
 
 def test_more_streams_than_a_model_may_have(school, body, monkeypatch):
-    intake = school.service.learners._intake
-    monkeypatch.setattr(intake, "settings", intake.settings.model_copy(update={"max_observation_streams": 2}))
+    monkeypatch.setattr("service.learning.ingest.intake.MAX_STREAMS", 2)
     pupil, other = school.enrol("popular"), school.enrol("unpopular")
     for stream_id in ("a", "b"):
         send(pupil, 0, body, stream_id)
     said = refused(pupil, batch(0, body, "c"), 429, "busy")
-    assert "LIPSERVE_MAX_OBSERVATION_STREAMS" in said["message"]
+    assert "has 2 sources of observations in use" in said["message"]
     assert send(pupil, 1, part(recording(), 10, 16), "b")["accepted"] == 6
     assert send(other, 0, body, "c")["accepted"] == 6
 

@@ -112,8 +112,9 @@ def test_a_killed_learner_comes_back_and_catches_up(serving, caplog):
     assert revisions[-1] == 4
 
 
-def test_a_learner_that_hangs_is_replaced_and_nothing_is_lost(home, caplog):
-    hasty = Serving(home, learner_heartbeat_s=2.0)
+def test_a_learner_that_hangs_is_replaced_and_nothing_is_lost(home, caplog, monkeypatch):
+    monkeypatch.setattr("service.runtime.companion.QUIET_S", 2.0)
+    hasty = Serving(home)
     try:
         hasty.teach(0, 1)
         hasty.answering(2)

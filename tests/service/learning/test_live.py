@@ -10,11 +10,10 @@ from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.contract.learning import LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
-from service.foundation.settings import Settings
 from service.learning.ingest.intake import Judged
 from service.learning.ingest.screening import Screened
 from service.learning.live import feed
-from service.learning.live.feed import MOST_UNREAD, Feed, FeedEvent, pick, thinned
+from service.learning.live.feed import MAX_FOLLOWERS, MOST_UNREAD, Feed, FeedEvent, pick, thinned
 from service.learning.live.look import at_most
 from tests.service.data import error, eventually, service_of
 from tests.service.learning.batches import rows
@@ -83,7 +82,7 @@ def test_following_ends_when_the_model_is_deleted(school):
 
 def test_no_more_readers_than_may_be(school, monkeypatch):
     school.enrol("crowded")
-    monkeypatch.setattr(school.service.learners.live, "open", school.service.settings.max_live_followers)
+    monkeypatch.setattr(school.service.learners.live, "open", MAX_FOLLOWERS)
     answer = school.client.get("/v1/models/crowded/live")
     error(answer, 429, "busy")
     assert int(answer.headers["retry-after"]) > 0
@@ -205,7 +204,7 @@ class Look:
 @pytest.fixture
 def quick(monkeypatch):
     monkeypatch.setattr(feed, "TICK_S", 0.01)
-    return Feed(Settings())
+    return Feed()
 
 
 async def until(condition):

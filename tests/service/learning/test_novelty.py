@@ -45,7 +45,6 @@ def batch(number: int) -> dict[str, Any]:
 pytestmark = pytest.mark.slow
 PAUSE_S = 0.01
 """Between two questions of the watcher: the learner needs the processor too."""
-SETTINGS = {"novelty_rows": 400, "refresh_pause_s": 0.0}
 
 
 @contextmanager
@@ -69,7 +68,7 @@ def watched(pupil: Pupil, queries: dict[str, Any]) -> Iterator[list[Any]]:
 @pytest.fixture(scope="module")
 def story(tmp_path_factory):
     """What was seen from the first fast batch to the promotion."""
-    with opened(tmp_path_factory.mktemp("novel"), tmp_path_factory.mktemp("unused"), **SETTINGS) as school:
+    with opened(tmp_path_factory.mktemp("novel"), tmp_path_factory.mktemp("unused")) as school:
         api, pupil = school.client, Pupil(school.client, "arm")
         dataset = upload(api, slow(), name="slow")
         train(api, "arm", dataset["id"], options=OPTIONS)
@@ -91,7 +90,7 @@ def test_novel_motion_is_told_and_a_candidate_trained_on_data_and_log(story):
     [alarm] = [each for each in story.alarms if each["kind"] == "novelty"]
     assert alarm["evidence"]["novel_share"] > alarm["evidence"]["threshold"] == 0.2
     assert alarm["evidence"]["version"] == 1
-    assert f"{100 * alarm['evidence']['novel_share']:.0f} % of the last 400 samples" in alarm["message"]
+    assert f"{100 * alarm['evidence']['novel_share']:.0f} % of the last 2000 samples" in alarm["message"]
     refresh = story.job["refresh"]
     assert (story.job["state"], story.job["version"], refresh["version"]) == ("succeeded", 2, 1)
     assert refresh["trigger"] == "novelty"

@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families as parse
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES
 from service.learning.control import status
-from service.learning.ingest.monitor import Window
+from service.learning.ingest.monitor import WINDOWS_S, Window
 from tests.service.data import eventually
 from tests.service.learning.lessons import lesson
 
@@ -44,7 +44,7 @@ def test_rows_are_predicted_before_they_are_learnt(school):
     seen = pupil.get("quality")
     assert (seen["model"], seen["version"], seen["revision"], seen["level"]) == ("prequential", 1, 3, 0.95)
     assert seen["joint_names"] == ["joint1", "joint2"]
-    assert [window["seconds"] for window in seen["windows"]] == list(school.service.settings.quality_windows_s)
+    assert [window["seconds"] for window in seen["windows"]] == list(WINDOWS_S)
     for window in seen["windows"]:
         assert (window["rows"], window["accepted"], window["rejected"]) == (30, 30, {})
         for name in FIGURES:

@@ -2,6 +2,7 @@
 
 import time
 from datetime import UTC, datetime
+from unittest.mock import patch
 
 import pytest
 from sqlalchemy import select
@@ -10,6 +11,7 @@ from lipserve.states import CANCELLED, FAILED, RUNNING
 from service.journal import log
 from service.learning import refresh
 from service.learning.learner.publication import Published
+from service.learning.refresh import RefreshRule
 from service.storage.database import AlarmRow, JobRow, VersionRow, now
 from service.training import planned_fit, worker
 from tests.service.data import QUICK, arrays, ended, running, stream, train, upload
@@ -168,8 +170,8 @@ def published(pupil, share=0.5, version=1, errors=None):
 
 def consider(school, pupil, **changes):
     service = school.service
-    settings = service.settings.model_copy(update={"refresh_pause_s": changes.pop("pause", 0.0)})
-    return refresh.consider(settings, service.database, service.jobs, published(pupil, **changes))
+    with patch.object(refresh, "RULE", RefreshRule(pause_s=changes.pop("pause", 0.0))):
+        return refresh.consider(service.database, service.jobs, published(pupil, **changes))
 
 
 def alarms(pupil):

@@ -1,7 +1,5 @@
 """Which version answers where none is named: the newest, a promoted one, an older one; and what a verdict leads to."""
 
-from dataclasses import replace
-
 import pytest
 from sqlalchemy import select
 
@@ -172,9 +170,7 @@ def test_one_that_is_not_better_is_dismissed_for_good(school, pupil):
 def test_of_versions_that_refreshed_themselves_the_newest_are_kept_and_those_that_are_needed(
     school, pupil, monkeypatch
 ):
-    loaded = school.service.loaded
-    few = loaded.storage.settings.model_copy(update={"max_refreshed_versions": 1})
-    monkeypatch.setattr(loaded, "storage", replace(loaded.storage, settings=few))
+    monkeypatch.setattr("service.models.deletion.MAX_REFRESHED", 1)
 
     def end(version, trigger, better):
         """The end of a refresh."""

@@ -13,8 +13,9 @@ from starlette.requests import Request
 from starlette.responses import Response
 from starlette.websockets import WebSocket
 
+from service.api.limits.requests import PATIENCE, ClientPatience
 from service.api.server.connections import guarded
-from service.api.server.sockets import Server
+from service.api.server.sockets import DRAIN_S, Server
 from service.foundation.settings import Settings
 from service.telemetry.readiness import Stopping
 from tests.service.data import DEADLINE, eventually
@@ -62,17 +63,19 @@ class SmallApp:
 class Serving:
     """The server with limits, while the block lasts."""
 
-    def __init__(self, notice_s: float = 0.0, **limits: Any) -> None:
+    def __init__(
+        self, notice_s: float = 0.0, drain_s: int = DRAIN_S, patience: ClientPatience = PATIENCE, **limits: Any
+    ) -> None:
         self.app, self.stopping, self.port = SmallApp(), Stopping(), free_port()
         settings = Settings(**limits)
         config = uvicorn.Config(
             self.app,
             port=self.port,
-            http=guarded(settings),
+            http=guarded(settings, patience),
             lifespan="off",
             log_level="critical",
             timeout_keep_alive=settings.keep_alive_s,
-            timeout_graceful_shutdown=settings.drain_s,
+            timeout_graceful_shutdown=drain_s,
         )
         self.server = Server(config, None, self.stopping, notice_s)
         self.thread = threading.Thread(target=self.server.run, daemon=True)

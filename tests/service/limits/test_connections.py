@@ -6,12 +6,13 @@ from contextlib import suppress
 import pytest
 from websockets.sync.client import connect
 
+from service.api.limits.requests import ClientPatience
 from service.api.server.connections import REFUSED, GuardedProtocol
 from tests.service.data import DEADLINE, eventually
 from tests.service.limits.serving import Raw, Serving, refusal
 
 MiB = 1024 * 1024
-SOON = {"header_s": 1.0, "answer_s": 1.0, "keep_alive_s": 1}
+SOON = ClientPatience(header_s=1.0, answer_s=1.0)
 """Limits that are soon reached."""
 GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
 LARGE = GET.replace(b"/ ", b"/large ", 1)
@@ -21,14 +22,14 @@ POST = b"POST /body HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\
 @pytest.fixture(scope="module")
 def soon():
     """A server whose limits are soon reached."""
-    with Serving(**SOON) as serving:
+    with Serving(patience=SOON, keep_alive_s=1) as serving:
         yield serving
 
 
 @pytest.fixture(scope="module")
 def few():
     """A server for two connections that keeps them."""
-    with Serving(max_connections=2, max_header_bytes=4096) as serving:
+    with Serving(patience=ClientPatience(header_bytes=4096), max_connections=2) as serving:
         yield serving
 
 
@@ -72,7 +73,7 @@ def test_clients_that_do_not_ask_are_let_go(soon):
 
 @pytest.mark.slow
 def test_streams_outlast_what_requests_may_take(soon):
-    end = time.monotonic() + 2 * SOON["header_s"]
+    end = time.monotonic() + 2 * SOON.header_s
     with connect(f"ws://127.0.0.1:{soon.port}/") as stream:
         while time.monotonic() < end:
             stream.send(b"still there?")

@@ -104,7 +104,7 @@ def test_a_service_that_was_told_to_stop_says_so_and_answers_until_it_is_told_ag
 
 @pytest.mark.slow
 def test_a_service_that_stops_keeps_what_it_has_learnt_and_its_jobs(home):
-    with Server(home, LIPSERVE_SNAPSHOT_EVERY_S="3600") as server:
+    with Server(home) as server:
         rows = {each: [[0.1] * 7] * 5 for each in ("q", "dq", "ddq", "tau")}
         body = {"stream_id": "arm", "sequence": 0, "t": [0.0, 0.1, 0.2, 0.3, 0.4], **rows}
         assert server.client.post("/v1/models/panda-sim/observations", json=body).status_code == 200

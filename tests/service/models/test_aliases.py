@@ -95,7 +95,7 @@ def test_serving_is_moved_by_training_and_by_its_owner_and_taken_back(api, arm):
 
 
 def test_a_model_has_so_many_aliases_and_no_more(api, arm, monkeypatch):
-    monkeypatch.setitem(vars(service_of(api).settings), "max_aliases", 2)
+    monkeypatch.setattr(registry, "MAX_ALIASES", 2)
     put(api, arm, "one", version=1)
     put(api, arm, "two", version=1)
     assert "2 aliases, the most" in error(put(api, arm, "three", version=1), 409, "conflict")["message"]

@@ -9,7 +9,7 @@ import pytest
 from service import __version__
 from service.journal import log
 from service.learning.learner.process import LearnerProcess
-from service.learning.learners import RESTART_S
+from service.learning.learners import MAX_LAG_S, RESTART_S
 from service.learning.metrics import Learning
 from service.storage import storage
 from service.telemetry.readiness import KEPT_S, Readiness
@@ -150,7 +150,7 @@ def test_a_learner_that_hangs_is_found(api, look, monkeypatch):
 
 def test_observations_that_wait_for_long_are_found(api, trained, look, clock, monkeypatch):
     service = service_of(api)
-    learners, limit = service.learners, service.learners.settings.learner_lag_s
+    learners, limit = service.learners, MAX_LAG_S
     monkeypatch.setattr(LearnerProcess, "needed", True)
     monkeypatch.setattr(LearnerProcess, "pid", 1)
     service.loaded.get(trained.name, None)

@@ -32,7 +32,13 @@ from tests.service.recordings.bag_writers import (
     zipped,
 )
 
-SMALL = Settings(max_bag_part_bytes=1 << 20, max_unpacked_bytes=1 << 22)
+
+@pytest.fixture
+def small(monkeypatch) -> Settings:
+    """Settings for bags that unpack to little, with small parts."""
+    for module in ("container", "files"):
+        monkeypatch.setattr(f"service.datasets.formats.bags.{module}.MAX_PART_BYTES", 1 << 20)
+    return Settings(max_unpacked_bytes=1 << 22)
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +101,7 @@ def test_cut_off_anywhere_is_an_answer(bags, tmp_path, name):
 @pytest.mark.parametrize("name", ["rosbag1", "bz2", "db3", "zip", "mcap", "plain"])
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_flipped_bytes_are_an_answer(bags, tmp_path, name, data):
+def test_flipped_bytes_are_an_answer(bags, tmp_path, name, data, small):
     path, kind = bags[name]
     raw = bytearray(path.read_bytes())
     for _ in range(data.draw(st.integers(1, 4))):
@@ -103,7 +109,7 @@ def test_flipped_bytes_are_an_answer(bags, tmp_path, name, data):
     broken = tmp_path / "broken"
     broken.write_bytes(bytes(raw))
     with suppress(InvalidDataError, InvalidRequestError, TooLargeError):
-        read(broken, kind, settings=SMALL)
+        read(broken, kind, settings=small)
     assert not [each for each in tmp_path.iterdir() if each.is_dir()]
 
 
@@ -158,7 +164,7 @@ def test_an_mcap_that_declares_2_gb(bags, tmp_path):
         read(path, "mcap")
 
 
-def test_a_bomb_in_a_chunk(tmp_path):
+def test_a_bomb_in_a_chunk(tmp_path, small):
     """64 kB that unpack to 16 MB, declared or not."""
 
     def record(header: dict[bytes, bytes], data: bytes) -> bytes:
@@ -170,17 +176,17 @@ def test_a_bomb_in_a_chunk(tmp_path):
         chunk = {b"op": b"\x05", b"compression": b"bz2", b"size": struct.pack("<I", size)}
         (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n" + record(chunk, packed))
         with pytest.raises(error):
-            read(tmp_path / "a.bag", "rosbag1", settings=SMALL)
+            read(tmp_path / "a.bag", "rosbag1", settings=small)
 
 
-def test_messages_that_unpack_to_too_much(tmp_path):
+def test_messages_that_unpack_to_too_much(tmp_path, small):
     path = bare(write_rosbag2(tmp_path / "bag", states(3)), tmp_path / "a.db3")
     bomb = pa.compress(bytes(1 << 24), codec="zstd", asbytes=True)
     with sqlite3.connect(path) as database:
         database.execute("UPDATE messages SET data = ? WHERE id = 2", (bomb,))
     database.close()
     with pytest.raises(TooLargeError, match="a part of"):
-        read(path, "rosbag2", settings=SMALL)
+        read(path, "rosbag2", settings=small)
 
 
 @pytest.mark.parametrize(
@@ -226,11 +232,11 @@ def test_archives_that_are_no_bags(tmp_path, members, message):
     assert {each.name for each in tmp_path.rglob("*")} == {"uploads", "a.zip"}
 
 
-def test_an_archive_that_is_a_bomb(tmp_path):
+def test_an_archive_that_is_a_bomb(tmp_path, small):
     bombs = {"a.db3": bytes(1 << 23), "a.db3.zstd": pa.compress(bytes(1 << 23), codec="zstd", asbytes=True)}
     for name, data in bombs.items():
         with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr(name, data)
         with pytest.raises(TooLargeError):
-            read(tmp_path / "a.zip", "rosbag2", settings=SMALL)
+            read(tmp_path / "a.zip", "rosbag2", settings=small)
         assert [each.name for each in tmp_path.iterdir()] == ["a.zip"]

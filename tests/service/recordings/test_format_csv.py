@@ -123,8 +123,9 @@ def test_a_bad_cell_is_named_wherever_it_is(tmp_path, row):
         (",".join(f"c{i}" for i in range(30)).encode() + b"\n", "columns", "at most 20"),
     ],
 )
-def test_refused_with_the_place(tmp_path, body, field, message):
-    reply = refused(tmp_path, body, "csv", error=InvalidDataError, max_columns=20)
+def test_refused_with_the_place(tmp_path, monkeypatch, body, field, message):
+    monkeypatch.setattr("service.datasets.formats.table.MAX_COLUMNS", 20)
+    reply = refused(tmp_path, body, "csv", error=InvalidDataError)
     assert reply[0] == field
     assert message in " ".join(reply)
 

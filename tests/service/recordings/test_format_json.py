@@ -93,17 +93,22 @@ def test_a_bad_row_is_named_wherever_it_is(tmp_path, number, row, field, message
         (b'[{"a.b":1,"a":{"b":2}}]', "json", "column 2", "every column once"),
     ],
 )
-def test_refused_with_the_place(tmp_path, body, kind, field, message):
-    reply = refused(tmp_path, body, kind, error=InvalidDataError, max_json_line_bytes=2000, max_columns=20)
+def test_refused_with_the_place(tmp_path, monkeypatch, body, kind, field, message):
+    monkeypatch.setattr("service.datasets.formats.table.MAX_COLUMNS", 20)
+    monkeypatch.setattr("service.datasets.formats.json.MAX_COLUMNS", 20)
+    with monkeypatch.context() as short:
+        short.setattr("service.datasets.formats.json.MAX_LINE_BYTES", 2000)
+        reply = refused(tmp_path, body, kind, error=InvalidDataError)
     if b"[" * 5000 in body and kind == "json_lines":
         reply = refused(tmp_path, body, kind, error=InvalidDataError)
     assert reply[0] == field
     assert message in " ".join(reply)
 
 
-def test_a_large_document_is_refused_with_a_way_out(tmp_path):
+def test_a_large_document_is_refused_with_a_way_out(tmp_path, monkeypatch):
+    monkeypatch.setattr("service.datasets.formats.json.MAX_BYTES", 1000)
     body = json.dumps([ROW] * 100).encode()
-    assert "NDJSON" in refused(tmp_path, body, "json", error=TooLargeError, max_json_bytes=1000)
+    assert "NDJSON" in refused(tmp_path, body, "json", error=TooLargeError)
 
 
 def test_missing_values(tmp_path):

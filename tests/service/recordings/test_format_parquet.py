@@ -132,10 +132,11 @@ def test_an_extension_type_is_what_it_is_stored_as(tmp_path):
     assert [result[name][1] for name in result.names] == list(range(6, 12))
 
 
-def test_no_rows_two_gigabytes_of_footer_and_too_many_columns(tmp_path):
+def test_no_rows_two_gigabytes_of_footer_and_too_many_columns(tmp_path, monkeypatch):
     assert len(read(tmp_path, parquet({"t": pa.array([], pa.float64())}), "parquet")["t"]) == 0
     assert read(tmp_path, parquet({"x": ["a"]}), "parquet").names == ()
     footer = parquet(pa.Table.from_pandas(frame()))[:-8] + struct.pack("<I4s", 2**31 - 1, b"PAR1")
     assert refused(tmp_path, footer, "parquet")[0] == "file"
     many = parquet({f"c{i}": [1.0] for i in range(50)})
-    assert refused(tmp_path, many, "parquet", max_columns=20)[:2] == ("columns", "50")
+    monkeypatch.setattr("service.datasets.formats.table.MAX_COLUMNS", 20)
+    assert refused(tmp_path, many, "parquet")[:2] == ("columns", "50")

@@ -84,10 +84,10 @@ def test_a_lost_process_costs_its_shard_another_attempt(tmp_path):
     assert {"3", "20"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_a_process_that_hangs_costs_its_shard_another_attempt(tmp_path):
+def test_a_process_that_hangs_costs_its_shard_another_attempt(tmp_path, monkeypatch):
+    monkeypatch.setattr(executors, "HEARTBEAT_S", 3.0)
     expected = summed(Inline(), numbers, SHARDS, never)
-    settings = Settings(home=tmp_path, statistics_workers=2, training_cpus=2)
-    with shard_executor(settings.model_copy(update={"job_heartbeat_s": 3.0})) as executor:
+    with shard_executor(Settings(home=tmp_path, statistics_workers=2, training_cpus=2)) as executor:
         found = summed(executor, partial(freezing, str(tmp_path)), SHARDS, never)
     assert found.tobytes() == expected.tobytes()
     assert (tmp_path / "3").exists()

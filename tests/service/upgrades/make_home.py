@@ -86,7 +86,7 @@ def teach(api: TestClient) -> None:
 
 def main(home: Path, target: Path) -> None:
     """Make the home and write what is answered on it."""
-    settings = Settings(home=home, publish_every_s=0.05, snapshot_every_s=0.2)
+    settings = Settings(home=home, publish_every_s=0.05)
     queries = {name: getattr(recording(20, 11), name)[:6].tolist() for name in ("q", "dq", "ddq")}
     answers = {}
     with TestClient(create_app(settings), "http://localhost") as api:

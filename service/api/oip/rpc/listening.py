@@ -15,10 +15,12 @@ import grpc
 from starlette.types import ASGIApp, Message, Scope
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
+from service.api.limits.requests import MAX_REQUESTS, PATIENCE
 from service.api.oip.rpc import taken
 from service.api.oip.rpc.definition import SERVICE
 from service.api.oip.rpc.messages import PROTOBUF
 from service.api.oip.rpc.methods import CALL, METHODS
+from service.api.server.sockets import DRAIN_S
 from service.foundation.settings import Settings
 from service.telemetry.readiness import Stopping
 
@@ -62,17 +64,17 @@ async def listening(app: ASGIApp, settings: Settings, stopping: Stopping) -> Asy
         raise taken(settings, str(error)) from error
     await server.start()
     logger.info("gRPC on %s:%d", host, port)
-    stop = asyncio.create_task(_stop(server, stopping, settings.drain_s))
+    stop = asyncio.create_task(_stop(server, stopping))
     try:
         yield port
     finally:
         stop.cancel()
-        await server.stop(settings.drain_s)
+        await server.stop(DRAIN_S)
 
 
-async def _stop(server: grpc.aio.Server, stopping: Stopping, drain_s: float) -> None:
+async def _stop(server: grpc.aio.Server, stopping: Stopping) -> None:
     await stopping.closing.wait()
-    await server.stop(drain_s)
+    await server.stop(DRAIN_S)
 
 
 def _options(settings: Settings) -> list[tuple[str, int]]:
@@ -81,13 +83,13 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.so_reuseport", 0),  # else a second service would take half of the calls
         ("grpc.max_receive_message_length", settings.max_request_bytes),
         ("grpc.max_send_message_length", -1),
-        ("grpc.max_metadata_size", settings.max_header_bytes),
-        ("grpc.absolute_max_metadata_size", settings.max_header_bytes),
-        ("grpc.max_concurrent_streams", settings.max_requests),
+        ("grpc.max_metadata_size", PATIENCE.header_bytes),
+        ("grpc.absolute_max_metadata_size", PATIENCE.header_bytes),
+        ("grpc.max_concurrent_streams", MAX_REQUESTS),
         ("grpc.max_allowed_incoming_connections", settings.max_connections),
-        ("grpc.server_handshake_timeout_ms", int(settings.header_s * 1000)),
+        ("grpc.server_handshake_timeout_ms", int(PATIENCE.header_s * 1000)),
         ("grpc.max_connection_idle_ms", int(settings.stream_idle_s * 1000)),
-        ("grpc.keepalive_time_ms", int(settings.answer_s * 1000)),  # who has gone without a word
+        ("grpc.keepalive_time_ms", int(PATIENCE.answer_s * 1000)),  # who has gone without a word
         ("grpc.compression_enabled_algorithms_bitset", 1),  # none: messages are taken uncompressed
     ]
 

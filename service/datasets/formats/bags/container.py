@@ -18,6 +18,8 @@ from service.foundation.errors import InvalidDataError, TooLargeError, invalid_d
 from service.foundation.settings import Settings
 
 Data = bytes | memoryview
+MAX_PART_BYTES = 64 * 1024 * 1024
+"""Largest chunk or message of a bag, once unpacked."""
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 """Begins a message that rosbag2 compressed by itself; no CDR message begins so."""
 
@@ -52,7 +54,7 @@ class Bag(ABC):
 
     def unpacking(self) -> Unpacking:
         """What one pass through the bag may unpack."""
-        return Unpacking(self.settings.max_bag_part_bytes, self.settings.max_unpacked_bytes)
+        return Unpacking(MAX_PART_BYTES, self.settings.max_unpacked_bytes)
 
 
 class ScannedBag(Bag):

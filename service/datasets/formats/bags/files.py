@@ -13,7 +13,16 @@ from contextlib import closing
 from struct import Struct
 from typing import BinaryIO
 
-from service.datasets.formats.bags.container import Bag, Channel, Data, ScannedBag, Unpacking, damaged, type_name
+from service.datasets.formats.bags.container import (
+    MAX_PART_BYTES,
+    Bag,
+    Channel,
+    Data,
+    ScannedBag,
+    Unpacking,
+    damaged,
+    type_name,
+)
 
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, CHUNK, CONNECTION = 0x02, 0x03, 0x05, 0x07
@@ -268,7 +277,7 @@ class SqliteBag(Bag):
         database = sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
         try:
             database.text_factory = _text
-            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, self.settings.max_bag_part_bytes)
+            database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_PART_BYTES)
             database.execute("PRAGMA trusted_schema = OFF")
             database.execute("PRAGMA cell_size_check = ON")
             for table in ("messages", "topics"):

@@ -96,7 +96,7 @@ def read_channel(bag: Bag, channel: Channel, joint_names: tuple[str, ...] | None
     ]
     units = Decoder(channel).source.units
     return Table(
-        names=checked_names(("t", *(f"{joint}/{quantity}" for quantity in quantities for joint in names)), settings),
+        names=checked_names(("t", *(f"{joint}/{quantity}" for quantity in quantities for joint in names))),
         blocks=_blocks(bag, channel, joints, quantities, use_stamps, start),
         joint_names=names,
         units={"t": "s"}
