@@ -63,9 +63,7 @@ def add(
         raw = Staged.of_others(folder, recording.joint_names, recording.lengths, disk)
         prepared = prepare(raw, folder, options.recipe, MIN_SAMPLES, disk)
         gravity = recording.torque_convention == "gravity_included"
-        report = make_report(
-            raw, prepared, profile, recording.noted, settings, options.recipe, gravity, recording.facts
-        )
+        report = make_report(raw, prepared, profile, recording.noted, options.recipe, gravity, recording.facts)
         report["upload_sha256"] = sample_file.sha256(upload)
         report["joint_types"] = None if profile is None else _joint_types(profile, raw.joint_names)
         staged = prepared.staged

@@ -105,11 +105,12 @@ def check_offered(model: TorqueModel, components: Sequence[ComponentName]) -> No
             raise invalid_request(f"components[{index}]", name, expected)
 
 
-def check_components(model: TorqueModel, request: PredictRequest, limit: int) -> None:
+def check_components(model: TorqueModel, request: PredictRequest) -> None:
     """Raise InvalidRequestError for components the model lacks, too many queries, or a torque missing or in vain."""
     check_offered(model, request.components)
-    if request.components and request.q.ndim == 2 and len(request.q) > limit:
-        raise invalid_request("q", f"{len(request.q)} queries", f"at most {limit} in one request with components")
+    if request.components and request.q.ndim == 2 and len(request.q) > MAX_COMPONENT_BATCH:
+        expected = f"at most {MAX_COMPONENT_BATCH} in one request with components"
+        raise invalid_request("q", f"{len(request.q)} queries", expected)
     forward = "forward_dynamics" in request.components
     if forward and request.tau is None:
         raise invalid_request("tau", "missing", "the torque that forward_dynamics is asked for, shaped as q")
@@ -241,16 +242,15 @@ def at_once(served: Served, motion: Array, max_position: float, payload: Payload
 def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None = None) -> Prediction:
     """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
     served: what answers, where that is found already."""
-    settings = loaded.storage.settings
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model
     single = request.q.ndim == 1
-    check_components(known, request, MAX_COMPONENT_BATCH)
+    check_components(known, request)
     parts = check_shapes(request, known)
     query = Query(np.stack([np.atleast_2d(values) for values in parts]), single)
     if (count := query.values.shape[1]) > MAX_BATCH:
         raise invalid_request("q", f"{count} queries", f"at most {MAX_BATCH} in one request")
-    query.check(served.model.position_limits(settings.max_position))
+    query.check(served.model.position_limits(loaded.storage.settings.max_position))
 
     known = carrying(served, request.payload)
     q, dq, ddq, *_ = query.values

@@ -104,7 +104,7 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
         if ROBOT in files and "robot" not in manifest:
             raise ModelFormatError(f"{ROBOT} is there, but the manifest names no robot", ROBOT)
         check_texts(manifest)
-        _check_options(manifest["options"], settings)
+        _check_options(manifest["options"])
         for entry, fields in FIELDS.items():
             if entry in manifest:
                 where = entry
@@ -127,7 +127,7 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
     return manifest
 
 
-def _check_options(options: Mapping[str, Any], settings: Settings) -> None:
+def _check_options(options: Mapping[str, Any]) -> None:
     for name, most in MAX_OPTIONS.items():
         if options.get(name, 0) > most:
             raise ModelFormatError(f"options.{name} is {options[name]}, expected at most {most}")

@@ -9,7 +9,6 @@ from lipcore.estimators.noise import white
 from lipcore.model.torque_model import TorqueModel
 from service.contract.models import Evaluation
 from service.foundation.fields import finite
-from service.foundation.settings import Settings
 from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation
 from service.models.lineage import answer_of, figures
 from service.training import repeating
@@ -17,7 +16,7 @@ from service.training.material import Material
 from service.training.table import TablePart
 
 
-def judged_figures(settings: Settings, model: TorqueModel, material: Material) -> dict[str, Any]:
+def judged_figures(model: TorqueModel, material: Material) -> dict[str, Any]:
     """Return the figures of a fit on what was held out, as a lineage keeps them.
 
     If a last fit follows, these are also what can be computed no more after it: fields of a `HoldoutLineage`.

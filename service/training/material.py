@@ -21,7 +21,6 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import TorqueConvention
 from service.contract.models import Holdout, HoldoutLineage
 from service.datasets.mapping.checks import MIN_SAMPLES
-from service.foundation.settings import Settings
 from service.journal import log
 from service.models import registry
 from service.models.evaluation import MAX_EVALUATION_SAMPLES
@@ -105,7 +104,7 @@ class Material:
         return self.held_out is not None and self.every is not None and self.every is not self.table
 
 
-def recorded(settings: Settings, database: Database, files: Files, request: dict[str, Any]) -> Material:
+def recorded(database: Database, files: Files, request: dict[str, Any]) -> Material:
     """Samples of the data sets that a job names; raise CannotHoldOutError."""
     with database.session() as session:
         known = refresh_data.datasets(session, request["datasets"])
@@ -141,7 +140,7 @@ def recorded(settings: Settings, database: Database, files: Files, request: dict
     )
 
 
-def observed(settings: Settings, database: Database, files: Files, model: str, request: dict[str, Any]) -> Material:
+def observed(database: Database, files: Files, model: str, request: dict[str, Any]) -> Material:
     """Samples that a refresh learns from; raise NothingToLearnError where there are too few.
 
     Data sets and rows of the log are chosen by what the log says now: a change that has been logged since the job was

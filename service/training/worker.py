@@ -55,7 +55,7 @@ def run(settings: Settings, job: str) -> None:
     token = job_id.set(job)
     database, files = _database(settings), Files.of(settings, PATIENCE_S)
     try:
-        claim = _claim(settings, database, job)
+        claim = _claim(database, job)
         if claim is not None:
             _train(settings, database, files, claim)
     finally:
@@ -80,7 +80,7 @@ class Claim:
     request: dict[str, Any]
 
 
-def _claim(settings: Settings, database: Database, job: str) -> Claim | None:
+def _claim(database: Database, job: str) -> Claim | None:
     with database.transaction() as session:
         row = lifecycle.row_of(session, job)
         if row is None or row.state != QUEUED:
@@ -96,9 +96,9 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
     try:
         with Pulse(database, lambda session: _own(session, claim), claim.model, lifecycle.LIMITS.heartbeat_s) as pulse:
             if claim.request.get("refresh") is None:
-                material = recorded(settings, database, files, claim.request)
+                material = recorded(database, files, claim.request)
             else:
-                material = observed(settings, database, files, claim.model, claim.request)
+                material = observed(database, files, claim.model, claim.request)
             trained, lineage, judged = _version(settings, database, files, claim, material, pulse)
             pulse.stage("saving")
             folder = lifecycle.new_folder(claim.job)
@@ -134,7 +134,7 @@ def _version(
     lineage = {"job": claim.job, **material.lineage}
     if material.held_out is not None:
         pulse.stage("evaluating")
-        lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(settings, trained, material)}
+        lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(trained, material)}
     judged, learnt = _judged(settings, database, files, claim, material, trained, lineage), material
     judged_on = _judged_on(material)
     if last is not None and judged_on is not None:

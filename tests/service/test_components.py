@@ -9,7 +9,6 @@ from lipcore.data.motion import Motion
 from lipcore.kernels.independent import SquaredExponentialKernel
 from lipcore.model import dynamics
 from service.contract.predictions import PredictRequest
-from service.foundation.settings import Settings
 from service.inference import predicting
 from service.inference.predicting import MAX_COMPONENT_BATCH
 from tests.service.data import error
@@ -91,7 +90,7 @@ def test_components_that_an_estimator_lacks_are_refused_naming_what_it_offers(tr
         {name: values.tolist() for name, values in motion.items()} | {"components": ["friction", "gravity"]}
     )
     with pytest.raises(Exception, match="components") as caught:
-        predicting.check_components(black_box, request, Settings().max_component_batch)
+        predicting.check_components(black_box, request)
     (problem,) = caught.value.detail
     assert (problem.field, problem.value) == ("components[1]", "gravity")
     assert problem.expected == "what a model with the estimator se offers: friction"

@@ -72,7 +72,7 @@ def rows_of(samples, result):
 def material(api, *datasets, **holdout):
     service = service_of(api)
     request = {"datasets": list(datasets), "holdout": holdout, "joint_types": ["revolute"] * 2}
-    return recorded(service.settings, service.database, service.files, request)
+    return recorded(service.database, service.files, request)
 
 
 def held_out(result):

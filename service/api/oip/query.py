@@ -100,7 +100,7 @@ def read(message: Message, model: TorqueModel, settings: Settings) -> Question:
     outputs = _outputs(request, model)
     tensors = _inputs(request, bool(NEED_TORQUE & outputs.keys()))
     shape = request.inputs[0].shape
-    _check_shape(request.inputs[0], shape, model, settings, bool(PARTS.keys() & outputs.keys()))
+    _check_shape(request.inputs[0], shape, model, bool(PARTS.keys() & outputs.keys()))
     message.check()
     single, rows = len(shape) == 1, 1 if len(shape) == 1 else shape[0]
     values = np.empty((len(tensors), rows, model.n_joints))
@@ -163,9 +163,7 @@ def _inputs(request: schema.InferRequest, torque: bool) -> tuple[str, ...]:
     return needed
 
 
-def _check_shape(
-    tensor: schema.InferInput, shape: list[int], model: TorqueModel, settings: Settings, components: bool
-) -> None:
+def _check_shape(tensor: schema.InferInput, shape: list[int], model: TorqueModel, components: bool) -> None:
     n, field = model.n_joints, f"{tensor.name}.shape"
     if len(shape) not in (1, 2) or shape[-1] != n or shape[0] == 0:
         joints = ", ".join(model.joint_names)

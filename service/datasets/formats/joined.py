@@ -53,7 +53,7 @@ def open_joined(path: Path, options: ReadOptions, settings: Settings) -> Iterato
     from service.datasets.formats.csv import open_csv  # noqa: PLC0415 - it imports pyarrow
 
     with TemporaryDirectory(dir=path.parent) as folder, ExitStack() as stack:
-        with open_zip(path, settings, EXPECTED) as archive:
+        with open_zip(path, EXPECTED) as archive:
             files = _unpacked(archive, Path(folder), settings)
         left = None if options.column_names is None else list(options.column_names)
         parts: list[Part] = []

@@ -128,7 +128,7 @@ class Rows:
     names: of the columns, those that hold numbers in the first rows; facts: what is left out.
     """
 
-    def __init__(self, rows: Iterator[Any], settings: Settings) -> None:
+    def __init__(self, rows: Iterator[Any]) -> None:
         self._rest = rows
         self._first = list(islice(rows, SAMPLE_ROWS))
         for number, row in enumerate(self._first, start=1):
@@ -219,7 +219,7 @@ ARRAYS = "an array of objects, or an object of arrays"
 @contextmanager
 def open_json_lines(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
     """Open a file of one JSON object a line as a table; raise InvalidDataError naming the line, or row and column."""
-    rows = Rows(_lines(path, settings), settings)
+    rows = Rows(_lines(path))
     yield Table(rows.names, rows.blocks(), facts=rows.facts)
 
 
@@ -232,11 +232,11 @@ def open_json(path: Path, options: ReadOptions, settings: Settings) -> Iterator[
             "(NDJSON), which may be longer"
         )
     rows, joint_names, facts = _document(path.read_bytes())
-    table = Rows(rows, settings)
+    table = Rows(rows)
     yield Table(table.names, table.blocks(), joint_names=joint_names, facts=facts + table.facts)
 
 
-def _lines(path: Path, settings: Settings) -> Iterator[Any]:
+def _lines(path: Path) -> Iterator[Any]:
     most = MAX_LINE_BYTES
     number = 0
     with path.open("rb") as file:

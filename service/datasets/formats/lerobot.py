@@ -39,7 +39,7 @@ def open_lerobot(path: Path, options: ReadOptions, settings: Settings) -> Iterat
     (`.vel`, `.effort`), `action` with that word in front; `t` in s and `episode` come from `timestamp` and
     `episode_index`. One Parquet file at a time is unpacked, beside the archive, under no name.
     """
-    with open_zip(path, settings, EXPECTED) as archive:
+    with open_zip(path, EXPECTED) as archive:
         names = archive.namelist()
         root = root_of(names)
         if root is None:

@@ -59,7 +59,7 @@ def open_npz(path: Path, options: ReadOptions, settings: Settings) -> Iterator[T
     Known are `ARRAYS`; every other array of one number or one row of numbers a sample becomes columns too, and what
     else there is is left out, which is a fact of the table.
     """
-    with open_zip(path, settings, EXPECTED) as archive, ExitStack() as files:
+    with open_zip(path, EXPECTED) as archive, ExitStack() as files:
         members = archive.infolist()
         for member in members:
             if "/" in member.filename or not member.filename.endswith(".npy"):

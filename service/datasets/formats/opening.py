@@ -82,7 +82,7 @@ FURTHER = {
 """Modules and names of openers that stand on Arrow; bags have one for all their kinds."""
 
 
-def sniff(path: Path, settings: Settings | None = None) -> str | None:
+def sniff(path: Path) -> str | None:
     """One of `KINDS`; None where the content is none of them, or cannot be told. Raises nothing of damaged files."""
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
@@ -90,7 +90,7 @@ def sniff(path: Path, settings: Settings | None = None) -> str | None:
         if head.startswith(magic):
             return kind
     if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
-        return _zip(path, settings or Settings())
+        return _zip(path)
     return _text(head)
 
 
@@ -106,9 +106,9 @@ def foreign(path: Path) -> str | None:
     return None
 
 
-def _zip(path: Path, settings: Settings) -> str | None:
+def _zip(path: Path) -> str | None:
     try:
-        with open_zip(path, settings, "a zip archive") as archive:
+        with open_zip(path, "a zip archive") as archive:
             names = archive.namelist()
     except ServiceError:
         return None
@@ -161,7 +161,7 @@ def open_table(path: Path, kind: str | None, options: ReadOptions, settings: Set
     """
     if path.stat().st_size == 0:
         raise invalid_data("file", "empty", KINDS.get(kind or "", "a recording"))
-    actual = _kind(path, kind, settings)
+    actual = _kind(path, kind)
     with _open(path, actual, options, settings) as table:
         if options.dt is not None:
             _count_time(table, options.dt)
@@ -186,9 +186,9 @@ def _count_time(table: Table, step: float) -> None:
     table.facts.append(f"times are counted in steps of {step:g} s, as the upload says")
 
 
-def _kind(path: Path, kind: str | None, settings: Settings) -> str:
+def _kind(path: Path, kind: str | None) -> str:
     """What a file is to be read as."""
-    actual = sniff(path, settings)
+    actual = sniff(path)
     if actual is not None:
         if (kind, actual) == ("json_lines", "json") and not _starts(path, b"["):
             with path.open("rb") as file:  # a damaged first line makes lines of JSON look like a document

@@ -28,7 +28,7 @@ _COMPLETE = "a complete zip archive"
 
 
 @contextmanager
-def open_zip(path: Path, settings: Settings, expected: str) -> Iterator[zipfile.ZipFile]:
+def open_zip(path: Path, expected: str) -> Iterator[zipfile.ZipFile]:
     """Open an archive whose members have plain names, each once; raise InvalidDataError of any other."""
     with path.open("rb") as file:
         try:
@@ -93,7 +93,7 @@ def unpacked_bag(path: Path, settings: Settings) -> Iterator[list[Path]]:
     They have names of our own there. Raise InvalidDataError, or TooLargeError.
     """
     with TemporaryDirectory(dir=path.parent) as folder:
-        with open_zip(path, settings, _COMPLETE) as archive:
+        with open_zip(path, _COMPLETE) as archive:
             try:
                 files = _unpack(archive, Path(folder), settings)
             except ERRORS as error:

@@ -40,7 +40,6 @@ from service.datasets.report.signals import (
     white_noise,
 )
 from service.datasets.staging import EPISODE, QUANTITIES, Prepared, Staged, column
-from service.foundation.settings import Settings
 
 MAX_ROWS = 2000
 """Rows of a data set that figures on several joints together are taken over."""
@@ -53,7 +52,6 @@ def make_report(
     prepared: Prepared,
     profile: Profile | None,
     noted: list[str],
-    settings: Settings,
     recipe: Recipe | None = None,
     gravity: bool = True,
     source: dict[str, Any] | None = None,
@@ -68,7 +66,7 @@ def make_report(
     limits = limits_of(profile, names)
     clock = look_at_clock(raw, recipe.gap_steps, prepared.repeated)
     recorded = _look_at_raw(raw, clock, limits)
-    samples = _look_at_samples(prepared, limits, MAX_ROWS)
+    samples = _look_at_samples(prepared, limits)
     upload, signals = Upload(names, gravity, source), Signals(*samples.motion, samples.tau)
     candidates, best = proposed(names, signals) if profile is None else ((), None)
     known = profile if best is None else profiles.profile(best)
@@ -181,12 +179,12 @@ def _share(level: float | None, values: Array) -> float | None:
     return None if level is None or wide == 0 else level / wide
 
 
-def _look_at_samples(prepared: Prepared, limits: Limits | None, most: int) -> _Samples:
+def _look_at_samples(prepared: Prepared, limits: Limits | None) -> _Samples:
     staged, rate = prepared.staged, prepared.rate_hz
     part = number_parts(staged.rows, [np.diff(staged.read(EPISODE)) != 0])
     starts, ends = bounds(part)
     steps = None if rate is None else shifts(rate, int((ends - starts).max()))
-    rows = thin(part, most, 0 if steps is None else int(steps[-1]))
+    rows = thin(part, MAX_ROWS, 0 if steps is None else int(steps[-1]))
     motion = (staged.table("q", rows), staged.table("dq", rows), staged.table("ddq", rows))
     tau = staged.table("tau", rows)
     fit = make_fit(rows, *motion, tau=tau, independent=_independent(prepared))

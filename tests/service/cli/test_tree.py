@@ -1,5 +1,6 @@
 """The tree of commands: its reference, its lists, completion, exit codes, and what it says of mistakes."""
 
+import json
 import runpy
 from pathlib import Path
 
@@ -43,6 +44,19 @@ def test_every_command_prints_json_and_has_a_help():
             assert parameter.help, (path, parameter.name)
         if not hasattr(command, "list_commands") and path[1] not in PRINTS_NO_RESULT:
             assert "--json" in [name for each in command.params for name in each.opts], path
+
+
+def test_settings_are_listed_with_units_and_without_passwords(lipserve, monkeypatch):
+    monkeypatch.setenv("LIPSERVE_DATABASE_URL", "postgresql://me:secret@host/name")
+    monkeypatch.setenv("LIPSERVE_FILES_URL", "s3://bucket/prefix")
+    code, out, _ = lipserve("settings")
+    assert (code, "secret" in out) == (0, False)
+    assert "LIPSERVE_PUBLISH_EVERY_S" in out
+    code, out, _ = lipserve("settings", "--json")
+    shown = {each["variable"]: each for each in json.loads(out)}
+    assert shown["LIPSERVE_DATABASE_URL"]["value"] == "postgresql://me:***@host/name"
+    publish = {name: shown["LIPSERVE_PUBLISH_EVERY_S"][name] for name in ("value", "default", "unit")}
+    assert publish == {"value": "0.5", "default": "0.5", "unit": "s"}
 
 
 @pytest.fixture

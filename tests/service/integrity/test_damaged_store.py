@@ -31,7 +31,7 @@ def test_damaged_data_set_is_not_evaluated_and_not_trained_on(api, trained, spoi
     answer = api.post(f"/v1/models/{trained.name}/evaluate", json={"dataset": dataset["id"]})
     assert dataset["id"] in error(answer, 500, "damaged_data")["message"]
     with pytest.raises(DamagedDataError, match="Upload it again"):
-        recorded(service.settings, service.database, service.files, {"datasets": [dataset["id"]]})
+        recorded(service.database, service.files, {"datasets": [dataset["id"]]})
     assert api.get(f"/v1/datasets/{dataset['id']}").status_code == 200
     assert api.delete(f"/v1/datasets/{dataset['id']}").status_code == 204
 

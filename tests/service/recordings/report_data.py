@@ -64,7 +64,7 @@ def report_on(
     recipe = recipe or Recipe()
     raw = staged(folder, names, columns)
     prepared = prepare(raw, folder, recipe, 30, raw.disk)
-    made = make_report(raw, prepared, profile, ["read"], Settings(home=folder), recipe, **options)
+    made = make_report(raw, prepared, profile, ["read"], recipe, **options)
     return DatasetReport.model_validate(made)
 
 

@@ -74,7 +74,7 @@ def upload(folder: Path, columns: dict[str, np.ndarray], /, **query: str) -> Dat
         got = read(table, folder, options, robot, settings, disk)
     prepared = prepare(got.staged, folder, options.recipe, 30, disk)
     holds = got.torque_convention == "gravity_included"
-    made = make_report(got.staged, prepared, robot, got.noted, settings, options.recipe, holds, got.facts)
+    made = make_report(got.staged, prepared, robot, got.noted, options.recipe, holds, got.facts)
     return DatasetReport.model_validate(made)
 
 

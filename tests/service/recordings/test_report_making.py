@@ -12,7 +12,6 @@ from service.contract.datasets import DatasetReport
 from service.datasets.report.advice import listed
 from service.datasets.report.making import make_report
 from service.datasets.staging import prepare
-from service.foundation.settings import Settings
 from tests.service.recordings.report_data import profile_of, recording, report_on, staged
 
 
@@ -21,7 +20,7 @@ def test_a_report_tells_of_the_samples(tmp_path: Path) -> None:
     profile = profile_of("double-pendulum", 50.0)
     raw = staged(tmp_path, profile.joint_names, columns)
     prepared = prepare(raw, tmp_path, Recipe(), 30, raw.disk)
-    made = make_report(raw, prepared, profile, ["a fact"], Settings(home=tmp_path))
+    made = make_report(raw, prepared, profile, ["a fact"])
     report = DatasetReport.model_validate(made)
     assert json.loads(json.dumps(made, allow_nan=False)) == made
     tau = low_pass(columns["tau"], 128.0)[32:-32]
