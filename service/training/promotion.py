@@ -63,7 +63,7 @@ def settle(session: Session, model: str, judged: Promotion, option: PromotionOpt
 
 
 def wait(session: Session, model: str, version: int) -> None:
-    """Let a version wait that was just added as a candidate: it learns nothing and is in no contest, as whoever looks
+    """Let a version wait that was just added as a candidate: it learns nothing, as whoever looks
     at it says what becomes of it. The alias `candidate` points to it, where there is room for that."""
     session.get_one(LearnerRow, (model, version)).role = "dismissed"
     known = aliases.names(session, model)

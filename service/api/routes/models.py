@@ -164,7 +164,7 @@ def show_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNum
 )
 @needs(ADMIN)
 def delete_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNumber) -> None:
-    """Delete a version that nothing needs: no alias, not the service, no contest and no job. Its number is not given
+    """Delete a version that nothing needs: no alias, not the service and no job. Its number is not given
     again."""
     deletion.delete_version(loaded, model, version)
 

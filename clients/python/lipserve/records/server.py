@@ -25,10 +25,10 @@ class Health(Record, frozen=True, kw_only=True):
     """The process answers, and what it can do.
 
     can: What is installed besides serving, teaching and training of learnt arms, by the name of its extra: `train`, to
-        train the estimators se, gip and lse, and train on a GPU; `robots`, to use URDFs; `sim`, to simulate robots and
-        know them by name; `ingest`, to read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra); `cluster`, to
-        share PostgreSQL, S3 and a Dask cluster; `grpc`, to answer over gRPC; `opentelemetry`, to send traces; `plot`,
-        to draw pictures
+        train the estimators se, gip and lse, on a GPU if there is one; `robots`, to use URDFs; `sim`, to simulate
+        robots and know them by name; `ingest`, to read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra);
+        `cluster`, to share PostgreSQL, S3 and a Dask cluster; `grpc`, to answer over gRPC; `opentelemetry`, to send
+        traces; `plot`, to draw pictures
     missing: Of what is not installed
     confined: What this system has to keep the process in which an upload is read from harm: limits of `memory` and
         `processor`; `landlock`, from files; `seccomp`, from the network and other processes
