@@ -9,6 +9,7 @@ from functools import cached_property
 from xml.etree import ElementTree
 
 import numpy as np
+from msgspec import Struct
 
 from lipcore.data.motion import Array
 from lipcore.profiles.names import Assignment, assignments, is_number, makes
@@ -16,52 +17,23 @@ from lipcore.robots.urdf import describe
 from lipcore.robots.urdf_text import MOVABLE, UrdfError
 from lipcore.vocabulary import EffortMeaning, JointType
 
-FREE = (-np.inf, np.inf)
-"""Range of a joint that turns without end."""
 
-
-@dataclass(frozen=True)
-class Numbers:
-    """Limits as a maker publishes them, one a joint, in rad, rad/s, rad/s², N·m; None: not published."""
-
-    ranges: tuple[tuple[float, float], ...]
-    speed: tuple[float, ...]
-    torque: tuple[float, ...] | None
-    acceleration: tuple[float, ...] | None = None
-
-
-@dataclass(frozen=True)
-class Sheet:
-    """A robot as the catalogue writes it down, before its URDF is looked for.
-
-    joints: names as its own URDF or driver has them, from base to tip; aliases: (n) other names, none by default;
-    numbers: None takes those of the installed URDF, and without one there is no profile; source: of the numbers;
-    placeholders: whether that URDF's limits of speed and torque mean nothing.
-    """
+class Sheet(Struct, frozen=True, forbid_unknown_fields=True):
+    """A robot as `arms.toml`, which documents the fields, writes it down, before its URDF is looked for."""
 
     title: str
-    joints: tuple[str, ...]
     effort: EffortMeaning
     effort_note: str
     source: str
-    numbers: Numbers | None = None
+    remark: str = ""
+    joints: tuple[str, ...] = ()
     aliases: tuple[tuple[str, ...], ...] = ()
+    degrees: bool = False
+    ranges: tuple[tuple[float, float], ...] | None = None
+    speed: tuple[float, ...] | None = None
+    torque: tuple[float, ...] | None = None
+    acceleration: tuple[float, ...] | None = None
     placeholders: bool = False
-
-
-def degrees(*values: float) -> tuple[float, ...]:
-    """Degrees in radians."""
-    return tuple(np.radians(values).tolist())
-
-
-def symmetric(*degrees_each: float) -> tuple[tuple[float, float], ...]:
-    """Ranges of ± so many degrees, in radians."""
-    return tuple((-limit, limit) for limit in degrees(*degrees_each))
-
-
-def numbered(count: int, *patterns: str) -> tuple[tuple[str, ...], ...]:
-    """The names of joints 1..count in each of the patterns."""
-    return tuple(tuple(pattern.format(joint) for pattern in patterns) for joint in range(1, count + 1))
 
 
 def array(values: Sequence[float] | None, n_joints: int) -> Array:

@@ -8,15 +8,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lipcore.profiles import from_urdf, names, profile, profiles, recognise
-from lipcore.profiles.arms import ARMS
-from lipcore.profiles.catalogue import SHEETS
+from lipcore.profiles.catalogue import sheets
 from lipcore.profiles.names import words
 from lipcore.robots.library import ROBOTS, UnknownRobotError, load_robot, profile_urdf
 from lipcore.robots.urdf import RigidBody
 from lipcore.robots.urdf_text import UrdfError
 from tests.lipcore.test_urdf import joint, link, robot
 
+SHEETS = sheets()
 ALL = tuple(SHEETS)
+ARMS = tuple(name for name, sheet in SHEETS.items() if sheet.ranges)
 UR = tuple(f"{each}_joint" for each in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))
 SO = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 ANOTHER_SOURCE = {"ur3", "ur5", "ur10"}
@@ -77,7 +78,7 @@ def test_without_example_robot_data_the_arms_with_numbers_of_their_own_are_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("lipcore.profiles.catalogue.installed_profiles", lambda: ())
-    assert names() == tuple(ARMS)
+    assert names() == ARMS
     assert profile("panda").urdf is None
     assert "no URDF is installed" in profile("panda").why_no_urdf()
     assert profile("panda").lower[0] == -2.8973
