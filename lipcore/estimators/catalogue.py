@@ -143,14 +143,14 @@ FUNCTION_STD_FACTOR = {
 class Calibration:
     """function_std_factor: what the standard deviation of the function is multiplied by, at least 1."""
 
-    function_std_factor: float = 1.0
+    function_std_factor: float
 
     def __post_init__(self) -> None:
         if not 1.0 <= self.function_std_factor < 100.0:
             raise ValueError(f"function_std_factor is {self.function_std_factor!r}, expected a number from 1 to 100")
 
 
-NO_CALIBRATION = Calibration()
+NO_CALIBRATION = Calibration(1.0)
 
 
 def calibrate(estimator: str) -> Calibration:

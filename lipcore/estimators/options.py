@@ -59,6 +59,8 @@ class FitOptions:
             value = getattr(self, name)
             if type(value) is not int or not low <= value <= high:
                 raise ValueError(f"{name} is {value!r}, expected a whole number from {low} to {high}")
+        if type(self.tied) is not bool:
+            raise ValueError(f"tied is {self.tied!r}, expected true or false")
         if self.statistics not in get_args(Standing):
             raise ValueError(f"statistics is {self.statistics!r}, expected one of {', '.join(get_args(Standing))}")
         if self.device not in ("auto", "cpu", "cuda"):

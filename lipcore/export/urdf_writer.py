@@ -13,10 +13,11 @@ from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.files.arm import bodies_of, read_geometry
+from lipcore.files.entries import Chain, Inertia
 from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of, skew
 
 Element = ElementTree.Element
@@ -123,18 +124,16 @@ def urdf_of_parameters(
     """
     if "inertia" not in parameters:
         raise ValueError("the model has no rigid bodies, so no masses: a URDF needs the estimator 'rigid-body'")
-    n = len(joint_names)
-    geometry, order = read_geometry(parameters["geometry"], n, plausible=True)
-    places, bodies = parameters["geometry"]["joints"], parameters["inertia"]["bodies"]
-    friction, ranges = parameters["friction"], training_range
+    arm, inertia = msgspec.convert(parameters["geometry"], Chain), msgspec.convert(parameters["inertia"], Inertia)
+    friction, ranges, order = parameters["friction"], training_range, arm.order
     rotor = parameters["rotor"]["mean"]
 
     def chain(values: Any) -> Array:
         return np.asarray(values, np.float64)[order]
 
     undetermined = tuple(
-        (*place["undetermined"], *bodies[joint].get("undetermined", ()))
-        for place, joint in zip(places, order, strict=True)
+        (*place.undetermined, *inertia.bodies[joint].undetermined)
+        for place, joint in zip(arm.joints, order, strict=True)
     )
     joints = ArmJoints(
         names=tuple(joint_names[joint] for joint in order),
@@ -147,13 +146,9 @@ def urdf_of_parameters(
         rotor=chain(rotor),
         undetermined=undetermined,
     )
-    inertia, notes = parameters["inertia"], list[str]()
-    if "plausible_deviation" in inertia:
-        off = ", ".join(f"{value:.2g}" for value in chain(inertia["plausible_deviation"]))
-        notes = [
-            f"Torque of these bodies differs from what was learnt by {off} N·m (N), root mean square, base to tip."
-        ]
-    return urdf_text(geometry, bodies_of(inertia)[order], joints, name, notes)
+    off = ", ".join(f"{value:.2g}" for value in chain(inertia.plausible_deviation))
+    notes = [f"Torque of these bodies differs from what was learnt by {off} N·m (N), root mean square, base to tip."]
+    return urdf_text(arm.geometry(plausible=True), inertia.plausible()[order], joints, name, notes)
 
 
 def rpy(rotation: Array) -> Array:

@@ -20,7 +20,7 @@ from safetensors.numpy import save as save_tensors
 
 from lipcore.data.motion import Array, Indices, Motion
 from lipcore.estimators.catalogue import Calibration, make_estimator
-from lipcore.files.arm import arm_tensors, is_of_arm, read_arm, read_mode
+from lipcore.files.arm import arm_tensors, is_of_arm, read_arm
 from lipcore.files.durable import make_folder, sync
 from lipcore.files.manifest import (
     DEFAULT_LIMITS,
@@ -44,7 +44,7 @@ from lipcore.posterior.linalg import pack_symmetric, unpack_symmetric
 from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.statistics import Statistics
 from lipcore.robots.urdf import RigidBody
-from lipcore.vocabulary import ROBOT_ESTIMATORS
+from lipcore.vocabulary import GEOMETRY_MODES, ROBOT_ESTIMATORS
 
 SAME = 1e-6
 """Relative difference of the noise in the manifest and in the tensors that another processor may make."""
@@ -318,12 +318,10 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: Rigi
 
 
 def _arm(manifest: Mapping[str, Any], tensors: Mapping[str, Array]) -> Arm:
+    if "geometry" not in manifest["fit"]:
+        raise ModelFormatError(f"fit.geometry is missing, expected one of {', '.join(GEOMETRY_MODES)}")
     try:
-        mode = read_mode(manifest["fit"].get("geometry"))
-    except ValueError as error:
-        raise ModelFormatError(str(error)) from None
-    try:
-        return read_arm(tensors, manifest["joint_types"], mode)
+        return read_arm(tensors, manifest["joint_types"], manifest["fit"]["geometry"])
     except ValueError as error:
         raise ModelFormatError(str(error), TENSORS) from None
 

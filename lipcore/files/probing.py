@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.files.checks import LARGEST
+from lipcore.files.entries import LARGEST
 from lipcore.files.manifest import TENSORS, ModelFormatError
 from lipcore.model.torque_model import TorqueModel
 

@@ -1,49 +1,64 @@
-"""JSON from strangers: one meaning only, and nothing that runs away.
-
-Python's reader takes more than JSON is: NaN and Infinity, numbers that overflow to it, one name twice, halves of
-characters that no text can hold, whole numbers of any length. All of these are refused here.
-"""
+"""JSON from strangers: of limited size and depth, and of the types that are expected."""
 
 from __future__ import annotations
 
-import json
-import math
-from typing import Any, NoReturn
+import re
+from typing import Any, TypeVar
+
+import msgspec
+
+from lipcore.model.selection import shortened
+
+T = TypeVar("T")
 
 MAX_DEPTH = 32
-"""Objects and lists within one another: what is written again, checked or quoted recurses as deep."""
+"""Objects and lists within one another: what is written again or checked recurses as deep."""
 MAX_QUOTE = 80
 """Characters of a quoted value."""
 MAX_INTEGER = 2**63
 
 
 class StrictJsonError(ValueError):
-    """The bytes are not JSON of one meaning; the message says what is wrong and where."""
+    """The bytes are not the JSON that is expected; the message says what is wrong and where."""
 
 
-def read(payload: bytes, most_bytes: int) -> Any:
-    """The value that the bytes of a JSON document hold.
-
-    Raise StrictJsonError for what is not JSON of one meaning, and for more than `most_bytes`.
-    """
-    if len(payload) > most_bytes:
-        raise StrictJsonError(f"it has {len(payload)} bytes, expected at most {most_bytes}")
+def read(payload: bytes, max_bytes: int) -> Any:
+    """Return the value of a JSON document, its numbers finite; raise StrictJsonError."""
+    if len(payload) > max_bytes:
+        raise StrictJsonError(f"it has {len(payload)} bytes, expected at most {max_bytes}")
     try:
-        value = json.loads(
-            payload.decode(),  # UTF-8 only: json would guess
-            parse_constant=_no_number,
-            parse_float=_finite,
-            parse_int=_integer,
-            object_pairs_hook=_object,
-        )
+        value = msgspec.json.decode(payload)
     except RecursionError:
         raise StrictJsonError(f"it nests more than {MAX_DEPTH} deep") from None
-    except UnicodeDecodeError as error:
-        raise StrictJsonError(f"it is not UTF-8 at byte {error.start}") from None
-    except json.JSONDecodeError as error:
-        raise StrictJsonError(f"it is not JSON: {error}") from None
-    _check_tree(value)
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        reason = str(error).removeprefix("JSON is malformed: ")
+        raise StrictJsonError(f"it is not JSON: {reason}") from None
+    _check_tree(value, MAX_DEPTH)
     return value
+
+
+def decode(decoder: msgspec.json.Decoder[T], payload: bytes, max_bytes: int) -> T:
+    """Return the typed value of a JSON document; raise StrictJsonError that names the field, its value and what was
+    expected."""
+    value = read(payload, max_bytes)
+    try:
+        return decoder.decode(payload)
+    except msgspec.ValidationError as error:
+        raise StrictJsonError(_explain(str(error), value)) from None
+
+
+def check_texts(where: str, value: Any) -> None:
+    """Raise StrictJsonError for a text that a terminal or a log would not show as it is."""
+    if isinstance(value, str):
+        if not all(each.isprintable() or each == "\N{NO-BREAK SPACE}" for each in value):
+            raise StrictJsonError(f"{where} is {quote(value)}, which has a character that cannot be printed")
+    elif isinstance(value, dict):
+        for name, each in value.items():
+            check_texts("a name" + f" in {where}" * bool(where), name)
+            check_texts(f"{where}.{name}".lstrip("."), each)
+    elif isinstance(value, list):
+        for index, each in enumerate(value):
+            check_texts(f"{where}[{index}]", each)
 
 
 def quote(value: object) -> str:
@@ -52,51 +67,27 @@ def quote(value: object) -> str:
     return text if len(text) <= MAX_QUOTE else text[:MAX_QUOTE] + "…"
 
 
-def _check_tree(root: Any) -> None:
-    """Raise StrictJsonError for texts that cannot be stored or quoted, and for a deep nest; does not recurse."""
-    waiting = [(root, 1)]
-    while waiting:
-        value, depth = waiting.pop()
-        if isinstance(value, str):
-            _check_text(value)
-        elif isinstance(value, list | dict):
-            if depth > MAX_DEPTH:
-                raise StrictJsonError(f"it nests more than {MAX_DEPTH} deep")
-            if isinstance(value, dict):
-                for name in value:
-                    _check_text(name)
-            waiting += [(each, depth + 1) for each in (value.values() if isinstance(value, dict) else value)]
+def _check_tree(value: Any, left: int) -> None:
+    """Raise StrictJsonError for a deep nest, and for whole numbers that no float holds."""
+    if isinstance(value, int) and not -MAX_INTEGER <= value < MAX_INTEGER:
+        raise StrictJsonError(f"the number {quote(value)} is too large")
+    if isinstance(value, list | dict):
+        if not left:
+            raise StrictJsonError(f"it nests more than {MAX_DEPTH} deep")
+        for each in value.values() if isinstance(value, dict) else value:
+            _check_tree(each, left - 1)
 
 
-def _check_text(text: str) -> None:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        raise StrictJsonError(f"{quote(text)} holds half a character, which no text can") from None
-
-
-def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    entries: dict[str, Any] = {}
-    for name, value in pairs:
-        if name in entries:
-            raise StrictJsonError(f"the name {quote(name)} is given twice")
-        entries[name] = value
-    return entries
-
-
-def _no_number(name: str) -> NoReturn:
-    raise StrictJsonError(f"it holds {name}, expected finite numbers")
-
-
-def _finite(text: str) -> float:
-    value = float(text)
-    if not math.isfinite(value):
-        raise StrictJsonError(f"the number {quote(text)} is too large")
-    return value
-
-
-def _integer(text: str) -> int:
-    # by its length first: the time to read a whole number grows with its square
-    if len(text) > 20 or not -MAX_INTEGER <= int(text) < MAX_INTEGER:
-        raise StrictJsonError(f"the number {quote(text)} is too large")
-    return int(text)
+def _explain(error: str, value: Any) -> str:
+    """Say what msgspec found wrong with a value: "noise_std[1] is -1, expected `float` >= 0.0"."""
+    found = re.fullmatch(r"(.*?)(?: - at `\$\.?(.*)`)?", error, re.DOTALL)
+    assert found is not None  # the pattern takes any text
+    what, path = found[1], found[2] or ""
+    if not what.startswith("Expected "):
+        return shortened(f"{path}: {what}" if path else what)
+    for key in re.findall(r"[^.\[\]]+", path):
+        value = value[int(key) if isinstance(value, list) else key]
+    expected = what.removeprefix("Expected ").partition(", got ")[0]
+    if words := re.fullmatch(r"`str` matching regex '\^\((.*)\)\\\\Z'", expected):
+        expected = "one of " + words[1].replace("\\", "").replace("|", ", ")
+    return f"{path or 'it'} is {quote(value)}, expected {expected}"

@@ -1,23 +1,21 @@
 """The tensors of a model, in the safetensors format: checked by their header before anything is read of them."""
 
-from __future__ import annotations
-
 import math
-from typing import Any, NamedTuple
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
-from safetensors import SafetensorError
-from safetensors.numpy import load as load_tensors
+from msgspec import Meta, Struct
 
 from lipcore.data.motion import Array
 from lipcore.files import strict_json
 from lipcore.files.arm import is_of_arm
+from lipcore.files.entries import Count
 from lipcore.files.manifest import TENSORS, Limits, ModelFormatError
 from lipcore.files.strict_json import quote
 
 MAX_HEADER = 256 * 1024
 MAX_TENSORS = 1000
-MAX_DIMENSIONS = 4
 LENGTH = 8
 """Bytes that hold the header's length."""
 WIDTH = 8
@@ -26,16 +24,19 @@ OUTPUTS = "inducing/outputs"
 INDUCING = ("inducing/q", "inducing/dq", "inducing/ddq")
 A, B, FLOOR, MISFIT = "statistics/a", "statistics/b", "floor", "misfit"
 PARAMS = "params/"
-TYPES = {"F64": "float64", "I64": "int64"}
+TYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype("<f8"), "I64": np.dtype("<i8")}
 
 
-class Entry(NamedTuple):
-    """One tensor as the header describes it; begin, end: its bytes after the header."""
+class Tensor(Struct, frozen=True, forbid_unknown_fields=True):
+    """A tensor as the header describes it. data_offsets: its bytes after the header, from and to."""
 
     dtype: str
-    shape: tuple[int, ...]
-    begin: int
-    end: int
+    shape: Annotated[tuple[Count, ...], Meta(max_length=4)]
+    data_offsets: tuple[Count, Count]
+
+
+_HEADER = msgspec.json.Decoder(Annotated[dict[str, msgspec.Raw], Meta(max_length=MAX_TENSORS)])
+_TENSOR = msgspec.json.Decoder(Tensor)
 
 
 def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Array]:
@@ -43,13 +44,15 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Array]:
 
     Sizes are checked against the limits before a number is read: what is computed from them grows with their square.
     """
-    entries = _read_header(payload)
+    entries, start = _read_header(payload)
     _check_sizes(entries, n, limits)
-    try:
-        # copied: what is loaded may be read-only, which compiled code takes for another type
-        tensors = {name: value.copy() for name, value in load_tensors(payload).items()}
-    except (SafetensorError, ValueError, RuntimeError) as error:
-        raise _bad(f"{TENSORS} cannot be read: {error}") from None
+    tensors = {
+        # copied: what is loaded is read-only, which compiled code takes for another type
+        name: np.frombuffer(payload, TYPES[each.dtype], math.prod(each.shape), start + each.data_offsets[0])
+        .reshape(each.shape)
+        .copy()
+        for name, each in entries.items()
+    }
     for name, value in tensors.items():
         if name != OUTPUTS and not np.isfinite(value).all():
             raise _bad(f"tensor {name!r} is not made of finite float64 numbers")
@@ -67,52 +70,46 @@ def _bad(message: str) -> ModelFormatError:
     return ModelFormatError(message, TENSORS)
 
 
-def _read_header(payload: bytes) -> dict[str, Entry]:
-    """The tensors as the header has them: together they fill the rest of the file, without holes and overlaps."""
+def _read_header(payload: bytes) -> tuple[dict[str, Tensor], int]:
+    """The tensors as the header has them, which fill the rest of the file without holes and overlaps, and where that
+    begins."""
     if len(payload) < LENGTH:
         raise _bad(f"{TENSORS} has {len(payload)} bytes, expected a header")
     length = int.from_bytes(payload[:LENGTH], "little")
     if length > min(MAX_HEADER, len(payload) - LENGTH):
         raise _bad(f"{TENSORS} says that its header has {length} bytes, expected at most {MAX_HEADER} and the file's")
     try:
-        header = strict_json.read(payload[LENGTH : LENGTH + length].rstrip(b" "), MAX_HEADER)
+        header = strict_json.decode(_HEADER, payload[LENGTH : LENGTH + length], MAX_HEADER)
     except strict_json.StrictJsonError as error:
         raise _bad(f"the header of {TENSORS} cannot be read: {error}") from None
-    if not isinstance(header, dict) or len(header) > MAX_TENSORS:
-        raise _bad(f"the header of {TENSORS} is {quote(header)}, expected at most {MAX_TENSORS} tensors")
     entries = {name: _entry(name, value) for name, value in header.items()}
     reached = 0
-    for name, entry in sorted(entries.items(), key=lambda item: (item[1].begin, item[1].end)):
-        if entry.begin != reached:
-            raise _bad(
-                f"tensor {quote(name)} begins at byte {entry.begin}, expected {reached}, where the last one ends"
-            )
-        reached = entry.end
-    if reached != len(payload) - LENGTH - length:
-        raise _bad(f"the tensors end at byte {reached}, expected {len(payload) - LENGTH - length}, the end of the file")
-    return entries
+    for name, entry in sorted(entries.items(), key=lambda item: item[1].data_offsets):
+        begin, end = entry.data_offsets
+        if begin != reached:
+            raise _bad(f"tensor {quote(name)} begins at byte {begin}, expected {reached}, where the last one ends")
+        reached = end
+    start = LENGTH + length
+    if reached != len(payload) - start:
+        raise _bad(f"the tensors end at byte {reached}, expected {len(payload) - start}, the end of the file")
+    return entries, start
 
 
-def _entry(name: str, value: Any) -> Entry:
-    if not isinstance(value, dict) or set(value) != {"dtype", "shape", "data_offsets"}:
-        raise _bad(f"tensor {quote(name)} is described by {quote(value)}, expected dtype, shape and data_offsets")
-    dtype, shape, offsets = value["dtype"], value["shape"], value["data_offsets"]
+def _entry(name: str, value: msgspec.Raw) -> Tensor:
+    try:
+        entry = strict_json.decode(_TENSOR, bytes(value), MAX_HEADER)
+    except strict_json.StrictJsonError as error:
+        raise _bad(f"tensor {quote(name)}: {error}") from None
     expected = "I64" if name == OUTPUTS else "F64"
-    if dtype != expected:
-        kind = TYPES.get(dtype, quote(dtype)) if isinstance(dtype, str) else quote(dtype)
-        raise _bad(f"tensor {quote(name)} is of type {kind}, expected {TYPES[expected]}")
-    if not _are_counts(shape) or len(shape) > MAX_DIMENSIONS:
-        raise _bad(f"tensor {quote(name)} has the shape {quote(shape)}, expected at most {MAX_DIMENSIONS} lengths")
-    if not _are_counts(offsets) or len(offsets) != 2 or offsets[1] - offsets[0] != WIDTH * math.prod(shape):
-        raise _bad(f"tensor {quote(name)} has the offsets {quote(offsets)}, expected those of its shape {shape}")
-    return Entry(dtype, tuple(shape), *offsets)
+    if entry.dtype != expected:
+        raise _bad(f"tensor {quote(name)} is of type {quote(entry.dtype)}, expected {expected}")
+    begin, end = entry.data_offsets
+    if end - begin != WIDTH * math.prod(entry.shape):
+        raise _bad(f"tensor {quote(name)} has {end - begin} bytes, expected those of its shape {entry.shape}")
+    return entry
 
 
-def _are_counts(value: object) -> bool:
-    return isinstance(value, list) and all(type(each) is int and each >= 0 for each in value)
-
-
-def _check_sizes(entries: dict[str, Entry], n: int, limits: Limits) -> None:
+def _check_sizes(entries: dict[str, Tensor], n: int, limits: Limits) -> None:
     for name in entries:
         if not (name.startswith(PARAMS) or is_of_arm(name)) and name not in (OUTPUTS, *INDUCING, A, B, FLOOR, MISFIT):
             raise _bad(f"{TENSORS} has the tensor {quote(name)}, which this release does not know")

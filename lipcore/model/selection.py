@@ -1,57 +1,65 @@
 """How an estimator was chosen, in plain data: for manifests, answers and pages."""
 
 from collections.abc import Iterable
-from typing import NotRequired, TypedDict
+from typing import Annotated, NotRequired, TypedDict
 
 import numpy as np
+from msgspec import Meta
 
 from lipcore.vocabulary import AUTO
 
 MOST_TEXT = 300
 """Characters of a reason or an error."""
+MAX_CANDIDATES = 10
+
+Name = Annotated[str, Meta(min_length=1, max_length=100)]
+Sentence = Annotated[str, Meta(min_length=1, max_length=MOST_TEXT)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Positive = Annotated[float, Meta(ge=0)]
+Share = Annotated[float, Meta(ge=0, le=1)]
 
 
 class Candidate(TypedDict):
     """How an estimator did on held-out samples; None if it was not judged."""
 
-    estimator: str
+    estimator: Name
     log_density: float | None
     """Log predictive density, noise included, summed over the joints, nats a sample."""
     difference: float | None
     """Difference of the log density from that of the best."""
-    standard_error: float | None
+    standard_error: Positive | None
     """Standard error of that difference."""
-    nmse: list[float | None] | None
+    nmse: list[Positive | None] | None
     """(n,), None for a joint whose torque does not vary."""
-    edge_nmse: NotRequired[list[float | None] | None]
+    edge_nmse: NotRequired[list[Positive | None] | None]
     """(n,), of the rows at the edge of the data, over the variance of all held-out rows."""
-    coverage: list[float | None] | None
+    coverage: list[Share | None] | None
     """(n,), share of measurements inside the 95 % interval."""
-    seconds: float
-    error: str | None
+    seconds: Positive
+    error: Sentence | None
     """Why it could not be trained."""
 
 
 class HeldOut(TypedDict):
     """What was held out to judge by."""
 
-    rows: int
-    blocks: int
+    rows: Count
+    blocks: Count
     repeats: bool
     """Whether the recording repeats itself, so that figures flatter, except at the edge."""
-    edge_rows: NotRequired[int]
+    edge_rows: NotRequired[Count]
     """Rows at the edge of the data."""
-    edge_blocks: NotRequired[int]
+    edge_blocks: NotRequired[Count]
 
 
 class Selection(TypedDict):
     """How an estimator was chosen: what was asked for and what was chosen, why, on which rows, and how each did."""
 
-    asked: str
-    chosen: str
-    reason: str
+    asked: Name
+    chosen: Name
+    reason: Sentence
     held_out: HeldOut
-    table: list[Candidate]
+    table: Annotated[list[Candidate], Meta(min_length=1, max_length=MAX_CANDIDATES)]
 
 
 def selection(chosen: str, reason: str, table: list[Candidate], held_out: HeldOut | None = None) -> Selection:

@@ -18,6 +18,8 @@ from lipcore.data.splits import GUARD_S
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.linalg import cholesky
 
+MAX_SCALE = 1e12
+
 
 @dataclass(frozen=True)
 class Conformal:
@@ -36,8 +38,8 @@ class Conformal:
         """Raise ValueError for what no blocks say."""
         object.__setattr__(self, "scale", tuple(self.scale))
         object.__setattr__(self, "guaranteed", tuple(self.guaranteed))
-        if not all(1.0 <= each < np.inf for each in self.scale):
-            raise ValueError(f"scale is {list(self.scale)}, expected finite numbers, at least 1")
+        if not all(1.0 <= each <= MAX_SCALE for each in self.scale):
+            raise ValueError(f"scale is {list(self.scale)}, expected numbers from 1 to {MAX_SCALE:g}")
         if not all(0.0 <= each < 1.0 for each in self.guaranteed) or len(self.guaranteed) != len(self.scale):
             raise ValueError(f"guaranteed is {list(self.guaranteed)}, expected a share from 0 to 1 for each scale")
         if self.blocks < 1:

@@ -14,6 +14,7 @@ from lipcore.estimators.base import RobotKind
 from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, ROBOT, TENSORS, ModelFormatError, read_manifest_bytes
 from lipcore.files.probing import probe
+from lipcore.files.strict_json import StrictJsonError, check_texts
 from lipcore.model.acceptance import Acceptance, accept
 from lipcore.model.parameters import report
 from lipcore.model.warnings import warnings
@@ -23,8 +24,8 @@ from service.contract.states import PromotionOption
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
 from service.models import archive_reading, registry
-from service.models.archive_fields import FIELDS
-from service.models.archive_reading import check_texts, invalid_member, invalid_model, limits_of
+from service.models.archive_lineage import Lineage
+from service.models.archive_reading import invalid_member, invalid_model, limits_of
 from service.models.lineage import held_out_figures
 from service.models.loaded import LoadedModels
 from service.runtime import cage
@@ -98,17 +99,13 @@ def _accepted(manifest: Mapping[str, Any]) -> Acceptance:
 def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
     """The manifest of files that make a model which answers; what can be computed of it is computed anew."""
     limits = limits_of(settings)
-    where = ""
     try:
         manifest = read_manifest_bytes(files[MANIFEST], limits)
         if ROBOT in files and "robot" not in manifest:
             raise ModelFormatError(f"{ROBOT} is there, but the manifest names no robot", ROBOT)
-        check_texts(manifest)
+        check_texts("", manifest)
         _check_options(manifest["options"])
-        for entry, fields in FIELDS.items():
-            if entry in manifest:
-                where = entry
-                fields.model_validate(manifest[entry])
+        Lineage.model_validate(manifest["lineage"])
         model = persistence.decode(files, limits)
         probe(model)
         basis = model.posterior.basis
@@ -120,8 +117,10 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
         read_manifest_bytes(persistence.manifest_bytes(manifest), limits)
     except ModelFormatError as error:
         raise invalid_model(error) from None
+    except StrictJsonError as error:
+        raise invalid_model(ModelFormatError(str(error))) from None
     except ValidationError as error:
-        raise invalid_member(f"{MANIFEST}: {where}", error) from None
+        raise invalid_member(f"{MANIFEST}: lineage", error) from None
     except (ValueError, ArithmeticError) as error:  # parameters that no fit has
         raise invalid_data(TENSORS, str(error), "parameters that are finite numbers") from None
     return manifest

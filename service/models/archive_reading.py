@@ -182,26 +182,13 @@ def invalid_model(error: ModelFormatError) -> InvalidDataError:
     return InvalidDataError(f"{error.file}: {error}", [problem(error.file, str(error), "a valid model")])
 
 
-def check_texts(value: Any) -> None:
-    """Raise ModelFormatError for a text that a terminal or a log would not show as it is. The depth is limited."""
-    if isinstance(value, str):
-        if not all(each.isprintable() or each == "\N{NO-BREAK SPACE}" for each in value):
-            raise ModelFormatError(f"{strict_json.quote(value)} has a character that cannot be printed")
-    elif isinstance(value, dict):
-        for name, each in value.items():
-            check_texts(name)
-            check_texts(each)
-    elif isinstance(value, list):
-        for each in value:
-            check_texts(each)
-
-
 def _json(member: str, content: bytes) -> Any:
     try:
         value = strict_json.read(content, SMALL)
-        check_texts(value)
-    except (strict_json.StrictJsonError, ModelFormatError) as error:
-        raise invalid_data(member, str(error), "JSON as an export writes it") from None
+        strict_json.check_texts("", value)
+    except strict_json.StrictJsonError as error:
+        item = problem(member, str(error), "JSON as an export writes it")
+        raise InvalidDataError(f"{member}: {error}", [item]) from None
     return value
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -18,7 +19,7 @@ from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import make_estimator
 from lipcore.files import persistence
-from lipcore.files.arm import bodies_of, read_geometry
+from lipcore.files.entries import Parameters
 from lipcore.files.manifest import read_manifest_bytes
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative
@@ -133,7 +134,7 @@ def test_an_arm_that_does_not_fit_is_refused(name: str, learnt: TorqueModel, sam
 def test_a_way_to_come_by_a_geometry_that_there_is_not(learnt: TorqueModel) -> None:
     manifest, files = persistence.encode(learnt)
     manifest["fit"]["geometry"] = "guess"
-    with pytest.raises(ModelFormatError, match=r"fit\.geometry is .*, expected one of learn, calibrate, fixed"):
+    with pytest.raises(ModelFormatError, match=r"fit\.geometry is 'guess', expected one of learn, calibrate, fixed"):
         persistence.decode({**files, "manifest.json": persistence.manifest_bytes(manifest)})
 
 
@@ -225,11 +226,10 @@ def reported() -> Any:
 
 
 def test_a_report_is_read_back(reported: Any) -> None:
-    entry = read_manifest_bytes(manifest(reported))["parameters"]
-    geometry, order = read_geometry(entry["geometry"], 3)
-    assert order == ORDER
-    np.testing.assert_array_equal(geometry.constants, random_geometry("RPR", 1).constants)
-    np.testing.assert_array_equal(bodies_of(entry["inertia"])[order], random_bodies(3, 1))
+    entry = msgspec.convert(read_manifest_bytes(manifest(reported))["parameters"], Parameters)
+    assert entry.geometry.order == ORDER
+    np.testing.assert_array_equal(entry.geometry.geometry().constants, random_geometry("RPR", 1).constants)
+    np.testing.assert_array_equal(entry.inertia.plausible()[ORDER], random_bodies(3, 1))
 
 
 def test_what_earlier_releases_reported_is_read(reported: Any) -> None:
@@ -241,23 +241,27 @@ def test_what_earlier_releases_reported_is_read(reported: Any) -> None:
 
 MALFORMED: dict[str, Callable[[Any], None]] = {
     r"parameters.geometry.mode is 'guess', expected one of learn": lambda r: r["geometry"].update(mode="guess"),
-    r"parameters.geometry lacks order": lambda r: r["geometry"].pop("order"),
-    r"parameters.geometry.order is .*, expected each of the joints 0 to 2": lambda r: r["geometry"].update(
+    r"parameters.geometry: Object missing required field `order`": lambda r: r["geometry"].pop("order"),
+    r"parameters.geometry: order is .*, expected each of the joints 0 to 2": lambda r: r["geometry"].update(
         order=[0, 0, 1]
     ),
     r"parameters.geometry.gravity\[2\] is": lambda r: r["geometry"].update(gravity=[0, 0, "down"]),
-    r"parameters.geometry.joints is .*a list of 3": lambda r: r["geometry"]["joints"].pop(),
+    r"parameters.geometry.joints is a list of 2 entries, expected 3": lambda r: r["geometry"]["joints"].pop(),
     r"parameters.geometry.joints\[1\].type": lambda r: r["geometry"]["joints"][1].update(type="ball"),
-    r"parameters.geometry.joints\[0\].turn_std is": lambda r: r["geometry"]["joints"][0].update(turn_std=[0.1]),
+    r"parameters.geometry.joints\[0\]: turn_std has 1 value": lambda r: r["geometry"]["joints"][0].update(
+        turn_std=[0.1]
+    ),
     r"parameters.geometry.joints\[0\].undetermined": lambda r: r["geometry"]["joints"][0].update(undetermined=["x"]),
-    r"parameters.geometry.joints\[2\] has the entry 'mesh'": lambda r: r["geometry"]["joints"][2].update(mesh="file"),
+    r"parameters.geometry.joints\[2\]: Object contains unknown field `mesh`": lambda r: r["geometry"]["joints"][
+        2
+    ].update(mesh="file"),
     r"parameters.geometry: rotation holds a matrix": lambda r: r["geometry"]["joints"][0]["rotation"][0].reverse(),
     r"parameters.rotor.std is": lambda r: r["rotor"].update(std=[0.1]),
     r"parameters.inertia.bodies\[1\].mean.first_moment\[0\] is": lambda r: r["inertia"]["bodies"][1]["mean"].update(
         first_moment=[None, 0, 0]
     ),
     r"parameters.inertia.bodies\[0\].undetermined is": lambda r: r["inertia"]["bodies"][0].update(undetermined="mass"),
-    r"parameters has the entry 'colour'": lambda r: r.update(colour="red"),
+    r"parameters: Object contains unknown field `colour`": lambda r: r.update(colour="red"),
 }
 
 

@@ -13,7 +13,7 @@ from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from service.models import registry
-from service.models.archive_fields import Lineage
+from service.models.archive_lineage import Lineage
 from service.models.lineage import learnt_from, named
 from service.storage.database import DatasetRow
 from service.training import planned_fit, worker

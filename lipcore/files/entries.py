@@ -1,0 +1,168 @@
+"""What entries of a manifest are made of, and those of an arm.
+
+A list has one item a joint (`check_lengths`); whatever else repeats is a tuple.
+"""
+
+import re
+from collections.abc import Iterable
+from typing import Annotated, Any
+
+import numpy as np
+from msgspec import UNSET, Meta, Struct, UnsetType
+
+from lipcore.data.samples import Array
+from lipcore.kernels.geometry import Geometry
+from lipcore.model.parameters import STEPS
+from lipcore.robots.urdf import PARAMETERS
+from lipcore.vocabulary import GEOMETRY_MODES, JOINT_TYPES
+
+LARGEST = 1e12
+"""No motion, torque or parameter in SI units is larger."""
+MAX_NAME = 100
+
+
+def one_of(words: Iterable[str]) -> Meta:
+    """Return the constraint of a text that is one of these words; its error names them, that of a Literal does not."""
+    return Meta(pattern=rf"^({'|'.join(map(re.escape, words))})\Z")
+
+
+Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
+Size = Annotated[float, Meta(ge=0, le=LARGEST)]
+"""A deviation, a duration or anything else that is not below zero."""
+Share = Annotated[float, Meta(ge=0, le=1)]
+Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
+Text = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
+JointKind = Annotated[str, one_of(JOINT_TYPES)]
+Vector = tuple[Number, Number, Number]
+Matrix = tuple[Vector, Vector, Vector]
+Steps = Annotated[tuple[Number, ...], Meta(max_length=2)]
+"""Standard deviations of a joint's two turns or shifts; none of what is fixed."""
+
+
+class Entry(Struct, forbid_unknown_fields=True):
+    """An object with these fields and no others."""
+
+
+class Estimate(Entry):
+    """Mean and standard deviation of a number of each joint."""
+
+    mean: list[Number]
+    std: list[Size]
+
+
+class Friction(Entry):
+    """See `lipcore.kernels.friction`."""
+
+    viscous: Estimate
+    coulomb: Estimate
+    offset: Estimate
+    stribeck: Estimate | UnsetType = UNSET
+
+
+class Masses(Entry):
+    """Ten parameters of a body: see `lipcore.model.parameters.InertialParameters`."""
+
+    mass: Number
+    first_moment: Vector
+    inertia: tuple[Number, Number, Number, Number, Number, Number]
+
+
+class Body(Entry):
+    """What a joint moves."""
+
+    joint: str
+    mean: Masses
+    std: Masses
+    plausible: Masses
+    undetermined: tuple[Annotated[str, one_of(Masses.__struct_fields__)], ...]
+
+
+class Inertia(Entry):
+    """Bodies in the order of the data."""
+
+    mean_is_plausible: bool
+    bodies: list[Body]
+    plausible_deviation: list[Number]
+
+    def plausible(self) -> Array:
+        """Return the ten physically possible parameters of each body, (n, 10)."""
+        each = [(body.plausible.mass, *body.plausible.first_moment, *body.plausible.inertia) for body in self.bodies]
+        return np.array(each, np.float64).reshape(-1, PARAMETERS)
+
+
+class Place(Entry):
+    """Where a joint lies in the frame of the one before it."""
+
+    rotation: Matrix
+    translation: Vector
+
+
+class Joint(Place):
+    """A joint of a chain: see `lipcore.kernels.geometry.Geometry`."""
+
+    joint: str
+    type: JointKind
+    axis: Vector
+    across: tuple[Vector, Vector]
+    turn_std: Steps
+    shift_std: Steps
+    undetermined: tuple[Annotated[str, one_of(STEPS)], ...]
+    plausible: Place | UnsetType = UNSET
+    """For which the plausible bodies are meant, if it is another place."""
+
+    def __post_init__(self) -> None:
+        for name in ("turn_std", "shift_std"):
+            if len(getattr(self, name)) == 1:
+                raise ValueError(f"{name} has 1 value, expected 2 or none")
+
+
+class Chain(Entry):
+    """Joints from base to tip; order: the data's joint at each place."""
+
+    mode: Annotated[str, one_of(GEOMETRY_MODES)]
+    gravity: Vector
+    order: list[Count]
+    joints: list[Joint]
+
+    def __post_init__(self) -> None:
+        if sorted(self.order) != list(range(len(self.order))):
+            raise ValueError(f"order is {self.order}, expected each of the joints 0 to {len(self.order) - 1} once")
+        for plausible in (False, True):
+            self.geometry(plausible)
+
+    def geometry(self, plausible: bool = False) -> Geometry:
+        """Return where the joints lie; plausible: for the plausible bodies. Raise ValueError for no rotation matrix."""
+        places = [each.plausible if plausible and each.plausible is not UNSET else each for each in self.joints]
+        kinds: tuple[Any, ...] = tuple(joint.type for joint in self.joints)
+        return Geometry(
+            joint_types=kinds,
+            gravity=np.array(self.gravity),
+            rotation=np.array([place.rotation for place in places]),
+            translation=np.array([place.translation for place in places]),
+            axis=np.array([joint.axis for joint in self.joints]),
+        )
+
+
+class Parameters(Entry):
+    """What `lipcore.model.parameters.report` tells of a model."""
+
+    friction: Friction
+    inertia: Inertia | UnsetType = UNSET
+    rotor: Estimate | UnsetType = UNSET
+    geometry: Chain | UnsetType = UNSET
+
+    def __post_init__(self) -> None:
+        if len({each is UNSET for each in (self.inertia, self.rotor, self.geometry)}) > 1:
+            raise ValueError("inertia, rotor and geometry are not all there, expected all of them or none")
+
+
+def check_lengths(where: str, entry: Any, n: int) -> None:
+    """Raise ValueError for a list in an entry that has not one item for each of n joints."""
+    if isinstance(entry, list):
+        if len(entry) != n:
+            raise ValueError(f"{where} is a list of {len(entry)} entries, expected {n}, one for each joint")
+        for index, each in enumerate(entry):
+            check_lengths(f"{where}[{index}]", each, n)
+    elif isinstance(entry, Struct):
+        for name in entry.__struct_fields__:
+            check_lengths(f"{where}.{name}".lstrip("."), getattr(entry, name), n)

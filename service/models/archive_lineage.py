@@ -1,0 +1,78 @@
+"""The lineage of an imported version: the type and range of each field that the service reads or shows."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from lipcore.files.entries import LARGEST
+from service.contract.models import HoldoutLineage
+
+Count = Annotated[int, Field(ge=0, lt=2**63)]
+Size = Annotated[float, Field(ge=0, le=LARGEST)]
+"""A deviation, a duration or anything else that is not below zero."""
+Share = Annotated[float, Field(ge=0, le=1)]
+Finite = Annotated[float, Field(allow_inf_nan=False)]
+Plain = bool | int | Finite
+
+
+class Strict(BaseModel):
+    """Values are of their types already."""
+
+    model_config = ConfigDict(extra="allow", strict=True)
+
+
+class Figures(Strict):
+    """How well a version answered for samples, per joint: see `service.models.lineage.figures`."""
+
+    samples: Count | None = None
+    of: Count | None = None
+    nmse: list[Annotated[float, Field(ge=0)] | None] = []
+    rmse: list[Size | None] = []
+    nlpd: list[Finite | None] = []
+    coverage: list[Share | None] = []
+    coverage_low: list[Share | None] = []
+    coverage_high: list[Share | None] = []
+    interval_width: list[Size | None] = []
+    independent: list[Size | None] = []
+
+
+class HeldOut(HoldoutLineage, Figures):
+    """The same of what was held out."""
+
+
+class ProcessFields(Strict):
+    """What a training took."""
+
+    __pydantic_extra__: dict[str, Plain]
+
+    seconds: Size | None = None
+    peak_memory_mb: Size | None = None
+
+
+class LineageDataset(BaseModel):
+    """A data set as a lineage names it."""
+
+    model_config = ConfigDict(strict=True)
+
+    id: str = Field(max_length=40)
+    name: str = Field("", max_length=1000)
+    sha256: str = Field("", max_length=64)
+    rows: Count = 0
+
+
+class Lineage(BaseModel):
+    """What the service reads or shows of a lineage; whatever else there is goes with it unread."""
+
+    model_config = ConfigDict(strict=True)
+
+    datasets: list[LineageDataset] = Field([], max_length=10_000)
+    imported: list[dict[str, Any]] = Field([], max_length=1000)
+    learnt: dict[str, Any] | None = None
+    holdout: HeldOut | None = None
+    training_metrics: Figures | None = None
+    training_process: ProcessFields | None = None
+    trained_at: str | None = Field(None, max_length=40)
+    job: str | None = Field(None, max_length=100)
+    software: dict[str, str | int] = Field({}, max_length=20)
