@@ -13,12 +13,12 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from lipcore.data.samples import Array
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.parameters import STEPS
+from lipcore.model.selection import Count
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.vocabulary import GEOMETRY_MODES, JOINT_TYPES
 
 LARGEST = 1e12
 """No motion, torque or parameter in SI units is larger."""
-MAX_NAME = 100
 
 
 def one_of(words: Iterable[str]) -> Meta:
@@ -29,9 +29,6 @@ def one_of(words: Iterable[str]) -> Meta:
 Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
 Size = Annotated[float, Meta(ge=0, le=LARGEST)]
 """A deviation, a duration or anything else that is not below zero."""
-Share = Annotated[float, Meta(ge=0, le=1)]
-Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
-Text = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
 JointKind = Annotated[str, one_of(JOINT_TYPES)]
 Vector = tuple[Number, Number, Number]
 Matrix = tuple[Vector, Vector, Vector]

@@ -14,19 +14,17 @@ from lipcore.estimators.options import FitOptions
 from lipcore.files import strict_json
 from lipcore.files.entries import (
     LARGEST,
-    Count,
     Entry,
     Estimate,
     JointKind,
     Number,
     Parameters,
     Size,
-    Text,
     check_lengths,
     one_of,
 )
 from lipcore.files.strict_json import StrictJsonError, check_texts, quote
-from lipcore.model.selection import Candidate, HeldOut, Selection
+from lipcore.model.selection import Candidate, Count, HeldOut, Name, Selection
 from lipcore.posterior.conformal import Conformal
 from lipcore.vocabulary import GEOMETRY_MODES, PRIORS, TORQUE_CONVENTIONS
 
@@ -84,7 +82,7 @@ class Fit(TypedDict, total=False):
         str,
         Meta(max_length=300, pattern=r"^\d+ by [a-z]+(, \d+ by [a-z]+)*; the first are rows [\d, ]+, counted from 0$"),
     ]
-    refit_error: Text
+    refit_error: Name
     independent_samples: Size
     row_correlation: Size
     motion_dimensions: Size
@@ -170,8 +168,8 @@ class Manifest(Entry, kw_only=True):
 
     format: str
     format_version: int
-    estimator: Text
-    joint_names: list[Text]
+    estimator: Name
+    joint_names: list[Name]
     joint_types: list[JointKind]
     torque_convention: Annotated[str, one_of(TORQUE_CONVENTIONS)]
     noise_std: list[Size]

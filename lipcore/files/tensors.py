@@ -10,9 +10,9 @@ from msgspec import Meta, Struct
 from lipcore.data.motion import Array
 from lipcore.files import strict_json
 from lipcore.files.arm import is_of_arm
-from lipcore.files.entries import Count
 from lipcore.files.manifest import TENSORS, Limits, ModelFormatError
 from lipcore.files.strict_json import quote
+from lipcore.model.selection import Count
 
 MAX_HEADER = 256 * 1024
 MAX_TENSORS = 1000
@@ -46,14 +46,14 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Array]:
     """
     entries, start = _read_header(payload)
     _check_sizes(entries, n, limits)
-    tensors = {
-        # copied: what is loaded is read-only, which compiled code takes for another type
-        name: np.frombuffer(payload, TYPES[each.dtype], math.prod(each.shape), start + each.data_offsets[0])
-        .reshape(each.shape)
-        .copy()
-        for name, each in entries.items()
-    }
-    for name, value in tensors.items():
+    tensors: dict[str, Array] = {}
+    for name, each in entries.items():
+        values = np.frombuffer(payload, TYPES[each.dtype], math.prod(each.shape), start + each.data_offsets[0])
+        try:
+            # copied: what is loaded is read-only, which compiled code takes for another type
+            value = tensors[name] = values.reshape(each.shape).copy()
+        except ValueError as error:  # empty, but with lengths that no array has
+            raise _bad(f"tensor {quote(name)} cannot be read: {error}") from None
         if name != OUTPUTS and not np.isfinite(value).all():
             raise _bad(f"tensor {name!r} is not made of finite float64 numbers")
     if FLOOR in tensors and bool((tensors[FLOOR] < 0).any()):

@@ -10,9 +10,10 @@ from lipcore.vocabulary import AUTO
 
 MOST_TEXT = 300
 """Characters of a reason or an error."""
+MAX_NAME = 100
 MAX_CANDIDATES = 10
 
-Name = Annotated[str, Meta(min_length=1, max_length=100)]
+Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
 Sentence = Annotated[str, Meta(min_length=1, max_length=MOST_TEXT)]
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Positive = Annotated[float, Meta(ge=0)]

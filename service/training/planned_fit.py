@@ -10,8 +10,7 @@ from lipcore.data.samples import Samples
 from lipcore.estimators.hyperparameters import Progress
 from lipcore.estimators.options import FitOptions
 from lipcore.estimators.task import Task
-from lipcore.files.entries import MAX_NAME
-from lipcore.model.selection import shortened
+from lipcore.model.selection import MAX_NAME, shortened
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import REFIT_ERROR
 from lipcore.training.conditioning import should_condition

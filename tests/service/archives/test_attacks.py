@@ -257,6 +257,9 @@ HEADER_ATTACKS = {
     "beyond the end": described(shape=[10**6], data_offsets=[0, 8 * 10**6]),
     "negative offsets": described(data_offsets=[-8, 0]),
     "huge shape": described(shape=[2**40, 2**40]),
+    "empty huge shape": lambda header: header.update(
+        {"params/evil": {"dtype": "F64", "shape": [2**62, 2**62, 0], "data_offsets": [0, 0]}}
+    ),
     "shape of truth values": described(shape=[True]),
     "other type": described(dtype="F16"),
     "unknown type": described(dtype=["F64"]),
