@@ -12,6 +12,9 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.vocabulary import CODES, LEARNT
 
+AHEAD_S = 1.0
+"""By how much the rows of a batch may be dated after its arrival, s, where they are learnt."""
+
 
 @dataclass(frozen=True)
 class Rows:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.samples import Array
+from lipcore.online.changes.opening import BAND, LENGTH, Opening
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.vocabulary import TorqueConvention
@@ -31,7 +32,6 @@ from service.datasets.options import UploadOptions
 from service.datasets.staging import Staged, prepare
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
-from service.learning.ingest.opening import BAND, LENGTH, Opening
 from service.storage.disk import Disk
 
 

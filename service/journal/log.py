@@ -19,7 +19,7 @@ from sqlalchemy import ColumnElement, Select, bindparam, case, delete, func, sel
 from sqlalchemy.orm import Session, undefer
 
 from lipcore.data.samples import Array
-from lipcore.online.batch import Rows
+from lipcore.online.batch import AHEAD_S, Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import BusyError, ConflictError
 from service.storage.database import EventRow, LearnerRow, LearningRow, ServingRow, SnapshotRow, StreamRow, fetch, now
@@ -34,8 +34,6 @@ UNTIMED = [CODES.index("non_finite"), CODES.index("time_jump")]
 """Codes of rows whose own time says nothing."""
 MOST_RANGES = 1000
 """Ranges that are remembered; the lowest are given up first, being the least likely to be filled."""
-AHEAD_S = 1.0
-"""By how much the rows of a batch may be dated after its arrival, s, where they are learnt."""
 IN_USE_S = 10.0
 """Seconds without a batch after which a stream makes room for a new one, if it was silent for longest."""
 ARRAYS = tuple(field.name for field in fields(Rows))

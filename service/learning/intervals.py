@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
 from lipcore.online.adaptive import Adaptive, outside
-from service.learning.ingest.screening import Seen
+from lipcore.online.screening import Seen
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from sqlalchemy.orm import Session, undefer
 
 from lipcore.data.samples import Array
 from lipcore.online.adaptive import Adaptive
-from service.learning.ingest.judging import ContactGate
-from service.learning.ingest.opening import Opening
+from lipcore.online.changes.opening import Opening
+from lipcore.online.judging import ContactGate
 from service.learning.intervals import ScaleRecord
 from service.models.scales import Factor
 from service.storage.database import EventRow, LearningRow, StreamRow

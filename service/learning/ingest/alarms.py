@@ -5,11 +5,11 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
+from lipcore.online.judging import Verdict
 from service.foundation.text import percent
 from service.journal import log
 from service.journal.alarms import raise_alarm
 from service.learning import owner
-from service.learning.ingest.judging import Verdict
 from service.models.loaded import Served
 from service.storage import audit
 from service.storage.database import EventRow

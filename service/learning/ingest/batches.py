@@ -16,19 +16,20 @@ from sqlalchemy.orm import Session
 from lipcore.data import independence
 from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
+from lipcore.online import screening
 from lipcore.online.batch import Rows
 from lipcore.online.gates import check_rows
+from lipcore.online.screening import Answered
 from service.contract.observations import Derivation, ExpiredError, ObservationRequest, ObservationResponse, State
 from service.foundation.errors import ConflictError, invalid_request
 from service.inference.predicting import QUANTITIES, check_shapes
 from service.journal import log
 from service.journal.log import NewBatch, StreamKind, check_kind
 from service.learning import owner
-from service.learning.ingest import dating, deriving, screening
+from service.learning.ingest import dating, deriving
 from service.learning.ingest.dating import Measured, StreamTime
 from service.learning.ingest.intake import Intake
 from service.learning.ingest.monitor import Monitor
-from service.learning.ingest.screening import Answered
 from service.models.loaded import Served
 from service.storage.database import EventRow
 
@@ -70,7 +71,7 @@ def _take(
         if answer is not None:
             monitor.counts["duplicates"] += 1
             return answer
-        bounds = screening.limits(served.model, options, intake.settings)
+        bounds = dating.row_limits(served.model, options, intake.settings)
         before, after = log.neighbours(session, *key)
         clock = StreamTime.of(source, sequence, before, after, received)
         previous = before.last if before is not None and clock.adjacent else None
@@ -78,7 +79,7 @@ def _take(
         rows, own, derived = dated.rows, slice(0, len(batch)), None
         if batch.ddq is None and batch.t is not None:
             rows, own, derived = deriving.derive(session, *key, rows, batch.t, bounds)
-    screened = screening.predict(rows, served, own, derived, carrying=served.loads.of(stream_id))
+    screened = screening.predict(rows, served, own, carrying=served.loads.of(stream_id))
     new = _new(served, stream_id, "batches", (sequence, sequence), content, rows, dated.offset, received)
     waited = None if derived is None else Derivation(ddq=derived).model_dump()
     details = {"derived": waited, "span": dated.span, "leap": dated.leap}
@@ -234,7 +235,7 @@ def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
         if not new.any():
             return FramesResult(int(frames.sequences[-1]), 0, repeated.frames, {}, repeated.revision)
         model = frames.served.model
-        bounds = screening.limits(model, options, intake.settings)
+        bounds = dating.row_limits(model, options, intake.settings)
         q, dq, ddq, tau = numbers = [np.ascontiguousarray(getattr(frames, name)[new]) for name in QUANTITIES]
         # frames are dated by the service as they arrive, so that their times need no check
         weights = independence.stream_weights(frames.time[new], None if before is None else before.last)
@@ -242,7 +243,7 @@ def observe_frames(intake: Intake, frames: Frames) -> FramesResult:
         carrying = frames.served.loads.of(frames.stream_id)
         other_load = frames.loaded != (carrying is not None)
         answered = Answered(frames.mean, frames.std, frames.factor, other_load).take(new)
-        screened = screening.predict(rows, frames.served, slice(0, len(rows)), None, answered, carrying)
+        screened = screening.predict(rows, frames.served, slice(0, len(rows)), answered, carrying)
         sequences = frames.sequences[new]
         ends = int(sequences[0]), int(sequences[-1])
         content = _digest(sequences, numbers)

@@ -13,9 +13,12 @@ from numpy.typing import NDArray
 
 from lipcore.data import independence
 from lipcore.data.samples import Array
+from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
 from lipcore.online.gates import RowLimits, check_rows, time_span
 from lipcore.vocabulary import CODES, LEARNT
+from service.contract.observations import LearningOptions
+from service.foundation.settings import Settings
 from service.storage.database import EventRow, StreamRow
 
 NON_FINITE, LIMIT, TIME_JUMP, LATE = (CODES.index(code) for code in ("non_finite", "limit", "time_jump", "late"))
@@ -29,6 +32,21 @@ LEAP_S = 60.0
 sent faster than it was measured comes to lie as far ahead step by step."""
 FORGOTTEN = 7.0
 """Time constants of forgetting after which a row counts a thousandth, and teaches nothing."""
+
+
+def row_limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> RowLimits:
+    """What a row of a model may hold: its actuators' limits are those of its options, else those of its URDF."""
+    torque = None if options.torque_limits is None else np.array(options.torque_limits)
+    if torque is None and model.robot is not None:
+        effort = np.asarray(model.robot.model.effortLimit, np.float64)[list(model.robot.order)]
+        if (effort > 0).all():
+            torque = effort
+    return RowLimits(
+        model.position_limits(settings.max_position),
+        settings.max_velocity,
+        settings.max_acceleration,
+        torque,
+    )
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,10 @@ import numpy as np
 from sqlalchemy import case, func, select, update
 from sqlalchemy.orm import Session
 
-from lipcore.online.batch import Rows
+from lipcore.online import judging
+from lipcore.online.batch import AHEAD_S, Rows
+from lipcore.online.judging import JudgeOptions, Verdict
+from lipcore.online.screening import Screened
 from lipcore.vocabulary import CODES
 from service.contract.observations import LearningOptions
 from service.foundation.errors import ConflictError, not_found
@@ -23,12 +26,10 @@ from service.journal import log
 from service.journal.log import NewBatch
 from service.journal.snapshots import retain
 from service.learning import intervals, owner
-from service.learning.ingest import alarms, judging
+from service.learning.ingest import alarms
 from service.learning.ingest.dating import LEAP_S
 from service.learning.ingest.host_clock import HostClock
-from service.learning.ingest.judging import Verdict
 from service.learning.ingest.monitor import Monitor
-from service.learning.ingest.screening import Screened
 from service.learning.intervals import ScaleRecord
 from service.learning.streams import StreamRecord
 from service.learning.weigher.weighing import Weighing
@@ -170,7 +171,14 @@ class Intake:
             if new:
                 streams.forget(stream_id)  # one of this name that has made room for others
             verdict = judging.judge(
-                screened, monitor.watch(stream_id, new), held, options, usual, batch.received, since, served.base.scale
+                screened,
+                monitor.watch(stream_id, new),
+                held,
+                JudgeOptions(options.enabled, options.on_change, options.contact_threshold),
+                usual,
+                batch.received,
+                since,
+                served.base.scale,
             )
             if verdict.change is not None and options.on_change == "adapt" and not held:
                 log.append(session, model, "change", {"t": verdict.change.at}, batch.received)
@@ -218,7 +226,7 @@ class Intake:
                 "waited": held,
                 "doubted": doubted,
                 "aside": verdict.held or not options.enabled,
-                "until": None if screened.until is None else min(screened.until, batch.received + log.AHEAD_S),
+                "until": None if screened.until is None else min(screened.until, batch.received + AHEAD_S),
                 **answered,
                 "surprise": None if verdict.surprise is None else verdict.surprise.tolist(),
             }

@@ -17,12 +17,12 @@ from sqlalchemy.orm import Session
 from lipcore.data.samples import Array
 from lipcore.online.changes.departure import Departure
 from lipcore.online.changes.detectors import ChangeDetector
+from lipcore.online.changes.opening import Opening
+from lipcore.online.judging import Innovations, Watch
 from lipcore.online.record import Record
 from lipcore.vocabulary import CODES, LEARNT
 from service.journal import log
 from service.learning import intervals
-from service.learning.ingest.judging import Innovations, Watch
-from service.learning.ingest.opening import Opening
 from service.learning.intervals import HeldIntervals, ScaleRecord
 from service.learning.payloads import Payloads
 from service.learning.streams import Streams

@@ -12,12 +12,12 @@ from dataclasses import replace
 from sqlalchemy import select
 
 from lipcore.online.payload.holding import Watch
+from lipcore.online.screening import Screened
 from service.foundation.errors import ServiceError
 from service.journal import log
 from service.journal.alarms import raise_alarm
 from service.journal.log import NewBatch
 from service.learning.ingest.monitor import Monitor
-from service.learning.ingest.screening import Screened
 from service.learning.streams import PayloadRecord
 from service.learning.weigher.messages import MOST_STREAMS, Asked, Message, Revised, Stream, Unweighed, Weighed
 from service.learning.weigher.process import MOST_WAITING, WeigherProcess

@@ -7,15 +7,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lipcore.online import judging, screening
 from lipcore.online.batch import Rows
 from lipcore.online.changes.detectors import ChangeDetector
+from lipcore.online.judging import ContactGate, Innovations, JudgeOptions, Watch
 from lipcore.online.record import Record
-from service.contract.observations import LearningOptions
+from lipcore.online.screening import Screened
 from service.journal import log
-from service.learning.ingest import judging, screening
-from service.learning.ingest.judging import ContactGate, Innovations, Watch
 from service.learning.ingest.monitor import Monitor
-from service.learning.ingest.screening import Screened
 from tests.service.learning import lessons
 from tests.service.learning.lessons import Pupil
 from tests.service.learning.recordings import codes, part, recording, send
@@ -265,11 +264,11 @@ def screened(count, push, first=0.0):
     zeros = np.zeros((count, 1))
     rows = Rows(time, zeros, zeros + 0.1, zeros, tau, np.zeros(count, np.uint8))
     every = np.ones(count, np.bool_)
-    return Screened(rows, slice(0, count), None, every, every, zeros, zeros, zeros, np.ones(1))
+    return Screened(rows, slice(0, count), every, every, zeros, zeros, zeros, np.ones(1))
 
 
 def test_a_gate_that_stood_back_returns_once_rows_fit():
-    options = LearningOptions(on_change="learn")
+    options = JudgeOptions(on_change="learn")
     watch = Watch(ContactGate.start(2.0).stand_back(), ChangeDetector(), Innovations.empty(1))
     opened = []
     for second in range(5):

@@ -11,7 +11,7 @@ from service.contract.observations import LearningOptions
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.learning.ingest.batches import MAX_ROWS
-from service.learning.ingest.screening import limits
+from service.learning.ingest.dating import row_limits
 from tests.service.learning.lessons import apart
 from tests.service.learning.recordings import batch, codes, learnt_from, logged, part, recording, send
 
@@ -234,16 +234,16 @@ def model(school):
 
 def test_torque_limits_are_those_of_the_owner_else_those_of_the_urdf(model):
     settings, options = Settings(), LearningOptions()
-    assert limits(model, options, settings).torque is None
+    assert row_limits(model, options, settings).torque is None
     robot = RigidBody.from_profile("double-pendulum", model.joint_names, model.joint_types)
     robot.model.effortLimit = np.array([30.0, 20.0])
     known = replace(model, robot=robot)
-    np.testing.assert_array_equal(limits(known, options, settings).torque, [30.0, 20.0])
+    np.testing.assert_array_equal(row_limits(known, options, settings).torque, [30.0, 20.0])
     chosen = LearningOptions(torque_limits=[5.0, 6.0])
-    np.testing.assert_array_equal(limits(known, chosen, settings).torque, [5.0, 6.0])
+    np.testing.assert_array_equal(row_limits(known, chosen, settings).torque, [5.0, 6.0])
     turned = RigidBody.from_profile("double-pendulum", model.joint_names[::-1], model.joint_types)
     turned.model.effortLimit = np.array([30.0, 20.0])  # in the order of the chain
-    turned_limits = limits(replace(model, robot=turned), options, settings).torque
+    turned_limits = row_limits(replace(model, robot=turned), options, settings).torque
     np.testing.assert_array_equal(turned_limits, [20.0, 30.0])
     robot.model.effortLimit = np.array([30.0, 0.0])  # 0 is what many URDFs say for "not known"
-    assert limits(known, options, settings).torque is None
+    assert row_limits(known, options, settings).torque is None

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from service.learning.ingest.opening import BAND, LEAST, LENGTH, Opening
+from lipcore.online.changes.opening import BAND, LEAST, LENGTH, Opening
 from tests.service.learning import lessons
 from tests.service.learning.lessons import Pupil, apart
 from tests.service.learning.recordings import codes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,17 +12,27 @@ from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.adaptive import scores
 from lipcore.online.batch import Rows
-from lipcore.online.gates import RowLimits, is_implausible
+from lipcore.online.gates import is_implausible
 from lipcore.vocabulary import CODES, LEARNT
-from service.contract.observations import DerivedAcceleration, LearningOptions
-from service.foundation.settings import Settings
-from service.models.served import Served
 
 LIMIT, STATIONARY, IMPLAUSIBLE = (CODES.index(code) for code in ("limit", "stationary", "implausible"))
 
 COMPARED, LEAST_COMPARED = 4.0, 10
 """Rows that are compared with the version as trained, for each effective row, and of a batch at least: neighbours of a
 fast stream say the same, and each prediction takes time of a core."""
+
+
+class Version(Protocol):
+    """A version that serves. model: with what it has learnt; base: as trained; version: its number."""
+
+    @property
+    def model(self) -> TorqueModel: ...  # noqa: D102
+
+    @property
+    def base(self) -> TorqueModel: ...  # noqa: D102
+
+    @property
+    def version(self) -> int: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -82,7 +93,6 @@ class Screened:
 
     rows: Rows
     own: slice
-    derived: DerivedAcceleration | None
     asked: NDArray[np.bool_]
     predicted: NDArray[np.bool_]
     mean: Array
@@ -99,26 +109,10 @@ class Screened:
         return float(self.rows.time[self.predicted].max()) if self.predicted.any() else None
 
 
-def limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> RowLimits:
-    """What a row of a model may hold: its actuators' limits are those of its options, else those of its URDF."""
-    torque = None if options.torque_limits is None else np.array(options.torque_limits)
-    if torque is None and model.robot is not None:
-        effort = np.asarray(model.robot.model.effortLimit, np.float64)[list(model.robot.order)]
-        if (effort > 0).all():
-            torque = effort
-    return RowLimits(
-        model.position_limits(settings.max_position),
-        settings.max_velocity,
-        settings.max_acceleration,
-        torque,
-    )
-
-
 def predict(
     rows: Rows,
-    served: Served,
+    version: Version,
     own: slice,
-    derived: DerivedAcceleration | None = None,
     answered: Answered | None = None,
     carrying: TorqueModel | None = None,
 ) -> Screened:
@@ -126,7 +120,7 @@ def predict(
     for are beyond its limits, and those whose torque nobody has measured are implausible. answered: of all rows, where
     a stream has answered them already; carrying: the version with what the arm carries, where it does: it is compared
     with the version as trained no more."""
-    model = served.model if carrying is None else carrying
+    model = version.model if carrying is None else carrying
     codes, predicted = rows.code.copy(), rows.code == LEARNT
     asked = predicted | ((codes == STATIONARY) & np.isfinite(rows.ddq).all(axis=1))
     good, floor = rows.take(asked), model.posterior.floor
@@ -156,25 +150,24 @@ def predict(
     return Screened(
         replace(rows, code=codes),
         own,
-        derived,
         answerable,
         predicted,
         mean,
         std,
         bare,
         model.noise_std,
-        None if carrying is not None else _as_trained(good.take(judged), served, mean, bare),
+        None if carrying is not None else _as_trained(good.take(judged), version, mean, bare),
         seen,
         given.take(judged) if given.other_load else None,
     )
 
 
-def _as_trained(rows: Rows, served: Served, mean: Array, bare: Array) -> Trained:
+def _as_trained(rows: Rows, version: Version, mean: Array, bare: Array) -> Trained:
     """What the version as trained predicts of some of the rows, of which it predicts mean and bare, (P, n), by now."""
     compared = evenly(rows.weight)
-    same = served.model is served.base
-    answers = (mean[compared], bare[compared]) if same else _answers(rows.take(compared), served.base)
-    return Trained(served.version, compared, len(rows) / max(1, len(compared)), *answers)
+    same = version.model is version.base
+    answers = (mean[compared], bare[compared]) if same else _answers(rows.take(compared), version.base)
+    return Trained(version.version, compared, len(rows) / max(1, len(compared)), *answers)
 
 
 def evenly(weight: Array) -> NDArray[np.int64]:

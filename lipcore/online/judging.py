@@ -4,26 +4,34 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
-from lipcore.online.batch import Rows
+from lipcore.online.batch import AHEAD_S, Rows
 from lipcore.online.changes.departure import Departure
 from lipcore.online.changes.detectors import RATIO, Change, ChangeDetector, friction_share
+from lipcore.online.changes.opening import Opening
 from lipcore.online.gates import Patience, is_contact
 from lipcore.online.record import Record
+from lipcore.online.screening import Screened, Trained
 from lipcore.vocabulary import CODES, LEARNT
-from service.contract.observations import LearningOptions
-from service.journal.log import AHEAD_S
-from service.learning.ingest.opening import Opening
-from service.learning.ingest.screening import Screened, Trained
 
 CONTACT, CHANGE, PAYLOAD, PAUSED = (CODES.index(code) for code in ("contact", "change", "payload", "paused"))
 MOST_INNOVATIONS = 1000
 """Rows whose innovations are kept to tell friction from a payload."""
+
+
+@dataclass(frozen=True)
+class JudgeOptions:
+    """What the owner of a model has set. enabled: whether rows are learnt; on_change: what follows from a change;
+    contact_threshold: standard deviations from which on a row is a contact."""
+
+    enabled: bool = True
+    on_change: Literal["hold", "adapt", "learn"] = "hold"
+    contact_threshold: float = 8.0
 
 
 @dataclass(frozen=True)
@@ -150,7 +158,7 @@ def judge(
     batch: Screened,
     watch: Watch,
     held: bool,
-    options: LearningOptions,
+    options: JudgeOptions,
     usual: Callable[[], Record],
     received: float = np.inf,
     carried: float | None = None,
