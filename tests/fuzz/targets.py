@@ -8,6 +8,8 @@ from __future__ import annotations
 import tempfile
 import zipfile
 from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
@@ -17,6 +19,7 @@ from lipcore.files.tensors import read_tensors
 from lipcore.profiles import from_urdf
 from service.datasets.caged import read_upload
 from service.datasets.formats.bags import files
+from service.datasets.mapping.reading import read
 from service.datasets.options import UploadOptions
 from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
@@ -26,6 +29,20 @@ from service.storage.disk import Usage
 
 MiB = 1024 * 1024
 SETTINGS = Settings(max_samples=5000, max_unpacked_bytes=16 * MiB)
+SMALL = {
+    "caged.read": partial(read, min_samples=10),
+    "formats.table.MAX_COLUMNS": 200,
+    "formats.json.MAX_COLUMNS": 200,
+    "formats.npz.MAX_COLUMNS": 200,
+    "formats.parquet.MAX_COLUMNS": 200,
+    "formats.zips.MAX_MEMBERS": 50,
+    "formats.bags.container.MAX_PART_BYTES": 4 * MiB,
+    "formats.bags.files.MAX_PART_BYTES": 4 * MiB,
+    "formats.json.MAX_BYTES": MiB,
+    "formats.json.MAX_LINE_BYTES": 64 * 1024,
+    "formats.opening.MAX_LINE_BYTES": 64 * 1024,
+}
+"""Limits of recordings that keep each run short."""
 USAGE = Usage(0, 1 << 40, None, 0)
 JOINTS = 2
 """Of the models whose tensors are read."""
@@ -44,14 +61,16 @@ _without_sums = patch.object(files, "zlib", SimpleNamespace(crc32=lambda data: _
 def _recording(kind: str) -> Callable[[bytes], None]:
     """A reader of recordings that are sent as a kind, whatever they turn out to be."""
 
-    def read(data: bytes) -> None:
+    def read_bytes(data: bytes) -> None:
         with tempfile.TemporaryDirectory() as folder, patch.object(zipfile.ZipExtFile, "_update_crc", lambda *_: None):
             path = Path(folder) / "upload"
             path.write_bytes(data)
-            with _without_sums:
+            with _without_sums, ExitStack() as small:
+                for place, value in SMALL.items():
+                    small.enter_context(patch(f"service.datasets.{place}", value))
                 read_upload(path, kind, UploadOptions(), None, USAGE, Path(folder), SETTINGS)
 
-    return read
+    return read_bytes
 
 
 def _urdf(data: bytes) -> None:
