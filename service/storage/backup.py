@@ -37,6 +37,7 @@ FEW = 50
 """Files that may be left for the moment in which writers wait."""
 MOST_ROUNDS = 20
 CHUNK = 1 << 20
+LOCK = ".lock"
 _NAMES = re.compile(
     rf"{re.escape(FILE)}|{re.escape(MANIFEST)}|(datasets|learning)/[a-z]+_\w{{1,36}}\.safetensors"
     r"|versions/mv_\w{1,36}/[a-z][\w.-]{0,40}",
@@ -193,13 +194,14 @@ def restore(home: Path, file: Path) -> Backup:
     is no backup or is damaged.
     """
     with file.open("rb") as opened, hold_home(home):
-        if any(home.iterdir()):
+        if any(path.name != LOCK for path in home.iterdir()):
             raise HomeError(f"home is {str(home)!r}, expected an empty folder: nothing is restored over what is there")
         try:
             return _restored(home, opened)
         except BaseException:
             for path in home.iterdir():
-                remove(path)
+                if path.name != LOCK:
+                    remove(path)
             raise
 
 

@@ -77,17 +77,17 @@ def promote(session: Session, model: str, version: int, judged: Promotion, evide
     promoted = judged.answers and promotes and serving == judged.serving
     if promoted:
         registry.serve(session, model, version)
-        outcome = f"version {version} answers from now on: {judged.reason}"
+        outcome = f"answers from now on: {judged.reason}"
     elif judged.answers:
-        outcome = f"version {version} waits: {judged.reason}; a rollback to version {version} lets it answer"
+        outcome = f"waits: {judged.reason}; a rollback to version {version} lets it answer"
     else:
-        outcome = f"version {version} is dismissed: {judged.reason}"
+        outcome = f"is dismissed: {judged.reason}"
     if not promoted:
         after = {"verdict": "promote" if judged.answers else "dismiss", "serving": serving}
         audit.note(session, model, "candidate dismissed", version, after=after)
     named = {"serving": judged.serving, "candidate": version, "promoted": promoted}
     verdict = {"verdict": "promote" if judged.answers else "dismiss"}
-    raise_alarm(session, model, "promotion", outcome, {**named, **verdict, **evidence})
+    raise_alarm(session, model, "promotion", f"version {version} {outcome}", {**named, **verdict, **evidence})
     return outcome
 
 

@@ -208,7 +208,7 @@ def _publish(
         raise TakenBackError("part of what was observed has been taken back while it was trained on: refresh again")
     start, evidence = refresh["through"], manifest["lineage"]["refresh"]["evidence"]
     version = registry.publish(session, claim.model, folder, manifest, claim.job, True, start, judged)
-    return version, f": {refreshed.promote(session, claim.model, version, judged, evidence)}"
+    return version, f" and {refreshed.promote(session, claim.model, version, judged, evidence)}"
 
 
 def _code(error: Exception) -> str:

@@ -232,11 +232,10 @@ def test_a_report_is_read_back(reported: Any) -> None:
     np.testing.assert_array_equal(entry.inertia.plausible()[ORDER], random_bodies(3, 1))
 
 
-def test_what_earlier_releases_reported_is_read(reported: Any) -> None:
-    for body in reported["inertia"]["bodies"]:
-        del body["undetermined"]
-    read_manifest_bytes(manifest({name: reported[name] for name in ("friction", "inertia")}))
+def test_an_arm_is_reported_as_a_whole_or_not_at_all(reported: Any) -> None:
     read_manifest_bytes(manifest({"friction": reported["friction"]}))
+    with pytest.raises(ModelFormatError, match="inertia, rotor and geometry are not all there"):
+        read_manifest_bytes(manifest({name: reported[name] for name in ("friction", "inertia")}))
 
 
 MALFORMED: dict[str, Callable[[Any], None]] = {

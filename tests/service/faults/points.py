@@ -89,7 +89,7 @@ LEARNING = [
     Point("observation: row made", actions.Observe, Fault("service.journal.log:append_batch", "after"), "nothing"),
     *_around_commit("observation", actions.Observe, APPEND),
     *_around_commit("unlearning", actions.Unlearn, "service.learning.control.decisions:unlearn"),
-    *_both("learner: page read", actions.Observe, Fault(f"{LEARNER}.restore:advance", "before")),
+    *_both("learner: page read", actions.Observe, Fault("service.journal.restore:advance", "before")),
     *_both("learner: publication written", actions.Observe, Fault(f"{LEARNER}.publication:write", "after")),
     Point("publication: before it is read", actions.Observe, Fault(f"{LEARNER}.publication:read"), "all"),
     *_both("snapshot: half of the file", actions.Observe, Fault(RENAME, "before", STORE)),

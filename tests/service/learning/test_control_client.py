@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lipserve import ApiError, Client
-from service.learning import owner
+from service.journal.alarms import raise_alarm
 from tests.service.archives.packing import exported, send, unpack
 from tests.service.learning.lessons import LESSON, QUERIES, answered
 
@@ -42,7 +42,7 @@ def test_what_is_seen(school, client):
     assert seen.observed.tau == tau
     same(client.learning("seen-by-client"), pupil.get("learning"))
     with school.service.database.transaction() as session:
-        owner.raise_alarm(session, "seen-by-client", "novelty", "beyond", {})
+        raise_alarm(session, "seen-by-client", "novelty", "beyond", {})
     same_items(client.alarms("seen-by-client"), pupil.get("alarms"))
 
 

@@ -7,6 +7,7 @@ import pytest
 from service.contract.observations import LearningOptions
 from service.foundation.errors import NotFoundError
 from service.journal import log, snapshots
+from service.journal.alarms import raise_alarm
 from service.learning import owner
 from service.learning.control import decisions
 from tests.service.learning.batches import MODEL, batch, everything, write
@@ -193,8 +194,8 @@ def test_alarms_are_listed_newest_first(school):
     assert pupil.get("alarms") == {"items": [], "next_cursor": None}
     with school.service.database.transaction() as session:
         for number, kind in enumerate(("change", "novelty", "refresh", "promotion")):
-            owner.raise_alarm(session, "alarmed", kind, f"message {number}", {"number": number, "joints": ["joint1"]})
-        owner.raise_alarm(session, "panda-sim", "change", "of another model", {})
+            raise_alarm(session, "alarmed", kind, f"message {number}", {"number": number, "joints": ["joint1"]})
+        raise_alarm(session, "panda-sim", "change", "of another model", {})
     first = pupil.get("alarms", limit=3)
     rest = pupil.get("alarms", limit=3, cursor=first["next_cursor"])
     items = first["items"] + rest["items"]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lipcore.online.record import Record
+from service.journal.alarms import raise_alarm
 from service.learning import owner
 from service.learning.ingest.monitor import Window
 from tests.service.data import stream, train, upload
@@ -75,8 +76,8 @@ def test_what_needs_a_decision_is_shown(school):
     pupil = school.enrol("hesitant")
     with school.service.database.transaction("hesitant") as session:
         owner.hold(session, "hesitant", {"at": 1.0})
-        owner.raise_alarm(session, "hesitant", "novelty", "the first", {})
-        owner.raise_alarm(session, "hesitant", "change", "the newest", {"joint": 1})
+        raise_alarm(session, "hesitant", "novelty", "the first", {})
+        raise_alarm(session, "hesitant", "change", "the newest", {"joint": 1})
     seen = glance(school.client, "hesitant")
     assert seen["held"]
     assert seen["alarm"] == pupil.get("alarms")["items"][0]
