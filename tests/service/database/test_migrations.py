@@ -59,6 +59,14 @@ def test_a_model_without_a_serving_version_serves_its_newest(earlier):
     database.close()
 
 
+def test_snapshots_that_contain_what_was_unlearnt_later_go(earlier):
+    """Event 5 of one model has unlearnt event 2; release 0.2.0 has kept a snapshot after each event."""
+    snapshots = "SELECT model, number FROM snapshots ORDER BY model, number"
+    assert execute(earlier, snapshots) == [*(("bodies", k) for k in range(1, 5)), *(("chain", k) for k in range(1, 6))]
+    Database(earlier).close()
+    assert execute(earlier, snapshots) == [*(("bodies", k) for k in range(1, 5)), ("chain", 1), ("chain", 5)]
+
+
 @pytest.mark.parametrize("change", ["DROP TABLE alembic_version", "UPDATE alembic_version SET version_num = '0003'"])
 def test_a_database_of_a_release_before_is_refused_as_it_is(earlier, change):
     execute(earlier, change)
