@@ -138,7 +138,7 @@ def test_a_version_that_waits_says_why_and_is_let_answer(visitor: Visitor, dashb
     noise = np.random.default_rng(0).standard_normal(good.tau.shape) * (np.arange(120) >= 84)[:, None]
     first, second = (upload(dashboard.client, each)["id"] for each in (good, replace(good, tau=good.tau + 5 * noise)))
     train(dashboard.client, "waits", first)
-    job = train(dashboard.client, "waits", second, holdout={"share": 0.3})
+    job = train(dashboard.client, "waits", second, holdout={"share": 0.3}, promotion="ask")
     page = visitor.open(f"#/jobs/{job['id']}")
     expect(page.get_by_text("waits as candidate and did not answer by itself")).to_be_visible()
     assert audit(page) == []

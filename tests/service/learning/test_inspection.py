@@ -76,7 +76,15 @@ def test_rows_come_as_they_were_sent_with_their_codes(pupil):
 def test_a_frame_is_found_in_the_batch_it_was_logged_with(school):
     pupil = school.enrol("framed")
     rows = Rows(100.0 + np.arange(5), *np.ones((4, 5, 2)), np.full(5, CODES.index("contact"), np.uint8))
-    said = {"accepted": 0, "rejected": {"contact": 5}, "held": False, "open": False}
+    said = {
+        "accepted": 0,
+        "rejected": {"contact": 5},
+        "held": False,
+        "open": False,
+        "waited": False,
+        "departure": None,
+        "until": None,
+    }
     batch = NewBatch("live", "frames", 20, 24, "0" * 64, 0.0, 100.0, 1, 0, rows, said, None)
     with school.service.database.transaction() as session:
         log.append_batch(session, "framed", batch)
