@@ -75,7 +75,7 @@ class LearningOptions(BaseModel):
         "arm. Meanwhile rows teach the payload, and not the arm",
     )
     auto_refresh: bool = Field(True, description="Train a new version by itself where motion leaves what is known")
-    auto_promote: bool = Field(True, description="Let such a version answer by itself once it predicts better")
+    auto_promote: bool = Field(True, description="Let such a version serve if it predicts better")
 
 
 MOST_SEQUENCE = 2**53 - 1

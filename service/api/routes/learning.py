@@ -209,7 +209,8 @@ def list_alarms(learners: LearnersDep, model: str, page: PageQuery) -> schema.Al
 def create(queue: JobQueueDep, model: str, request: schema.RefreshRequest, response: Response) -> Job:
     """Queue a job that trains on the version's data sets and on what has been observed since.
 
-    The version that it makes learns along and answers once it has predicted better than the one that serves.
+    The new version serves if it predicts the newest third of the observations better than the serving version, before
+    either has learnt them.
     """
     job = jobs.refresh(queue, model)
     response.headers["Location"] = f"/v1/jobs/{job.id}"

@@ -79,7 +79,7 @@ class LearningOptions(Record, frozen=True, kw_only=True):
     payloads: Notice what the arm takes up and puts down, and answer with it at once; for models that know the arm.
         Meanwhile rows teach the payload, and not the arm
     auto_refresh: Train a new version by itself where motion leaves what is known
-    auto_promote: Let such a version answer by itself once it predicts better
+    auto_promote: Let such a version serve if it predicts better
     """
 
     enabled: bool = True
