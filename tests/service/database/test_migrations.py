@@ -76,6 +76,20 @@ def test_a_database_of_a_release_before_is_refused_as_it_is(earlier, change):
     assert execute(earlier, "SELECT sql FROM sqlite_master") == before
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("UPDATE datasets SET report = json_remove(report, '$.timing')", r"\d+ of the datasets were made by a release"),
+        ("UPDATE versions SET manifest = json_remove(manifest, '$.parameters')", r"\d+ of the versions were made by"),
+    ],
+)
+def test_what_a_release_before_has_made_is_refused_by_name(earlier, change, message):
+    execute(earlier, change)
+    with pytest.raises(DatabaseVersionError, match=message):
+        Database(earlier)
+    assert execute(earlier, "SELECT version_num FROM alembic_version") == [("0004",)]
+
+
 def test_what_reports_and_events_said_of_streams_becomes_their_records(tmp_path):
     body = {"mass": 2.0, "com": [0.0, 0.0, 0.1], "inertia": None}
     report = {

@@ -60,7 +60,28 @@ def _upgrade(connection: sa.Connection, prior: str | None) -> None:
             f"the database has revision {prior!r}, expected at most {HEAD!r}: a later release of LIPServe has used it; "
             "start that one, or set LIPSERVE_HOME, or LIPSERVE_DATABASE_URL, to another"
         )
+    if prior == FIRST:
+        _check_contents(connection)
     command.upgrade(config, HEAD)
+
+
+KEPT: dict[str, tuple[str, str, tuple[str, ...]]] = {
+    "datasets": ("id", "report", ("timing", "advice")),
+    "versions": ("folder", "manifest", ("parameters", "warnings", "hyperparameters")),
+}
+"""Tables of which release 0.2.0 has kept rows of 0.1: what names a row, and entries of its JSON that these lack."""
+
+
+def _check_contents(connection: sa.Connection) -> None:
+    """Raise DatabaseVersionError for data sets and versions that release 0.1 has made."""
+    for table, (name, document, entries) in KEPT.items():
+        rows = sa.table(table, sa.column(name), sa.column(document, sa.JSON))
+        lacking = sa.or_(*(rows.c[document][entry].as_string().is_(None) for entry in entries))
+        if older := list(connection.scalars(sa.select(rows.c[name]).where(lacking))):
+            raise DatabaseVersionError(
+                f"{len(older)} of the {table} were made by a release before 0.2.0, which this one does not read: start "
+                f"release 0.2.0, delete them there, and upload or train them again ({', '.join(older[:5])})"
+            )
 
 
 NUMBER = sa.BigInteger().with_variant(sa.Integer(), "sqlite")
