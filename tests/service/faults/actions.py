@@ -129,7 +129,13 @@ class Cancel(Action):
 
 
 def _queued(house: House, model: str, dataset: str, options: dict) -> str:
-    wanted = {"model": model, "datasets": [dataset], "options": options, "estimator": "lip-chain"}
+    wanted = {
+        "model": model,
+        "datasets": [dataset],
+        "options": options,
+        "estimator": "lip-chain",
+        "promotion": "always",
+    }
     answer = house.client.post("/v1/jobs", json=wanted)
     assert answer.status_code == 202, answer.text
     return answer.json()["id"]

@@ -207,7 +207,7 @@ def test_no_service_starts_on_a_disk_that_can_only_be_read(tmp_path):
             pytest.skip("this process may not mount a disk")
         Database(tmp_path / "disk" / "home").close()
         subprocess.run(["mount", "-o", "remount,ro", str(tmp_path / "disk")], check=True)
-        with pytest.raises(HomeError, match=r"service may write to and lock: Read-only file system"):
+        with pytest.raises(HomeError, match=r"service may write to: Read-only file system"):
             check_home(Settings(home=tmp_path / "disk" / "home"))
 
 
