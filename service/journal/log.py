@@ -6,27 +6,24 @@ dense and rise in the order of commits, and an event is durable once the transac
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
-from sqlalchemy import ColumnElement, Select, bindparam, case, delete, func, select, update
+from sqlalchemy import Select, bindparam, case, func, select
 from sqlalchemy.orm import Session, undefer
 
 from lipcore.data.samples import Array
 from lipcore.online.batch import AHEAD_S, Rows
 from lipcore.vocabulary import CODES, LEARNT
 from service.foundation.errors import BusyError, ConflictError
-from service.storage.database import EventRow, LearnerRow, LearningRow, ServingRow, SnapshotRow, StreamRow, fetch, now
+from service.storage.database import EventRow, LearnerRow, LearningRow, StreamRow, fetch, now
 from service.storage.rows import Page
 from service.storage.rows import newest as newest_rows
-
-logger = logging.getLogger(__name__)
 
 StreamKind = Literal["batches", "frames"]
 EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings", "payload"]
@@ -226,65 +223,6 @@ def rows_of(event: EventRow) -> Rows:
     """The rows of a batch or a replay, which are read only now."""
     assert event.payload is not None  # both have one for as long as they are in the log
     return decode(event.payload)
-
-
-def unlearn(session: Session, model: str, event: EventRow, received: float) -> EventRow:
-    """Mark a batch and its replays void, and delete the snapshots that contain them; return the event that says so.
-
-    Snapshots stay where the log is too short to fold it again without the batch, which then stays in them.
-    """
-    storing = select(SnapshotRow.version).where(SnapshotRow.model == model, SnapshotRow.number >= event.number)
-    serving = select(ServingRow.version).where(ServingRow.model == model)
-    for version in session.scalars(storing.union(serving)).all():
-        if start_of(session, model, version) >= event.number:
-            continue
-        if can_fold_again(session, model, version, event.number):
-            _delete_snapshots(session, model, event.number, SnapshotRow.version == version)
-        else:
-            name = f"batch {event.sequence} of stream {event.stream_id!r}"
-            logger.error("%s stays in what model %r has learnt: the log lacks what is before it", name, model)
-    numbers = [event.number, *(each.number for each in about(session, event, "replay"))]
-    session.execute(update(EventRow).where(EventRow.model == model, EventRow.number.in_(numbers)).values(void=True))
-    return append(session, model, "unlearn", {"event": event.number}, received)
-
-
-def rollback(session: Session, model: str, to: int, received: float) -> EventRow:
-    """Mark void what was learnt and set after event `to`, for every version, and delete the snapshots that contain it;
-    return the event that says so. What was unlearnt stays unlearnt."""
-    made = ("batch", "replay", "change", "settings")
-    later = (EventRow.model == model, EventRow.number > to)
-    session.execute(update(EventRow).where(*later, EventRow.kind.in_(made), EventRow.void.is_(False)).values(void=True))
-    _delete_snapshots(session, model, to + 1)
-    event = append(session, model, "rollback", {"to": to}, received)
-    settings = session.get(LearningRow, model)
-    if settings is not None:
-        settings.options = {**settings.options, **asdict(memory(session, model, to))}
-    return event
-
-
-def must_fold_again(session: Session, model: str, version: int, seen: int, through: int) -> bool:
-    """Whether what a version has learnt up to event `through` contains what has been undone since event `seen`, and can
-    be made without. What it contains by training stays."""
-    later = (EventRow.model == model, EventRow.number > seen, EventRow.kind.in_(("unlearn", "rollback")))
-    for kind, detail in session.execute(select(EventRow.kind, EventRow.detail).where(*later)).all():
-        if kind == "rollback" and detail["to"] < through:
-            return True
-        if kind == "unlearn" and start_of(session, model, version) < (batch := detail["event"]) <= through:
-            return can_fold_again(session, model, version, batch)
-    return False
-
-
-def can_fold_again(session: Session, model: str, version: int, first: int) -> bool:
-    """Whether what a version has learnt can be made again without events from `first` on: whether the log has all
-    events since the newest snapshot before that, or since the version was trained."""
-    before = (SnapshotRow.model == model, SnapshotRow.version == version, SnapshotRow.number < first)
-    base = session.scalar(select(func.max(SnapshotRow.number)).where(*before))
-    base = start_of(session, model, version) if base is None else base
-    return is_complete(session, model, base, newest(session, model))
-
-
-def _delete_snapshots(session: Session, model: str, first: int, *of_version: ColumnElement[bool]) -> None:
-    session.execute(delete(SnapshotRow).where(SnapshotRow.model == model, SnapshotRow.number >= first, *of_version))
 
 
 def memory(session: Session, model: str, number: int) -> Memory:

@@ -25,7 +25,7 @@ from sqlalchemy.orm import Session, defer, undefer
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online import transfer as state
 from lipcore.online.learner import Novel, OnlineModel
-from service.journal import log, snapshots
+from service.journal import log, snapshots, undo
 from service.journal.log import Memory
 from service.storage.database import Database, EventRow, fetch
 from service.storage.files import Files
@@ -102,7 +102,7 @@ def advance(
         last = newest if at_most is None else min(at_most, newest)
         if last <= known.number:
             return known
-        begin = log.must_fold_again(session, model, known.version, known.seen, known.number)
+        begin = undo.must_fold_again(session, model, known.version, known.seen, known.number)
         events, end = _page(session, known, last)
         if not begin and not known.torn and not log.is_complete(session, model, known.number, end):
             row = snapshots.latest(session, model, known.version, at_most)

@@ -11,7 +11,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 
 from service.foundation.settings import Settings
-from service.journal import log
+from service.journal import log, undo
 from service.models import registry
 from service.storage.database import Database, EventRow, SnapshotRow, StreamRow, VersionRow, now
 from service.storage.errors import undecided
@@ -99,7 +99,7 @@ def _is_outdated(session: Session, model: str, version: int, number: int, seen: 
     """Whether part of a state has been undone, or the version is no more."""
     if session.get(VersionRow, (model, version)) is None:
         return True
-    return log.must_fold_again(session, model, version, seen, number)
+    return undo.must_fold_again(session, model, version, seen, number)
 
 
 def _add(session: Session, snapshot: str, digest: str, model: str, version: int, number: int, most: int) -> list[str]:

@@ -7,7 +7,7 @@ from contextlib import closing
 import pytest
 from sqlalchemy import delete
 
-from service.journal import log
+from service.journal import log, undo
 from service.models import aliases, registry
 from service.replication import Listener
 from service.storage.database import AlarmRow, Database, DeletedModelRow, EventRow, ModelRow, VersionRow, now
@@ -57,7 +57,7 @@ def test_every_change_is_told_once_and_in_order(database):
     work = [
         committed(database, lambda session: [log.append_batch(session, MODEL, batch(n)) for n in (1, 2)]),
         committed(
-            database, lambda session: log.unlearn(session, MODEL, log.find_batch(session, MODEL, "robot-1", 1), 0)
+            database, lambda session: undo.unlearn(session, MODEL, log.find_batch(session, MODEL, "robot-1", 1), 0)
         ),
         committed(database, aliases.point, OTHER, "stable", 1),
         committed(database, aliases.point, OTHER, "stable", None),

@@ -19,7 +19,7 @@ from lipcore.vocabulary import CODES, LEARNT
 from service.contract import learning as schema
 from service.contract.observations import LearningOptions
 from service.foundation.errors import ConflictError, invalid_request, not_found, problem
-from service.journal import log
+from service.journal import log, undo
 from service.journal.alarms import page as alarms_page
 from service.learning import owner
 from service.learning.control import status
@@ -64,7 +64,7 @@ def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> sc
         rows = batch.learnt + sum(each.learnt for each in log.about(session, batch, "replay") if not each.void)
         trained = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.start >= batch.number)
         versions = list(session.scalars(trained.order_by(LearnerRow.version)))
-        log.unlearn(session, model, batch, time.time())
+        undo.unlearn(session, model, batch, time.time())
         revised = revised_now(session, model, version)
         taken = {"stream_id": stream_id, "sequence": sequence, "rows": rows}
         audit.note(session, model, "observations unlearnt", version, before=taken)
@@ -74,7 +74,7 @@ def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> sc
 
 def _check_fold(session: Session, model: str, version: int, batch: EventRow) -> None:
     """Raise ConflictError if what a version has learnt cannot be made again without a batch."""
-    if not log.can_fold_again(session, model, version, batch.number):
+    if not undo.can_fold_again(session, model, version, batch.number):
         name = f"batch {batch.sequence} of stream {batch.stream_id!r}"
         raise ConflictError(
             f"{name} can no longer be unlearnt: the log does not reach back to a stored state without it. Roll back to "
@@ -130,7 +130,7 @@ def _to_revision(learners: Learners, model: str, revision: int) -> schema.Rolled
             EventRow.void.is_(False),
         )
         count = session.scalar(undone) or 0
-        log.rollback(session, model, to, time.time())
+        undo.rollback(session, model, to, time.time())
         session.flush()
         monitor.streams.take_back(session, model, version, served.base.scale)
         revised = revised_now(session, model, version)

@@ -7,7 +7,7 @@ from sqlalchemy.orm import Session
 
 from lipcore.online.judging import Verdict
 from service.foundation.text import percent
-from service.journal import log
+from service.journal import undo
 from service.journal.alarms import raise_alarm
 from service.learning import owner
 from service.models.loaded import Served
@@ -40,7 +40,7 @@ def _take_back(session: Session, event: EventRow) -> None:
         EventRow.void.is_(False),
     )
     for each in session.scalars(earlier.order_by(EventRow.number)).all():
-        log.unlearn(session, event.model, each, event.received)
+        undo.unlearn(session, event.model, each, event.received)
 
 
 def raise_clock_alarm(session: Session, model: str, stream_id: str, leap: float) -> None:

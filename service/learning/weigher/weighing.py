@@ -14,7 +14,7 @@ from sqlalchemy import select
 from lipcore.online.payload.holding import Watch
 from lipcore.online.screening import Screened
 from service.foundation.errors import ServiceError
-from service.journal import log
+from service.journal import log, undo
 from service.journal.alarms import raise_alarm
 from service.journal.log import NewBatch
 from service.learning.ingest.monitor import Monitor
@@ -144,7 +144,7 @@ class Weighing:
                         EventRow.void.is_(False),
                     )
                     for each in session.scalars(taught.order_by(EventRow.number)).all():
-                        log.unlearn(session, model, each, message.received)
+                        undo.unlearn(session, model, each, message.received)
                 event = log.append(session, model, "payload", detail, message.received)
                 event.stream_id, event.version = stream_id, served.version
                 if (source := log.stream(session, model, stream_id)) is not None:

@@ -9,7 +9,7 @@ from sqlalchemy import select
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.foundation.settings import Settings
-from service.journal import log
+from service.journal import log, undo
 from service.journal.log import NewBatch
 from service.storage.database import Database, EventRow, ModelRow, ServingRow, StreamRow, VersionRow, now
 
@@ -85,13 +85,13 @@ def take_back(database: Database, number: int) -> int:
     """Unlearn the batch of this number; return the number of the event that says so."""
     with database.transaction() as session:
         [event] = log.events(session, MODEL, number - 1, 1, void=True)
-        return log.unlearn(session, MODEL, event, 3000.0).number
+        return undo.unlearn(session, MODEL, event, 3000.0).number
 
 
 def roll_back(database: Database, to: int) -> int:
     """Roll back to the event of this number; return the number of the event that says so."""
     with database.transaction() as session:
-        return log.rollback(session, MODEL, to, 3000.0).number
+        return undo.rollback(session, MODEL, to, 3000.0).number
 
 
 def source(database: Database, stream_id: str = "robot-1", model: str = MODEL) -> StreamRow | None:

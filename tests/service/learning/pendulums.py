@@ -21,7 +21,7 @@ from lipcore.online.record import Record
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.statistics import collect, merge
 from service.foundation.settings import Settings
-from service.journal import log, snapshots
+from service.journal import log, snapshots, undo
 from service.journal.log import NewBatch
 from service.journal.restore import Restored, advance, restore
 from service.learning.learner import publication
@@ -146,12 +146,12 @@ class Arm:
     def unlearn(self, number: int) -> int:
         """Unlearn the batch that is the event of this number."""
         with self.database.transaction() as session:
-            return log.unlearn(session, self.model, self.find(number), self._now(session)).number
+            return undo.unlearn(session, self.model, self.find(number), self._now(session)).number
 
     def rollback(self, to: int) -> int:
         """Roll back to the event of this number."""
         with self.database.transaction() as session:
-            return log.rollback(session, self.model, to, self._now(session)).number
+            return undo.rollback(session, self.model, to, self._now(session)).number
 
     def _now(self, session: Session) -> float:
         """When the last event came."""

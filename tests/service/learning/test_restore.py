@@ -204,6 +204,16 @@ def test_where_the_log_reaches_back_no_more_a_batch_stays_and_that_is_said(arm, 
     assert "batch 1 of stream 's' stays in what model 'arm' has learnt" in caplog.text
 
 
+def test_a_rollback_counts_beside_a_batch_that_stays(arm):
+    arm.batches(*range(4))
+    known = arm.restored()
+    with arm.database.transaction() as session:
+        session.connection().exec_driver_sql("DELETE FROM events WHERE number = 1")
+    arm.unlearn(2)  # which the log is too short for
+    arm.rollback(3)
+    same(arm.followed(known).online, at_once([2]))
+
+
 def test_a_snapshot_of_what_was_undone_meanwhile_is_not_stored(arm):
     arm.batches(*range(4))
     known = arm.restored()
