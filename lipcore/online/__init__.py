@@ -1,1 +1,1 @@
-"""Learning from a live stream: exact, reversible, and honest about what it does not explain."""
+"""Learning from a live stream: exact, and honest about what it does not explain."""

@@ -1,7 +1,7 @@
 """What a compact posterior needs to know of the data: sums over samples, and how they are added, aged and solved.
 
 All functions are pure. Sums know no order: fitting all samples at once, or in parts, or one by one, gives the same
-posterior, and what has been added can be subtracted.
+posterior.
 """
 
 from __future__ import annotations

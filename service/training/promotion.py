@@ -23,7 +23,7 @@ from service.contract.models import HoldoutLineage, Promotion
 from service.contract.states import PromotionOption
 from service.models import aliases, registry
 from service.models.lineage import answer_of, held_out_figures, learnt_from
-from service.storage.database import Database, LearnerRow, VersionRow
+from service.storage.database import Database, VersionRow
 from service.storage.files import Files
 
 CANDIDATE = "candidate"
@@ -63,9 +63,7 @@ def settle(session: Session, model: str, judged: Promotion, option: PromotionOpt
 
 
 def wait(session: Session, model: str, version: int) -> None:
-    """Let a version wait that was just added as a candidate: it learns nothing, as whoever looks
-    at it says what becomes of it. The alias `candidate` points to it, where there is room for that."""
-    session.get_one(LearnerRow, (model, version)).role = "dismissed"
+    """Point the alias `candidate` to a version that was just added and does not serve, if there is room for it."""
     known = aliases.names(session, model)
     if CANDIDATE in known or len(known) < registry.MAX_ALIASES:
         aliases.point(session, model, CANDIDATE, version)

@@ -18,6 +18,7 @@ from lipcore.data.samples import Samples
 from lipcore.model.acceptance import Acceptance
 from lipcore.model.torque_model import TorqueModel
 from service.contract.models import Promotion
+from service.contract.observations import LearningOptions
 from service.foundation.fields import finite
 from service.journal.alarms import raise_alarm
 from service.journal.floor import error_floor_of
@@ -60,19 +61,16 @@ def compare(
         "figures": {which: _figures(samples, answer) for which, answer in answers.items()},
     }
     amount = f"negative log density {found.mean[0]:+.3g} ± {found.half_width[0]:.2g} nats a row"
-    if found.significant[0] and found.mean[0] < 0:
-        better = f"it predicts the newest logged rows better than {name}: {amount}"
-        return Compared(Acceptance(speaks_for=(better,)), evidence)
-    return Compared(
-        Acceptance(against=(f"it predicts the newest logged rows no better than {name}: {amount}",)), evidence
-    )
+    better = bool(found.significant[0] and found.mean[0] < 0)
+    said = (f"it predicts the newest logged rows {'' if better else 'no '}better than {name}: {amount}",)
+    return Compared(Acceptance(speaks_for=said) if better else Acceptance(against=said), evidence)
 
 
 def promote(session: Session, model: str, version: int, judged: Promotion, evidence: dict[str, Any]) -> str:
     """Let a refreshed version that was just added serve if it is better and its owner wants that; raise the alarm that
     says what came of it, and return it in words."""
-    options = session.get(LearningRow, model)
-    promotes = options is None or options.options.get("auto_promote", True)
+    row = session.get(LearningRow, model)
+    promotes = (LearningOptions() if row is None else LearningOptions(**row.options)).auto_promote
     serving = registry.answering(session, model)
     promoted = judged.answers and promotes and serving == judged.serving
     if promoted:
@@ -82,12 +80,12 @@ def promote(session: Session, model: str, version: int, judged: Promotion, evide
         outcome = f"waits: {judged.reason}; a rollback to version {version} lets it answer"
     else:
         outcome = f"is dismissed: {judged.reason}"
+    verdict = "promote" if judged.answers else "dismiss"
     if not promoted:
-        after = {"verdict": "promote" if judged.answers else "dismiss", "serving": serving}
+        after = {"verdict": verdict, "serving": serving}
         audit.note(session, model, "candidate dismissed", version, after=after)
-    named = {"serving": judged.serving, "candidate": version, "promoted": promoted}
-    verdict = {"verdict": "promote" if judged.answers else "dismiss"}
-    raise_alarm(session, model, "promotion", f"version {version} {outcome}", {**named, **verdict, **evidence})
+    named = {"serving": judged.serving, "candidate": version, "verdict": verdict, "promoted": promoted}
+    raise_alarm(session, model, "promotion", f"version {version} {outcome}", {**named, **evidence})
     return outcome
 
 

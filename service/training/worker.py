@@ -135,8 +135,9 @@ def _version(
     if material.held_out is not None:
         pulse.stage("evaluating")
         lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(trained, material)}
-    judged, learnt = _judged(settings, database, files, claim, material, trained, lineage), material
     judged_on = _judged_on(material)
+    judged = _judged(settings, database, files, claim, material, trained, judged_on, lineage)
+    learnt = material
     if last is not None and judged_on is not None:
         trained = last.last(settings, trained, judged_on, pulse)
         if REFIT_ERROR not in trained.fit:
@@ -172,13 +173,14 @@ def _judged(
     claim: Claim,
     material: Material,
     trained: TorqueModel,
+    judged_on: Samples | None,
     lineage: dict[str, Any],
 ) -> Promotion:
     """Whether the version answers by itself. The lineage of a refresh says how it compares with the version that it
     refreshes."""
     refresh = claim.request.get("refresh")
     if refresh is None:
-        judged_on, option = _judged_on(material), _option(settings, claim)
+        option = _option(settings, claim)
         return promotion.judge(database, files, claim.model, trained, judged_on, lineage, option)
     with database.session() as session:
         serving = session.get_one(VersionRow, (claim.model, refresh["version"]))
