@@ -29,7 +29,7 @@ from service.models.archive_reading import invalid_member, invalid_model, limits
 from service.models.lineage import held_out_figures
 from service.models.loaded import LoadedModels
 from service.runtime import cage
-from service.storage.database import LearnerRow, now
+from service.storage.database import now
 from service.storage.errors import undecided
 from service.storage.files import new_id
 
@@ -81,10 +81,9 @@ def _publish(
         registry.check_robot(session, model, RobotKind.of_manifest(manifest))
         first = not registry.has_model(session, model)
         judged = Promotion.of(_accepted(manifest) if first else OTHERS, registry.answering(session, model), option)
-        waits = not judged.answers
-        version = registry.publish(session, model, folder, manifest, None, candidate=waits, promotion=judged)
-        if waits:  # it is nobody's rival: who imports it says what becomes of it
-            session.get_one(LearnerRow, (model, version)).role = "dismissed"
+        version = registry.publish(
+            session, model, folder, manifest, None, candidate=not judged.answers, promotion=judged
+        )
     return version, judged.answers
 
 
