@@ -1,12 +1,20 @@
-"""Accelerations from measured velocities of a live stream: a local slope, late by a known delay."""
+"""Accelerations from measured velocities of a live stream: a local slope, late by a known delay; and those of a batch
+that was sent without, across the batches next to it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
+from lipcore.online.batch import Rows
+from lipcore.online.gates import RowLimits, check_rows
+from lipcore.vocabulary import CODES, LEARNT
+
+EDGE = CODES.index("edge")
 
 MIN_RATE = 50.0
 RATE_SLACK = 0.95
@@ -19,6 +27,14 @@ MIN_HALF = 2
 
 class RateError(ValueError):
     """The stream is too slow to derive accelerations from."""
+
+
+class DerivationError(ValueError):
+    """Accelerations of a batch cannot be derived: `field` has `value`, and `expected` says what is needed."""
+
+    def __init__(self, field: str, value: str, expected: str) -> None:
+        super().__init__(f"{field} is {value}, expected {expected}")
+        self.field, self.value, self.expected = field, value, expected
 
 
 @dataclass(frozen=True)
@@ -99,3 +115,112 @@ def _check_rate(rate: float) -> None:
         raise RateError(
             f"the rate is {rate:.3g} Hz, expected at least {MIN_RATE:g} Hz to derive accelerations; send ddq instead"
         )
+
+
+@dataclass(frozen=True)
+class Derivation:
+    """How the accelerations of a batch are derived: from `half` rows on either side of a row, of `rate` rows a second.
+
+    An acceleration is known `delay_s` later than its row."""
+
+    half: int
+    rate: float
+
+    @property
+    def delay_s(self) -> float:
+        """How much later than its row an acceleration is known, s."""
+        return self.half / self.rate
+
+    @staticmethod
+    def of(t: Array, half: int | None) -> Derivation:
+        """Return that of a batch with times (N,), s, by its stream's clock. half: of the batch next to it, None without
+        one: a stream has one window, however its rate is measured. Raise DerivationError."""
+        rate = _batch_rate(t)
+        return Derivation(half or window(rate), rate)
+
+
+@dataclass(frozen=True)
+class DerivedRows:
+    """rows: those of a batch with accelerations, and rows of others that it completes; own: places of the batch's;
+    carried: how many rows of others."""
+
+    rows: Rows
+    own: slice
+    carried: int
+
+
+def derive_rows(
+    rows: Rows, how: Derivation, before: Sequence[Rows], after: Sequence[Rows], limits: RowLimits
+) -> DerivedRows:
+    """Derive the accelerations of a batch of rows, whose `ddq` is ignored, across the batches next to it in its stream.
+
+    An acceleration stands on the velocities of `half` rows on either side of its row. At the ends of a batch they are
+    those of the batches before and after, of which 2·half rows suffice. A row waits, coded `edge`, until both are
+    there, in whatever order; it is decided with the later one, so that it is learnt exactly once, and as if the stream
+    were one batch.
+    """
+    everything = Rows.concatenate([*before, rows, *after])
+    own = np.zeros(len(everything), np.bool_)
+    first = sum(map(len, before))
+    own[first : first + len(rows)] = True
+    everything = replace(everything, ddq=_slopes(everything, how))
+    known = np.isfinite(everything.ddq).all(axis=1)
+    codes = everything.code.copy()
+    # 2 half rows on either side are so few that every window that is complete reaches into the batch: none was before
+    decided = known & ~own & (codes == EDGE)
+    codes[~known & (codes == LEARNT)] = EDGE
+    codes[decided] = LEARNT
+    fresh = codes == LEARNT
+    again = everything.take(fresh)
+    codes[fresh] = check_rows(None, again.q, again.dq, again.ddq, again.tau, limits)
+    start = int(decided[:first].sum())
+    return DerivedRows(
+        replace(everything, code=codes).take(decided | own), slice(start, start + len(rows)), int(decided.sum())
+    )
+
+
+def _batch_rate(t: Array) -> float:
+    """Rows a second, in the longest stretch without a gap: event time is too coarse to tell, to 0.2 µs today. Raise
+    DerivationError if accelerations cannot be derived at this rate, or time is too uneven."""
+    finite = t[np.isfinite(t)]
+    if len(finite) < 2:
+        raise DerivationError("t", f"{len(finite)} times", "at least 2 rows with times, to derive ddq from dq with")
+    steps = np.diff(finite)
+    rising = steps[steps > 0]
+    step = float(np.median(rising)) if len(rising) else 0.0
+    run = max(_runs(t, np.isfinite(t), step), key=len)
+    if len(run) < 2 or 2 * np.count_nonzero(_even(steps, step)) < len(steps):
+        spread = f"uneven, with steps from {steps.min():.3g} to {steps.max():.3g} s"
+        raise DerivationError(
+            "t", spread, f"steps that differ by at most {100 * JITTER:.0f} %, to derive ddq from dq with"
+        )
+    rate = (len(run) - 1) / float(t[run[-1]] - t[run[0]])
+    try:
+        window(rate * (1 - 1e-9))  # so that rounding leads to no other answer later
+    except RateError:
+        expected = f"measured accelerations, or at least {MIN_RATE:g} rows a second to derive them from"
+        raise DerivationError("ddq", f"missing, with {rate:.3g} rows a second", expected) from None
+    return rate
+
+
+def _runs(t: Array, usable: NDArray[np.bool_], step: float) -> list[NDArray[np.int64]]:
+    """Places of rows that follow each other evenly, run after run."""
+    joined = usable[:-1] & usable[1:]
+    joined[joined] = _even(t[1:][joined] - t[:-1][joined], step)
+    return np.split(np.arange(len(t)), np.flatnonzero(~joined) + 1)
+
+
+def _even(steps: Array, step: float) -> NDArray[np.bool_]:
+    return np.asarray((steps > 0) & (np.abs(steps - step) <= JITTER * step))
+
+
+def _slopes(rows: Rows, how: Derivation) -> Array:
+    """Accelerations of all rows in the middle of 2·half + 1 even ones, NaN for the others: (N, n)."""
+    ddq = np.full_like(rows.dq, np.nan)
+    usable = np.isfinite(rows.time) & np.isfinite(rows.dq).all(axis=1)
+    for run in _runs(rows.time, usable, 1 / how.rate):
+        if len(run) > 2 * how.half:
+            # a controller samples more evenly than it stamps, and event time is coarse
+            slopes = derive(np.arange(len(run)) / how.rate, rows.dq[run], how.half)
+            ddq[run[slopes.first : slopes.first + len(slopes.ddq)]] = slopes.ddq
+    return ddq

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,3 +68,34 @@ class Rows:
     def concatenate(parts: Sequence[Rows]) -> Rows:
         """Rows of all parts in order."""
         return Rows(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Rows)})
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where the rows of a logged batch lie in their stream: what the batches next to it need of it.
+
+    own: first and last place of the batch's own rows among those that were logged with it. span: first and last time by
+    the stream's clock, s; None if no row has one. window: rows on either side that its accelerations are derived from;
+    None if they were measured. frames: ranges of sequences, of frames that were logged together.
+    """
+
+    own: tuple[int, int]
+    span: tuple[float, float] | None = None
+    window: int | None = None
+    frames: tuple[tuple[int, int], ...] = ()
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as the log keeps them; `window` is kept with what was derived."""
+        frames = {"frames": [list(each) for each in self.frames]} if self.frames else {}
+        return {"own": list(self.own), "span": None if self.span is None else list(self.span), **frames}
+
+    @staticmethod
+    def from_json(report: Mapping[str, Any]) -> Placement:
+        """Read what `to_json` returned, from all that the log keeps of a batch."""
+        span, derived = report["span"], report["derived"]
+        return Placement(
+            tuple(report["own"]),
+            None if span is None else tuple(span),
+            None if derived is None else int(derived["ddq"]["window"]),
+            tuple((first, last) for first, last in report.get("frames", ())),
+        )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ Codes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 MAX_GAP_S = 1.0
-"""Step of time within a batch that is taken for a jump, s."""
+"""A longer step of time within a batch is a pause, s."""
 STATIONARY_SPEED = 1e-3
 """Speed of all joints, rad/s or m/s, below which a row tells of stiction only."""
 
@@ -27,18 +29,17 @@ class RowLimits:
     """What a row may hold.
 
     position: largest |q|, of each joint (n,) or of all; velocity, acceleration: largest |dq|, |ddq| of any joint, SI.
-    torque: (n,) largest |tau| of each joint, N·m or N, or None where not known. max_gap_s: longest step of time within
-    rows that accelerations are derived from, s; None: any. stationary_speed: a robot whose every |dq| lies below it
-    stands; 0: never. saturation_share: share of its limit from which on a torque is taken for cut off, below the limit
-    since a drive's measured torque wavers about it: 0.98 leaves 2 %, four standard deviations of a noise of half a per
-    cent of the limit.
+    torque: (n,) largest |tau| of each joint, N·m or N, or None where not known. max_gap_s: a longer step of time
+    is a pause, s. stationary_speed: a robot whose every |dq| lies below it stands; 0: never. saturation_share: share of
+    its limit from which on a torque is taken for cut off, below the limit since a drive's measured torque wavers about
+    it: 0.98 leaves 2 %, four standard deviations of a noise of half a per cent of the limit.
     """
 
     position: Array | float
     velocity: float
     acceleration: float
     torque: Array | None
-    max_gap_s: float | None = MAX_GAP_S
+    max_gap_s: float = MAX_GAP_S
     stationary_speed: float = STATIONARY_SPEED
     saturation_share: float = 0.98
 
@@ -52,7 +53,6 @@ def check_rows(
     limits: RowLimits,
     after: float | None = None,
     before: float | None = None,
-    derived: bool = False,
 ) -> Codes:
     """Code of each row, (N,) places in CODES: the first that applies, or `learnt`.
 
@@ -61,8 +61,7 @@ def check_rows(
     - `non_finite`: a number of the row is not finite.
     - `limit`: a magnitude is above its limit.
     - `time_jump`: of the rows with a finite time between `after` and `before`, all but the longest run of strictly
-      increasing times, so that one wrong time, forward or backward, costs its row and no other. Where accelerations
-      are `derived` also the first row beyond a gap of more than max_gap_s; measured ones do not suffer from a gap.
+      increasing times, so that one wrong time, forward or backward, costs its row and no other.
     - `saturation`: a |tau| of at least saturation_share of its limit: the robot did not do what the torque says.
     - `stationary`: every |dq| below stationary_speed: stiction holds any torque within its band.
 
@@ -85,7 +84,7 @@ def check_rows(
         saturated = np.abs(tau) >= limits.saturation_share * most
         codes[saturated.any(axis=1)] = CODES.index("saturation")
     if t is not None:
-        codes[_time_jumps(t, after, before, limits.max_gap_s if derived else None)] = CODES.index("time_jump")
+        codes[_time_jumps(t, after, before)] = CODES.index("time_jump")
     beyond = (np.abs(q) > limits.position) | (np.abs(dq) > limits.velocity) | (np.abs(tau) > most)
     if ddq is not None:
         beyond |= np.abs(np.nan_to_num(ddq)) > limits.acceleration
@@ -184,6 +183,64 @@ class Patience:
         return replace(self, elapsed=elapsed, rows=rows, contacts=contacts, last=last)
 
 
+CONTACT_PATIENCE_S = 2.0
+"""How long torques may be far off before it is no contact but a change of the robot, s."""
+
+
+@dataclass(frozen=True)
+class ContactGate:
+    """Rejects rows far outside a stream's predictive interval for as long as that can be a contact; immutable.
+
+    It stands back while a changed robot is learnt anew. patience: how long rows have been contacts. calm: how long they
+    have not, while the gate stands back; else None.
+    """
+
+    patience: Patience
+    calm: Patience | None = None
+
+    @classmethod
+    def start(cls, seconds: float = CONTACT_PATIENCE_S) -> ContactGate:
+        """A gate that keeps contacts out for so long."""
+        return cls(Patience(seconds))
+
+    def to_json(self) -> list[list[Any] | None]:
+        """Its state as numbers and lists; `from_json` gives back the same gate to the last bit."""
+        return [None if each is None else list(astuple(each)[1:]) for each in (self.patience, self.calm)]
+
+    @classmethod
+    def from_json(cls, values: Sequence[Sequence[Any] | None], seconds: float = CONTACT_PATIENCE_S) -> ContactGate:
+        """The gate that `to_json` wrote, with the patience of this release, s."""
+        patience, calm = (None if each is None else Patience(seconds, *each) for each in values)
+        return cls(patience or Patience(seconds), calm)
+
+    @property
+    def open(self) -> bool:
+        """Whether it stands back: contacts and what has changed cannot be told apart."""
+        return self.calm is not None
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether this has lasted too long for a contact."""
+        return self.patience.exhausted
+
+    @property
+    def began(self) -> float | None:
+        """Event time of the first of the rows that have been contacts for so long, s."""
+        return None if self.patience.last is None else self.patience.last - self.patience.elapsed
+
+    def step(self, time: Array, contact: Mask) -> ContactGate:
+        """Follow rows at event times (N,) that are contacts or not; a gate that stood back returns once they fit."""
+        if self.calm is None:
+            return ContactGate(self.patience.step(time, contact))
+        calm = self.calm.step(time, ~contact)
+        return ContactGate.start(calm.seconds) if calm.exhausted else ContactGate(self.patience, calm)
+
+    def stand_back(self) -> ContactGate:
+        """Let everything pass until most rows fit again for as long as the patience lasts."""
+        fresh = Patience(self.patience.seconds)
+        return ContactGate(fresh, fresh)
+
+
 def _check_shapes(t: Array | None, q: Array, dq: Array, ddq: Array | None, tau: Array, limits: RowLimits) -> None:
     if q.ndim != 2:
         raise ValueError(f"q has shape {q.shape}, expected (N, n)")
@@ -196,8 +253,8 @@ def _check_shapes(t: Array | None, q: Array, dq: Array, ddq: Array | None, tau: 
         raise ValueError(f"limits.torque has shape {limits.torque.shape}, expected {q.shape[1:]}, one limit a joint")
 
 
-def _time_jumps(t: Array, after: float | None, before: float | None, gap: float | None) -> Mask:
-    """Rows (N,) whose time is out of bounds or out of order, or the first beyond a step of more than `gap`."""
+def _time_jumps(t: Array, after: float | None, before: float | None) -> Mask:
+    """Rows (N,) whose time is out of bounds or out of order."""
     inside = np.isfinite(t)
     inside &= (t > (-np.inf if after is None else after)) & (t < (np.inf if before is None else before))
     kept = np.flatnonzero(inside)
@@ -205,10 +262,6 @@ def _time_jumps(t: Array, after: float | None, before: float | None, gap: float 
         kept = kept[_longest_increasing(t[kept].tolist())]
     jumps = np.ones(len(t), dtype=np.bool_)
     jumps[kept] = False
-    if gap is not None and len(kept):
-        earlier = np.append(t[kept[0]] if after is None else after, t[kept[:-1]])
-        # as a comparison of sums: a difference of damaged times may overflow
-        jumps[kept[t[kept] > earlier + gap]] = True
     return jumps
 
 

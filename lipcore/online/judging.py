@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -12,217 +12,225 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.online.batch import AHEAD_S, Rows
 from lipcore.online.changes.departure import Departure
-from lipcore.online.changes.detectors import RATIO, Change, ChangeDetector, friction_share
+from lipcore.online.changes.detectors import RATIO, Change
 from lipcore.online.changes.opening import Opening
-from lipcore.online.gates import Patience, is_contact
+from lipcore.online.gates import ContactGate, is_contact
+from lipcore.online.judgement import LoggedJudgement, ModelRecord
 from lipcore.online.record import Record
+from lipcore.online.scale import HeldIntervals, ScaleRecord
 from lipcore.online.screening import Screened, Trained
+from lipcore.online.stream import StreamRecord
 from lipcore.vocabulary import CODES, LEARNT
 
 CONTACT, CHANGE, PAYLOAD, PAUSED = (CODES.index(code) for code in ("contact", "change", "payload", "paused"))
-MOST_INNOVATIONS = 1000
-"""Rows whose innovations are kept to tell friction from a payload."""
+ACCEPTED = (LEARNT, CODES.index("stationary"), PAYLOAD)
+"""Codes of rows that are not kept out: the model, with the payload it knows of, is to explain them."""
 
 
 @dataclass(frozen=True)
 class JudgeOptions:
-    """What the owner of a model has set. enabled: whether rows are learnt; on_change: what follows from a change;
-    contact_threshold: standard deviations from which on a row is a contact."""
+    """What the owner of a model has set.
+
+    enabled: whether rows are learnt; on_change: what follows from a change; contact_threshold: standard deviations from
+    which on a row is a contact; adaptive_intervals: whether streams have a scale.
+    """
 
     enabled: bool = True
     on_change: Literal["hold", "adapt", "learn"] = "hold"
     contact_threshold: float = 8.0
+    adaptive_intervals: bool = True
 
 
 @dataclass(frozen=True)
-class ContactGate:
-    """Rejects rows far outside a stream's predictive interval for as long as that can be a contact; immutable.
+class Judgement:
+    """What becomes of a batch.
 
-    It stands back while a changed robot is learnt anew. patience: how long rows have been contacts. calm: how long they
-    have not, while the gate stands back; else None.
-    """
-
-    patience: Patience
-    calm: Patience | None = None
-
-    @classmethod
-    def start(cls, seconds: float) -> ContactGate:
-        """A gate that keeps contacts out for so long."""
-        return cls(Patience(seconds))
-
-    def to_json(self) -> list[list[Any] | None]:
-        """Its state as numbers and lists; `from_json` gives back the same gate to the last bit."""
-        return [None if each is None else list(astuple(each)[1:]) for each in (self.patience, self.calm)]
-
-    @classmethod
-    def from_json(cls, values: Sequence[Sequence[Any] | None], seconds: float) -> ContactGate:
-        """The gate that `to_json` wrote, with the patience that is set now, s."""
-        patience, calm = (None if each is None else Patience(seconds, *each) for each in values)
-        return cls(patience or Patience(seconds), calm)
-
-    @property
-    def open(self) -> bool:
-        """Whether it stands back: contacts and what has changed cannot be told apart."""
-        return self.calm is not None
-
-    @property
-    def exhausted(self) -> bool:
-        """Whether this has lasted too long for a contact."""
-        return self.patience.exhausted
-
-    @property
-    def began(self) -> float | None:
-        """Event time of the first of the rows that have been contacts for so long, s."""
-        return None if self.patience.last is None else self.patience.last - self.patience.elapsed
-
-    def step(self, time: Array, contact: NDArray[np.bool_]) -> ContactGate:
-        """Follow rows at event times (N,) that are contacts or not; a gate that stood back returns once they fit."""
-        if self.calm is None:
-            return ContactGate(self.patience.step(time, contact))
-        calm = self.calm.step(time, ~contact)
-        return ContactGate.start(calm.seconds) if calm.exhausted else ContactGate(self.patience, calm)
-
-    def stand_back(self) -> ContactGate:
-        """Let everything pass until most rows fit again for as long as the patience lasts."""
-        fresh = Patience(self.patience.seconds)
-        return ContactGate(fresh, fresh)
-
-
-@dataclass(frozen=True)
-class Innovations:
-    """The latest rows that were predicted: event time (N,) s, dq (N, n), error = tau − mean (N, n)."""
-
-    time: Array
-    dq: Array
-    error: Array
-
-    @staticmethod
-    def empty(n: int) -> Innovations:
-        """None yet, of n joints."""
-        return Innovations(np.empty(0), np.empty((0, n)), np.empty((0, n)))
-
-    def then(self, rows: Rows, mean: Array) -> Innovations:
-        """Those of more rows, and as many of the ones before as are kept."""
-        new = rows.time, rows.dq, rows.tau - mean
-        old = self.time, self.dq, self.error
-        return Innovations(*(np.concatenate(both)[-MOST_INNOVATIONS:] for both in zip(old, new, strict=True)))
-
-    def friction(self, since: float) -> Array:
-        """Share of friction in those from an event time on, (n,)."""
-        late = self.time >= since
-        return friction_share(self.dq[late], self.error[late])
-
-
-@dataclass(frozen=True)
-class Watch:
-    """State of judging after the rows before: the stream's gate, the model's detector, innovations and departure from
-    what it was trained on, and the stream's opening, None where that has been judged; immutable."""
-
-    gate: ContactGate
-    detector: ChangeDetector
-    innovations: Innovations
-    departure: Departure | None = None
-    opening: Opening | None = None
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """rows: with their final codes. record: of those that count for quality. watch: for the next rows.
-
-    surprise: mean of e²/s² of the same rows, (n,), with s less the floor of past errors, which would
-    hide a change from the detector.
-
-    change: detected with these rows; while learning waits already, how a stream began is all that is. held: whether
-    these rows had to wait for a decision. departed, opened: what shows the change where that is the distance from the
-    version as trained, or how the stream began.
+    rows: with their final codes. record: of those that count for quality, None without any. logged: what the log keeps
+    beside both. stream, model: what is known after the batch. change: detected with these rows; departed, opened: what
+    shows it, if that is the distance from the version as trained, or how the stream began.
     """
 
     rows: Rows
     record: Record | None
-    surprise: Array | None
-    watch: Watch
-    change: Change | None
-    held: bool
+    logged: LoggedJudgement
+    stream: StreamRecord
+    model: ModelRecord
+    change: Change | None = None
     departed: Departure | None = None
     opened: Opening | None = None
 
     def evidence(self, joint_names: Sequence[str]) -> dict[str, Any]:
         """Evidence of the change, for JSON."""
         assert self.change is not None
-        evidence = self.change.evidence(joint_names, self.watch.innovations.friction(self.change.at))
+        evidence = self.change.evidence(joint_names, self.model.innovations.friction(self.change.at))
         reason = self.departed or self.opened
         return evidence if reason is None else evidence | reason.evidence(joint_names)
 
 
+@dataclass(frozen=True)
+class Gated:
+    """The P rows that were predicted, after the gate of contacts. gate: after them; passing: whether contacts are let
+    through; counted: rows that count for quality, (P,)."""
+
+    rows: Rows
+    contact: NDArray[np.bool_]
+    gate: ContactGate
+    passing: bool
+    counted: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the rows of a batch say of the robot. model, opening: after them; surprise: mean of e²/s² of the rows that
+    count, (n,), with s less the floor of past errors, which would hide a change from the detector."""
+
+    model: ModelRecord
+    opening: Opening | None
+    record: Record | None = None
+    surprise: Array | None = None
+    change: Change | None = None
+    departed: Departure | None = None
+    opened: Opening | None = None
+
+
 def judge(
     batch: Screened,
-    watch: Watch,
-    held: bool,
+    stream: StreamRecord,
+    model: ModelRecord,
     options: JudgeOptions,
     usual: Callable[[], Record],
-    received: float = np.inf,
+    received: float,
     carried: float | None = None,
-    scale: Array | float = 1.0,
-) -> Verdict:
-    """Decide about the rows that were predicted. held: whether learning waits already; usual: the record of before;
-    received: when the rows came, Unix time, s; carried: event time, s, from which on the arm carries something, None
-    where it does not: such rows teach what it carries, and not the arm; scale: of the version's intervals, (n,)."""
+) -> Judgement:
+    """Decide about the rows of a batch that were predicted.
+
+    stream, model: what is known before it. usual: returns the record of the time before. received: when the rows came,
+    Unix time, s. carried: event time, s, from which on the arm carries something, None if it does not: such rows teach
+    what it carries, and not the arm.
+    """
+    gated = gate_rows(batch, stream.gate, model.held, options)
+    found = find_change(batch, gated, stream, model, usual, received, carried)
+    opened_in_vain = found.opened is not None and options.on_change == "learn"
+    followed = found.change is not None and not model.held and not opened_in_vain
+    held = model.held or (found.change is not None and options.on_change == "hold")
+    gate, departure = gated.gate, found.model.departure
+    if followed and not held:
+        if found.departed is None:
+            gate = gate.stand_back()  # after a departure it does not, as what is learnt is followed too well
+        departure = departure and departure.decided()
+    rows = _coded(batch, gated, gate, held, options, carried)
+    doubted = held and (found.opened is not None or stream.doubted)
+    scale, answered = _scaled(batch, rows, stream.scale, options)
+    logged = LoggedJudgement(
+        held=held,
+        waited=model.held,
+        open=gate.open,
+        doubted=doubted,
+        aside=held or not options.enabled,
+        until=None if batch.until is None else min(batch.until, received + AHEAD_S),
+        departure=departure,
+        surprise=found.surprise,
+        answered=answered,
+        accepted_scale=None if scale is None else scale.accepted,
+    )
+    return Judgement(
+        rows,
+        found.record,
+        logged,
+        replace(stream, gate=gate, opening=found.opening, doubted=doubted, scale=scale, received=received),
+        found.model.settled(logged),
+        found.change,
+        found.departed,
+        found.opened,
+    )
+
+
+def gate_rows(batch: Screened, gate: ContactGate, waiting: bool, options: JudgeOptions) -> Gated:
+    """Tell contacts from rows that fit. waiting: whether learning waits for a decision, and the gate with it."""
     rows = batch.rows.take(batch.predicted)
-    if not len(rows):
-        return Verdict(batch.rows, None, None, watch, None, held)
     contact = is_contact(rows.tau, batch.mean, batch.std, batch.noise_std, options.contact_threshold)
-    gate = watch.gate if held else watch.gate.step(rows.time, contact)
-    passing = held or watch.gate.open or gate.exhausted
-    counted = np.ones(len(rows), np.bool_) if passing else ~contact
-    detector, change, record, surprise = watch.detector, None, None, None
-    departure, departed = watch.departure, None
-    opening, opened, waiting = watch.opening, None, held
+    after = gate if waiting else gate.step(rows.time, contact)
+    passing = waiting or gate.open or after.exhausted
+    return Gated(rows, contact, after, passing, np.ones(len(rows), np.bool_) if passing else ~contact)
+
+
+def find_change(
+    batch: Screened,
+    gated: Gated,
+    stream: StreamRecord,
+    model: ModelRecord,
+    usual: Callable[[], Record],
+    received: float,
+    carried: float | None,
+) -> Found:
+    """Look for a change of the robot: by how the stream began, by contacts without end, by errors that have grown, by
+    the distance from the version as trained, in this order."""
+    rows, counted, opening = gated.rows, gated.counted, stream.opening
+    if not len(rows):
+        return Found(model, opening)
+    opened: Opening | None = None
     if opening is not None:
-        opening = _begun(opening, batch, rows, carried, scale)
+        opening = _begun(opening, batch, rows, carried)
         opened, opening = (opening if opening.misfit else None), (None if opening.over else opening)
+    record, surprise, change, departed, following = None, None, None, None, model
+    known = model.held or stream.gate.open  # a change is known of: what follows from it is none of its own
     if counted.any():
         error, bare = (rows.tau - batch.mean)[counted], batch.bare[counted]
         answered = batch.answered or batch
         record = Record.of(rows.tau[counted], answered.mean[counted], answered.std[counted], batch.noise_std)
         surprise = (error**2 / (bare**2 + batch.noise_std**2)).mean(axis=0)
-        at = min(float(rows.time.max()), received + AHEAD_S)  # one stream's clock is not that of all
-        detector, change = detector.step(replace(record, standardised=surprise), at)
-        if not held and not watch.gate.open and batch.trained is not None:
-            departure = _followed(departure, batch.trained, rows, counted, batch.noise_std)
-    if opened is not None and opened.since is not None and not watch.gate.open:
+        following, change = model.step(record, surprise, min(float(rows.time.max()), received + AHEAD_S))
+        if not known and batch.trained is not None:
+            compared = _compared(model.departure, batch, batch.trained, rows, counted)
+            following = replace(following, departure=compared)
+    departure = following.departure
+    if opened is not None and opened.since is not None and not stream.gate.open:
         change = Change(opened.since, opened.joints, usual(), _everything(batch, rows), "sudden")
-    elif held or watch.gate.open:
-        change = None  # the consequence of a change that is known
-    elif change is None and gate.exhausted:
-        change = _lasting(gate, _everything(batch, rows), usual(), rows)
+    elif known:
+        change = None
+    elif change is None and gated.gate.exhausted:
+        change = _lasting(gated.gate, _everything(batch, rows), usual(), rows)
     elif change is None and departure is not None and departure.joints:
         departed = departure
         change = Change(departure.began, departure.joints, usual(), _everything(batch, rows), "departure")
-    followed = change is not None and not waiting and not (opened is not None and options.on_change == "learn")
-    if change is not None and options.on_change == "hold":
-        held = True
-    elif followed and departed is None:
-        gate = gate.stand_back()  # after a departure it does not, as what is learnt is followed too well
-    if departure is not None and followed and not held:
-        departure = departure.decided()
-    if not held and not gate.open:
-        detector = detector.acknowledged()
-    codes = batch.rows.code.copy()
-    learnt = np.where(contact & (not (passing or gate.open)), CONTACT, LEARNT)
+    following = replace(following, innovations=model.innovations.then(rows, batch.mean))
+    return Found(following, opening, record, surprise, change, departed, opened if change is not None else None)
+
+
+def _coded(
+    batch: Screened, gated: Gated, gate: ContactGate, held: bool, options: JudgeOptions, carried: float | None
+) -> Rows:
+    """The rows of a batch with their final codes. gate: once a change was decided about."""
+    learnt = np.where(gated.contact & (not (gated.passing or gate.open)), CONTACT, LEARNT)
     if carried is not None:
-        learnt = np.where((learnt == LEARNT) & (rows.time >= carried), PAYLOAD, learnt)
+        learnt = np.where((learnt == LEARNT) & (gated.rows.time >= carried), PAYLOAD, learnt)
     if not options.enabled:
         learnt = np.where(learnt == LEARNT, PAUSED, learnt)
+    codes = batch.rows.code.copy()
     codes[batch.predicted] = CHANGE if held else learnt
-    judged = replace(batch.rows, code=codes)
-    following = Watch(gate, detector, watch.innovations.then(rows, batch.mean), departure, opening)
-    return Verdict(judged, record, surprise, following, change, held, departed, opened if change is not None else None)
+    return replace(batch.rows, code=codes)
 
 
-def _begun(opening: Opening, batch: Screened, rows: Rows, carried: float | None, scale: Array | float) -> Opening:
+def _scaled(
+    batch: Screened, rows: Rows, known: ScaleRecord | None, options: JudgeOptions
+) -> tuple[ScaleRecord | None, HeldIntervals | None]:
+    """The scale of a stream's intervals after a batch, and what its intervals held; None if they do not adapt. Another
+    version begins anew, from its own scale."""
+    if not options.adaptive_intervals or batch.seen is None:
+        return None, None
+    if known is None or known.version != batch.version:
+        known = ScaleRecord.start(batch.scale, batch.version)
+    held = HeldIntervals.of(known.state, batch.seen)
+    # other errors were of the arm without what it carries, or with what it no longer does
+    if batch.answered is None:
+        known = known.step(batch.seen, np.isin(rows.code[batch.asked], ACCEPTED))
+    return known, held
+
+
+def _begun(opening: Opening, batch: Screened, rows: Rows, carried: float | None) -> Opening:
     """A stream's opening after rows; those that carry what was noticed with them were predicted without it."""
     own = np.full(len(rows), True) if carried is None or batch.trained is None else rows.time < carried
-    spread = scale * np.sqrt(batch.bare**2 + batch.noise_std**2)
+    spread = batch.scale * np.sqrt(batch.bare**2 + batch.noise_std**2)
     return opening.step(rows.time[own], rows.weight[own], (rows.tau - batch.mean)[own], spread[own])
 
 
@@ -231,16 +239,16 @@ def _everything(batch: Screened, rows: Rows) -> Record:
     return Record.of(rows.tau, batch.mean, batch.std, batch.noise_std)
 
 
-def _followed(
-    before: Departure | None, trained: Trained, rows: Rows, counted: NDArray[np.bool_], noise_std: Array
+def _compared(
+    before: Departure | None, batch: Screened, trained: Trained, rows: Rows, counted: NDArray[np.bool_]
 ) -> Departure:
     """The departure from a version as trained after rows, (P,), those of them that count: (P,)."""
-    if before is None or before.version != trained.version:
-        before = Departure.start(trained.version, rows.tau.shape[1])
+    if before is None or before.version != batch.version:
+        before = Departure.start(batch.version, rows.tau.shape[1])
     kept = counted[trained.rows]
     compared = rows.take(trained.rows[kept])
     error, std = compared.tau - trained.mean[kept], trained.std[kept]
-    return before.step(compared.time, trained.share * compared.weight, error, std, noise_std)
+    return before.step(compared.time, trained.share * compared.weight, error, std, batch.noise_std)
 
 
 def _lasting(gate: ContactGate, record: Record, usual: Record, rows: Rows) -> Change:

@@ -42,7 +42,6 @@ class Trained:
     rows: (M,), their places among these; share: rows that each stands for; mean, std: (M, n).
     """
 
-    version: int
     rows: NDArray[np.int64]
     share: float
     mean: Array
@@ -83,12 +82,13 @@ class Answered:
 
 @dataclass(frozen=True)
 class Screened:
-    """Rows, and the predictions of the model that serves for those that passed so far.
+    """Rows, and the predictions of the version that serves for those that passed so far.
 
     own: which of the rows are of this batch, the others had waited for it. asked: (N,), rows with a finite answer, at
     rest or not; predicted: (N,); mean, std, bare: (P, n) of these, bare the standard deviation without the floor that
-    past errors put under `std`. noise_std: (n,). trained: see there; None where nothing is compared with it. seen: what
-    intervals are judged by. answered: of the P rows, where that was with another load.
+    past errors put under `std`. noise_std: (n,). version: its number; scale: of its intervals as trained, (n,).
+    trained: see there; None where nothing is compared with it. seen: what intervals are judged by. answered: of the P
+    rows, where that was with another load.
     """
 
     rows: Rows
@@ -99,6 +99,8 @@ class Screened:
     std: Array
     bare: Array
     noise_std: Array
+    version: int
+    scale: Array
     trained: Trained | None = None
     seen: Seen | None = None
     answered: Answered | None = None
@@ -156,6 +158,8 @@ def predict(
         std,
         bare,
         model.noise_std,
+        version.version,
+        version.base.scale,
         None if carrying is not None else _as_trained(good.take(judged), version, mean, bare),
         seen,
         given.take(judged) if given.other_load else None,
@@ -167,7 +171,7 @@ def _as_trained(rows: Rows, version: Version, mean: Array, bare: Array) -> Train
     compared = evenly(rows.weight)
     same = version.model is version.base
     answers = (mean[compared], bare[compared]) if same else _answers(rows.take(compared), version.base)
-    return Trained(version.version, compared, len(rows) / max(1, len(compared)), *answers)
+    return Trained(compared, len(rows) / max(1, len(compared)), *answers)
 
 
 def evenly(weight: Array) -> NDArray[np.int64]:

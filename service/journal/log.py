@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -118,12 +118,15 @@ class NewBatch:
     version: int
     revision: int
     rows: Rows
-    report: dict[str, Any]
-    record: dict[str, Any] | None
+    report: dict[str, Any] = field(default_factory=dict)
+    record: dict[str, Any] | None = None
 
 
-def append_batch(session: Session, model: str, batch: NewBatch, most_streams: int | None = None) -> EventRow:
-    """Log a batch and what its stream still misses; return its event, which is written with the session's next flush.
+def append_batch(
+    session: Session, model: str, batch: NewBatch, most_streams: int | None = None
+) -> tuple[EventRow, StreamRow]:
+    """Log a batch and what its stream still misses; return its event, which is written with the session's next flush,
+    and the row of its stream.
 
     Raise ConflictError where the stream is of another kind, where frames do not go on after the last, or where the
     batch may have been learnt before and is no longer kept; BusyError beyond `most_streams` streams in use. That
@@ -131,8 +134,8 @@ def append_batch(session: Session, model: str, batch: NewBatch, most_streams: in
     """
     names = ("stream_id", "sequence", "last_sequence", "digest", "version", "revision", "report", "record")
     event = EventRow(number=newest(session, model) + 1, **{name: getattr(batch, name) for name in names})
-    _note_arrival(session, model, batch, most_streams)
-    return _append(session, event, model, "batch", batch.received, batch.rows)
+    source = _note_arrival(session, model, batch, most_streams)
+    return _append(session, event, model, "batch", batch.received, batch.rows), source
 
 
 def append(
@@ -308,8 +311,8 @@ def _append(
     return event
 
 
-def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: int | None) -> None:
-    """Note in the row of a stream which sequences are there; a new row for a new stream."""
+def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: int | None) -> StreamRow:
+    """Note in the row of a stream which sequences are there, and return it; a new row for a new stream."""
     source = stream(session, model, batch.stream_id)
     if source is None:
         _check_new(session, model, batch)
@@ -324,6 +327,7 @@ def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: i
         gaps = Gaps.from_json(source.missing, source.last).arrived(batch.sequence, batch.last_sequence)
     source.offset = source.offset or batch.offset
     source.last, source.missing, source.received = gaps.last, gaps.to_json(), batch.received
+    return source
 
 
 def _check_new(session: Session, model: str, batch: NewBatch) -> None:

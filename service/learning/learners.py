@@ -20,9 +20,10 @@ from service.contract.observations import ObservationRequest, ObservationRespons
 from service.contract.states import PartState
 from service.foundation.errors import BusyError
 from service.journal import log
-from service.learning.ingest.batches import Frames, FramesResult, observe_batch, observe_frames
-from service.learning.ingest.intake import Intake
+from service.learning.ingest.append import ObservationLog
+from service.learning.ingest.frames import Frames, FramesResult, observe_frames
 from service.learning.ingest.monitor import Monitor
+from service.learning.ingest.observations import observe_batch
 from service.learning.learner import publication
 from service.learning.learner.process import LearnerProcess
 from service.learning.learner.publication import Failed, Message, Published
@@ -137,9 +138,8 @@ class Learners:
         loaded.learn_from(self.process.wake)
         loaded.when_deleted.append(self.forget)
         self.live = Feed()
-        self._intake = Intake(loaded, self._monitor, self.monitors, self.process.wake, self.live.note)
-        self._intake.check_clock_at_start()
-        self.weighing = self._intake.weighing
+        self._log = ObservationLog(loaded, self._monitor, self.monitors, self.process.wake, self.live.note)
+        self.weighing = self._log.weighing
 
     def close(self) -> None:
         """Finish the batches that have begun, and end the processes; the learner stores its state."""
@@ -148,30 +148,30 @@ class Learners:
         self.process.close()
 
     def observe(self, model: str, request: ObservationRequest) -> ObservationResponse:
-        """Take a batch of observations; see `batches.observe_batch`. Not for the event loop."""
-        return observe_batch(self._intake, model, request)
+        """Take a batch of observations; see `observations.observe_batch`. Not for the event loop."""
+        return observe_batch(self._log, model, request)
 
     def observe_frames(self, frames: Frames) -> FramesResult:
         """Take frames of a stream; see `frames.observe_frames`. Not for the event loop."""
-        return observe_frames(self._intake, frames)
+        return observe_frames(self._log, frames)
 
     def monitor(self, model: str) -> Monitor:
         """The monitor of a model, up to the batches that other services have logged by now. Not for the event loop.
         Raise NotFoundError or UnreadableVersionError."""
         monitor = self._monitor(self.loaded.get(model, None))
-        self._intake.follow(monitor, model)
+        self._log.follow(monitor, model)
         return monitor
 
     def turn(self, model: str) -> AbstractContextManager[None]:
-        """See `Intake.turn`; raise as `monitor` does. Not for the event loop."""
-        return self._intake.turn(self._monitor(self.loaded.get(model, None)), model)
+        """See `ObservationLog.turn`; raise as `monitor` does. Not for the event loop."""
+        return self._log.turn(self._monitor(self.loaded.get(model, None)), model)
 
     def follow(self, models: Collection[str] | None = None) -> None:
         """Bring the monitors of these models up to the batches that other services have logged, of all that there are
         where None. Not for the event loop."""
         if models is None:
             for model, monitor in self.monitors().items():
-                self._intake.follow(monitor, model)
+                self._log.follow(monitor, model)
         else:
             for model in models:
                 self.monitor(model)
@@ -190,7 +190,7 @@ class Learners:
         for model in learning:
             if (served := self.loaded.peek(model)) is not None:
                 fresh[model] = self._monitor(served)
-                self._intake.follow(fresh[model], model)
+                self._log.follow(fresh[model], model)
         return dict(sorted((self.monitors() | fresh).items()))
 
     def forget(self, model: str) -> None:

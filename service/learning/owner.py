@@ -60,7 +60,7 @@ def held(session: Session, model: str) -> dict[str, Any] | None:
 
 
 def declare(session: Session, model: str, payload: dict[str, Any]) -> None:
-    """Keep what was declared of the payload of all streams, see `streams.PayloadRecord`."""
+    """Keep what was declared of the payload of all streams, see `lipcore.online.stream.PayloadRecord`."""
     _row(session, model).payload = payload
 
 

@@ -17,9 +17,10 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
 from lipcore.online.payload.estimate import Estimate
 from lipcore.online.payload.holding import Watch
+from lipcore.online.stream import PayloadRecord
 from lipcore.vocabulary import CODES, LEARNT
 from service.journal import log
-from service.learning.streams import PayloadRecord, Streams
+from service.learning.streams import Streams
 from service.models.loads import Carried
 from service.storage.database import EventRow
 

@@ -53,7 +53,7 @@ def test_honest_motion_of_a_panda_is_learnt_and_saturated_torque_is_not(panda: R
     samples = simulate(panda, Stream(n_samples=500, rate=50, speed=5, noise=0.05), seed=0)
     q, dq, ddq, tau = samples.q, samples.dq, samples.ddq, samples.tau
     for t, second in ((samples.t, ddq), (None, ddq), (samples.t, None)):
-        codes = check_rows(t, q, dq, second, tau, replace(LIMITS, torque=PANDA_TORQUE), derived=True)
+        codes = check_rows(t, q, dq, second, tau, replace(LIMITS, torque=PANDA_TORQUE))
         assert codes.dtype == np.uint8
         assert set(names(codes)) == {"learnt"}
     # a weaker drive than the motion needs
@@ -114,13 +114,9 @@ def test_times_outside_their_bounds_are_rejected() -> None:
     assert jumps([4.0, 5.0, 1e12], before=60.0) == [2]  # a leap into the future
 
 
-def test_gap_costs_the_row_beyond_it_only_where_accelerations_are_derived() -> None:
-    t = [1.0, 1.1, 1.2, 5.0, 5.1]
-    assert jumps(t) == []
-    assert jumps(t, derived=True) == [3]
-    assert jumps(t, derived=True, after=-3.0) == [0, 3]
-    assert jumps(t, replace(LIMITS, max_gap_s=None), derived=True, after=-3.0) == []
-    assert jumps([-1e308, 1e308], derived=True) == [1]
+def test_a_pause_costs_no_row() -> None:
+    assert jumps([1.0, 1.1, 1.2, 5.0, 5.1]) == []
+    assert jumps([-1e308, 1e308]) == []
 
 
 def after_each(batches: list[list[float]]) -> list[list[int]]:

@@ -17,7 +17,7 @@ from service.api.limits.requests import ClientPatience
 from service.api.stream.session import Session
 from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
-from service.learning.ingest.batches import FramesResult
+from service.learning.ingest.frames import FramesResult
 from service.telemetry.meters import Meters
 from tests.service.data import DEADLINE
 from tests.service.streams import ASK_EXTERNAL, ERROR, EXTERNAL, MOTION, STD, TAU, frame, read

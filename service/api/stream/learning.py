@@ -17,8 +17,8 @@ import numpy as np
 from lipcore.data.samples import Array
 from service.contract.frames import NUMBER, REQUEST
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
-from service.learning.ingest.batches import Frames
-from service.learning.ingest.host_clock import SET_S
+from service.learning.ingest.clock import SET_S
+from service.learning.ingest.frames import Frames
 from service.learning.learners import Learners
 from service.models.loaded import Served
 from service.storage.errors import translated

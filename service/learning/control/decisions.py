@@ -23,7 +23,7 @@ from service.journal import log, undo
 from service.journal.alarms import page as alarms_page
 from service.learning import owner
 from service.learning.control import status
-from service.learning.ingest.batches import state
+from service.learning.ingest.observations import state
 from service.learning.learners import Learners
 from service.models import registry
 from service.storage import audit

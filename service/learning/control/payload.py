@@ -15,6 +15,7 @@ from lipcore.model.payload import Carrier
 from lipcore.online.payload.bodies import BELOW, DIAGONAL
 from lipcore.online.payload.estimate import Estimate
 from lipcore.online.payload.holding import Watch
+from lipcore.online.stream import PayloadRecord
 from lipcore.robots.urdf import RigidBody
 from service.contract.payload import (
     LivePayload,
@@ -31,7 +32,6 @@ from service.journal import log
 from service.learning import owner
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
-from service.learning.streams import PayloadRecord
 from service.models.served import Served
 from service.storage import audit
 

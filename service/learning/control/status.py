@@ -19,8 +19,8 @@ from service.foundation.errors import NotFoundError, not_found
 from service.foundation.fields import finite
 from service.journal import log, snapshots
 from service.learning import owner
-from service.learning.ingest.batches import state
 from service.learning.ingest.monitor import Window
+from service.learning.ingest.observations import state
 from service.learning.learners import Learners
 from service.models import registry
 from service.storage.database import EventRow, StreamRow

@@ -14,24 +14,20 @@ import numpy as np
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
-from lipcore.data.samples import Array
-from lipcore.online.changes.departure import Departure
-from lipcore.online.changes.detectors import ChangeDetector
-from lipcore.online.changes.opening import Opening
-from lipcore.online.judging import Innovations, Watch
+from lipcore.online.judgement import Innovations, LoggedJudgement, ModelRecord
+from lipcore.online.judging import Judgement
 from lipcore.online.record import Record
+from lipcore.online.scale import HeldIntervals
+from lipcore.online.stream import StreamRecord
 from lipcore.vocabulary import CODES, LEARNT
 from service.journal import log
-from service.learning import intervals
-from service.learning.intervals import HeldIntervals, ScaleRecord
+from service.learning import owner
 from service.learning.payloads import Payloads
 from service.learning.streams import Streams
 from service.storage.database import EventRow
 
 WINDOWS_S = (60.0, 600.0, 3600.0)
 """Windows of the prequential quality, s."""
-CONTACT_PATIENCE_S = 2.0
-"""How long torques may be far off before it is no contact but a change of the robot, s."""
 PARTS = 60
 """Buckets of a window: its length is true to a sixtieth."""
 MOST_EVENTS = 3000
@@ -96,18 +92,15 @@ class Window:
 
 
 class Monitor:
-    """One model's windows of quality, the records of its streams, and its detector of changes.
+    """One model's windows of quality, and what judging knows of it and of its streams.
 
-    joint_names: in whose order records are. streams: what is known of each; payloads: what they carry, as versions see
-    it; payload_alarm_at: when an alarm was last raised of one, Unix time, s. lock: held while a batch is judged and
-    logged, one at a time; whoever only reads needs none. counts: rows by code and "learnt", "batches" and "duplicates",
-    since the start and that this service has taken. held: whether learning waited for a decision at the last batch.
-    number: of the last event that was taken in.
+    joint_names: in whose order records are. record: of the model; streams: of each stream; payloads: what they carry,
+    as versions see it; payload_alarm_at: when an alarm was last raised of one, Unix time, s. lock: held while a batch
+    is judged and logged, one at a time; whoever only reads needs none. counts: rows by code and "learnt", "batches" and
+    "duplicates", since the start and that this service has taken. number: of the last event that was taken in.
 
-    Several services take batches of one model in turn, and each follows the log before it judges: streams, detector and
-    windows are then the same to the last bit as if one service had taken all, from the first batch on that all of them
-    know. Innovations are those of this service's own batches, because the log has no predictions: friction is told from
-    a payload on fewer rows then.
+    Several services take batches of one model in turn, and each follows the log before it judges: records and windows
+    are then the same to the last bit as if one service had taken all, from the first batch on that all of them know.
     """
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
@@ -115,11 +108,9 @@ class Monitor:
         n = len(joint_names)
         self.windows = tuple(Window(seconds, n) for seconds in WINDOWS_S)
         self.counts: Counter[str] = Counter()
-        self.held, self.number = False, 0
-        self._since_due = 0
-        self._detector, self._innovations = ChangeDetector(), Innovations.empty(n)
-        self._departure: Departure | None = None
-        self.streams = Streams(CONTACT_PATIENCE_S)
+        self.number, self._since_due = 0, 0
+        self.record = ModelRecord(Innovations.empty(n))
+        self.streams = Streams()
         self.payloads = Payloads(self.streams)
         self.payload_alarm_at = -np.inf
 
@@ -137,45 +128,54 @@ class Monitor:
             made._remember(event, now - DETECTOR_S < event.received <= now)
         return made
 
-    def follow(self, session: Session, model: str) -> None:
-        """Take in what other services have logged since `number`; `lock` is held."""
-        decided, streams = False, set[str]()
-        since = EventRow.model == model, EventRow.kind.in_(("payload", "rollback")), EventRow.number > self.number
-        others = session.execute(select(EventRow.stream_id, EventRow.number, EventRow.kind).where(*since)).all()
-        for event in _batches(session, model, EventRow.number > self.number):
-            held = self.held
-            self._remember(event, True)
-            decided |= held and not (event.report or {})["waited"]
-            self.number = event.number
+    def follow(self, session: Session, model: str) -> bool:
+        """Take in what others have logged since `number`, and return whether that is anything; `lock` is held."""
+        newest = log.newest(session, model)
+        if newest == self.number:
+            return False
+        later = EventRow.number > self.number, EventRow.number <= newest
+        kinds = EventRow.kind.in_(("payload", "rollback"))
+        others = session.execute(
+            select(EventRow.stream_id, EventRow.kind).where(EventRow.model == model, kinds, *later)
+        )
+        said = [(stream_id or "", kind) for stream_id, kind in others]
+        streams, decided = {stream_id for stream_id, _ in said}, any(kind == "rollback" for _, kind in said)
+        for event in _batches(session, model, *later):
+            held = self.record.held
+            logged = self._remember(event, True)
+            decided |= held and logged is not None and not logged.waited
             streams.add(event.stream_id or "")
-        for stream_id, number, kind in others:
-            self.number = max(self.number, number)
-            streams.add(stream_id or "")
-            decided |= kind == "rollback"
         if streams:  # a decision, and a rollback, is in the records of all
             self.streams.read(session, model, None if decided else streams)
+        self.number = newest
+        return True
 
-    def watch(self, stream_id: str, new: bool = False) -> Watch:
-        """State of judging before the next rows of a stream. new: whether none of its rows is known."""
-        known = self.streams.get(stream_id)
-        opening = Opening.start(len(self.joint_names)) if new else known.opening
-        return Watch(known.gate, self._detector, self._innovations, self._departure, opening)
+    def follow_decision(self, session: Session, model: str) -> None:
+        """Judge streams anew if the owner has ended a hold; `lock` is held."""
+        held = owner.held(session, model) is not None
+        if self.record.held and not held:
+            self.record = self.record.decided()
+            self.streams.change_all(session, model, StreamRecord.decided)
+        elif held and not self.record.held:
+            self.record = replace(self.record, held=True)
 
-    def scale(self, stream_id: str, version: int, own: Array) -> ScaleRecord:
-        """The scale of a stream's intervals before its next rows, which a version predicts: another one begins anew,
-        from its `own`, (n,)."""
-        known = self.streams.get(stream_id).scale
-        return ScaleRecord.start(own, version) if known is None or known.version != version else known
+    def stream(self, session: Session, model: str, stream_id: str) -> StreamRecord:
+        """The record of a stream before its next batch, that of a new one if the database has none; `lock` is held."""
+        if log.stream(session, model, stream_id) is not None:
+            return self.streams.get(stream_id)
+        self.streams.forget(stream_id)  # one of this name that has made room for others
+        return StreamRecord.start(len(self.joint_names))
 
     def usual(self, now: float) -> Record:
         """Record of the shortest window before a Unix time, s."""
         return min(self.windows, key=lambda window: window.seconds).record(now)
 
-    def note(self, event: EventRow, innovations: Innovations) -> None:
-        """Take in a batch that this service has logged; `lock` is held. innovations: those up to it."""
-        self._remember(event, True)
-        self.number, self._innovations = event.number, innovations
-        self.counts.update({"batches": 1, **_counts(event.report or {})})
+    def note(self, event: EventRow, judgement: Judgement) -> None:
+        """Take in a batch that this service has judged and logged; `lock` is held."""
+        counts = _counts(event.report or {})
+        self._count(event, judgement.record, counts, judgement.logged)
+        self.number, self.record = event.number, judgement.model
+        self.counts.update({"batches": 1, **counts})
         self._since_due += 1
 
     def due(self, batches: int) -> bool:
@@ -191,35 +191,25 @@ class Monitor:
         for window in self.windows:
             window.set_clock(step)
         self.streams.set_clock(step)
-        self._detector = self._detector.moved(step)
+        self.record = self.record.moved(step)
 
-    def decided(self) -> None:
-        """Learning goes on after it was held; `lock` is held."""
-        self.held = False
-        self._departure = self._departure and self._departure.decided()
-
-    def _remember(self, event: EventRow, recent: bool) -> None:
-        """Take in a batch as it was judged when it was logged. recent: whether the detector still looks back to it."""
-        report = event.report or {}
+    def _remember(self, event: EventRow, recent: bool) -> LoggedJudgement | None:
+        """Take in a batch as it was judged when it was logged; None if it has other joints. recent: whether the
+        detector still looks back to it."""
         record = None if event.record is None else Record.from_json(event.record)
         if record is not None and record.n_joints != len(self.joint_names):
-            return
-        held = intervals.held(report)
+            return None
+        report = event.report or {}
+        logged = LoggedJudgement.from_json(report)
+        self._count(event, record, _counts(report), logged)
+        self.record = self.record.follow(logged, record, recent)
+        return logged
+
+    def _count(
+        self, event: EventRow, record: Record | None, counts: Mapping[str, int], logged: LoggedJudgement
+    ) -> None:
         for window in self.windows:
-            window.add(record, _counts(report), event.received, held)
-        if self.held and not report["waited"]:
-            self.decided()
-        self.held, waits = report["held"], report["held"] or report["open"]
-        departure = report["departure"]
-        self._departure = None if departure is None else Departure.from_json(departure)
-        at = report["until"]
-        if at is None or not recent:
-            return
-        if record is not None:
-            judged = replace(record, standardised=np.array(report["surprise"], np.float64))
-            self._detector, _ = self._detector.step(judged, at)
-        if not waits:
-            self._detector = self._detector.acknowledged()
+            window.add(record, counts, event.received, logged.answered)
 
 
 def _batches(

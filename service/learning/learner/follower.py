@@ -136,14 +136,13 @@ class Follower:
     def store_in_turn(self) -> None:
         """Store the state, unless another service has stored what this version has learnt since it was due last. The
         first one does it for all: they learn the same."""
-        if self.database.shared:
-            with self.database.session() as session:
-                last = snapshots.last_stored(session, self.model, self.version)
-            since = None if last is None or last[0] == self._snapshot else time.time() - last[1]
-            # one from the future shows that clocks differ, or that one was set back: it says nothing of when
-            if since is not None and 0 <= since < self.snapshot_every_s:
-                self._stored_at = time.monotonic()
-                return
+        with self.database.session() as session:
+            last = snapshots.last_stored(session, self.model, self.version)
+        since = None if last is None or last[0] == self._snapshot else time.time() - last[1]
+        # one from the future shows that clocks differ, or that one was set back: it says nothing of when
+        if since is not None and 0 <= since < self.snapshot_every_s:
+            self._stored_at = time.monotonic()
+            return
         self.store()
 
     def store(self) -> None:
@@ -174,9 +173,7 @@ class Follower:
         self._stored = self.number
 
     def _is_stored(self) -> bool:
-        """Whether another service has stored this state or a later one; a single one knows what it has stored."""
-        if not self.database.shared:
-            return False
+        """Whether this state or a later one is stored."""
         with self.database.session() as session:
             row = snapshots.latest(session, self.model, self.version, None)
         return row is not None and row.number >= self.number

@@ -19,13 +19,13 @@ from anyio import to_thread
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
+from lipcore.online.acceleration import EDGE
 from lipcore.online.batch import Rows
 from lipcore.online.learner import uncovered
 from lipcore.vocabulary import CODES, LEARNT
 from service.contract.learning import DECIMALS, LiveLost, LiveNovelty, LivePart, LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
-from service.learning.ingest.deriving import EDGE
-from service.learning.ingest.intake import Judged
+from service.learning.ingest.append import Judged
 from service.models.loaded import Served
 from service.runtime.counted import Counted
 

@@ -13,12 +13,12 @@ from sqlalchemy import select
 
 from lipcore.online.payload.holding import Watch
 from lipcore.online.screening import Screened
+from lipcore.online.stream import PayloadRecord
 from service.foundation.errors import ServiceError
 from service.journal import log, undo
 from service.journal.alarms import raise_alarm
 from service.journal.log import NewBatch
 from service.learning.ingest.monitor import Monitor
-from service.learning.streams import PayloadRecord
 from service.learning.weigher.messages import MOST_STREAMS, Asked, Message, Revised, Stream, Unweighed, Weighed
 from service.learning.weigher.process import MOST_WAITING, WeigherProcess
 from service.models.loaded import LoadedModels, Served
@@ -34,7 +34,7 @@ a machine that is too slow is told of as often."""
 class Weighing:
     """Follows what the streams of all models carry; safe from several threads.
 
-    process: the weigher process. monitor, turn: see `Intake`.
+    process: the weigher process. monitor, turn: see `ObservationLog`.
     """
 
     def __init__(

@@ -231,6 +231,11 @@ class Database:
         """Whether other services may write to it too."""
         return self.adapter.shared
 
+    @property
+    def own_clock(self) -> bool:
+        """Whether this machine's clock alone dates what is stored."""
+        return not self.shared
+
     @contextmanager
     def session(self) -> Iterator[Session]:
         """Session for reading: every statement sees what was committed before it."""

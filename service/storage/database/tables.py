@@ -203,7 +203,7 @@ class LearnerRow(Base):
 
 class LearningRow(Base):
     """How a model learns, as its owner has set it, whether it holds still after a change, and the payload that was
-    declared for all of its streams (see `service.learning.streams.PayloadRecord`)."""
+    declared for all of its streams (see `lipcore.online.stream.PayloadRecord`)."""
 
     __tablename__ = "learning"
 
@@ -218,7 +218,7 @@ class StreamRow(Base):
 
     kind: "batches" or "frames"; last: highest sequence seen; missing: ranges [first, last] of sequences below it that
     have not come; forgotten: highest sequence whose batch is no longer kept, so that it cannot be known again;
-    received: when the last one came, Unix time, s; record: see `service.learning.streams.StreamRecord`; both are None
+    received: when the last one came, Unix time, s; record: see `lipcore.online.stream.StreamRecord`; both are None
     for what an earlier release has written.
     """
 

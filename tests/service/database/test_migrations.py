@@ -11,7 +11,7 @@ from alembic.migration import MigrationContext
 from alembic.script import ScriptDirectory
 from sqlalchemy import inspect, select
 
-from lipcore.online.judging import ContactGate
+from lipcore.online.gates import ContactGate
 from service.learning.streams import Streams
 from service.storage.database import Base, Database, LearnerRow, ServingRow, migrations
 from service.storage.database.migrations import HEAD, DatabaseVersionError

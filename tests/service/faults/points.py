@@ -83,7 +83,7 @@ JOBS = [
     *_around_commit("job cancelled while it runs", actions.Cancel, "service.training.jobs:cancel"),
 ]
 POINTED = "service.models.loaded:LoadedModels.point"
-APPEND = "service.learning.ingest.intake:Intake.append"
+APPEND = "service.learning.ingest.append:ObservationLog.append"
 STORE = "service.journal.snapshots:save"
 LEARNING = [
     Point("observation: row made", actions.Observe, Fault("service.journal.log:append_batch", "after"), "nothing"),

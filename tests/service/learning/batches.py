@@ -71,7 +71,7 @@ def write(database: Database, *batches: NewBatch, model: str = MODEL) -> list[in
     numbers = []
     for item in batches:
         with database.transaction() as session:
-            numbers.append(log.append_batch(session, model, item).number)
+            numbers.append(log.append_batch(session, model, item)[0].number)
     return numbers
 
 

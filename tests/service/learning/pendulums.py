@@ -131,7 +131,7 @@ class Arm:
             "record": None,
         }
         with self.database.transaction() as session:
-            return log.append_batch(session, model or self.model, NewBatch(**usual | fields)).number
+            return log.append_batch(session, model or self.model, NewBatch(**usual | fields))[0].number
 
     def batches(self, *numbers: int) -> None:
         """Log several batches."""

@@ -9,10 +9,12 @@ import pytest
 
 from lipcore.online import judging, screening
 from lipcore.online.batch import Rows
-from lipcore.online.changes.detectors import ChangeDetector
-from lipcore.online.judging import ContactGate, Innovations, JudgeOptions, Watch
+from lipcore.online.gates import ContactGate
+from lipcore.online.judgement import Innovations, ModelRecord
+from lipcore.online.judging import JudgeOptions
 from lipcore.online.record import Record
 from lipcore.online.screening import Screened
+from lipcore.online.stream import StreamRecord
 from service.journal import log
 from service.learning.ingest.monitor import Monitor
 from tests.service.learning import lessons
@@ -264,22 +266,22 @@ def screened(count, push, first=0.0):
     zeros = np.zeros((count, 1))
     rows = Rows(time, zeros, zeros + 0.1, zeros, tau, np.zeros(count, np.uint8))
     every = np.ones(count, np.bool_)
-    return Screened(rows, slice(0, count), every, every, zeros, zeros, zeros, np.ones(1))
+    return Screened(rows, slice(0, count), every, every, zeros, zeros, zeros, np.ones(1), 1, np.ones(1))
 
 
 def test_a_gate_that_stood_back_returns_once_rows_fit():
     options = JudgeOptions(on_change="learn")
-    watch = Watch(ContactGate.start(2.0).stand_back(), ChangeDetector(), Innovations.empty(1))
-    opened = []
+    stream, model, opened = StreamRecord(ContactGate.start().stand_back()), ModelRecord(Innovations.empty(1)), []
     for second in range(5):
-        verdict = judging.judge(screened(100, 0.0, second), watch, False, options, nothing)
-        watch = verdict.watch
-        opened.append(watch.gate.open)
+        judgement = judging.judge(screened(100, 0.0, second), stream, model, options, nothing, second + 1.0)
+        stream, model = judgement.stream, judgement.model
+        opened.append(stream.gate.open)
     assert opened == [True, True, False, False, False]
-    assert judging.judge(screened(10, 20.0, 5.0), watch, False, options, nothing).rows.rejected() == {"contact": 10}
+    hit = judging.judge(screened(10, 20.0, 5.0), stream, model, options, nothing, 5.1)
+    assert hit.rows.rejected() == {"contact": 10}
 
 
-HIDDEN = ("_detector", "_departure", "held", "number")
+HIDDEN = ("detector", "departure", "held")
 
 
 def comparable(value: Any) -> Any:
@@ -294,7 +296,8 @@ def comparable(value: Any) -> Any:
 
 
 def state(monitor: Monitor) -> dict[str, Any]:
-    return {name: comparable(getattr(monitor, name)) for name in HIDDEN} | {
+    return {name: comparable(getattr(monitor.record, name)) for name in HIDDEN} | {
+        "number": monitor.number,
         "windows": [comparable(window._buckets) for window in monitor.windows],
         "streams": comparable(dict(monitor.streams.all())),
     }
@@ -331,9 +334,9 @@ def test_a_collision_a_change_and_a_decision(beside):
     drive(pupil, range(8, 9), push=PUSH)
     assert beside.agree()
     drive(pupil, range(9, 16), push=PUSH)
-    assert beside.follower.held is False
+    assert beside.follower.record.held is False
     assert beside.agree()
-    assert beside.follower.held is True
+    assert beside.follower.record.held is True
     pupil.post("learning/change", {"decision": "adapt"})
     drive(pupil, range(8, 10), stream_id="other")  # its gate stands back too, and no batch of "arm" has come since
     assert beside.agree()

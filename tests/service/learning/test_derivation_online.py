@@ -84,8 +84,8 @@ def test_a_row_without_velocity_or_time_takes_its_neighbours_accelerations(schoo
 
 def test_rows_that_waited_are_checked_once_their_acceleration_is_known(school, monkeypatch):
     """A knock at the seam of two batches: its velocities are possible, its acceleration is not."""
-    intake = school.service.learners._intake
-    monkeypatch.setattr(intake, "settings", intake.settings.model_copy(update={"max_acceleration": 100.0}))
+    observed = school.service.learners._log
+    monkeypatch.setattr(observed, "settings", observed.settings.model_copy(update={"max_acceleration": 100.0}))
     pupil = school.enrol("knock")
     parts = pieces([30])
     parts[1]["dq"][0] = [45.0, 0.0]
@@ -93,7 +93,7 @@ def test_rows_that_waited_are_checked_once_their_acceleration_is_known(school, m
     said = send(pupil, 1, parts[1])
     assert said["rejected"]["limit"] > 0
     found = logged(school, pupil)[1]
-    beyond = np.abs(np.nan_to_num(found.ddq)).max(axis=1) > intake.settings.max_acceleration
+    beyond = np.abs(np.nan_to_num(found.ddq)).max(axis=1) > observed.settings.max_acceleration
     assert (found.code[beyond] != 0).all()
     assert beyond[:HALF].any()
 

@@ -11,7 +11,7 @@ from lipcore.online.record import Record
 from service.contract.observations import ExpiredError
 from service.foundation.errors import ConflictError
 from service.journal import log, snapshots
-from service.learning.ingest.batches import Frames, FramesResult
+from service.learning.ingest.frames import Frames, FramesResult
 from tests.service.learning.lessons import apart
 from tests.service.learning.recordings import codes, learnt_from, logged, part, recording, send
 

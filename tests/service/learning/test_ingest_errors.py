@@ -10,8 +10,7 @@ from lipcore.robots.urdf import RigidBody
 from service.contract.observations import LearningOptions
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
-from service.learning.ingest.batches import MAX_ROWS
-from service.learning.ingest.dating import row_limits
+from service.learning.ingest.observations import MAX_ROWS, row_limits
 from tests.service.learning.lessons import apart
 from tests.service.learning.recordings import batch, codes, learnt_from, logged, part, recording, send
 
@@ -108,7 +107,7 @@ def test_batches_that_are_no_longer_kept_are_not_taken_for_new(school, body):
 
 
 def test_more_streams_than_a_model_may_have(school, body, monkeypatch):
-    monkeypatch.setattr("service.learning.ingest.intake.MAX_STREAMS", 2)
+    monkeypatch.setattr("service.learning.ingest.append.MAX_STREAMS", 2)
     pupil, other = school.enrol("popular"), school.enrol("unpopular")
     for stream_id in ("a", "b"):
         send(pupil, 0, body, stream_id)

@@ -11,7 +11,7 @@ from lipcore.online.screening import Screened
 from lipcore.vocabulary import CODES
 from service.contract.learning import LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
-from service.learning.ingest.intake import Judged
+from service.learning.ingest.append import Judged
 from service.learning.live import feed
 from service.learning.live.feed import MAX_FOLLOWERS, MOST_UNREAD, Feed, FeedEvent, pick, thinned
 from service.learning.live.look import at_most
@@ -125,7 +125,9 @@ def judged(count=4, codes=(), stream_id="one", of=None, seed=0, bare=0.05):
     mean = found.tau[predicted] - 0.5
     std = np.full(mean.shape, 0.3)
     noise = np.array([0.1, 0.2])
-    screened = Screened(found, slice(0, count), predicted, predicted, mean, std, np.full(mean.shape, bare), noise)
+    screened = Screened(
+        found, slice(0, count), predicted, predicted, mean, std, np.full(mean.shape, bare), noise, 1, np.ones(2)
+    )
     return Judged(of or served(), stream_id, found, screened)
 
 

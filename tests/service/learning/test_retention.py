@@ -3,11 +3,12 @@
 import pytest
 from sqlalchemy import select
 
+from lipcore.online.stream import PayloadRecord
 from service.foundation.errors import BusyError, ConflictError
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
 from service.journal.log import Memory, encode
-from service.learning.streams import PayloadRecord, Streams
+from service.learning.streams import Streams
 from service.storage.database import LearnerRow, ServingRow, SnapshotRow, StreamRow, now
 from tests.choosing import slow
 from tests.service.learning.batches import MODEL, OTHER, batch, everything, note, rows, source, take_back, write

@@ -6,10 +6,13 @@ from types import SimpleNamespace
 import pytest
 from sqlalchemy import select, update
 
+from lipcore.online.batch import Placement
 from lipserve.states import CANCELLED, RUNNING
+from service.contract.observations import LearningOptions
 from service.foundation.errors import ConflictError, NotFoundError, UnreadableVersionError
 from service.foundation.settings import Settings
 from service.journal import snapshots
+from service.learning.ingest.append import Arrival
 from service.learning.learner.learnt import LearntVersions
 from service.models import registry
 from service.models.loaded import LoadedModels
@@ -172,14 +175,15 @@ def test_a_deleted_version_is_not_published_by_who_still_holds_it(api, arm):
 def test_a_batch_that_was_predicted_by_what_is_deleted_is_not_logged(api, arm):
     service = service_of(api)
     served = service.loaded.get(arm, None)
-    intake = service.learners._intake
-    monitor, screened = service.learners.monitor(arm), SimpleNamespace(own=slice(0, 1))
+    observed = service.learners._log
+    monitor, new = service.learners.monitor(arm), batch(0)
+    arrival = Arrival(new, SimpleNamespace(rows=new.rows, own=slice(0, 1)), Placement((0, 1)))
     assert delete(api, arm).status_code == 204
     with pytest.raises(NotFoundError, match="no model"):
-        intake.append(monitor, served, None, batch(0), screened, {})
+        observed.append(monitor, served, LearningOptions(), arrival)
     publish(api, arm)
     with pytest.raises(ConflictError, match=r"version 3 .* was deleted meanwhile"):
-        intake.append(monitor, served, None, batch(0), screened, {})
+        observed.append(monitor, served, LearningOptions(), arrival)
 
 
 def test_who_asks_for_a_pointer_is_answered_though_it_moves_and_the_version_before_goes(api, arm, monkeypatch):

@@ -30,7 +30,7 @@ class ScaleRecord:
 
     def step(self, seen: Seen, accepted: NDArray[np.bool_]) -> ScaleRecord:
         """Follow measurements (M, n). accepted: (M,), of rows that were not kept out."""
-        factors = factor(self.state, seen)
+        factors = answered_with(self.state, seen)
         given = seen.score[accepted], None if seen.factor is None else seen.factor[accepted]
         state = self.state.step(seen.time, seen.score, factors)
         return replace(self, state=state, accepted=self.accepted.step(seen.time[accepted], *given))
@@ -60,6 +60,13 @@ class HeldIntervals:
         """Of no rows of n joints."""
         return HeldIntervals(0, np.zeros(n))
 
+    @staticmethod
+    def of(state: Adaptive, seen: Seen) -> HeldIntervals:
+        """Of the rows of a batch, by the scale before it. Every measurement counts: those of contacts, of rows that
+        wait for a decision, and of rows at rest."""
+        rows, off = len(seen.score), outside(seen.score, answered_with(state, seen)).sum(axis=0)
+        return HeldIntervals(rows, rows - off)
+
     def __add__(self, other: HeldIntervals) -> HeldIntervals:
         return HeldIntervals(self.rows + other.rows, self.inside + other.inside)
 
@@ -67,22 +74,16 @@ class HeldIntervals:
         """Share of measurements inside, per joint; None without rows."""
         return [number / self.rows if self.rows else None for number in self.inside.tolist()]
 
+    def to_json(self) -> dict[str, Any]:
+        """Return both fields as JSON has them."""
+        return {"rows": self.rows, "inside": self.inside.tolist()}
 
-def inside(state: Adaptive, seen: Seen) -> dict[str, Any]:
-    """What the report of a batch says of the intervals that its rows were answered with: how many rows they held.
-
-    Every measurement counts: those of contacts, of rows that wait for a decision, and of rows at rest.
-    """
-    rows, off = len(seen.score), outside(seen.score, factor(state, seen)).sum(axis=0)
-    return {"rows": rows, "inside": (rows - off).tolist()}
+    @staticmethod
+    def from_json(values: Mapping[str, Any]) -> HeldIntervals:
+        """Read what `to_json` returned."""
+        return HeldIntervals(values["rows"], np.array(values["inside"], np.float64))
 
 
-def factor(state: Adaptive, seen: Seen) -> Array:
+def answered_with(state: Adaptive, seen: Seen) -> Array:
     """The factors on half widths that rows were answered with: (n,), or (N, n) where a stream was answered."""
     return state.factor if seen.factor is None else seen.factor
-
-
-def held(report: Mapping[str, Any]) -> HeldIntervals | None:
-    """What the report of a batch says that intervals held; None where it says nothing."""
-    values = report.get("answered")
-    return None if values is None else HeldIntervals(values["rows"], np.array(values["inside"], np.float64))

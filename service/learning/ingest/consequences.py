@@ -5,7 +5,8 @@ from __future__ import annotations
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipcore.online.judging import Verdict
+from lipcore.online.judging import Judgement
+from service.contract.observations import LearningOptions
 from service.foundation.text import percent
 from service.journal import undo
 from service.journal.alarms import raise_alarm
@@ -22,12 +23,13 @@ CONSEQUENCES = {
 }
 
 
-def apply_verdict(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
-    """Do what follows from a verdict: one of CONSEQUENCES where it is a change."""
-    if verdict.opened is not None and verdict.held:
+def apply(session: Session, served: Served, options: LearningOptions, judgement: Judgement, event: EventRow) -> None:
+    """Do what follows from a judgement: raise the alarm of a change, let learning wait, take back what a stream that
+    does not fit has taught."""
+    if judgement.opened is not None and judgement.logged.held:
         _take_back(session, event)
-    if verdict.change is not None:
-        _alarm(session, served, follows, verdict, event)
+    if judgement.change is not None:
+        _alarm(session, served, "waits" if judgement.logged.waited else options.on_change, judgement, event)
 
 
 def _take_back(session: Session, event: EventRow) -> None:
@@ -52,23 +54,23 @@ def raise_clock_alarm(session: Session, model: str, stream_id: str, leap: float)
     raise_alarm(session, model, "clock", message, {"stream_id": stream_id, "ahead_s": leap})
 
 
-def _alarm(session: Session, served: Served, follows: str, verdict: Verdict, event: EventRow) -> None:
+def _alarm(session: Session, served: Served, follows: str, judgement: Judgement, event: EventRow) -> None:
     """Raise the alarm of a change, and hold learning where the owner is to decide about it.
 
     follows: one of CONSEQUENCES.
     """
-    change, names = verdict.change, served.model.joint_names
+    change, names = judgement.change, served.model.joint_names
     assert change is not None
-    evidence = verdict.evidence(names) | {"stream_id": event.stream_id, "sequence": event.sequence}
+    evidence = judgement.evidence(names) | {"stream_id": event.stream_id, "sequence": event.sequence}
     joints = ", ".join(names[joint] for joint in change.joints)
     finding = f"does not fit what was learnt any more: {evidence['suspect']}?"
-    if verdict.departed is not None:
+    if judgement.departed is not None:
         finding = (
-            f"has left what version {verdict.departed.version} was trained on, step by step ({evidence['cause']}):"
+            f"has left what version {judgement.departed.version} was trained on, step by step ({evidence['cause']}):"
         )
     message = f"the torque of {joints} {finding} {CONSEQUENCES[follows]}"
-    if verdict.opened is not None:
-        share = percent(verdict.opened.coverage.mean())
+    if judgement.opened is not None:
+        share = percent(judgement.opened.coverage.mean())
         message = (
             f"stream {event.stream_id} does not fit the model: {share} of its first second lies within the 95 % band; "
             f"is it this robot, with the friction and the payload that were learnt? {CONSEQUENCES[follows]}"

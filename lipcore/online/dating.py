@@ -13,13 +13,9 @@ from numpy.typing import NDArray
 
 from lipcore.data import independence
 from lipcore.data.samples import Array
-from lipcore.model.torque_model import TorqueModel
-from lipcore.online.batch import Rows
+from lipcore.online.batch import Placement, Rows
 from lipcore.online.gates import RowLimits, check_rows, time_span
 from lipcore.vocabulary import CODES, LEARNT
-from service.contract.observations import LearningOptions
-from service.foundation.settings import Settings
-from service.storage.database import EventRow, StreamRow
 
 NON_FINITE, LIMIT, TIME_JUMP, LATE = (CODES.index(code) for code in ("non_finite", "limit", "time_jump", "late"))
 
@@ -32,21 +28,6 @@ LEAP_S = 60.0
 sent faster than it was measured comes to lie as far ahead step by step."""
 FORGOTTEN = 7.0
 """Time constants of forgetting after which a row counts a thousandth, and teaches nothing."""
-
-
-def row_limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> RowLimits:
-    """What a row of a model may hold: its actuators' limits are those of its options, else those of its URDF."""
-    torque = None if options.torque_limits is None else np.array(options.torque_limits)
-    if torque is None and model.robot is not None:
-        effort = np.asarray(model.robot.model.effortLimit, np.float64)[list(model.robot.order)]
-        if (effort > 0).all():
-            torque = effort
-    return RowLimits(
-        model.position_limits(settings.max_position),
-        settings.max_velocity,
-        settings.max_acceleration,
-        torque,
-    )
 
 
 @dataclass(frozen=True)
@@ -79,15 +60,15 @@ class StreamTime:
 
     @staticmethod
     def of(
-        source: StreamRow | None, sequence: int, before: EventRow | None, after: EventRow | None, arrived: float
+        offset: float, before: Placement | None, after: Placement | None, adjacent: bool, arrived: float
     ) -> StreamTime:
-        """The clock of a stream, with the batches that are kept next below and above a sequence."""
-        offset = None if source is None or source.offset == 0 else source.offset
-        first, last = _span(after), _span(before)
-        latest = None if offset is None else arrived + FAR_AHEAD - offset
-        bounds = [bound for bound in (latest, None if first is None else first[0]) if bound is not None]
-        adjacent = before is not None and before.last_sequence == sequence - 1
-        return StreamTime(offset, None if last is None else last[1], min(bounds, default=None), adjacent, arrived)
+        """Return the clock of a stream. offset: s, 0 while it is unknown; before, after: the batches that are kept next
+        below and above the sequence; adjacent: whether the one below is the previous sequence."""
+        latest = arrived + FAR_AHEAD - offset if offset else None
+        last = None if before is None or before.span is None else before.span[1]
+        first = None if after is None or after.span is None else after.span[0]
+        bounds = [bound for bound in (latest, first) if bound is not None]
+        return StreamTime(offset or None, last, min(bounds, default=None), adjacent, arrived)
 
     def settled(self, t: Array | None, usable: NDArray[np.bool_], gap: float) -> float:
         """The offset, s, fixed now if these rows (times (N,), those to be believed) are the first that have times."""
@@ -131,11 +112,6 @@ class StreamTime:
         return np.where(np.isfinite(times), times, self.arrived)
 
 
-def _span(event: EventRow | None) -> list[float] | None:
-    times: list[float] | None = None if event is None or event.report is None else event.report["span"]
-    return times
-
-
 @dataclass(frozen=True)
 class Dated:
     """Rows with event times and the codes of `check_rows`. offset: of the stream, s; span: first and last time of the
@@ -144,11 +120,11 @@ class Dated:
 
     rows: Rows
     offset: float
-    span: list[float] | None
+    span: tuple[float, float] | None
     leap: float | None
 
 
-def dated(
+def date_rows(
     measured: Measured, clock: StreamTime, bounds: RowLimits, previous: float | None, forgetting_s: float | None = None
 ) -> Dated:
     """Check, date and weigh rows. previous: event time of the row right before them, s, where it is known;
@@ -158,7 +134,7 @@ def dated(
     numbers = measured.q, measured.dq, measured.ddq, measured.tau
     codes = check_rows(t, *numbers, bounds, clock.after, clock.before)
     usable = ~np.isin(codes, (NON_FINITE, TIME_JUMP))
-    gap = np.inf if bounds.max_gap_s is None else bounds.max_gap_s
+    gap = bounds.max_gap_s
     offset, span, leap = clock.settled(t, usable, gap), None, None
     if t is not None:
         codes[clock.leaps(t, usable, offset, gap) & (codes != LIMIT)] = TIME_JUMP
@@ -178,4 +154,4 @@ def dated(
     else:
         weights = independence.even_weights(t)
     rows = Rows(time, measured.q, measured.dq, ddq, measured.tau, codes, weights)
-    return Dated(rows, offset, None if span is None else list(span), None if leap is None else leap[1])
+    return Dated(rows, offset, span, None if leap is None else leap[1])
