@@ -8,31 +8,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, Literal
 
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
-from sqlalchemy import Select, bindparam, case, func, select
+from sqlalchemy import Select, bindparam, func, select
 from sqlalchemy.orm import Session, undefer
 
 from lipcore.data.samples import Array
-from lipcore.online.batch import AHEAD_S, Rows
+from lipcore.online.batch import AHEAD_S, Placement, Rows
 from lipcore.vocabulary import CODES, LEARNT
-from service.foundation.errors import BusyError, ConflictError
-from service.storage.database import EventRow, LearnerRow, LearningRow, StreamRow, fetch, now
+from service.journal.arrivals import NewBatch, note_arrival
+from service.storage.database import EventRow, LearnerRow, LearningRow, StreamRow, fetch
 from service.storage.rows import Page
 from service.storage.rows import newest as newest_rows
 
-StreamKind = Literal["batches", "frames"]
 EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings", "payload"]
 UNTIMED = [CODES.index("non_finite"), CODES.index("time_jump")]
 """Codes of rows whose own time says nothing."""
-MOST_RANGES = 1000
-"""Ranges that are remembered; the lowest are given up first, being the least likely to be filled."""
-IN_USE_S = 10.0
-"""Seconds without a batch after which a stream makes room for a new one, if it was silent for longest."""
 ARRAYS = tuple(field.name for field in fields(Rows))
 """Of the safetensors archive that an event's rows are kept as."""
 
@@ -68,60 +63,6 @@ class Memory:
         return Memory(detail["forgetting_s"], detail.get("friction_walk_s"))
 
 
-@dataclass(frozen=True)
-class Gaps:
-    """Sequences that a stream misses: ranges [a, b], rising, between the first (lowest) and the last that are there."""
-
-    first: int
-    last: int
-    ranges: tuple[tuple[int, int], ...] = ()
-
-    def arrived(self, first: int, last: int) -> Gaps:
-        """The gaps once `first` to `last` are there too, in whatever order batches arrive."""
-        left: list[tuple[int, int]] = []
-        if last + 1 < self.first:
-            left.append((last + 1, self.first - 1))
-        for a, b in self.ranges:
-            if a < first:
-                left.append((a, min(b, first - 1)))
-            if b > last:
-                left.append((max(a, last + 1), b))
-        if self.last + 1 < first:
-            left.append((self.last + 1, first - 1))
-        return Gaps(min(self.first, first), max(self.last, last), tuple(left[-MOST_RANGES:]))
-
-    def may_hold(self, sequence: int) -> bool:
-        """Whether a sequence may have arrived: not where it is known to be missing."""
-        return self.first <= sequence <= self.last and not any(a <= sequence <= b for a, b in self.ranges)
-
-    def to_json(self) -> dict[str, Any]:
-        """As a stream's row keeps them, which has `last` in a column of its own."""
-        return {"first": self.first, "ranges": [list(pair) for pair in self.ranges]}
-
-    @staticmethod
-    def from_json(missing: dict[str, Any], last: int) -> Gaps:
-        """Read what `to_json` wrote."""
-        return Gaps(missing["first"], last, tuple((a, b) for a, b in missing["ranges"]))
-
-
-@dataclass(frozen=True)
-class NewBatch:
-    """A batch to be logged; its fields are those of `EventRow` and, where the stream is new, of `StreamRow`."""
-
-    stream_id: str
-    kind: StreamKind
-    sequence: int
-    last_sequence: int
-    digest: str
-    offset: float
-    received: float
-    version: int
-    revision: int
-    rows: Rows
-    report: dict[str, Any] = field(default_factory=dict)
-    record: dict[str, Any] | None = None
-
-
 def append_batch(
     session: Session, model: str, batch: NewBatch, most_streams: int | None = None
 ) -> tuple[EventRow, StreamRow]:
@@ -134,7 +75,7 @@ def append_batch(
     """
     names = ("stream_id", "sequence", "last_sequence", "digest", "version", "revision", "report", "record")
     event = EventRow(number=newest(session, model) + 1, **{name: getattr(batch, name) for name in names})
-    source = _note_arrival(session, model, batch, most_streams)
+    source = note_arrival(session, model, batch, most_streams)
     return _append(session, event, model, "batch", batch.received, batch.rows), source
 
 
@@ -159,25 +100,64 @@ def covering(session: Session, model: str, stream_id: str, sequence: int) -> Eve
     return event if event is not None and event.last_sequence is not None and sequence <= event.last_sequence else None
 
 
-def neighbours(session: Session, model: str, stream_id: str, sequence: int) -> tuple[EventRow | None, EventRow | None]:
-    """The batches that are kept next below and next above a sequence, with a gap in between or without."""
+@dataclass(frozen=True)
+class Past:
+    """What is kept of a stream around a sequence. source: its row, None of a new stream; same: the batch of exactly
+    this sequence; below, above: those next to it, with a gap in between or without."""
+
+    source: StreamRow | None
+    same: EventRow | None = None
+    below: EventRow | None = None
+    above: EventRow | None = None
+
+
+def past(session: Session, model: str, stream_id: str, sequence: int) -> Past:
+    """Read what is kept of a stream around a sequence."""
     source = stream(session, model, stream_id)
     if source is None:
-        return None, None
+        return Past(None)
     place = {"model": model, "stream_id": stream_id, "sequence": sequence}
-    # most batches are the last of their stream
-    return session.scalar(_BEFORE, place), session.scalar(_AFTER, place) if sequence < source.last else None
+    below = session.scalar(_BEFORE, place)
+    if sequence > source.last:  # most batches are the last of their stream
+        return Past(source, None, below)
+    return Past(source, find_batch(session, model, stream_id, sequence), below, session.scalar(_AFTER, place))
+
+
+def derived_beside(session: Session, model: str, stream_id: str, sequence: int) -> int | None:
+    """The window of the batches right next to a sequence, see `Placement`; None if none of them was derived."""
+    for other in (sequence - 1, sequence + 1):
+        if (event := _derived(session, model, stream_id, other)) is not None:
+            return Placement.from_json(event.report or {}).window
+    return None
+
+
+def rows_beside(session: Session, model: str, stream_id: str, sequence: int, way: int, count: int) -> list[Rows]:
+    """Rows whose accelerations were derived, next after (way 1) or before (−1) a sequence, without a gap of sequences,
+    in order, at most `count`."""
+    parts: list[Rows] = []
+    while count > 0:
+        sequence += way
+        event = _derived(session, model, stream_id, sequence)
+        if event is None:
+            break
+        own = Placement.from_json(event.report or {}).own
+        part = rows_of(event).take(slice(*own))  # without those that had waited for it
+        parts.append(part.take(slice(0, count) if way > 0 else slice(max(len(part) - count, 0), None)))
+        count -= len(part)
+    return parts[::way]
+
+
+def _derived(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
+    """The batch of a sequence, if its accelerations were derived and it still teaches."""
+    event = find_batch(session, model, stream_id, sequence)
+    if event is None or event.void or event.report is None:
+        return None
+    return event if Placement.from_json(event.report).window is not None else None
 
 
 def stream(session: Session, model: str, stream_id: str) -> StreamRow | None:
     """What is known of a source of observations."""
     return session.get(StreamRow, (model, stream_id))
-
-
-def is_forgotten(source: StreamRow, sequence: int) -> bool:
-    """Whether a batch may have arrived that is no longer kept: whether it is a repetition cannot be known then."""
-    gaps = Gaps.from_json(source.missing, source.last)
-    return source.forgotten is not None and sequence <= source.forgotten and gaps.may_hold(sequence)
 
 
 def newest(session: Session, model: str) -> int:
@@ -309,68 +289,3 @@ def _append(
             event.first, event.last = float(times.min()), float(times.max())
     session.add(event)
     return event
-
-
-def _note_arrival(session: Session, model: str, batch: NewBatch, most_streams: int | None) -> StreamRow:
-    """Note in the row of a stream which sequences are there, and return it; a new row for a new stream."""
-    source = stream(session, model, batch.stream_id)
-    if source is None:
-        _check_new(session, model, batch)
-        if most_streams is not None:
-            _make_room(session, model, most_streams, batch.received)
-        source = StreamRow(model=model, stream_id=batch.stream_id, kind=batch.kind, offset=batch.offset)
-        source.created_at = now()
-        gaps = Gaps(batch.sequence, batch.last_sequence)
-        session.add(source)
-    else:
-        _check_stream(source, batch)
-        gaps = Gaps.from_json(source.missing, source.last).arrived(batch.sequence, batch.last_sequence)
-    source.offset = source.offset or batch.offset
-    source.last, source.missing, source.received = gaps.last, gaps.to_json(), batch.received
-    return source
-
-
-def _check_new(session: Session, model: str, batch: NewBatch) -> None:
-    """Raise ConflictError where the log has later batches of a stream that was silent for so long that it is no longer
-    known."""
-    of_stream = EventRow.model == model, EventRow.stream_id == batch.stream_id
-    last = session.scalar(select(func.max(EventRow.last_sequence)).where(*of_stream))
-    if last is not None and batch.sequence <= last:
-        raise ConflictError(
-            f"stream {batch.stream_id!r} was silent for so long that nobody knows any more which of its batches up to "
-            f"{last} have come: go on with higher sequences, or with a stream_id of its own"
-        )
-
-
-def _make_room(session: Session, model: str, most: int, received: float) -> None:
-    """Forget the stream that was silent for longest where there are too many; raise BusyError where all are in use."""
-    of_model = StreamRow.model == model
-    known = session.scalar(select(func.count()).select_from(StreamRow).where(of_model)) or 0
-    if known < most:
-        return
-    used = func.coalesce(StreamRow.received, 0.0)
-    silent = case((used > received + IN_USE_S, 0.0), else_=used)  # by a clock that was set right since
-    oldest = session.scalars(select(StreamRow).where(of_model).order_by(silent).limit(1)).one()
-    if abs((oldest.received or 0.0) - received) < IN_USE_S:
-        raise BusyError(
-            f"model {model!r} has {known} sources of observations in use, the most it may have: go on with one of "
-            "their stream_ids"
-        )
-    session.delete(oldest)
-    session.flush()
-
-
-def check_kind(source: StreamRow | None, kind: StreamKind) -> None:
-    """Raise ConflictError where a stream carries something else: one sequence cannot count both."""
-    if source is not None and source.kind != kind:
-        name = f"stream {source.stream_id!r} of model {source.model!r}"
-        raise ConflictError(f"{name} carries {source.kind}, not {kind}: use another stream_id")
-
-
-def _check_stream(source: StreamRow, batch: NewBatch) -> None:
-    name = f"stream {source.stream_id!r} of model {source.model!r}"
-    check_kind(source, batch.kind)
-    if batch.kind == "frames" and batch.sequence <= source.last:
-        raise ConflictError(f"{name} has come to frame {source.last}, frame {batch.sequence} does not go on from there")
-    if is_forgotten(source, batch.sequence):
-        raise ConflictError(f"batch {batch.sequence} of {name} may have come before: that far back none is kept")

@@ -18,6 +18,7 @@ from service.contract.observations import ObservationResponse
 from service.foundation.errors import NotFoundError, not_found
 from service.foundation.fields import finite
 from service.journal import log, snapshots
+from service.journal.arrivals import is_forgotten
 from service.learning import owner
 from service.learning.ingest.monitor import Window
 from service.learning.ingest.observations import state
@@ -146,7 +147,7 @@ def find(session: Session, model: str, stream_id: str, sequence: int) -> EventRo
     if event is not None:
         return event
     source = log.stream(session, model, stream_id)
-    if source is not None and log.is_forgotten(source, sequence):
+    if source is not None and is_forgotten(source, sequence):
         raise NotFoundError(f"batch {sequence} of stream {stream_id!r} is no longer kept, if it has come")
     raise not_found("batch", f"{sequence} of stream {stream_id}")
 

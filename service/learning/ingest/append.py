@@ -20,7 +20,7 @@ from lipcore.online.stream import StreamRecord
 from service.contract.observations import Derivation, LearningOptions, ObservationResponse
 from service.foundation.errors import ConflictError, not_found
 from service.journal import log
-from service.journal.log import NewBatch
+from service.journal.arrivals import NewBatch
 from service.journal.snapshots import retain
 from service.learning import owner
 from service.learning.ingest import consequences
@@ -53,11 +53,12 @@ class Judged(NamedTuple):
 
 
 class Arrival(NamedTuple):
-    """A batch that is yet to be judged. place: in its stream; derived: what was not measured, None if all was; leap:
-    how far its stream's clock has leapt ahead, s."""
+    """A batch that is yet to be judged. first: whether it is the first of its stream; place: in that; derived: what was
+    not measured, None if all was; leap: how far the stream's clock has leapt ahead, s."""
 
     batch: NewBatch
     predicted: Screened
+    first: bool
     place: Placement
     derived: Derivation | None = None
     leap: float | None = None
@@ -126,7 +127,7 @@ class ObservationLog:
         with self.database.transaction(model) as session:
             _check_kept(session, served)
             monitor.follow_decision(session, model)
-            before = monitor.stream(session, model, stream_id)
+            before = monitor.stream(stream_id, arrival.first)
             judgement = judge(
                 predicted,
                 before,
@@ -137,7 +138,7 @@ class ObservationLog:
                 carried,
             )
             event, answer, after = _write(session, served, options, arrival, before, judgement)
-            if after.begun == event.number:
+            if arrival.first:
                 session.flush()
                 streams.keep(session, model)
         streams.judged(stream_id, after)
@@ -195,7 +196,7 @@ def _write(
     consequences.apply(session, served, options, judgement, event)
     if arrival.leap is not None and not before.leapt:
         consequences.raise_clock_alarm(session, model, batch.stream_id, arrival.leap)
-    begun = before.begun or event.number
+    begun = event.number if arrival.first else before.begun
     after = replace(judgement.stream, leapt=arrival.leap is not None, begun=begun)
     source.record = after.to_json()
     answer = ObservationResponse(

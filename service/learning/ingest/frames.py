@@ -19,7 +19,7 @@ from lipcore.online.screening import Answered
 from service.foundation.errors import ConflictError
 from service.inference.predicting import QUANTITIES
 from service.journal import log
-from service.journal.log import NewBatch, check_kind
+from service.journal.arrivals import NewBatch, check_kind
 from service.learning import owner
 from service.learning.ingest.append import Arrival, ObservationLog
 from service.learning.ingest.observations import ONCE, check_kept, row_limits
@@ -74,7 +74,7 @@ def observe_frames(observed: ObservationLog, frames: Frames) -> FramesResult:
             source = log.stream(session, frames.model, frames.stream_id)
             check_kind(source, "frames")
             last = -1 if source is None else source.last
-            before, _ = log.neighbours(session, frames.model, frames.stream_id, last + 1)
+            before = log.past(session, frames.model, frames.stream_id, last + 1).below
             new = frames.sequences > last
             repeated = Repeated(0) if new.all() else _repeated(session, frames, ~new)
         monitor.counts["duplicates"] += repeated.frames
@@ -103,7 +103,7 @@ def observe_frames(observed: ObservationLog, frames: Frames) -> FramesResult:
             rows,
         )
         place = Placement((0, len(rows)), frames=_ranges(sequences))
-        answer = observed.append(monitor, frames.served, options, Arrival(batch, screened, place))
+        answer = observed.append(monitor, frames.served, options, Arrival(batch, screened, source is None, place))
     observed.follow_up(monitor, frames.model)
     return FramesResult(int(sequences[-1]), answer.accepted, repeated.frames, answer.rejected, answer.revision)
 
@@ -142,7 +142,7 @@ def _logged(session: Session, frames: Frames, sequence: int) -> tuple[EventRow, 
     """The batch of frames that a sequence lies in, the place of each of its sequences, and its rows."""
     event = log.covering(session, frames.model, frames.stream_id, sequence)
     if event is None:
-        check_kept(session, frames.model, frames.stream_id, sequence)
+        check_kept(log.stream(session, frames.model, frames.stream_id), sequence)
         raise _order(frames, sequence)
     ranges = Placement.from_json(event.report or {}).frames
     sequences = [number for first, last in ranges for number in range(first, last + 1)]

@@ -159,9 +159,9 @@ class Monitor:
         elif held and not self.record.held:
             self.record = replace(self.record, held=True)
 
-    def stream(self, session: Session, model: str, stream_id: str) -> StreamRecord:
-        """The record of a stream before its next batch, that of a new one if the database has none; `lock` is held."""
-        if log.stream(session, model, stream_id) is not None:
+    def stream(self, stream_id: str, new: bool) -> StreamRecord:
+        """The record of a stream before its next batch; `lock` is held. new: whether none of its rows is known."""
+        if not new:
             return self.streams.get(stream_id)
         self.streams.forget(stream_id)  # one of this name that has made room for others
         return StreamRecord.start(len(self.joint_names))

@@ -29,11 +29,12 @@ from service.foundation.errors import ConflictError, invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import check_shapes
 from service.journal import log
-from service.journal.log import NewBatch, check_kind
+from service.journal.arrivals import NewBatch, check_kind, is_forgotten
+from service.journal.log import Past
 from service.learning import owner
 from service.learning.ingest.append import Arrival, ObservationLog
 from service.models.loaded import Served
-from service.storage.database import EventRow
+from service.storage.database import EventRow, StreamRow
 
 MAX_ROWS = 5000
 """Rows of one observation batch."""
@@ -49,13 +50,14 @@ def observe_batch(observed: ObservationLog, model: str, request: ObservationRequ
     monitor = observed.monitor(served)
     with observed.turn(monitor, model):
         with observed.database.session() as session:
-            known = acknowledged(session, served.name, request.stream_id, request.sequence, content)
+            past = log.past(session, model, request.stream_id, request.sequence)
+            known = acknowledged(session, past, request, content)
             if known is not None:
                 monitor.counts["duplicates"] += 1
                 return known
             options = owner.options(session, model)
             limits = row_limits(served.model, options, observed.settings)
-            arrival = _prepared(session, served, request, batch, content, received, options, limits)
+            arrival = _prepared(session, past, served, request, batch, content, received, options, limits)
         answer = observed.append(monitor, served, options, arrival)
     observed.follow_up(monitor, model)
     return answer
@@ -63,6 +65,7 @@ def observe_batch(observed: ObservationLog, model: str, request: ObservationRequ
 
 def _prepared(
     session: Session,
+    past: Past,
     served: Served,
     request: ObservationRequest,
     batch: Measured,
@@ -73,12 +76,11 @@ def _prepared(
 ) -> Arrival:
     """Date a new batch, derive its accelerations if none were sent, and predict it."""
     model, stream_id, sequence = served.name, request.stream_id, request.sequence
-    source = log.stream(session, model, stream_id)
-    below, above = log.neighbours(session, model, stream_id, sequence)
+    source, below = past.source, past.below
     clock = StreamTime.of(
         0.0 if source is None else source.offset,
         _place(below),
-        _place(above),
+        _place(past.above),
         below is not None and below.last_sequence == sequence - 1,
         received,
     )
@@ -101,46 +103,21 @@ def _prepared(
         served.revision,
         rows,
     )
-    return Arrival(entry, predicted, place, derived, dated.leap)
+    return Arrival(entry, predicted, source is None, place, derived, dated.leap)
 
 
 def _derived(
     session: Session, key: tuple[str, str, int], t: Array, dated: Dated, limits: RowLimits
 ) -> tuple[Rows, slice, Derivation]:
     """The rows of a batch with derived accelerations, and those of others that it completes, and which are its own."""
-    model, stream_id, sequence = key
-    beside = (_derivable(session, model, stream_id, sequence + way) for way in (-1, 1))
-    known = next((_place(event) for event in beside if event is not None), None)
     try:
-        how = acceleration.Derivation.of(t, None if known is None else known.window)
+        how = acceleration.Derivation.of(t, log.derived_beside(session, *key))
     except DerivationError as error:
         raise invalid_request(error.field, error.value, error.expected) from error
-    before, after = (_around(session, *key, way, 2 * how.half) for way in (-1, 1))
+    before, after = (log.rows_beside(session, *key, way, 2 * how.half) for way in (-1, 1))
     found = acceleration.derive_rows(dated.rows, how, before, after, limits)
     told = DerivedAcceleration(delay_s=how.delay_s, window=how.half, rate_hz=how.rate, carried=found.carried)
     return found.rows, found.own, Derivation(ddq=told)
-
-
-def _around(session: Session, model: str, stream_id: str, sequence: int, way: int, count: int) -> list[Rows]:
-    """Rows next after (way 1) or before (−1) a batch, without a gap of sequences, in order, at most `count`."""
-    parts: list[Rows] = []
-    while count > 0:
-        sequence += way
-        event = _derivable(session, model, stream_id, sequence)
-        if event is None:
-            break
-        own = Placement.from_json(event.report or {}).own
-        part = log.rows_of(event).take(slice(*own))  # without those that had waited for it
-        parts.append(part.take(slice(0, count) if way > 0 else slice(max(len(part) - count, 0), None)))
-        count -= len(part)
-    return parts[::way]
-
-
-def _derivable(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
-    """The batch of a sequence, if its accelerations were derived and it still teaches."""
-    event = log.find_batch(session, model, stream_id, sequence)
-    place = None if event is None or event.void else _place(event)
-    return event if place is not None and place.window is not None else None
 
 
 def _place(event: EventRow | None) -> Placement | None:
@@ -205,36 +182,31 @@ def digest(rows: Measured) -> str:
     return content.hexdigest()
 
 
-def acknowledged(
-    session: Session, model: str, stream_id: str, sequence: int, content: str
-) -> ObservationResponse | None:
+def acknowledged(session: Session, past: Past, request: ObservationRequest, content: str) -> ObservationResponse | None:
     """The first acknowledgement of a batch that is in the log, with its state now; None for one that is new.
 
     Raise ConflictError where the log has another content under its sequence, or frames under its stream; ExpiredError
     where the log no longer reaches back to it.
     """
-    source = log.stream(session, model, stream_id)
-    check_kind(source, "batches")
-    if source is None or sequence > source.last:
-        return None
-    event = log.find_batch(session, model, stream_id, sequence)
+    check_kind(past.source, "batches")
+    event = past.same
     if event is None:
-        check_kept(session, model, stream_id, sequence)
+        check_kept(past.source, request.sequence)
         return None
     if event.digest != content:
-        raise ConflictError(f"batch {sequence} of stream {stream_id!r} has come before with other content: {ONCE}")
+        name = f"batch {request.sequence} of stream {request.stream_id!r}"
+        raise ConflictError(f"{name} has come before with other content: {ONCE}")
     return ObservationResponse.model_validate(
         {**(event.report or {}), "duplicate": True, "state": state(session, event)}
     )
 
 
-def check_kept(session: Session, model: str, stream_id: str, sequence: int) -> None:
+def check_kept(source: StreamRow | None, sequence: int) -> None:
     """Raise ExpiredError where a batch that is not in the log may have been there."""
-    source = log.stream(session, model, stream_id)
-    if source is not None and log.is_forgotten(source, sequence):
+    if source is not None and is_forgotten(source, sequence):
         raise ExpiredError(
-            f"it is not known any more whether batch {sequence} of stream {stream_id!r} has come before: batches up to "
-            f"{source.forgotten} are no longer kept"
+            f"it is not known any more whether batch {sequence} of stream {source.stream_id!r} has come before: "
+            f"batches up to {source.forgotten} are no longer kept"
         )
 
 

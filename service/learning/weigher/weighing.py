@@ -17,7 +17,7 @@ from lipcore.online.stream import PayloadRecord
 from service.foundation.errors import ServiceError
 from service.journal import log, undo
 from service.journal.alarms import raise_alarm
-from service.journal.log import NewBatch
+from service.journal.arrivals import NewBatch
 from service.learning.ingest.monitor import Monitor
 from service.learning.weigher.messages import MOST_STREAMS, Asked, Message, Revised, Stream, Unweighed, Weighed
 from service.learning.weigher.process import MOST_WAITING, WeigherProcess

@@ -10,7 +10,7 @@ from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.foundation.settings import Settings
 from service.journal import log, undo
-from service.journal.log import NewBatch
+from service.journal.arrivals import NewBatch
 from service.storage.database import Database, EventRow, ModelRow, ServingRow, StreamRow, VersionRow, now
 
 MODEL, OTHER = "arm", "other"

@@ -22,7 +22,7 @@ from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.statistics import collect, merge
 from service.foundation.settings import Settings
 from service.journal import log, snapshots, undo
-from service.journal.log import NewBatch
+from service.journal.arrivals import NewBatch
 from service.journal.restore import Restored, advance, restore
 from service.learning.learner import publication
 from service.learning.learner.publication import Published

@@ -6,7 +6,7 @@ import pytest
 from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.journal import log
-from service.journal.log import NewBatch
+from service.journal.arrivals import NewBatch
 from tests.service.learning.lessons import LESSON, lesson
 
 

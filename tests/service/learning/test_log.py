@@ -15,7 +15,8 @@ from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.foundation.errors import ConflictError
 from service.journal import log
-from service.journal.log import Gaps, decode, encode
+from service.journal.arrivals import MOST_RANGES, Gaps
+from service.journal.log import decode, encode
 from service.storage.database import SnapshotRow, now
 from tests.service.learning.batches import (
     MODEL,
@@ -156,9 +157,9 @@ def test_the_gaps_of_ranges_are_right_even_where_they_overlap(spans):
 
 def test_only_the_newest_of_very_many_gaps_are_remembered():
     known = Gaps(0, 0)
-    for sequence in range(2, 2 * log.MOST_RANGES + 6, 2):
+    for sequence in range(2, 2 * MOST_RANGES + 6, 2):
         known = known.arrived(sequence, sequence)
-    assert len(known.ranges) == log.MOST_RANGES
+    assert len(known.ranges) == MOST_RANGES
     assert (known.ranges[0], known.ranges[-1]) == ((5, 5), (2003, 2003))
     assert known.may_hold(3)  # it may have, for all that is known
 

@@ -7,6 +7,7 @@ from lipcore.online.stream import PayloadRecord
 from service.foundation.errors import BusyError, ConflictError
 from service.foundation.settings import Settings
 from service.journal import log, snapshots
+from service.journal.arrivals import is_forgotten
 from service.journal.log import Memory, encode
 from service.learning.streams import Streams
 from service.storage.database import LearnerRow, ServingRow, SnapshotRow, StreamRow, now
@@ -120,7 +121,7 @@ def test_a_deleted_batch_is_not_taken_for_a_new_one(database):
     assert retain(database, batches=1) == 5
     robot = source(database)
     assert (robot.forgotten, source(database, "robot-2").forgotten) == (6, 1)
-    assert [log.is_forgotten(robot, k) for k in (3, 4, 5, 6, 7, 9)] == [False, True, True, True, False, False]
+    assert [is_forgotten(robot, k) for k in (3, 4, 5, 6, 7, 9)] == [False, True, True, True, False, False]
 
 
 @pytest.mark.parametrize("runs", [60, slow(10_000)])

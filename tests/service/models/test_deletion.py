@@ -177,7 +177,7 @@ def test_a_batch_that_was_predicted_by_what_is_deleted_is_not_logged(api, arm):
     served = service.loaded.get(arm, None)
     observed = service.learners._log
     monitor, new = service.learners.monitor(arm), batch(0)
-    arrival = Arrival(new, SimpleNamespace(rows=new.rows, own=slice(0, 1)), Placement((0, 1)))
+    arrival = Arrival(new, SimpleNamespace(rows=new.rows, own=slice(0, 1)), False, Placement((0, 1)))
     assert delete(api, arm).status_code == 204
     with pytest.raises(NotFoundError, match="no model"):
         observed.append(monitor, served, LearningOptions(), arrival)
