@@ -10,6 +10,7 @@ import numpy as np
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
+from lipcore.online.window import Window
 from service.contract.learning import Alarm
 from service.contract.overview import (
     ArmSketch,
@@ -20,7 +21,7 @@ from service.contract.overview import (
     SketchedJoint,
 )
 from service.learning.control import payload
-from service.learning.ingest.monitor import Monitor, Window
+from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
 from service.models import registry
 from service.models.loaded import Served

@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Rows
 from lipcore.online.record import Record
+from lipcore.online.window import Window
 from lipcore.vocabulary import CODES, LEARNT
 from service.contract import learning as schema
 from service.contract.observations import ObservationResponse
@@ -20,7 +21,6 @@ from service.foundation.fields import finite
 from service.journal import log, snapshots
 from service.journal.arrivals import is_forgotten
 from service.learning import owner
-from service.learning.ingest.monitor import Window
 from service.learning.ingest.observations import state
 from service.learning.learners import Learners
 from service.models import registry

@@ -6,8 +6,6 @@ import threading
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import reduce
-from operator import add
 from typing import Any
 
 import numpy as np
@@ -17,8 +15,8 @@ from sqlalchemy.orm import Session
 from lipcore.online.judgement import Innovations, LoggedJudgement, ModelRecord
 from lipcore.online.judging import Judgement
 from lipcore.online.record import Record
-from lipcore.online.scale import HeldIntervals
 from lipcore.online.stream import StreamRecord
+from lipcore.online.window import Window
 from lipcore.vocabulary import CODES, LEARNT
 from service.journal import log
 from service.learning import owner
@@ -28,67 +26,10 @@ from service.storage.database import EventRow
 
 WINDOWS_S = (60.0, 600.0, 3600.0)
 """Windows of the prequential quality, s."""
-PARTS = 60
-"""Buckets of a window: its length is true to a sixtieth."""
 MOST_EVENTS = 3000
 """Events that the windows are rebuilt from after a start, at most: 0.3 ms each."""
 DETECTOR_S = 60.0
 """Time before a start that the detector of changes is rebuilt from, s: more than it looks back."""
-
-
-class Window:
-    """Records and counts of the last `seconds`, in at most PARTS + 1 buckets. Read it from any thread."""
-
-    def __init__(self, seconds: float, n_joints: int) -> None:
-        self.seconds, self._n_joints = seconds, n_joints
-        self._length = max(seconds / PARTS, 1.0)
-        self._buckets: tuple[tuple[int, Record, Counter[str], HeldIntervals], ...] = ()
-
-    def add(
-        self, record: Record | None, counts: Mapping[str, int], at: float, held: HeldIntervals | None = None
-    ) -> None:
-        """Add a batch's record and counts at a Unix time, s, and what intervals held. From one thread at a time."""
-        number = int(at // self._length)
-        empty = number, Record.empty(self._n_joints), Counter[str](), HeldIntervals.none(self._n_joints)
-        *rest, last = self._buckets or (empty,)
-        if last[0] != number:
-            rest, last = [*rest, last], empty
-        changed = (
-            number,
-            last[1] if record is None else last[1] + record,
-            last[2] + Counter(counts),
-            last[3] if held is None else last[3] + held,
-        )
-        # another tuple each time: readers keep the one they have
-        self._buckets = tuple(bucket for bucket in (*rest, changed) if self._holds(bucket[0], at))
-
-    def record(self, now: float) -> Record:
-        """Sum of the records within the window before a Unix time, s."""
-        records = (bucket[1] for bucket in self._buckets if self._holds(bucket[0], now))
-        return reduce(add, records, Record.empty(self._n_joints))
-
-    def course(self, now: float) -> list[tuple[float, Record]]:
-        """The records of the window's buckets, oldest first, each with when it began: Unix times, s."""
-        return [(number * self._length, record) for number, record, *_ in self._buckets if self._holds(number, now)]
-
-    def counts(self, now: float) -> Counter[str]:
-        """Sum of the counts within the window before a Unix time, s."""
-        counts = (bucket[2] for bucket in self._buckets if self._holds(bucket[0], now))
-        return reduce(add, counts, Counter[str]())
-
-    def held(self, now: float) -> HeldIntervals:
-        """What intervals, as answered, held of the rows within the window before a Unix time, s."""
-        parts = (bucket[3] for bucket in self._buckets if self._holds(bucket[0], now))
-        return reduce(add, parts, HeldIntervals.none(self._n_joints))
-
-    def set_clock(self, step: float) -> None:
-        """Take the buckets with a clock that was set by `step`, s."""
-        moved = round(step / self._length)
-        self._buckets = tuple((bucket[0] + moved, *bucket[1:]) for bucket in self._buckets)
-
-    def _holds(self, number: int, now: float) -> bool:
-        """Whether a bucket is in the window before a Unix time, s; none is that a wrong clock has put behind it."""
-        return -self.seconds < (number + 1) * self._length - now <= 2 * self._length
 
 
 class Monitor:

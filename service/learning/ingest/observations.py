@@ -33,7 +33,6 @@ from service.journal.arrivals import NewBatch, check_kind, is_forgotten
 from service.journal.log import Past
 from service.learning import owner
 from service.learning.ingest.append import Arrival, ObservationLog
-from service.models.loaded import Served
 from service.storage.database import EventRow, StreamRow
 
 MAX_ROWS = 5000
@@ -48,70 +47,59 @@ def observe_batch(observed: ObservationLog, model: str, request: ObservationRequ
     batch = validated(request, served.model)
     content = digest(batch)
     monitor = observed.monitor(served)
+    stream_id, sequence = request.stream_id, request.sequence
     with observed.turn(monitor, model):
         with observed.database.session() as session:
-            past = log.past(session, model, request.stream_id, request.sequence)
+            past = log.past(session, model, stream_id, sequence)
             known = acknowledged(session, past, request, content)
             if known is not None:
                 monitor.counts["duplicates"] += 1
                 return known
             options = owner.options(session, model)
             limits = row_limits(served.model, options, observed.settings)
-            arrival = _prepared(session, past, served, request, batch, content, received, options, limits)
+            dated = _dated(batch, past, sequence, received, limits, options)
+            rows, own, derived = _complete(session, (model, stream_id, sequence), batch, dated, limits)
+        predicted = screening.predict(rows, served, own, carrying=served.loads.of(stream_id))
+        entry = NewBatch(
+            stream_id,
+            "batches",
+            sequence,
+            sequence,
+            content,
+            dated.offset,
+            received,
+            served.version,
+            served.revision,
+            rows,
+        )
+        place = Placement((own.start, own.stop), dated.span)
+        arrival = Arrival(entry, predicted, past.source is None, place, derived, dated.leap)
         answer = observed.append(monitor, served, options, arrival)
     observed.follow_up(monitor, model)
     return answer
 
 
-def _prepared(
-    session: Session,
-    past: Past,
-    served: Served,
-    request: ObservationRequest,
-    batch: Measured,
-    content: str,
-    received: float,
-    options: LearningOptions,
-    limits: RowLimits,
-) -> Arrival:
-    """Date a new batch, derive its accelerations if none were sent, and predict it."""
-    model, stream_id, sequence = served.name, request.stream_id, request.sequence
-    source, below = past.source, past.below
-    clock = StreamTime.of(
-        0.0 if source is None else source.offset,
-        _place(below),
-        _place(past.above),
-        below is not None and below.last_sequence == sequence - 1,
-        received,
-    )
-    previous = below.last if below is not None and clock.adjacent else None
-    dated = date_rows(batch, clock, limits, previous, options.forgetting_s)
-    rows, own, derived = dated.rows, slice(0, len(batch)), None
-    if batch.ddq is None and batch.t is not None:
-        rows, own, derived = _derived(session, (model, stream_id, sequence), batch.t, dated, limits)
-    predicted = screening.predict(rows, served, own, carrying=served.loads.of(stream_id))
-    place = Placement((own.start, own.stop), dated.span)
-    entry = NewBatch(
-        stream_id,
-        "batches",
-        sequence,
-        sequence,
-        content,
-        dated.offset,
-        received,
-        served.version,
-        served.revision,
-        rows,
-    )
-    return Arrival(entry, predicted, source is None, place, derived, dated.leap)
+def _dated(
+    batch: Measured, past: Past, sequence: int, received: float, limits: RowLimits, options: LearningOptions
+) -> Dated:
+    """Date the rows of a new batch by the clock of its stream."""
+    below = past.below
+    offset = 0.0 if past.source is None else past.source.offset
+    adjacent = below is not None and below.last_sequence == sequence - 1
+    clock = StreamTime.of(offset, _place(below), _place(past.above), adjacent, received)
+    previous = below.last if below is not None and adjacent else None
+    return date_rows(batch, clock, limits, previous, options.forgetting_s)
 
 
-def _derived(
-    session: Session, key: tuple[str, str, int], t: Array, dated: Dated, limits: RowLimits
-) -> tuple[Rows, slice, Derivation]:
-    """The rows of a batch with derived accelerations, and those of others that it completes, and which are its own."""
+def _complete(
+    session: Session, key: tuple[str, str, int], batch: Measured, dated: Dated, limits: RowLimits
+) -> tuple[Rows, slice, Derivation | None]:
+    """The rows of a batch, with derived accelerations if none were sent; those of others that it completes; which are
+    its own; and how they were derived."""
+    if batch.ddq is not None or batch.t is None:
+        return dated.rows, slice(0, len(batch)), None
     try:
-        how = acceleration.Derivation.of(t, log.derived_beside(session, *key))
+        how = acceleration.Derivation.of(batch.t, log.derived_beside(session, *key))
     except DerivationError as error:
         raise invalid_request(error.field, error.value, error.expected) from error
     before, after = (log.rows_beside(session, *key, way, 2 * how.half) for way in (-1, 1))

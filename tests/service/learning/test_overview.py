@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from lipcore.online.record import Record
+from lipcore.online.window import Window
 from service.journal.alarms import raise_alarm
 from service.learning import owner
-from service.learning.ingest.monitor import Window
 from tests.service.data import stream, train, upload
 from tests.service.learning.lessons import LESSON, answered, lesson
 

@@ -9,9 +9,10 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families as parse
 
 from lipcore.online.record import Record
+from lipcore.online.window import Window
 from lipcore.vocabulary import CODES
 from service.learning.control import status
-from service.learning.ingest.monitor import WINDOWS_S, Window
+from service.learning.ingest.monitor import WINDOWS_S
 from tests.service.data import eventually
 from tests.service.learning.lessons import lesson
 
