@@ -7,8 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
+from lipcore.model.body import Body
+from lipcore.model.payload import Carrier
+from lipcore.online.batch import Rows
 from lipcore.online.changes.opening import Opening
 from lipcore.online.gates import ContactGate
+from lipcore.online.payload.holding import Watch
 from lipcore.online.scale import ScaleRecord
 
 FORMAT = 1
@@ -34,6 +40,19 @@ class PayloadRecord:
     def holds(self) -> bool:
         """Whether something is carried."""
         return self.body is not None or (self.watch is not None and self.watch["held"] is not None)
+
+    def seen_by(self, carrier: Carrier, version: int, rows: Rows | None = None) -> Watch:
+        """Return the payload as a version sees it. One whose geometry was learnt has a frame of its own, in which a
+        payload that another version has seen lies elsewhere. rows: that the payload was seen on, None if unknown."""
+        n, noticed, body = carrier.model.n_joints, self.watch, self.body
+        if noticed is not None:
+            if carrier.term.arm.mode == "learn" and self.version != version:
+                return Watch.of_another(noticed, n, carrier)
+            return Watch.from_json(noticed, n, carrier, rows)
+        if body is None:
+            return Watch(n).put_down(self.received)
+        inertia = None if body["inertia"] is None else np.array(body["inertia"])
+        return Watch(n).declare(carrier, Body(body["mass"], np.array(body["com"]), inertia), self.received)
 
     def to_json(self) -> dict[str, Any]:
         """All fields as JSON has them; `PayloadRecord(**values)` reads them."""

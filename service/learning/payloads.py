@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.batch import Rows
@@ -83,7 +80,7 @@ class Payloads:
                 return seen.watch
             known = self._rows.get(stream_id)
             rows = None if known is None or known[0] is not record else known[1]
-            watch = _watch_of(record, carrier, version, rows)
+            watch = record.seen_by(carrier, version, rows)
             self._seen[stream_id] = Seen(record, version, carrier, watch)
             return watch
 
@@ -128,19 +125,6 @@ class Payloads:
         return model
 
 
-def _watch_of(record: PayloadRecord, carrier: Carrier, version: int, rows: Rows | None) -> Watch:
-    """A record as a version sees it. One whose geometry was learnt has a frame of its own, in which a payload that
-    another version has seen lies elsewhere. rows: that the payload was seen on, where they were looked for."""
-    n, noticed, body = carrier.model.n_joints, record.watch, record.body
-    if noticed is not None:
-        if carrier.term.arm.mode == "learn" and record.version != version:
-            return Watch.of_another(noticed, n, carrier)
-        return Watch.from_json(noticed, n, carrier, rows)
-    if body is None:
-        return Watch(n).put_down(record.received)
-    return Watch(n).declare(carrier, _body(body), record.received)
-
-
 def _seen_on(session: Session, model: str, stream_id: str, since: float) -> Rows | None:
     """Rows of a stream since an event time, s, of as many batches as are read, evenly spread; None without any."""
     of_stream = EventRow.model == model, EventRow.stream_id == stream_id, EventRow.kind == "batch"
@@ -154,8 +138,3 @@ def _seen_on(session: Session, model: str, stream_id: str, since: float) -> Rows
     rows = Rows.concatenate(parts)
     rows = rows.take(np.isin(rows.code, TEACHING) & (rows.time >= since))
     return rows.take(np.argsort(rows.time, kind="stable")) if len(rows) else None
-
-
-def _body(values: Mapping[str, Any]) -> Body:
-    inertia = values["inertia"]
-    return Body(values["mass"], np.array(values["com"]), None if inertia is None else np.array(inertia))
