@@ -12,8 +12,8 @@ from threadpoolctl import threadpool_limits
 
 from lipcore.arm import right_angles
 from lipcore.arm.posing import make_problem, mode_of, surroundings, with_samples, with_stribeck
-from lipcore.arm.problem import UNIT_WIDTH, Point, Problem, root_of
-from lipcore.arm.right_angles import NEAR_NATS, Candidate, Layout
+from lipcore.arm.problem import WIDTHS, Point, Problem, root_of
+from lipcore.arm.right_angles import Candidate, Layout
 from lipcore.arm.scales import rescale
 from lipcore.arm.search import Pool, SearchResult, search
 from lipcore.data.samples import Array, Samples
@@ -29,21 +29,34 @@ from lipcore.posterior.misfit import Misfit, estimate, shared_rows
 from lipcore.posterior.selection import spread_out
 from lipcore.vocabulary import GeometryMode
 
-SEARCH_ROWS, ROWS_PER_JOINT = 80, 10
-"""Rows that the search looks at: at least the first, and this many a joint."""
-POLISHED, POLISHING = 4, 40
-"""Optima of few rows that are followed on all rows, and steps of that."""
-ROUNDS, ROUND_STEPS = 3, 15
-"""Times that scales and geometry are fitted in turn, and steps of each."""
-DIFFERS = 0.3
-"""An alternative arm matters where its torque differs by this share of the spread that is stated anyway."""
-CHECKS = 200
-STRIBECK_NATS = 3.0
-"""What a fourth term of friction has to gain to be kept: odds of twenty to one, from independent samples. On simulated
-arms without such friction it lost two to seven where every row counted."""
-STRIBECK_ROUNDS, REST_ROUNDS = 2, 2
-CORRELATED = 20_000
-"""Contiguous rows at most that tell what lasts of the errors."""
+
+@dataclass(frozen=True)
+class ArmOptions:
+    """Effort of learning an arm, and what its friction and its alternatives must gain."""
+
+    min_search_rows: int = 80
+    search_rows_per_joint: int = 10
+    """Rows of the search: this many a joint, at least the min."""
+    polished: int = 4
+    """Optima of the search that are followed on all rows."""
+    polish_steps: int = 40
+    rounds: int = 3
+    round_steps: int = 15
+    """Times that scales and geometry are fitted in turn, and steps of each."""
+    min_difference: float = 0.3
+    """An alternative arm is kept if its torque differs by this share of the stated spread."""
+    check_motions: int = 200
+    """Motions at which arms are compared."""
+    min_stribeck_nats: float = 3.0
+    """Min gain of the fourth term of friction: odds of twenty to one, from independent samples. On simulated arms
+    without such friction the term lost two to seven nats if every row counted."""
+    stribeck_rounds: int = 2
+    rest_rounds: int = 2
+    max_contiguous_rows: int = 20_000
+    """Max contiguous rows from which the lasting part of the errors is estimated."""
+
+
+OPTIONS = ArmOptions()
 
 
 @dataclass(frozen=True)
@@ -84,21 +97,23 @@ def learn(
         chosen = samples.rows(rows)
         problem = make_problem(chosen, task.joint_types, order, task.gravity, around, samples)
         if task.sibling is not None:
-            problem = replace(problem, scale_width=UNIT_WIDTH)
+            problem = replace(problem, scale_width=WIDTHS.unit)
         result: SearchResult | None = None
         if mode == "learn" and not begin:
             result = _search(task, problem, order, chosen, known, seed, watch)
-            starts = [(each.geometry, each.sigma) for each in result.points[:POLISHED]]
+            starts = [(each.geometry, each.sigma) for each in result.points[: OPTIONS.polished]]
         else:
             if around is not None and (mode == "fixed" or not begin):
                 begin = [around.geometry]
             starts = [(each, noise.start(samples)[order]) for each in begin]
-        polished = Pool(problem.recombined(CHECKS))
+        polished = Pool(problem.recombined(OPTIONS.check_motions))
         for geometry, sigma in starts:
-            polished.add(problem.descend(geometry, sigma, POLISHING, watch.stop))
+            polished.add(problem.descend(geometry, sigma, OPTIONS.polish_steps, watch.stop))
         ends = polished.points
         watch.step("hyperparameters", ends[0].value, 0.85)
-        counting = _Counting(task.contiguous(CORRELATED), order, shared_rows(samples, task.joint_types, len(rows)))
+        counting = _Counting(
+            task.contiguous(OPTIONS.max_contiguous_rows), order, shared_rows(samples, task.joint_types, len(rows))
+        )
         problem = counting.applied(problem, ends[0], at_rest=False)
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
         found, stribeck_nats = _refined(problem, ends, counting, watch, known if mode == "learn" else None)
@@ -165,7 +180,7 @@ def _search(
 ) -> SearchResult:
     """Search for the geometry on a few of the rows `samples` of a problem."""
     types = tuple(task.joint_types[joint] for joint in order)
-    few = spread_out(samples.motion(), max(SEARCH_ROWS, ROWS_PER_JOINT * len(types)))
+    few = spread_out(samples.motion(), max(OPTIONS.min_search_rows, OPTIONS.search_rows_per_joint * len(types)))
     sensor = noise_level([task.signals.tau[part][:, order] for part in task.signals.episodes()])
     seconds = task.options.search_seconds
     return search(problem.rows(few), types, task.gravity, sensor, seconds, seed, known, watch.searching)
@@ -183,32 +198,32 @@ def _refined(
 
     known: geometries for the search for right angles, if the geometry is learnt from nothing; else None.
     """
-    best, problem = _in_turn(problem, ends[0], ROUNDS, 0.85, watch)
+    best, problem = _in_turn(problem, ends[0], OPTIONS.rounds, 0.85, watch)
     free: Layout = (None,) * problem.n_joints
-    others = [end for end in ends[1:] if end.value < ends[0].value + 2 * NEAR_NATS]
+    others = [end for end in ends[1:] if end.value < ends[0].value + 2 * right_angles.OPTIONS.near_nats]
     starts = [(free, problem.expected, end) for end in (best, *others)]
     if known is not None:
         chosen = right_angles.likely_layouts(problem, [best, *ends[1:]], known, watch.stop)
         starts = [*((each.layout, each.problem.expected, each.point) for each in chosen), *starts]
         problem = replace(problem, expected=starts[0][1])
-        best, problem = _in_turn(problem, starts[0][2], STRIBECK_ROUNDS, 0.87, watch)
+        best, problem = _in_turn(problem, starts[0][2], OPTIONS.stribeck_rounds, 0.87, watch)
     wider = with_stribeck(problem)
     start = wider.at(best.geometry, best.sigma)
     gain = rescale(problem, best).value - rescale(wider, start).value
-    if gain > STRIBECK_NATS:
-        best, problem = _in_turn(wider, start, STRIBECK_ROUNDS, 0.88, watch)
-    for number in range(REST_ROUNDS):
+    if gain > OPTIONS.min_stribeck_nats:
+        best, problem = _in_turn(wider, start, OPTIONS.stribeck_rounds, 0.88, watch)
+    for number in range(OPTIONS.rest_rounds):
         problem = counting.applied(problem, best, at_rest=True)
         best, problem = _in_turn(
-            problem, problem.at(best.geometry, best.sigma), STRIBECK_ROUNDS, 0.9 + 0.02 * number, watch
+            problem, problem.at(best.geometry, best.sigma), OPTIONS.stribeck_rounds, 0.9 + 0.02 * number, watch
         )
     found = [right_angles.weigh(problem, best, starts[0][0])]
     for layout, expected, other in starts[1:]:
         posed = replace(problem, expected=expected)
-        end = posed.descend(other.geometry, best.sigma, ROUND_STEPS, watch.stop, noise=False)
+        end = posed.descend(other.geometry, best.sigma, OPTIONS.round_steps, watch.stop, noise=False)
         found.append(right_angles.weigh(posed, end, layout))
     found.sort(key=lambda each: each.evidence)
-    return [each for each in found if each.evidence < found[0].evidence + NEAR_NATS], gain
+    return [each for each in found if each.evidence < found[0].evidence + right_angles.OPTIONS.near_nats], gain
 
 
 def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch: _Watch) -> tuple[Point, Problem]:
@@ -216,7 +231,7 @@ def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch
     for number in range(rounds):
         scaled = rescale(problem, point)
         problem = scaled.problem
-        point = problem.descend(point.geometry, scaled.point.sigma, ROUND_STEPS, watch.stop, noise=False)
+        point = problem.descend(point.geometry, scaled.point.sigma, OPTIONS.round_steps, watch.stop, noise=False)
         watch.step("hyperparameters", point.value, fraction + 0.01 * number)
     return point, problem
 
@@ -267,14 +282,14 @@ def _alternative(problem: Problem, point: Point, place: NDArray[np.int64], share
 
 def _differs(problem: Problem, best: Point, other: Point) -> bool:
     """Whether two arms differ in torque beyond what is stated, where motions recombine those of the samples."""
-    asked = problem.recombined(CHECKS)
+    asked = problem.recombined(OPTIONS.check_motions)
     means = [asked.mean(point) for point in (best, other)]
     hessian, _, _ = problem.normal(best)
     root = root_of(hessian)
     both = asked.all_features(best)
     spread = np.square(np.linalg.solve(root, both.reshape(-1, both.shape[2]).T)).sum(0).reshape(means[0].shape)
     stated = np.sqrt(np.mean(spread, axis=0) + best.sigma**2)
-    return bool(np.any(np.sqrt(np.mean((means[0] - means[1]) ** 2, axis=0)) > DIFFERS * stated))
+    return bool(np.any(np.sqrt(np.mean((means[0] - means[1]) ** 2, axis=0)) > OPTIONS.min_difference * stated))
 
 
 def _search_report(

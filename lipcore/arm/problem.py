@@ -20,19 +20,24 @@ from lipcore.data.samples import Array
 from lipcore.kernels.fast.arm import PARAMETERS, arm_masses, arm_shapes
 from lipcore.kernels.geometry import Geometry
 
-ANGLE, LENGTH = 1.0, 0.5
-"""Prior widths of a geometry that nothing is known of, rad and m."""
-LARGEST_TURN, LARGEST_SHIFT = 0.5, 0.3
-"""Longest step in one number, rad and m: beyond it the linearisation says nothing."""
-DAMPING, EASIER, HARDER, TRIALS = 1e-2, 8.0, 8.0, 7
-CONVERGED = 1e-2
-"""nats."""
-NOISE_WIDTH = 3.0
-"""Prior width of log σ."""
-SCALE_WIDTH, UNIT_WIDTH = 2.0, 0.3
-"""Prior widths of the parts that a logarithm of s is the sum of (`arm.scales`): a factor of seven either way within one
-deviation; and of those of masses and rotor inertias around another unit's, which differ about as much as expected."""
-MOST_LEVERAGE = 0.9
+
+@dataclass(frozen=True)
+class PriorWidths:
+    """Prior widths of an arm of which only the joints are known."""
+
+    angle: float = 1.0
+    """Directions of axes, rad."""
+    length: float = 0.5
+    """Places of axes, m."""
+    noise: float = 3.0
+    """Logarithm of σ."""
+    scale: float = 2.0
+    """Parts that a logarithm of s is the sum of (`arm.scales`): a factor of seven either way within one deviation."""
+    unit: float = 0.3
+    """The same of masses and rotor inertias around another unit's, which differ about as much as expected."""
+
+
+WIDTHS = PriorWidths()
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,7 @@ class Expected:
     @classmethod
     def anything(cls, geometry: Geometry) -> Expected:
         """Nothing is known but the joints: axes point anywhere, and lie within some 0.5 m of the frame before."""
-        return cls(np.where(geometry.turns, ANGLE, LENGTH))
+        return cls(np.where(geometry.turns, WIDTHS.angle, WIDTHS.length))
 
     def step(self, geometry: Geometry) -> Array:
         """From a geometry to what is expected, (g,) rad and m."""
@@ -94,7 +99,7 @@ class Problem:
     noise: Array
     floor: Array
     expected: Expected | None
-    scale_width: float = SCALE_WIDTH
+    scale_width: float = WIDTHS.scale
 
     @property
     def n_joints(self) -> int:
@@ -180,7 +185,7 @@ class Problem:
         value = 0.5 * (left @ left + weights @ weights) + np.log(lower.diagonal()).sum()
         value += self.counts.sum(0) @ np.log(sigma)
         value += 0.0 if self.expected is None else self.expected.value(geometry)
-        value += 0.5 * np.sum((np.log(sigma / self.noise) / NOISE_WIDTH) ** 2)
+        value += 0.5 * np.sum((np.log(sigma / self.noise) / WIDTHS.noise) ** 2)
         return Point(geometry, sigma, float(value), weights, features, lower)
 
     def laplace(self, point: Point) -> float:
@@ -203,7 +208,7 @@ class Problem:
         scaled, _ = self._scaled(point.features, point.sigma)
         white = solve_triangular(point.factor, scaled.T, lower=True, check_finite=False)
         leverage = np.square(white).sum(0).reshape(size, n).sum(0)
-        left = size - np.minimum(leverage, MOST_LEVERAGE * size)
+        left = size - np.minimum(leverage, 0.9 * size)
         squares = (self.counts / self.counts.mean(0) * self.residual(point) ** 2).sum(0)
         sigma = np.maximum(np.sqrt(squares / left), self.floor)
         return self.at(point.geometry, sigma, point.features)
@@ -220,12 +225,12 @@ class Problem:
 
         stop: asked at every step. Raise LinAlgError where the evidence cannot be computed.
         """
-        point, damping = self.at(start, sigma), DAMPING
-        largest = np.where(start.turns, LARGEST_TURN, LARGEST_SHIFT)
+        point, damping = self.at(start, sigma), 1e-2
+        largest = np.where(start.turns, 0.5, 0.3)  # rad and m: beyond, the linearisation says nothing
         for iteration in range(iterations):
             before = point.value
             hessian, gradient, k = self.normal(point)
-            for _ in range(TRIALS if self.expected is not None else 0):
+            for _ in range(7 if self.expected is not None else 0):
                 damped = hessian.copy()
                 shape = np.arange(k, len(damped))
                 damped[shape, shape] *= 1 + damping
@@ -236,12 +241,12 @@ class Problem:
                     moved = moved.canonical()
                 trial = self.at(moved, point.sigma)
                 if trial.value < point.value:
-                    point, damping = trial, max(damping / EASIER, 1e-8)
+                    point, damping = trial, max(damping / 8, 1e-8)
                     break
-                damping = min(damping * HARDER, 1e8)
+                damping = min(damping * 8, 1e8)
             for _ in range(2 if noise else 0):
                 point = self.with_noise(point)
-            if (abs(before - point.value) < CONVERGED and iteration > 2) or (stop is not None and stop()):
+            if (abs(before - point.value) < 0.01 and iteration > 2) or (stop is not None and stop()):
                 break
         return point
 

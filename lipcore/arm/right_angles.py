@@ -1,7 +1,7 @@
 """Arms as they are built: axes at right angles to each other, at the zero pose and up to a turn about the vertical.
 
 Of an axis that a recording leaves open, one of six directions is far more likely than any other. A *layout* names for
-each joint the direction of its axis, or none. Given a layout the axes are expected within TURN_WIDTH of it, the free
+each joint the direction of its axis, or none. Given a layout the axes are expected near it, the free
 ones anywhere; layouts are weighed by their evidence, with the geometry integrated out.
 """
 
@@ -13,26 +13,40 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from lipcore.arm.problem import ANGLE, LENGTH, Expected, Point, Problem
+from lipcore.arm.problem import WIDTHS, Expected, Point, Problem
 from lipcore.data.samples import Array
 from lipcore.kernels.geometry import Geometry, aligned, rotation_of
 
 DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
-AXES = "xXyYzZ"
 TYPICAL_LAYOUTS = {7: ("zyzyzyz", "zyzYzyz"), 6: ("zyyxyx", "zyyyzy")}
 """Axes of common arms at their zero pose, base to tip; capitals point backwards."""
-TURN_WIDTH = 0.01
-"""How far an axis at a right angle may lie from it, standard deviation in rad."""
-NEAR_RAD = np.radians(12.0)
-"""An axis within this angle of a direction is put there at once."""
-RIGHT_SHARE = 0.9
-"""Share of all axes that are built at right angles."""
-SEARCH_ROWS, SEARCH_STEPS = 80, 5
-"""Rows of a problem that layouts are compared on, and steps of each descent."""
-MAX_KEPT, MAX_IMPROVED, MAX_SWEEPS = 3, 2, 3
-"""Layouts that are kept, those that are improved, and times that all joints are tried in turn."""
-NEAR_NATS, GAIN_NATS = 7.0, 1.0
-"""A candidate that much less likely than the best counts for a thousandth; what a sweep has to gain to be repeated."""
+
+
+@dataclass(frozen=True)
+class LayoutOptions:
+    """How near axes are to right angles, and how layouts are searched for."""
+
+    turn_width_rad: float = 0.01
+    """Standard deviation of an axis from its right angle."""
+    near_rad: float = float(np.radians(12.0))
+    """An axis within this angle of a direction is put there at once."""
+    right_share: float = 0.9
+    """Share of all axes that are built at right angles."""
+    rows: int = 80
+    """Rows of a problem that layouts are compared on."""
+    steps: int = 5
+    """Steps of each descent."""
+    max_kept: int = 3
+    max_improved: int = 2
+    max_sweeps: int = 3
+    """Max number of layouts that are kept, of those that are improved, and of times that all joints are tried."""
+    near_nats: float = 7.0
+    """A candidate that is this much less likely than the best counts for a thousandth."""
+    min_gain_nats: float = 1.0
+    """Min gain of a sweep after which another one follows."""
+
+
+OPTIONS = LayoutOptions()
 
 Layout = tuple[int | None, ...]
 """For each joint, base to tip, the row of DIRECTIONS that its axis points to, or None for a free axis."""
@@ -56,7 +70,9 @@ def weigh(problem: Problem, point: Point, layout: Layout) -> Candidate:
     if problem.expected is None:
         return Candidate(layout, problem, point, point.value)
     snapped = sum(each is not None for each in layout)
-    share = snapped * np.log(RIGHT_SHARE / len(DIRECTIONS)) + (len(layout) - snapped) * np.log(1 - RIGHT_SHARE)
+    share = snapped * np.log(OPTIONS.right_share / len(DIRECTIONS)) + (len(layout) - snapped) * np.log(
+        1 - OPTIONS.right_share
+    )
     occam = float(np.log(problem.expected.widths).sum())
     return Candidate(layout, problem, point, problem.laplace(point) + occam - share)
 
@@ -67,27 +83,31 @@ def likely_layouts(
     known: Sequence[Geometry] = (),
     stop: Callable[[], bool] | None = None,
 ) -> list[Candidate]:
-    """Return the layouts that are more likely than the first of some optima is without one: at most MAX_KEPT.
+    """Return the layouts that are more likely than the first of some optima is without one: `max_kept` at most.
 
     They are compared on few rows of the problem, which count for all. A search starts at the optima, with the axes that
     lie near a direction put there, at known geometries, and at TYPICAL_LAYOUTS. The best of these are improved: each
-    joint in turn is tried in all directions, MAX_SWEEPS times at most, until that gains nothing.
+    joint in turn is tried in all directions, `max_sweeps` times at most, until that gains nothing.
     """
-    rows = np.unique(np.linspace(0, len(problem.tau) - 1, SEARCH_ROWS).round().astype(np.int64))
+    rows = np.unique(np.linspace(0, len(problem.tau) - 1, OPTIONS.rows).round().astype(np.int64))
     few = problem.rows(rows)
     few = replace(few, counts=few.counts * (len(problem.tau) / len(rows)))
     search = _Search(few, ends[0].sigma, stop)
-    typical = [tuple(map(AXES.index, axes)) for axes in TYPICAL_LAYOUTS.get(problem.n_joints, ())]
+    typical = [tuple(map("xXyYzZ".index, axes)) for axes in TYPICAL_LAYOUTS.get(problem.n_joints, ())]
     starts = [
-        *(search.nearest(end.geometry, NEAR_RAD) for end in ends[:MAX_KEPT]),
+        *(search.nearest(end.geometry, OPTIONS.near_rad) for end in ends[: OPTIONS.max_kept]),
         *(search.nearest(geometry, np.inf) for geometry in known),
         *(search.settle(ends[0].geometry, layout) for layout in typical),
     ]
-    for start in sorted({each.layout: each for each in starts}.values(), key=_evidence)[:MAX_IMPROVED]:
+    for start in sorted({each.layout: each for each in starts}.values(), key=_evidence)[: OPTIONS.max_improved]:
         search.improve(start)
     limit = weigh(few, few.at(ends[0].geometry, ends[0].sigma), (None,) * problem.n_joints).evidence
     ranked = sorted(search.found.values(), key=_evidence)
-    return [each for each in ranked[:MAX_KEPT] if each.evidence < min(limit, ranked[0].evidence + NEAR_NATS)]
+    return [
+        each
+        for each in ranked[: OPTIONS.max_kept]
+        if each.evidence < min(limit, ranked[0].evidence + OPTIONS.near_nats)
+    ]
 
 
 @dataclass
@@ -105,7 +125,7 @@ class _Search:
             start = laid_out(geometry, layout)
             posed = replace(self.problem, expected=expected_layout(start, layout))
             try:
-                end = weigh(posed, posed.descend(start, self.sigma, SEARCH_STEPS, noise=False), layout)
+                end = weigh(posed, posed.descend(start, self.sigma, OPTIONS.steps, noise=False), layout)
             except LinAlgError:
                 end = Candidate(layout, posed, posed.at(start, self.sigma), np.inf)
             self.found[layout] = end
@@ -121,7 +141,7 @@ class _Search:
 
     def improve(self, best: Candidate) -> None:
         """Try each joint in all directions until that gains nothing."""
-        for _ in range(MAX_SWEEPS):
+        for _ in range(OPTIONS.max_sweeps):
             before = best.evidence
             for joint in range(len(best.layout)):
                 for direction in (*range(len(DIRECTIONS)), None):
@@ -129,7 +149,7 @@ class _Search:
                         return
                     layout = (*best.layout[:joint], direction, *best.layout[joint + 1 :])
                     best = min(best, self.settle(best.point.geometry, layout), key=_evidence)
-            if best.evidence > before - GAIN_NATS:
+            if best.evidence > before - OPTIONS.min_gain_nats:
                 return
 
 
@@ -140,7 +160,9 @@ def _evidence(candidate: Candidate) -> float:
 def shares(found: Sequence[Candidate]) -> Array:
     """Return the probabilities of candidates, (K,)."""
     evidence = np.array([each.evidence for each in found])
-    odds = np.exp(np.maximum(evidence.min() - evidence, -2 * NEAR_NATS))  # none of zero: a covariance is made of them
+    odds = np.exp(
+        np.maximum(evidence.min() - evidence, -2 * OPTIONS.near_nats)
+    )  # none of zero: a covariance is made of them
     return np.asarray(odds / odds.sum())
 
 
@@ -151,10 +173,12 @@ def certainty(found: Sequence[Candidate]) -> Array:
 
 
 def expected_layout(geometry: Geometry, layout: Layout) -> Expected:
-    """Return what a layout expects around a geometry that has it: axes there, shifts within LENGTH of none."""
-    turn = np.array([ANGLE if each is None else TURN_WIDTH for each in layout]).repeat(geometry.screws)
+    """Return what a layout expects around a geometry that has it: axes there, shifts near none."""
+    turn = np.array([WIDTHS.angle if each is None else OPTIONS.turn_width_rad for each in layout]).repeat(
+        geometry.screws
+    )
     around = replace(geometry, translation=np.zeros_like(geometry.translation))
-    return Expected(np.where(geometry.turns, turn, LENGTH), around)
+    return Expected(np.where(geometry.turns, turn, WIDTHS.length), around)
 
 
 def laid_out(geometry: Geometry, layout: Layout) -> Geometry:

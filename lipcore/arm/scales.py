@@ -23,20 +23,27 @@ from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import KINDS
 from lipcore.kernels.fast.arm import PARAMETERS
 
-MAX_LOG_SHARE = 2.5
-"""Limit on the shares of masses and rotors, as a logarithm either way: a factor of 12."""
-MIN_FRICTION_SHARE = 0.1
-"""Smallest deviation of a friction torque, as a share of its joint's root mean square torque, which is the largest."""
-POOLING_WIDTH = 0.7
-"""Prior width of the logarithm of a joint's friction deviation around the mean of all joints."""
-MIN_COUNT = 40.0
-"""Measurements of a joint that the evidence of deviations counts at least, however few of a recording are independent.
 
-With few of them friction and masses seem to be nothing and are taken for noise; with all rows masses follow errors
-that last. Tried on recordings of seven arms, each left out in turn: with a URDF 30 and 60 differ by 2 %, and no such
-limit is 25 % worse (geometric mean of nMSE); without a URDF all three are within 8 %.
-"""
-ITERATIONS = 60
+@dataclass(frozen=True)
+class ScaleOptions:
+    """Limits of prior deviations."""
+
+    max_log_share: float = 2.5
+    """Max size of the logarithm of the shares of masses and rotors: a factor of 12 either way."""
+    min_friction_share: float = 0.1
+    """Min deviation of a friction torque, as a share of its joint's root mean square torque, which is the max."""
+    pooling_width: float = 0.7
+    """Prior width of the logarithm of a joint's friction deviation around the mean of all joints."""
+    min_count: float = 40.0
+    """Min measurements of a joint in the evidence of deviations, however few rows of a recording are independent.
+
+    With few measurements friction and masses seem to be zero and count as noise; with all rows masses follow lasting
+    errors. Tuned on recordings of seven arms, each left out in turn: with a URDF 30 and 60 differ by 2 %, and no such
+    limit is 25 % worse (geometric mean of nMSE); without a URDF all three are within 8 %.
+    """
+
+
+OPTIONS = ScaleOptions()
 BODY_KINDS = 3
 
 
@@ -62,8 +69,10 @@ def rescale(problem: Problem, point: Point) -> Scaled:
     evidence = _Evidence.around(problem, point)
     parts, masses = _parts(n, k), BODY_KINDS + n + 1
     frictions = k - problem.bodies
-    bounds = [(-MAX_LOG_SHARE, MAX_LOG_SHARE)] * masses + [(float(np.log(MIN_FRICTION_SHARE)), 0.0)] * frictions
-    width = np.repeat([problem.scale_width, POOLING_WIDTH], [masses, frictions])
+    bounds = [(-OPTIONS.max_log_share, OPTIONS.max_log_share)] * masses + [
+        (float(np.log(OPTIONS.min_friction_share)), 0.0)
+    ] * frictions
+    width = np.repeat([problem.scale_width, OPTIONS.pooling_width], [masses, frictions])
 
     def negative(shares: Array) -> tuple[float, Array]:
         value, slopes = evidence(parts @ shares)
@@ -73,14 +82,14 @@ def rescale(problem: Problem, point: Point) -> Scaled:
 
     start = np.linalg.lstsq(parts, np.log(problem.scale / problem.unit))[0]
     start = np.clip(start, *np.transpose(bounds))
-    best = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": ITERATIONS})
+    best = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
     problem = replace(problem, scale=problem.unit * np.exp(parts @ best.x))
     return Scaled(problem, problem.with_noise(problem.at(point.geometry, point.sigma)), float(best.fun))
 
 
 def tempered(counts: Array) -> Array:
-    """Counts with which torques enter the evidence of deviations: at least MIN_COUNT of a joint on average."""
-    return np.asarray(counts * max(1.0, MIN_COUNT / float(counts.sum(0).mean())))
+    """Counts with which torques enter the evidence of deviations: at least `min_count` of a joint on average."""
+    return np.asarray(counts * max(1.0, OPTIONS.min_count / float(counts.sum(0).mean())))
 
 
 @dataclass(frozen=True)

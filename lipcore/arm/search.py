@@ -21,13 +21,48 @@ from lipcore.robots.urdf_text import UrdfError
 from lipcore.vocabulary import JointType
 
 RIGHT_ANGLED = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], np.float64)
-DIRECTION_SHARES = (0.25, 0.05, 0.175, 0.175, 0.175, 0.175)
-"""How often an axis goes on as the one before, turns back, or lies across it: as arms are built."""
-UPRIGHT_SHARE, RIGHT_BASE_SHARE = 0.5, 0.7
-"""How often the first axis is upright, and, up to here, how often it is upright, upside down or level."""
-SIDE, LONG = 0.2, 0.3
-"""Widths of where the next axis lies, m: across and along the one before."""
-HOPS = 7
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How arms are drawn, and how long and from where the search goes on."""
+
+    direction_shares: tuple[float, ...] = (0.25, 0.05, 0.175, 0.175, 0.175, 0.175)
+    """Shares of axes that point as the one before, point back, or lie across it, in the order of `RIGHT_ANGLED`."""
+    upright_share: float = 0.5
+    """Share of arms whose first axis is upright."""
+    right_base_share: float = 0.7
+    """Share of arms whose first axis is upright, upside down or level."""
+    across_m: float = 0.2
+    along_m: float = 0.3
+    """Widths of the next axis' place, across and along the one before."""
+    screened: int = 400
+    """Random arms whose evidence is computed."""
+    starts: int = 20
+    """Best of the random arms, which the search starts from."""
+    max_idle: int = 60
+    max_idle_at_noise: int = 15
+    """Max successive hops without a gain: while residuals exceed the sensor's noise, and once they do not."""
+    explained_ratio: float = 1.3
+    """Residuals up to this many times the sensor's noise are explained."""
+    min_gain_nats: float = 1.0
+    """Min improvement that counts as a gain."""
+    same_nats: float = 0.5
+    same_noise: float = 3.0
+    check_motions: int = 40
+    """Two optima are the same within this many nats, and within this many noise levels of torque at these motions."""
+    max_kept: int = 6
+    """Max number of optima that are kept."""
+    steps: int = 25
+    """Max steps of a descent."""
+    hop_noise: float = 3.0
+    min_hop_noise_share: float = 0.02
+    """Noise that a hop starts with: this many times the optimum's, at least this share of the torque's spread."""
+    rank_scale: float = 1.5
+    """A hop starts at an optimum whose rank is drawn from an exponential distribution of this scale."""
+
+
+OPTIONS = SearchOptions()
 
 
 def draw(rng: np.random.Generator, joint_types: tuple[JointType, ...], gravity: bool) -> Geometry:
@@ -39,17 +74,17 @@ def draw(rng: np.random.Generator, joint_types: tuple[JointType, ...], gravity: 
     rotation, translation = np.empty((n, 3, 3)), np.zeros((n, 3))
     for j in range(n):
         kind = rng.uniform()
-        if j or kind >= UPRIGHT_SHARE:
-            direction = RIGHT_ANGLED[rng.choice(6, p=DIRECTION_SHARES)]
+        if j or kind >= OPTIONS.upright_share:
+            direction = RIGHT_ANGLED[rng.choice(6, p=OPTIONS.direction_shares)]
             if not j:
-                direction = RIGHT_ANGLED[rng.integers(6)] if kind < RIGHT_BASE_SHARE else _unit(rng)
+                direction = RIGHT_ANGLED[rng.integers(6)] if kind < OPTIONS.right_base_share else _unit(rng)
         else:
             direction = RIGHT_ANGLED[0]
         rotation[j] = aligned(direction) @ rotation_of(np.array([0.0, 0.0, rng.integers(4) * np.pi / 2]))
         if not j:  # where the first joint's zero lies relative to a tilt, nobody knows
             rotation[j] = rotation[j] @ rotation_of(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
         elif joint_types[j] == "revolute":
-            translation[j] = rng.normal(0, [SIDE, SIDE, LONG])
+            translation[j] = rng.normal(0, [OPTIONS.across_m, OPTIONS.across_m, OPTIONS.along_m])
     axis = np.tile([0.0, 0.0, 1.0], (n, 1))
     return Geometry(joint_types, rotation, translation, axis, weight(gravity)).canonical()
 
@@ -58,7 +93,7 @@ def hop(rng: np.random.Generator, geometry: Geometry) -> Geometry:
     """Another arm near an optimum: one or two joints turned, mirrored, reversed, moved, shaken or drawn anew."""
     rotation, translation, n = geometry.rotation.copy(), geometry.translation.copy(), geometry.n_joints
     for j in rng.choice(n, min(int(rng.integers(1, 3)), n), replace=False):
-        axis, kind = geometry.axis[j], rng.integers(HOPS)
+        axis, kind = geometry.axis[j], rng.integers(7)
         if kind == 0:  # all that follows, by a quarter or half about this axis
             rotation[j] = rotation[j] @ rotation_of(axis * rng.choice([0.5, 1.0, -0.5]) * np.pi)
         elif kind == 1:  # a right angle
@@ -68,14 +103,14 @@ def hop(rng: np.random.Generator, geometry: Geometry) -> Geometry:
             rotation[j] = half @ rotation[j] @ half
         elif kind == 3:  # anew
             rotation[j] = aligned(_unit(rng)) @ rotation_of(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
-            translation[j] = rng.normal(0, LONG, 3)
+            translation[j] = rng.normal(0, OPTIONS.along_m, 3)
         elif kind == 4:  # to the other side
             translation[j] = -translation[j]
         elif kind == 5:  # the other sense of turning
             rotation[j] = rotation[j] @ rotation_of(np.pi * geometry.across[j, rng.integers(2)])
         else:  # a little
             rotation[j] = rotation[j] @ rotation_of(rng.normal(0, 0.5, 3))
-            translation[j] = translation[j] + rng.normal(0, SIDE, 3)
+            translation[j] = translation[j] + rng.normal(0, OPTIONS.across_m, 3)
     return replace(geometry, rotation=rotation, translation=translation).canonical()
 
 
@@ -105,29 +140,11 @@ def known_geometries(joint_types: tuple[JointType, ...], gravity: bool) -> tuple
     return tuple(geometries)
 
 
-SCREENED, STARTS = 400, 20
-"""Random arms whose evidence is looked at, and how many of the best are followed."""
-IDLE, IDLE_AT_NOISE = 60, 15
-"""Hops in a row that must bring nothing: where the residuals are larger than the sensor's noise, and where not."""
-EXPLAINED = 1.3
-"""Residuals up to this many times the sensor's noise are explained."""
-GAIN = 1.0
-"""nats, by which a hop has to be better to have brought something."""
-SAME, ALIKE, CHECKED = 0.5, 3.0, 40
-"""Two optima count as one within this many nats, and this many noise levels of torque at this many motions."""
-KEPT = 6
-ITERATIONS = 25
-WIDER, WIDEST = 3.0, 0.02
-"""Noise that a hop sets out with: this many times the optimum's, at least this share of the torque's spread."""
-FAVOUR = 1.5
-"""Scale of the exponential by whose draw one of the optima, best first, is hopped from."""
-
-
 @dataclass(frozen=True)
 class SearchResult:
     """Where a search ended: optima, best first, and how.
 
-    points: up to KEPT distinct optima; starts, hops: descents; distinct: optima seen that differ by more than SAME;
+    points: distinct optima; starts, hops: descents; distinct: optima seen that differ;
     times_best: descents that ended in the best; explained: whether its residuals look like the sensor's noise;
     ended: `idle`, or `time` where the time limit came first; seconds.
     """
@@ -159,22 +176,22 @@ def search(
     Raise LinAlgError where no start has an evidence.
     """
     rng = np.random.default_rng(seed)
-    pool = Pool(problem.recombined(CHECKED))
+    pool = Pool(problem.recombined(OPTIONS.check_motions))
     spread = problem.tau.std(0)
     wide = 0.3 * spread + problem.floor
-    drawn = [draw(rng, joint_types, gravity) for _ in range(SCREENED)]
+    drawn = [draw(rng, joint_types, gravity) for _ in range(OPTIONS.screened)]
     with suppress(LinAlgError):
         problem.descend(drawn[0], wide, 1)  # compiles what is not compiled yet: that is none of the search's time
     began = time.monotonic()
     ranked = sorted(drawn, key=lambda each: _value(problem, each, wide))
-    begin = [*known, *ranked[:STARTS]]
+    begin = [*known, *ranked[: OPTIONS.starts]]
 
     def late() -> bool:
         return time.monotonic() - began > seconds
 
     def descend(geometry: Geometry, sigma: Array) -> None:
         try:
-            pool.add(problem.descend(geometry, sigma, ITERATIONS))
+            pool.add(problem.descend(geometry, sigma, OPTIONS.steps))
         except LinAlgError:
             pool.failed += 1
 
@@ -187,21 +204,26 @@ def search(
     if not pool.points:
         raise LinAlgError("no start of the search has an evidence that can be computed")
     starts, hops, quiet = pool.descents, 0, 0
-    while not late() and quiet < (IDLE_AT_NOISE if _explained(pool.points[0], sensor_noise, problem.floor) else IDLE):
+    while not late() and quiet < (
+        OPTIONS.max_idle_at_noise if _explained(pool.points[0], sensor_noise, problem.floor) else OPTIONS.max_idle
+    ):
         before = pool.best
-        chosen = pool.points[min(int(rng.exponential(FAVOUR)), len(pool.points) - 1)]
-        descend(hop(rng, chosen.geometry), np.maximum(WIDER * chosen.sigma, WIDEST * spread))
+        chosen = pool.points[min(int(rng.exponential(OPTIONS.rank_scale)), len(pool.points) - 1)]
+        descend(
+            hop(rng, chosen.geometry),
+            np.maximum(OPTIONS.hop_noise * chosen.sigma, OPTIONS.min_hop_noise_share * spread),
+        )
         hops += 1
-        quiet = 0 if pool.best < before - GAIN else quiet + 1
+        quiet = 0 if pool.best < before - OPTIONS.min_gain_nats else quiet + 1
         if step is not None:
-            step(pool.best, 0.4 + 0.6 * max(quiet / IDLE, (time.monotonic() - began) / seconds))
+            step(pool.best, 0.4 + 0.6 * max(quiet / OPTIONS.max_idle, (time.monotonic() - began) / seconds))
     best = pool.points[0]
     return SearchResult(
         tuple(pool.points),
         starts,
         hops,
         pool.distinct,
-        sum(1 for value in pool.ends if value < best.value + SAME),
+        sum(1 for value in pool.ends if value < best.value + OPTIONS.same_nats),
         _explained(best, sensor_noise, problem.floor),
         "time" if late() else "idle",
         time.monotonic() - began,
@@ -235,7 +257,10 @@ class Pool:
         torque = self.checks.mean(point)
         for place, (other, its) in enumerate(zip(self.points, self.torques, strict=True)):
             error = np.sqrt(np.mean((torque - its) ** 2, axis=0))
-            if abs(point.value - other.value) <= SAME and (error <= ALIKE * point.sigma).all():
+            if (
+                abs(point.value - other.value) <= OPTIONS.same_nats
+                and (error <= OPTIONS.same_noise * point.sigma).all()
+            ):
                 if point.value < other.value:
                     self._keep(place, point, torque)
                 return
@@ -247,12 +272,12 @@ class Pool:
         pairs = [*zip(self.points, self.torques, strict=True)]
         if place is not None:
             del pairs[place]
-        pairs = sorted([*pairs, (point, torque)], key=lambda each: each[0].value)[:KEPT]
+        pairs = sorted([*pairs, (point, torque)], key=lambda each: each[0].value)[: OPTIONS.max_kept]
         self.points, self.torques = [each for each, _ in pairs], [each for _, each in pairs]
 
 
 def _explained(point: Point, sensor_noise: Array, floor: Array) -> bool:
-    return bool(np.all(point.sigma <= EXPLAINED * np.maximum(sensor_noise, floor)))
+    return bool(np.all(point.sigma <= OPTIONS.explained_ratio * np.maximum(sensor_noise, floor)))
 
 
 def _value(problem: Problem, geometry: Geometry, sigma: Array) -> float:

@@ -12,9 +12,6 @@ from scipy.special import betaincinv
 from lipcore.data.metrics import LEVEL, Answer
 from lipcore.data.samples import Array, Samples
 
-LARGEST_STEP = 2.0
-"""Of usual steps of time; after a larger one errors count as not neighbouring."""
-
 
 @dataclass(frozen=True)
 class CoverageInterval:
@@ -84,8 +81,8 @@ def _correlation(values: Array, runs: Sequence[slice]) -> float:
 
 
 def _runs(samples: Samples) -> list[slice]:
-    """Rows that follow each other in time; thinning, which is even, is no gap."""
+    """Rows that follow each other in time, without a step of more than two usual ones; even thinning is no gap."""
     steps = np.diff(samples.t)
     usual = np.median(steps[steps > 0]) if (steps > 0).any() else np.inf
-    begins = np.flatnonzero((steps <= 0) | (steps > LARGEST_STEP * usual)) + 1
+    begins = np.flatnonzero((steps <= 0) | (steps > 2 * usual)) + 1
     return [slice(first, last) for first, last in pairwise([0, *begins.tolist(), len(samples)])]

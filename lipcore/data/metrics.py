@@ -101,10 +101,8 @@ LEVEL = 0.95
 """Probability of all intervals."""
 BLOCK_S = 1.0
 """Length of a block, s."""
-MIN_BLOCKS, MAX_BLOCKS = 20, 64
-"""Fewest blocks that a verdict stands on, and most: beyond it, neighbours become one."""
-MOST_CORRELATION = 0.9
-"""Correlation of neighbouring blocks that is reckoned with at most."""
+MIN_BLOCKS = 20
+"""Min blocks of a verdict."""
 
 
 @dataclass(frozen=True)
@@ -226,7 +224,7 @@ def _figures(tau: Array, answer: Answer) -> tuple[Array, Array, Array]:
 
 
 def blocks(samples: Samples) -> NDArray[np.int64]:
-    """First row of each block, rising, at most MAX_BLOCKS."""
+    """First row of each block, rising, at most 64: beyond, neighbours become one."""
     episodes = samples.episodes()
     starts: list[int] = []
     for episode in episodes:
@@ -235,7 +233,7 @@ def blocks(samples: Samples) -> NDArray[np.int64]:
             continue
         number = np.floor((samples.t[episode] - samples.t[episode.start]) / BLOCK_S)
         starts += (episode.start + np.flatnonzero(np.diff(number, prepend=-1.0))).tolist()
-    while len(starts) > MAX_BLOCKS:
+    while len(starts) > 64:
         starts = starts[::2]
     return np.array(starts, np.int64)
 
@@ -249,7 +247,7 @@ def of_blocks(rows: NDArray[np.int64], sums: Array) -> Difference:
     """Mean of paired differences of which B >= 1 blocks in their order are known: rows (B,) and sums (B, k).
 
     With S_b the sums and N_b the rows of the blocks, N = Σ N_b, d_b = S_b - N_b mean and ρ the correlation of
-    neighbouring d_b, corrected for the bias that it has in B blocks and at least 0:
+    neighbouring d_b, corrected for the bias that it has in B blocks and between 0 and 0.9:
     se² = B/(B-1) Σ d_b² / N² · (1+ρ)/(1-ρ), with B (1-ρ)/(1+ρ) - 1 degrees of freedom, at least 1.
     """
     mean, count = sums.sum(axis=0) / rows.sum(), len(rows)
@@ -262,7 +260,7 @@ def of_blocks(rows: NDArray[np.int64], sums: Array) -> Difference:
 
     neighbours = np.sum(deviation[1:] * deviation[:-1], axis=0)
     measured = np.divide(neighbours, squared, out=np.zeros_like(squared), where=squared > 0)
-    correlation = np.clip(measured + (1 + 4 * np.maximum(measured, 0)) / count, 0, MOST_CORRELATION)
+    correlation = np.clip(measured + (1 + 4 * np.maximum(measured, 0)) / count, 0, 0.9)
     inflation = (1 + correlation) / (1 - correlation)
     standard_error = np.sqrt(count / (count - 1) * squared * inflation) / rows.sum()
     freedom = np.maximum(count / inflation - 1, 1)

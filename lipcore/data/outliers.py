@@ -26,43 +26,50 @@ LARGEST_TORQUE = 1e6
 drown whatever was summed before."""
 LARGEST = {"q": 1e5, "dq": 1e4, "ddq": 1e6, "tau": LARGEST_TORQUE}
 """The same of what is measured besides: rad, rad/s, rad/s² (m, m/s, m/s²). Joints without end turn often."""
-AROUND, NEAREST = 8, 2
-"""Rows on either side that a row is compared with, but for the nearest, which it spoils itself."""
-USUAL = 0.8
-"""Quantile of the deviations around a row that counts as usual there: of 12 rows two may be corrupt themselves."""
-DEVIATIONS = 12.0
-"""Usual deviations that are let pass.
 
-This, USUAL, QUIET, LEAD and TURN were tuned on 612 simulated recordings of a double pendulum and a UR5 (seeds 1 and 2),
-clean, with Coulomb friction and with `Dirt`, at 10 to 250 Hz. In two of the UR5's 252 a row was left out that was
-sound: moves of 0.1 to 0.5 s, sampled at 10 Hz.
-"""
-SHARE_OF_SPREAD = 0.02
-"""What a deviation is to exceed of the column's spread (2nd to 98th percentile), besides DEVIATIONS usual ones."""
-ENDS = 3
-"""First and last rows of an episode, whose course cannot be told from both sides."""
-TINY = 1e-300
-FEWEST = 12
-"""Rows of an episode that its course can be told from."""
-RATIO = 30.0
-"""Rows whose course tells nothing are corrupt where they are so many times as far from the median as all others."""
-MOST_SHARE, MOST_ROWS = 0.02, 3
-"""Of a recording at most so much, or so many rows, is left out without asking: more is no accident."""
-QUIET = 4.0
-"""Usual changes up to which motion does not explain what the torque does, nor the torque the motion; beyond, what is
-explained grows with the square."""
-LEAD = 4.0
-"""Rows that stick out are corrupt where they do so this many times as much as the next one: a motion that is sampled so
-seldom that its moves take one row has many such rows."""
-TURN = 20.0
-"""By how much a torque may deviate more where its joint turns back: friction leaps, and back again where a turn and the
-next one lie a row apart."""
-ROUNDS = 3
-"""Corrupt rows may hide each other: what is left is looked at again, so often at most."""
-BLOCK, OVERLAP = 50_000, 2 * AROUND
-"""Rows of a long recording that are looked at together, and how many of those beside them."""
-NAMED = 10
-"""Rows that a message names."""
+
+@dataclass(frozen=True)
+class OutlierOptions:
+    """Limits beyond which a row is corrupt.
+
+    `usual_quantile`, `max_deviations`, `max_usual_changes`, `lead` and `turn_factor` were tuned on 612 simulated
+    recordings of a double pendulum and a UR5 (seeds 1 and 2), clean, with Coulomb friction and with `Dirt`, at 10 to
+    250 Hz. In two of the UR5's 252 recordings a sound row was left out: moves of 0.1 to 0.5 s, sampled at 10 Hz.
+    """
+
+    neighbours: int = 8
+    """Rows on either side that a row is compared with."""
+    skipped: int = 2
+    """Nearest rows on either side that are not compared: the row spoils their deviation."""
+    usual_quantile: float = 0.8
+    """Quantile of the neighbours' deviations that counts as usual: two of 12 neighbours may be corrupt themselves."""
+    max_deviations: float = 12.0
+    """Max deviation of a row, in usual deviations there."""
+    min_spread_share: float = 0.02
+    """A deviation also exceeds this share of the column's spread (2nd to 98th percentile)."""
+    end_rows: int = 3
+    """First and last rows of an episode: only one side of their course is known."""
+    min_rows: int = 12
+    """Min rows of an episode whose course is known."""
+    far_ratio: float = 30.0
+    """Without a course a row is corrupt if it is this many times as far from the median as all others."""
+    max_share: float = 0.02
+    max_rows: int = 3
+    """Max rows that are left out, as a share of the recording or a count, whichever is more: more is no accident."""
+    max_usual_changes: float = 4.0
+    """Motion explains a deviation of torque, and torque one of motion, from this many usual changes on, and more of it
+    with their square."""
+    lead: float = 4.0
+    """A corrupt row deviates this many times as much as the next one: a motion that is sampled so seldom that its moves
+    take one row has many such rows."""
+    turn_factor: float = 20.0
+    """Factor on a torque's allowed deviation where its joint turns back: friction leaps, and leaps back if two turns
+    lie a row apart."""
+    max_rounds: int = 3
+    """Corrupt rows may hide each other: the remaining rows are checked again, at most this often."""
+
+
+OPTIONS = OutlierOptions()
 
 
 class CorruptError(ValueError):
@@ -88,7 +95,7 @@ class Corrupt:
     @property
     def first(self) -> list[int]:
         """The first of them, counted from 0."""
-        return [int(row) for row in np.flatnonzero(self.rows)[:NAMED]]
+        return [int(row) for row in np.flatnonzero(self.rows)[:10]]
 
     def report(self) -> dict[str, Any]:
         """For JSON: how many rows, the first of them (counted from 0), and how many for each reason."""
@@ -107,7 +114,6 @@ class Corrupt:
 REASONS = ("magnitude", "course")
 """Why a row is corrupt: a magnitude that no robot reaches, or a value that fits neither what went before nor what
 follows, while what it depends on goes on as usual."""
-ALONE = REASONS.index("course")
 Read = Callable[[str, int], Array]
 """Gives the column of a quantity of a joint, (N,)."""
 
@@ -119,14 +125,15 @@ def corrupt(
 
     t: (N,) s, in any order, None where not known; episode: (N,), equal over one contiguous recording; read: a column of
     some quantities of q, dq, ddq and tau, NaN where missing; one at a time is in memory.
-    Raise CorruptError where more than MOST_SHARE of the rows are, naming the first ones.
+    Raise CorruptError where too many rows are corrupt, naming the first ones.
     """
     course = _Course.of(t, episode)
     count = len(course.order)
     rows, why = np.zeros(count, np.bool_), np.zeros(count, np.int64)
+    apart = REASONS.index("course")
     columns = [(name, joint) for joint in range(n_joints) for name in sorted(quantities)]  # velocities before torques
     turning = np.zeros(count, np.bool_)
-    for turn in range(ROUNDS):
+    for turn in range(OPTIONS.max_rounds):
         before = rows.copy()
         sides = {side: _Side(np.zeros(count), np.zeros(count)) for side in (True, False)}
         for name, joint in columns:
@@ -134,18 +141,18 @@ def corrupt(
             if turn == 0:
                 impossible = np.abs(values) > LARGEST[name]
                 far = _far(np.where(impossible, np.nan, values))
-                why[far & ~rows] = ALONE
+                why[far & ~rows] = apart
                 rows |= impossible | far
             deviates, change = course.look(np.where(rows, np.nan, values))
             if name == "dq":
                 turning = course.turning(values)
             elif name == "tau":
-                deviates[turning] /= TURN
+                deviates[turning] /= OPTIONS.turn_factor
             sides[name == "tau"].take(deviates, change)
         for side, other in ((True, False), (False, True)):
-            explained = np.maximum(sides[other].change / QUIET, 1.0) ** 2
-            alone = _leading(sides[side].deviation / explained, 1.0, LEAD)
-            why[alone & ~rows] = ALONE
+            explained = np.maximum(sides[other].change / OPTIONS.max_usual_changes, 1.0) ** 2
+            alone = _leading(sides[side].deviation / explained, 1.0, OPTIONS.lead)
+            why[alone & ~rows] = apart
             rows |= alone
         if (rows == before).all():
             break
@@ -166,15 +173,16 @@ def of_samples(samples: Samples) -> Corrupt:
     )
 
 
-def of_long(rows: int, take: Callable[[int, int], Samples]) -> Corrupt:
+def of_long(rows: int, take: Callable[[int, int], Samples], block: int = 50_000) -> Corrupt:
     """Find the corrupt rows of a recording that is not in memory, block by block; raise as `corrupt` does.
 
-    take: gives its samples from one row to another, exclusive.
+    take: gives its samples from one row to another, exclusive; block: rows that are checked together.
     """
     parts: list[Corrupt] = []
-    for first in range(0, rows, BLOCK):
-        begin, end = max(0, first - OVERLAP), min(rows, first + BLOCK + OVERLAP)
-        inner = slice(first - begin, min(first + BLOCK, rows) - begin)
+    overlap = 2 * OPTIONS.neighbours
+    for first in range(0, rows, block):
+        begin, end = max(0, first - overlap), min(rows, first + block + overlap)
+        inner = slice(first - begin, min(first + block, rows) - begin)
         try:
             inner_rows = of_samples(take(begin, end))
         except CorruptError as error:
@@ -213,7 +221,7 @@ class _Course:
         order = np.lexsort((places, times, episode))
         edges = np.flatnonzero(np.diff(episode[order])) + 1
         bounds = [0, *edges.tolist(), len(order)]
-        parts = [slice(a, b) for a, b in pairwise(bounds) if b - a >= FEWEST]
+        parts = [slice(a, b) for a, b in pairwise(bounds) if b - a >= OPTIONS.min_rows]
         return _Course(order, times[order], parts)
 
     def turning(self, dq: Array) -> Mask:
@@ -231,7 +239,7 @@ class _Course:
         far, change = np.zeros(len(values)), np.zeros(len(values))
         y = values[self.order]
         parts = [np.flatnonzero(np.isfinite(y[part]) & np.isfinite(self.t[part])) + part.start for part in self.parts]
-        parts = [part for part in parts if len(part) >= FEWEST]
+        parts = [part for part in parts if len(part) >= OPTIONS.min_rows]
         if not parts:
             return far, change
         every = np.concatenate(parts)
@@ -242,13 +250,14 @@ class _Course:
         quantum = float(np.quantile(steps[steps > 0], 0.1)) if (steps > 0).any() else np.inf
         floor = max(float(np.median(np.concatenate(deviations))), quantum)
         usual = max(float(np.quantile(steps, 0.6)), quantum)
+        inner = slice(OPTIONS.end_rows, -OPTIONS.end_rows)
         for part, deviates, differs in zip(parts, deviations, changes, strict=True):
-            least = SHARE_OF_SPREAD * (high - low)
-            share = deviates / max(DEVIATIONS * floor + least, TINY)
-            striking = np.flatnonzero(share > 1.0 / LEAD)  # of the others it does not matter how far they are
+            least = OPTIONS.min_spread_share * (high - low)
+            share = deviates / max(OPTIONS.max_deviations * floor + least, 1e-300)
+            striking = np.flatnonzero(share > 1.0 / OPTIONS.lead)  # of the others it does not matter how far they are
             usual_there = np.maximum(_around(deviates, striking), floor)
-            share[striking] = deviates[striking] / np.maximum(DEVIATIONS * usual_there + least, TINY)
-            far[self.order[part[ENDS:-ENDS]]] = share[ENDS:-ENDS]
+            share[striking] = deviates[striking] / np.maximum(OPTIONS.max_deviations * usual_there + least, 1e-300)
+            far[self.order[part[inner]]] = share[inner]
             change[self.order[part]] = differs / usual
         return far, change
 
@@ -296,15 +305,21 @@ def _through(at: Array, *points: tuple[Array, Array]) -> Array:
 
 def _around(each: Array, rows: NDArray[np.int64]) -> Array:
     """Usual deviation (N,) around some rows (M,), but for the row itself and those nearest: (M,)."""
-    padded = np.pad(each, AROUND, mode="reflect")
-    offsets = [at for at in range(2 * AROUND + 1) if abs(at - AROUND) > NEAREST]
-    return np.asarray(np.quantile(sliding_window_view(padded, 2 * AROUND + 1)[rows][:, offsets], USUAL, axis=1))
+    padded = np.pad(each, OPTIONS.neighbours, mode="reflect")
+    offsets = [at for at in range(2 * OPTIONS.neighbours + 1) if abs(at - OPTIONS.neighbours) > OPTIONS.skipped]
+    return np.asarray(
+        np.quantile(
+            sliding_window_view(padded, 2 * OPTIONS.neighbours + 1)[rows][:, offsets], OPTIONS.usual_quantile, axis=1
+        )
+    )
 
 
 def _far(y: Array) -> Mask:
     """Values (N,) that are far from the median, compared with all others."""
     known = np.isfinite(y)
-    return _leading(np.where(known, np.abs(y - np.median(y[known])) if known.any() else 0.0, 0.0), 0.0, RATIO)
+    return _leading(
+        np.where(known, np.abs(y - np.median(y[known])) if known.any() else 0.0, 0.0), 0.0, OPTIONS.far_ratio
+    )
 
 
 def _leading(sizes: Array, least: float, lead: float) -> Mask:
@@ -318,4 +333,4 @@ def _leading(sizes: Array, least: float, lead: float) -> Mask:
 
 def _most(count: int) -> int:
     """Rows of so many that may be corrupt by accident."""
-    return max(MOST_ROWS, round(MOST_SHARE * count))
+    return max(OPTIONS.max_rows, round(OPTIONS.max_share * count))

@@ -6,6 +6,7 @@ A held-out part that repeats motion of the training flatters: it is predicted we
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -14,20 +15,34 @@ import numpy as np
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import Mask, Numbers
 
-NEAR, NEAREST = 0.25, 0.1
-"""Two instants are alike where they lie nearer to each other than half a step from one instant to the next, but nearer
-than the first share of the usual distance of two instants, and no nearer than the second need be."""
-REPEATED = 0.5
-"""Share of instants that have their like elsewhere in time, from which on a stretch repeats."""
-ASKED = 60
-"""Instants of a block that are looked at."""
-JUDGED, AT_A_TIME = 600, 100
-"""Instants of a part that are looked at, and how many together."""
-LEAST_SPREAD = (0.01, 0.02, 0.1)
-"""Smallest spreads of position, velocity and acceleration that count as motion: rad, rad/s and rad/s² (m)."""
-RETURNING, PERIOD_TOLERANCE, PERIODIC = 0.25, 0.05, 0.6
-"""A motion has a period where at least the first share of its instants return, and of these at least the last share
-after the median time, but for the second share of it. Chosen on simulated arms (`tests/lipcore/test_repetition.py`)."""
+
+@dataclass(frozen=True)
+class RepetitionOptions:
+    """When two instants are alike, when a stretch repeats another, and when a motion has a period.
+
+    The numbers of the period were chosen on simulated arms (`tests/lipcore/test_repetition.py`).
+    """
+
+    max_near: float = 0.25
+    min_near: float = 0.1
+    """Two instants are alike if they are nearer than half the step to the next instant. This distance is limited to
+    these shares of the usual distance of two instants."""
+    repeated_share: float = 0.5
+    """Min share of instants with their like elsewhere in time in a stretch that repeats."""
+    block_instants: int = 60
+    """Max instants of a block that are compared."""
+    part_instants: int = 600
+    """Max instants of a part that are compared."""
+    min_spread: tuple[float, float, float] = (0.01, 0.02, 0.1)
+    """Min spreads of position, velocity and acceleration that count as motion: rad, rad/s and rad/s² (m)."""
+    min_returning: float = 0.25
+    """Min share of a periodic motion's instants that return."""
+    period_tolerance: float = 0.05
+    min_periodic: float = 0.6
+    """Min share of the returning instants that return after the median time, within this share of it."""
+
+
+OPTIONS = RepetitionOptions()
 
 
 def features(samples: Samples, joint_types: Sequence[str]) -> Array:
@@ -37,7 +52,7 @@ def features(samples: Samples, joint_types: Sequence[str]) -> Array:
     """
     turns = np.array([each == "revolute" for each in joint_types])
     parts = []
-    for angle, least in zip((samples.q, samples.dq, samples.ddq), LEAST_SPREAD, strict=True):
+    for angle, least in zip((samples.q, samples.dq, samples.ddq), OPTIONS.min_spread, strict=True):
         columns = angle[:, None, :]
         if angle is samples.q:
             columns = np.stack([np.where(turns, np.cos(angle), angle), np.where(turns, np.sin(angle), 0.0)], axis=1)
@@ -66,7 +81,7 @@ def groups(states: Array, edges: Numbers) -> Numbers:
     from scipy.sparse import csr_array  # noqa: PLC0415
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
-    linked = np.array([like.mean(axis=0) >= REPEATED for like in _likes(states, edges)])
+    linked = np.array([like.mean(axis=0) >= OPTIONS.repeated_share for like in _likes(states, edges)])
     return np.asarray(connected_components(csr_array(linked), directed=False)[1], np.int64)
 
 
@@ -76,7 +91,7 @@ def nearest(states: Array, edges: Numbers) -> Iterator[tuple[Numbers, Array]]:
     states: (N, k), in order of time; edges: (B + 1,), where blocks begin and end. Rows (asked,), distances (asked, B).
     """
     for first, last in pairwise(edges.tolist()):
-        rows = _evenly(first, last, ASKED)
+        rows = _evenly(first, last, OPTIONS.block_instants)
         yield rows, np.sqrt(np.minimum.reduceat(_squares(states[rows], states), edges[:-1], axis=1))
 
 
@@ -90,7 +105,7 @@ class Repetition(NamedTuple):
     @property
     def flatters(self) -> bool:
         """Whether the part repeats what was learnt from."""
-        return self.share >= REPEATED
+        return self.share >= OPTIONS.repeated_share
 
 
 def repetition(training: Samples, part: Samples, joint_types: Sequence[str]) -> Repetition:
@@ -106,8 +121,8 @@ def repetition(training: Samples, part: Samples, joint_types: Sequence[str]) -> 
 def share_repeated(known: Array, states: Array) -> float:
     """Share of some states (R, k) that have their like among those that are known, (N, k), in order of time."""
     limits, shares = _limits(known, np.concatenate([known, states])), []
-    rows = _evenly(0, len(states), JUDGED)
-    for few in np.array_split(rows, max(1, len(rows) // AT_A_TIME)):
+    rows = _evenly(0, len(states), OPTIONS.part_instants)
+    for few in np.array_split(rows, max(1, len(rows) // 100)):
         squares = _squares(states[few], known)
         nearest = squares.argmin(axis=1)
         shares.append(np.sqrt(squares[np.arange(len(few)), nearest]) <= limits[nearest])
@@ -122,7 +137,7 @@ def distinct(samples: Samples, joint_types: Sequence[str]) -> float:
     """
     states = features(samples, joint_types)
     limits, passes = _limits(states, states), []
-    for row in _evenly(0, len(states), JUDGED):
+    for row in _evenly(0, len(states), OPTIONS.part_instants):
         distances = np.sqrt(_squares(states[row : row + 1], states)[0])
         near, left = distances <= limits[row], distances > 2 * limits[row]
         inside = near[near | left]
@@ -138,17 +153,21 @@ def period(samples: Samples, joint_types: Sequence[str]) -> float | None:
     states = features(samples, joint_types)
     limits, lags, asked = _limits(states, states), [], 0
     ends = np.concatenate([np.flatnonzero(np.diff(samples.episode)) + 1, [len(samples)]])
-    for row in _evenly(0, len(samples), JUDGED // 2):
+    for row in _evenly(0, len(samples), OPTIONS.part_instants // 2):
         asked += 1
         end = ends[np.searchsorted(ends, row, side="right")]
         distances = np.sqrt(_squares(states[row : row + 1], states[row:end])[0])
         again = _return(distances, limits[row])
         if again is not None:
             lags.append(samples.t[row + again] - samples.t[row])
-    if len(lags) < max(1, RETURNING * asked):
+    if len(lags) < max(1, OPTIONS.min_returning * asked):
         return None
     usual = float(np.median(lags))
-    return usual if np.mean(np.abs(np.array(lags) - usual) <= PERIOD_TOLERANCE * usual) >= PERIODIC else None
+    return (
+        usual
+        if np.mean(np.abs(np.array(lags) - usual) <= OPTIONS.period_tolerance * usual) >= OPTIONS.min_periodic
+        else None
+    )
 
 
 def _return(distances: Array, limit: float) -> int | None:
@@ -170,10 +189,10 @@ def _likes(states: Array, edges: Numbers) -> Iterator[Mask]:
 
 
 def _limits(states: Array, all_states: Array) -> Array:
-    """How near another instant has to be to be like each of these, (N,); see NEAR."""
+    """How near another instant has to be to be like each of these, (N,)."""
     usual = np.sqrt(2 * all_states.var(axis=0).sum())
     steps = np.linalg.norm(np.diff(states, axis=0, append=states[-2:-1]), axis=1) if len(states) > 1 else np.zeros(1)
-    return np.asarray(np.clip(0.5 * steps, NEAREST * usual, NEAR * usual))
+    return np.asarray(np.clip(0.5 * steps, OPTIONS.min_near * usual, OPTIONS.max_near * usual))
 
 
 def _squares(states: Array, others: Array) -> Array:

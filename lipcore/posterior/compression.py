@@ -17,16 +17,6 @@ from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.selection import Pivots, pivots, spread_out
 from lipcore.posterior.statistics import collect
 
-QUERIES = 200
-"""Motions that compact and exact posterior are compared at."""
-NEGLIGIBLE = 1e-3
-"""Standard deviation, in units of the noise's, that smaller ones count as: what is known for certain has none."""
-STEP = 1.05
-"""Ratio of two numbers of inducing outputs that are tried."""
-STORED = 32
-"""Instants that are kept of the motion where no inducing outputs keep any."""
-RESIDUAL = 1e-6
-"""Variance, in units of the noise's, below which no more outputs are offered."""
 NONE = np.empty(0, np.int64)
 """No inducing outputs."""
 
@@ -49,7 +39,7 @@ class Deviation:
     @classmethod
     def between(cls, exact: Prediction, mean: Array, std: Array, noise_std: Array) -> Deviation:
         """Compare means and standard deviations, (N, n), with the exact prediction. noise_std: (n,)."""
-        unit = np.maximum(exact.std, NEGLIGIBLE * noise_std)
+        unit = np.maximum(exact.std, 1e-3 * noise_std)  # what is certain has no deviation of its own
         off, ratio = (mean - exact.mean) / unit, (std - exact.std) / unit
         rms = float(np.sqrt(np.square(off).mean()))
         return cls(rms, float(np.abs(off).max()), float(np.abs(ratio).max()), len(mean))
@@ -126,11 +116,11 @@ def linear(
 ) -> Compression:
     """The posterior of a kernel whose terms are all linear, which is compact as it is: nothing is left out.
 
-    samples: N; variance: (N, n) (N·m)², with which each torque teaches; std_factor: calibration. Of the motion, STORED
+    samples: N; variance: (N, n) (N·m)², with which each torque teaches; std_factor: calibration. Of the motion, 32
     spread-out instants are kept: to ask the model where it should know.
     """
     motion = samples.motion()
-    kept = motion[spread_out(motion, STORED)]
+    kept = motion[spread_out(motion, 32)]
     basis = Basis.build(kernel, params, kept, NONE)
     noise = np.exp(2 * params["noise.log_std"])
     statistics = collect(basis, variance, motion, samples.tau - kernel.mean(motion))
@@ -138,7 +128,7 @@ def linear(
     return Compression(posterior, Deviation(0.0, 0.0, 0.0, 0), tolerance, True)
 
 
-def checks(motion: Motion, queries: int = QUERIES) -> Motion:
+def checks(motion: Motion, queries: int = 200) -> Motion:
     """Motions to compare posteriors at: half of them training samples, half recombined from several.
 
     A recombined motion takes position, velocity and acceleration from three samples: it lies where the robot has been,
@@ -180,7 +170,7 @@ class _Candidates:
             gram = term.symmetric_gram(params, motion)
             gram *= precision
             gram *= precision[:, None]
-            order = pivots(gram, kernel.n_joints, most, RESIDUAL)
+            order = pivots(gram, kernel.n_joints, most, 1e-6)  # of the noise's variance
             del gram
             outputs = order.outputs
             samples, places = np.unique(outputs // kernel.n_joints, return_inverse=True)
@@ -217,8 +207,8 @@ class _Candidates:
 
 
 def _ladder(most: int) -> list[int]:
-    """Numbers of outputs to choose from, each about STEP times the one before, `most` the last."""
+    """Numbers of outputs to choose from, each about 1.05 times the one before, `most` the last."""
     sizes = [most]
     while sizes[-1] > 1:
-        sizes.append(min(sizes[-1] - 1, int(sizes[-1] / STEP)))
+        sizes.append(min(sizes[-1] - 1, int(sizes[-1] / 1.05)))
     return sizes[::-1]

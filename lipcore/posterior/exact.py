@@ -14,8 +14,6 @@ from lipcore.kernels.base import LinearKernel, Params, SumKernel, TorqueKernel
 from lipcore.posterior.linalg import Factor, add_diagonal, cholesky
 from lipcore.vocabulary import Place
 
-QUERIES_PER_CHUNK = 128
-
 
 @dataclass(frozen=True)
 class Prediction:
@@ -93,8 +91,8 @@ class Posterior(ABC):
         """
         kernel, n = component or self.kernel, self.kernel.n_joints
         means, covariances = [], []
-        for start in range(0, len(query), QUERIES_PER_CHUNK):
-            part = query[start : start + QUERIES_PER_CHUNK]
+        for start in range(0, len(query), 128):
+            part = query[start : start + 128]
             cross = self.cross(kernel, part)
             means.append(kernel.mean(part) + (self.weights @ cross).reshape(-1, n))
             white = np.ascontiguousarray(self.whiten(cross).reshape(-1, len(part), n).transpose(1, 2, 0))  # (N, n, r)

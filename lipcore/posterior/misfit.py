@@ -16,23 +16,28 @@ from lipcore.data.signals import noise_level
 from lipcore.kernels.fast.answer import ACCELERATED
 from lipcore.kernels.friction import SIGN_WIDTH
 
-LASTS_S = 1.0
-"""Seconds over which an error that is no white noise is the same: as long as the motion is. Chosen on simulated arms
-with `Dirt` (seeds 50 and 51 of `benchmarks/studies/dirty_arms.py`) among 0.5, 0.67 and 1."""
-ROWS = INDEPENDENT_HZ * LASTS_S
-"""Rows that share such an error, of those that count as independent otherwise."""
-AT_REST = 0.5
-"""Variance of the torque that holds a joint at rest, in units of its Coulomb torque squared: that of a joint which
-stopped anywhere on a slow oscillation; 1/3 if all torques that hold it were equally likely, 1 if only the largest."""
-SPEEDS = (0.01, 0.02, 0.05, 0.1, 0.2)
-"""Speeds below which friction may be unknown, rad/s (m/s)."""
-NATS = 10.0
-"""What more variance at low speed has to gain to be kept."""
-CHANCE = 1.5
-"""Variance over that of white noise, as estimated, that chance explains."""
-LEAST_SHARE = 0.01
-"""Of the mean square: variance that is left to faster motion at least."""
-STEPS = 30
+
+@dataclass(frozen=True)
+class MisfitOptions:
+    """What lasts of errors, and what variance at low speed must gain."""
+
+    lasting_s: float = 1.0
+    """Time over which an error that is no white noise is the same, s: as long as the motion is. Tuned on simulated arms
+    with `Dirt` (seeds 50 and 51 of `benchmarks/studies/dirty_arms.py`) among 0.5, 0.67 and 1."""
+    rest_share: float = 0.5
+    """Variance of the torque that holds a joint at rest, in units of its Coulomb torque squared: that of a joint which
+    stopped anywhere on a slow oscillation; 1/3 if all holding torques were equally likely, 1 if only the largest."""
+    speeds: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
+    """Speeds below which friction may be unknown, rad/s (m/s)."""
+    min_gain_nats: float = 10.0
+    """Min gain of more variance at low speed."""
+    white_ratio: float = 1.5
+    """Variance over the estimated one of white noise that chance explains."""
+    min_share: float = 0.01
+    """Min variance of faster motion, as a share of the mean square."""
+
+
+OPTIONS = MisfitOptions()
 
 
 @dataclass(frozen=True)
@@ -74,8 +79,8 @@ class Misfit:
         return Misfit.unpacked(self.packed()[:, joints])
 
     def with_friction(self, coulomb: Array) -> Misfit:
-        """The same with at least AT_REST of the squares of Coulomb torques, (n,) N·m, at rest, moved or not so far."""
-        return replace(self, rest=np.maximum(self.rest, AT_REST * coulomb**2))
+        """The same with at least `rest_share` of the squared Coulomb torques, (n,) N·m, at rest, moved so far or not."""
+        return replace(self, rest=np.maximum(self.rest, OPTIONS.rest_share * coulomb**2))
 
     def with_rest(self, other: Misfit) -> Misfit:
         """The same with the variance at rest, and its speed, of another where that is larger."""
@@ -99,7 +104,7 @@ class Misfit:
         faster = speed.clip(0.0) + ACCELERATED * acceleration.clip(0.0)
         return np.asarray(self.at_rest(motion.dq) + self.lasting * faster)
 
-    def of_row(self, noise: Array, dq: Array, rows: float = ROWS) -> Array:
+    def of_row(self, noise: Array, dq: Array, rows: float = INDEPENDENT_HZ * OPTIONS.lasting_s) -> Array:
         """Variance R with which each of N rows teaches, (N, n) (N·m)²: white noise is new in every row, an error that
         lasts is that of `rows` rows, which count together as one.
 
@@ -113,7 +118,9 @@ def shared_rows(samples: Samples, joint_types: Sequence[str], count: int) -> flo
 
     Such errors are functions of motion, so motion that repeats itself has the same again. joint_types: (n,).
     """
-    seconds = float(recording_weights(samples.t, samples.episode, 1 / LASTS_S).sum()) * distinct(samples, joint_types)
+    seconds = float(recording_weights(samples.t, samples.episode, 1 / OPTIONS.lasting_s).sum()) * distinct(
+        samples, joint_types
+    )
     return max(1.0, count / seconds) if seconds > 0 else 1.0
 
 
@@ -124,31 +131,31 @@ def estimate(
 
     residual: (N, n) N·m, what a model leaves of contiguous samples; tau: (N, n), their torques; motion: (2, N, n),
     their velocities and accelerations; episodes: their rows; least: (n,) (N·m)², that the noise has at least. What
-    differences of neighbours say, of torques or of residuals, is white noise, and CHANCE times that; the rest of the
-    noise lasts.
+    differences of neighbours say, of torques or of residuals, is white noise, and `white_ratio` times that; the rest
+    lasts.
     """
     noise, rest, slow = low_speed_variance(residual, motion[0])
     noise = np.maximum(noise, least)
     # residuals may be rougher than torques, where the model's friction turns round at once
     white = np.minimum(*(noise_level([each[part] for part in episodes]) for each in (residual, tau)))
-    lasting = np.maximum(noise - CHANCE * white**2, 0.0)
+    lasting = np.maximum(noise - OPTIONS.white_ratio * white**2, 0.0)
     usual = np.maximum(np.sqrt(np.mean(motion**2, axis=1)), SIGN_WIDTH)
     return Misfit(rest, slow, lasting, *usual), noise
 
 
 def low_speed_variance(residual: Array, dq: Array) -> tuple[Array, Array, Array]:
-    """Most likely s², r and w of residuals of variance s² + r exp(−(dq / w)²): (n,) each, w one of SPEEDS.
+    """Most likely s², r and w of residuals of variance s² + r exp(−(dq / w)²): (n,) each, w one of the speeds.
 
-    residual, dq: (N, n). Fisher scoring of both variances at once; r is zero where it gains less than NATS.
+    residual, dq: (N, n). Fisher scoring of both variances at once; r is zero where it gains less than `min_gain_nats`.
     """
     unit = np.maximum(np.mean(residual**2, axis=0), np.finfo(float).tiny)
     squares, mean = residual**2 / unit, np.ones_like(unit)
-    least = np.full_like(unit, 0.5 * len(residual) - NATS)
+    least = np.full_like(unit, 0.5 * len(residual) - OPTIONS.min_gain_nats)
     best = mean, np.zeros_like(unit), np.full_like(unit, SIGN_WIDTH)
-    for speed in SPEEDS:
+    for speed in OPTIONS.speeds:
         low = np.exp(-((dq / speed) ** 2))
         noise, rest = mean, np.zeros_like(mean)
-        for _ in range(STEPS):
+        for _ in range(30):
             weight = (noise + rest * low) ** -2.0
             total, cross, square = weight.sum(0), (weight * low).sum(0), (weight * low**2).sum(0)
             right, lowly = (weight * squares).sum(0), (weight * low * squares).sum(0)
@@ -156,7 +163,7 @@ def low_speed_variance(residual: Array, dq: Array) -> tuple[Array, Array, Array]
             known = determinant > 1e-12 * total * square
             rest = np.where(known, (total * lowly - cross * right) / np.where(known, determinant, 1.0), 0.0)
             rest = np.maximum(rest, 0.0)
-            noise = np.maximum((right - cross * rest) / total, LEAST_SHARE)
+            noise = np.maximum((right - cross * rest) / total, OPTIONS.min_share)
         variance = noise + rest * low
         value = 0.5 * (np.log(variance) + squares / variance).sum(axis=0)
         better = value < least

@@ -15,8 +15,6 @@ PREFERENCE = 10.0
 All outputs of a sample cost a query little more than one. On a 500-sample simulated Panda, 350 outputs then lie in 51
 samples instead of 240, and deviate from the exact posterior no more.
 """
-ROUNDING = 1e-13
-"""Residuals below this share of the largest variance are rounding."""
 
 
 def spread_out(motion: Motion, count: int) -> Indices:
@@ -75,7 +73,7 @@ def pivots(gram: Array, per_sample: int, most: int, residual: float) -> Pivots:
     size = len(gram)
     lower = np.zeros((min(most, size), size))  # rows are contiguous: L transposed
     left = gram.diagonal().copy()
-    stop = max(residual, ROUNDING * float(left.max()))
+    stop = max(residual, 1e-13 * float(left.max()))  # less is rounding
     handicap = np.full((size,), 1 / PREFERENCE)
     chosen: list[int] = []
     residuals: list[float] = []

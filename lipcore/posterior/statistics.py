@@ -24,8 +24,6 @@ from lipcore.posterior.linalg import (
     solve_lower_right,
 )
 
-ROUNDING = 1e-8
-"""Share of the largest eigenvalue of the statistics by which the smallest may lie below zero."""
 BELOW = 1e-5
 """How far below zero the eigenvalues of the statistics may lie by rounding without being looked at: by such a share a
 variance of which samples say nothing may exceed the prior's."""
@@ -197,7 +195,7 @@ def _by_cholesky(a: Array) -> Array | None:
 def _by_eigenvalues(a: Array) -> Array:
     """The same from any statistics, at three times the cost; raise NotPositiveDefiniteError for impossible ones."""
     values, vectors = eigen(a)
-    if not float(values[0]) >= -ROUNDING * max(float(values[-1]), 1.0):
+    if not float(values[0]) >= -1e-8 * max(float(values[-1]), 1.0):  # less is rounding
         raise NotPositiveDefiniteError(
             f"statistics of size {len(values)} have the eigenvalue {float(values[0]):.3g}, expected none below zero"
         )

@@ -12,7 +12,7 @@ import numpy as np
 
 from lipcore.arm.learning import Learnt, learn
 from lipcore.arm.posing import mode_of
-from lipcore.arm.search import EXPLAINED, known_geometries
+from lipcore.arm.search import OPTIONS, known_geometries
 from lipcore.data.metrics import Answer, compare, evaluate
 from lipcore.data.samples import Samples
 from lipcore.data.signals import noise_level
@@ -29,22 +29,15 @@ from lipcore.training.refit import refit, widened
 from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
 
 CHAIN = "lip-chain"
-MOST_PHYSICS_FIRST = (RIGID, LOCAL, CHAIN)
-"""The simplest first: an estimator that knows the arm errs less where nothing was measured."""
-AGAIN, ALL, FEW = "again", "all", "few"
 PLACES = {
     RIGID: (0, 0.25),
     LOCAL: (0.25, 0.3),
     CHAIN: (0.3, 0.92),
-    AGAIN: (0.92, 0.97),
-    ALL: (0.97, 1),
-    FEW: (0, 1),
+    "again": (0.92, 0.97),
+    "all": (0.97, 1),
+    "few": (0, 1),
 }
 """Which share of all the work each fit is, from and to."""
-JUDGED = 2000
-"""Held-out samples at most that are predicted."""
-SMOOTH = 0.01
-"""Positions in order of time have differences that vanish: noise below this share of their spread."""
 FAILURES = (ArithmeticError, ValueError)
 """What an estimator may fail with on samples that do not suit it."""
 
@@ -71,7 +64,7 @@ def choose(task: Task) -> TorqueModel:
     model = replace(
         widened(model, contest.held.samples), selection=selection(chosen, reason, contest.table(), held_out)
     )
-    model = refit(model, replace(task, on_progress=work.overall.of(chosen, ALL)))
+    model = refit(model, replace(task, on_progress=work.overall.of(chosen, "all")))
     return replace(model, fit={**model.fit, "seconds": work.overall.elapsed})
 
 
@@ -82,7 +75,7 @@ def _unjudged(work: Fits, reason: str) -> TorqueModel:
     for name in (RIGID, CHAIN):
         began = time.monotonic()
         try:
-            model = work.fit(work.task.samples, name, FEW)
+            model = work.fit(work.task.samples, name, "few")
         except FAILURES as error:
             errors.append(error)
             table.append(unjudged(name, time.monotonic() - began, error))
@@ -159,7 +152,7 @@ class Contest:
     def __init__(self, work: Fits, hold: HoldOut) -> None:
         self.work, parts = work, hold.parts
         self.training, held = taken(work.task.samples, parts.train), taken(work.task.samples, parts.held_out)
-        rows = np.unique(np.linspace(0, len(held) - 1, JUDGED).round().astype(np.int64))
+        rows = np.unique(np.linspace(0, len(held) - 1, 2000).round().astype(np.int64))
         self.held = HeldOutSamples(held.rows(rows), hold.edge[parts.held_out][rows])
         self.entries: dict[str, Contestant] = {}
         self.learnt: Learnt | None = None
@@ -176,10 +169,10 @@ class Contest:
         self.entries[LOCAL] = self._enter(LOCAL, LOCAL, self.learnt) if self.learnt else self.entries[RIGID]
         self.entries[CHAIN] = self._enter(CHAIN, CHAIN, self.learnt)
         if self.learnt and mode_of(self.work.task) == "learn" and self._chain_leads():
-            entry, learnt = self._rigid(AGAIN, self.learnt)
+            entry, learnt = self._rigid("again", self.learnt)
             if learnt and entry.density > self.entries[RIGID].density:
                 self.entries[RIGID], self.learnt = entry, learnt
-                self.entries[LOCAL] = self._enter(LOCAL, AGAIN, learnt)
+                self.entries[LOCAL] = self._enter(LOCAL, "again", learnt)
         errors = [each.error for each in self.entries.values() if each.error is not None]
         if len(errors) == len(self.entries):
             raise errors[0]
@@ -188,7 +181,8 @@ class Contest:
         """The estimator that is chosen, and why."""
         if len(self.entries) == 1:
             return RIGID, "it explains the held-out torque to the sensor's noise, so no other estimator was trained"
-        answers = {name: self.entries[name].answer for name in MOST_PHYSICS_FIRST}
+        # the simplest first: an estimator that knows the arm errs less where nothing was measured
+        answers = {name: self.entries[name].answer for name in (RIGID, LOCAL, CHAIN)}
         local = self.entries[LOCAL].model
         if local is None or not corrected_joints(local.fit):
             del answers[LOCAL]
@@ -239,13 +233,16 @@ class Contest:
         return Contestant(time.monotonic() - began, model, answer, density)
 
     def _is_explained(self) -> bool:
-        """Whether the arm predicts all joints to the sensor's noise, which signals in order of time tell."""
+        """Whether the arm predicts all joints to the sensor's noise.
+
+        It is known from signals in order of time, where the noise of positions is below 1 % of their spread.
+        """
         answer, signals = self.entries[RIGID].answer, self.work.task.signals
         if answer is None:
             return False
         q, tau = (noise_level([array[part] for part in signals.episodes()]) for array in (signals.q, signals.tau))
         error = np.sqrt(np.square(self.held.samples.tau - answer.mean).mean(axis=0))
-        return bool((q < SMOOTH * signals.q.std(axis=0)).all() and (error <= EXPLAINED * tau).all())
+        return bool((q < 0.01 * signals.q.std(axis=0)).all() and (error <= OPTIONS.explained_ratio * tau).all())
 
     def _chain_leads(self) -> bool:
         """Whether the chain predicts most joints better than the arm, by more than chance."""

@@ -12,9 +12,6 @@ from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import Mask
 from lipcore.vocabulary import LOCAL
 
-EQUAL = 1.02
-"""Errors of which one is this many times the other count as equal."""
-
 
 @dataclass(frozen=True)
 class HeldOutSamples:
@@ -75,7 +72,7 @@ def _objection(held_out: HeldOutSamples, simple: Answer, other: Answer, *, surel
         return "no states at the edge of the data could be held out"
     places = ((held_out.nmse, ""), (held_out.edge_nmse, " at the edge of the data"))
     for nmse, place in places if held_out.edge.any() else places[:1]:
-        if not _mean(nmse(other)) <= EQUAL * _mean(nmse(simple)):
+        if not _mean(nmse(other)) <= 1.02 * _mean(nmse(simple)):
             return f"its error is larger{place}"
     return None
 

@@ -23,18 +23,30 @@ from lipcore.posterior.linalg import block_diagonal
 from lipcore.posterior.selection import pivots
 from lipcore.posterior.statistics import Statistics, collect
 
-ROWS, BLOCKS = 1000, 10
-"""Rows at most that are looked at, and blocks that they are divided into."""
-NOISE_SHARES = (1e-3, 1e-2, 0.1, 0.3, 1.0)
-"""Noise variances that are tried, as shares of the correction's."""
-GAIN, CHANCE = 0.2, 2.82
-"""What a joint gains at least: a share of its squared error, and standard errors (99 % point of t for ten blocks)."""
+
+@dataclass(frozen=True)
+class CorrectionOptions:
+    """How a correction is judged, and how much of it is kept."""
+
+    max_rows: int = 1000
+    """Max number of rows that are used."""
+    blocks: int = 10
+    """Blocks that are left out in turn."""
+    noise_shares: tuple[float, ...] = (1e-3, 1e-2, 0.1, 0.3, 1.0)
+    """Noise variances that are tried, as shares of the correction's."""
+    min_gain: float = 0.2
+    """Min gain of a corrected joint, as a share of its squared error."""
+    min_gain_errors: float = 2.82
+    """The same in standard errors: the 99 % point of t for ten blocks."""
+    max_outputs: int = 400
+    """Max number of torques at which the correction is stored."""
+    open_share: float = 0.01
+    """Share of the correction's variance that these torques may leave open."""
+
+
+OPTIONS = CorrectionOptions()
 REPORTED = "local_"
 """Prefix of entries of a fit's report, one a corrected joint: the share of its squared error that is left."""
-NOTHING = 1e-12
-"""Prior variance of a joint that is not corrected, as a share of what is left over."""
-MOST_OUTPUTS, KNOWN = 400, 0.01
-"""Torques at most that the correction is remembered at, and share of its variance that they may leave open."""
 
 
 @dataclass(frozen=True)
@@ -60,10 +72,12 @@ def correct(kernel: TorqueKernel, arm: CompactPosterior, samples: Samples, joint
 
     kernel: the arm's, friction and the local one; joints: which to correct in any case, as an earlier fit did.
     The noise of a joint that is corrected is what is left of it in blocks that are left out. No joint is corrected of a
-    recording too short to leave BLOCKS of it out in turn.
+    recording too short to leave blocks of it out in turn.
     """
     order = np.lexsort((samples.t, samples.episode))
-    samples = samples.rows(order[np.unique(np.linspace(0, len(samples) - 1, ROWS).round().astype(np.int64))])
+    samples = samples.rows(
+        order[np.unique(np.linspace(0, len(samples) - 1, OPTIONS.max_rows).round().astype(np.int64))]
+    )
     motion, n = samples.motion(), samples.n_joints
     left = samples.tau - arm.mean(motion)
     local = LocalKernel(n)
@@ -72,17 +86,17 @@ def correct(kernel: TorqueKernel, arm: CompactPosterior, samples: Samples, joint
     with_it, without = _errors(samples, left / np.sqrt(power), near)
     best = with_it.mean(axis=0).argmin(axis=0)
     gain = without - with_it[:, best, np.arange(n)]
-    error, chance = without.mean(axis=0), CHANCE * gain.std(axis=0, ddof=1) / np.sqrt(len(gain))
-    corrected = (gain.mean(axis=0) > np.maximum(GAIN * error, chance)) | np.isin(np.arange(n), joints)
+    error, chance = without.mean(axis=0), OPTIONS.min_gain_errors * gain.std(axis=0, ddof=1) / np.sqrt(len(gain))
+    corrected = (gain.mean(axis=0) > np.maximum(OPTIONS.min_gain * error, chance)) | np.isin(np.arange(n), joints)
     errors = np.ones(n)
     errors[corrected] = np.minimum(1 - gain.mean(axis=0)[corrected] / error[corrected], 1.0)
-    own["local.log_scale"] = np.log(np.where(corrected, 1.0, NOTHING) * power)
+    own["local.log_scale"] = np.log(np.where(corrected, 1.0, 1e-12) * power)
     params = {**arm.params, **own, "noise.log_std": arm.params["noise.log_std"] + 0.5 * np.log(errors)}
     kept = arm.basis.inducing
     if corrected.any():
-        kept = motion[np.sort(pivots(near, 1, MOST_OUTPUTS // int(corrected.sum()), KNOWN).outputs)]
+        kept = motion[np.sort(pivots(near, 1, OPTIONS.max_outputs // int(corrected.sum()), OPTIONS.open_share).outputs)]
     outputs = (np.arange(len(kept))[:, None] * n + np.flatnonzero(corrected)).reshape(-1)
-    taught = collect(Basis.build(local, own, kept, outputs), np.array(NOISE_SHARES)[best] * power, motion, left)
+    taught = collect(Basis.build(local, own, kept, outputs), np.array(OPTIONS.noise_shares)[best] * power, motion, left)
     assert arm.statistics is not None  # as trained
     posterior = CompactPosterior.build(
         kernel,
@@ -102,21 +116,21 @@ def side_by_side(correction: Statistics, arm: Statistics) -> Statistics:
 
 
 def _errors(samples: Samples, left: Array, near: Array) -> tuple[Array, Array]:
-    """Mean squared errors of B blocks that are predicted from the others: for each of NOISE_SHARES, (B, S, n), and
+    """Mean squared errors of B blocks that are predicted from the others: for each of the noise shares, (B, S, n), and
     without a correction, (B, n); all the same if a block is too short.
 
     samples: in order; left: (N, n), in units of its root mean square; near: (N, N).
     """
-    block = np.arange(len(samples)) * BLOCKS // len(samples)
+    block = np.arange(len(samples)) * OPTIONS.blocks // len(samples)
     with_it, without = [], []
-    for each in range(BLOCKS):
+    for each in range(OPTIONS.blocks):
         parts = guarded(samples.episode, samples.t, np.arange(len(samples)), block == each, GUARD_S)
         if not (parts.train.any() and parts.held_out.any()):
-            return np.ones((2, len(NOISE_SHARES), left.shape[1])), np.ones((2, left.shape[1]))
+            return np.ones((2, len(OPTIONS.noise_shares), left.shape[1])), np.ones((2, left.shape[1]))
         values, vectors = eigh(near[np.ix_(parts.train, parts.train)])
         turned, across = vectors.T @ left[parts.train], near[np.ix_(parts.held_out, parts.train)] @ vectors
         asked = left[parts.held_out]
-        answers = [across @ (turned / (values.clip(0.0) + share)[:, None]) for share in NOISE_SHARES]
+        answers = [across @ (turned / (values.clip(0.0) + share)[:, None]) for share in OPTIONS.noise_shares]
         with_it.append([np.square(asked - answer).mean(axis=0) for answer in answers])
         without.append(np.square(asked).mean(axis=0))
     return np.array(with_it), np.array(without)

@@ -27,11 +27,6 @@ from lipcore.posterior.statistics import collect
 from lipcore.training.correction import correct
 from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
 
-LEAST_SAMPLES = 50
-"""That hyperparameters are fitted to."""
-CONTIGUOUS = 4000
-"""Rows at most that tell the misfit."""
-
 
 def fit_estimator(
     task: Task,
@@ -126,7 +121,7 @@ def compact(
         estimator.kernel, params, used, options.compact_tolerance, options.max_inducing_outputs, factor
     )
     posterior = compression.posterior
-    contiguous = task.contiguous(CONTIGUOUS)
+    contiguous = task.contiguous(4000)
     residual = contiguous.tau - posterior.mean(contiguous.motion())
     noise = posterior.noise_variance
     moved = np.stack([contiguous.dq, contiguous.ddq])
@@ -144,7 +139,7 @@ def compact(
 
 def independent_samples(options: FitOptions, learnt: Learnt) -> FitOptions:
     """Options for hyperparameters from no more samples than the recording holds independent ones."""
-    most = max(LEAST_SAMPLES, round(float(learnt.counts.mean(axis=1).sum())))
+    most = max(50, round(float(learnt.counts.mean(axis=1).sum())))
     return replace(
         options,
         hyperparameter_samples=min(options.hyperparameter_samples, most),

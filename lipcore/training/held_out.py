@@ -7,18 +7,34 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.data.repetition import REPEATED, features, groups, nearest, period, repeated, share_repeated
+from lipcore.data import repetition
+from lipcore.data.repetition import features, groups, nearest, period, repeated, share_repeated
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import GUARD_S, Mask, Numbers, Parts, SplitError, choose, guarded
 
-LEAST_ROWS, LEAST_BLOCKS, MOST_BLOCKS = 60, 4, 20
-"""Fewest rows that some are held out of, and how many blocks a recording is divided into."""
-BLOCK_ROWS, BLOCK_S = 15, 4 * GUARD_S
-"""Rows and seconds that a block has at least."""
-SHARE = 0.25
-"""Of the blocks, held out."""
-MOST_EPISODES, MOST_SHARE = 50, 0.5
-"""Most episodes that count as blocks, and largest share that is held out, unless more is asked for: or twice that."""
+
+@dataclass(frozen=True)
+class HoldOutOptions:
+    """Sizes of what is held out."""
+
+    min_rows: int = 60
+    """Min rows of a recording of which some are held out."""
+    min_blocks: int = 4
+    max_blocks: int = 20
+    """Blocks that a recording is divided into."""
+    block_rows: int = 15
+    """Min rows of a block."""
+    block_s: float = 4 * GUARD_S
+    """Min duration of a block, s."""
+    share: float = 0.25
+    """Share of the blocks that is held out."""
+    max_episodes: int = 50
+    """Max number of episodes that count as blocks."""
+    max_share: float = 0.5
+    """Max share of the rows that is held out, unless more is asked for; never more than twice what is asked for."""
+
+
+OPTIONS = HoldOutOptions()
 
 
 @dataclass(frozen=True)
@@ -42,18 +58,20 @@ def hold_out(samples: Samples, joint_types: Sequence[str]) -> HoldOut:
     Of fewer than six blocks one is held out, and none is at the edge. None is either if no group of blocks that repeat
     each other is small enough. Raise SplitError if there is too little to hold any out.
     """
-    if len(samples) < LEAST_ROWS:
-        raise SplitError("rows", len(samples), f"at least {LEAST_ROWS} to hold some out")
+    if len(samples) < OPTIONS.min_rows:
+        raise SplitError("rows", len(samples), f"at least {OPTIONS.min_rows} to hold some out")
     order = np.lexsort((samples.t, samples.episode))
     count = _count(samples.rows(order))
-    if count < LEAST_BLOCKS:
+    if count < OPTIONS.min_blocks:
         lasts = float(np.maximum(np.diff(samples.t[order]), 0.0).sum())
-        raise SplitError("seconds", round(lasts, 3), f"at least {LEAST_BLOCKS * BLOCK_S:g} to hold some out")
+        raise SplitError(
+            "seconds", round(lasts, 3), f"at least {OPTIONS.min_blocks * OPTIONS.block_s:g} to hold some out"
+        )
     edges = np.linspace(0, len(samples), count + 1).round().astype(np.int64)
-    number = max(1, round(SHARE * count))
+    number = max(1, round(OPTIONS.share * count))
     states = features(samples.rows(order), joint_types)
     outer = _outer_blocks(states, edges, number // 2)
-    new = repeated(states, edges) < REPEATED
+    new = repeated(states, edges) < repetition.OPTIONS.repeated_share
     repeats = int(new.sum()) < max(1, number // 2)
     inner = np.flatnonzero(~outer if repeats else new & ~outer)
     several = min(number - int(outer.sum()), len(inner))
@@ -74,11 +92,11 @@ def unrepeated(samples: Samples, joint_types: Sequence[str], share: float, seed:
     A block is a period of the motion, an episode, or one of equal stretches. samples: in order of episode and time;
     joint_types: (n,); share, seed: see `splits.choose`.
     """
-    if len(samples) < LEAST_ROWS:
+    if len(samples) < OPTIONS.min_rows:
         return None
     states = features(samples, joint_types)
     first = round((1 - share) * len(samples))
-    if share_repeated(states[:first], states[first:]) < REPEATED:
+    if share_repeated(states[:first], states[first:]) < repetition.OPTIONS.repeated_share:
         return None
     edges = _edges(samples, joint_types)
     if edges is None:
@@ -88,7 +106,10 @@ def unrepeated(samples: Samples, joint_types: Sequence[str], share: float, seed:
     if len(sizes) < 2:
         return None
     held = np.repeat(choose(sizes, share, seed)[group], lengths)
-    if held.mean() > max(share, min(MOST_SHARE, 2 * share)) or share_repeated(states[~held], states[held]) >= REPEATED:
+    if (
+        held.mean() > max(share, min(OPTIONS.max_share, 2 * share))
+        or share_repeated(states[~held], states[held]) >= repetition.OPTIONS.repeated_share
+    ):
         return None
     border = np.flatnonzero(np.diff(np.concatenate([[False], held, [False]])))
     return list(zip(border[::2].tolist(), border[1::2].tolist(), strict=True))
@@ -97,16 +118,16 @@ def unrepeated(samples: Samples, joint_types: Sequence[str], share: float, seed:
 def _edges(samples: Samples, joint_types: Sequence[str]) -> Numbers | None:
     """Where blocks begin and end that may repeat each other; None where there is too little for any."""
     episodes = samples.episodes()
-    if LEAST_BLOCKS <= len(episodes) <= MOST_EPISODES:
+    if OPTIONS.min_blocks <= len(episodes) <= OPTIONS.max_episodes:
         return np.array([0, *(each.stop for each in episodes)], np.int64)
     again = period(samples, joint_types) if len(episodes) == 1 else None
     if again is not None:
         number = (samples.t - samples.t[0]) / again
-        several = max(1, int(np.ceil(number[-1] / MOST_BLOCKS)))
+        several = max(1, int(np.ceil(number[-1] / OPTIONS.max_blocks)))
         begins = np.flatnonzero(np.diff(np.floor(number / several))) + 1
         return np.array([0, *begins.tolist(), len(samples)], np.int64)
     count = _count(samples)
-    return None if count < LEAST_BLOCKS else np.linspace(0, len(samples), count + 1).round().astype(np.int64)
+    return None if count < OPTIONS.min_blocks else np.linspace(0, len(samples), count + 1).round().astype(np.int64)
 
 
 def _outer_blocks(states: Array, edges: Numbers, most: int) -> Mask:
@@ -139,4 +160,4 @@ def _outer_blocks(states: Array, edges: Numbers, most: int) -> Mask:
 def _count(samples: Samples) -> int:
     """Blocks of equal length that samples in order are divided into."""
     lasts = float(np.maximum(np.diff(samples.t), 0.0).sum())
-    return int(min(MOST_BLOCKS, len(samples) // BLOCK_ROWS, lasts // BLOCK_S))
+    return int(min(OPTIONS.max_blocks, len(samples) // OPTIONS.block_rows, lasts // OPTIONS.block_s))

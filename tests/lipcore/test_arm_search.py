@@ -10,12 +10,12 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from lipcore import FitOptions, Samples, load, save, train
-from lipcore.arm import learning, right_angles
+from lipcore.arm import learning, right_angles, scales
 from lipcore.arm import search as searching
 from lipcore.arm.learning import learn
 from lipcore.arm.posing import make_problem
-from lipcore.arm.problem import NOISE_WIDTH, Point, Problem, root_of
-from lipcore.arm.scales import MAX_LOG_SHARE, MIN_FRICTION_SHARE, _Evidence, rescale, tempered
+from lipcore.arm.problem import WIDTHS, Point, Problem, root_of
+from lipcore.arm.scales import _Evidence, rescale, tempered
 from lipcore.arm.search import SearchResult, search
 from lipcore.data.metrics import evaluate
 from lipcore.data.signals import noise_level
@@ -146,7 +146,7 @@ KINDS = {"R": "revolute", "P": "prismatic"}
 @pytest.fixture
 def fewer_starts(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is found does not matter here."""
-    monkeypatch.setattr(searching, "SCREENED", 40)
+    monkeypatch.setattr(searching, "OPTIONS", replace(searching.OPTIONS, screened=40))
 
 
 def samples(kinds: str = "RRR", size: int = 60, noise: float = 0.01) -> Samples:
@@ -259,7 +259,7 @@ def plain_features(problem: Problem, geometry: Geometry) -> np.ndarray:
 
 
 def off_noise(problem: Problem, sigma: np.ndarray) -> float:
-    return float(0.5 * np.sum((np.log(sigma / problem.noise) / NOISE_WIDTH) ** 2))
+    return float(0.5 * np.sum((np.log(sigma / problem.noise) / WIDTHS.noise) ** 2))
 
 
 def off_geometry(problem: Problem, geometry: Geometry) -> float:
@@ -358,8 +358,8 @@ def test_scales_keep_within_their_limits(posed: tuple[Problem, Point]) -> None:
     few = replace(problem, counts=np.full(problem.tau.shape, 1e-3))
     shares = np.log(rescale(few, point).problem.scale / problem.unit)
     masses, friction = shares[: problem.bodies], shares[problem.bodies :]
-    assert (np.abs(masses) <= 2 * MAX_LOG_SHARE + 1e-9).all()
-    assert ((friction >= np.log(MIN_FRICTION_SHARE) - 1e-9) & (friction <= 1e-9)).all()
+    assert (np.abs(masses) <= 2 * scales.OPTIONS.max_log_share + 1e-9).all()
+    assert ((friction >= np.log(scales.OPTIONS.min_friction_share) - 1e-9) & (friction <= 1e-9)).all()
 
 
 def test_noise_does_not_depend_on_how_few_samples_count(posed: tuple[Problem, Point]) -> None:

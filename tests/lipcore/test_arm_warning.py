@@ -191,7 +191,7 @@ def test_friction_of_slow_joints_is_learnt_where_it_is(rubbing: TorqueModel, mon
     assert friction.stribeck is not None
     assert (np.abs(friction.stribeck - 0.5) < 3 * friction.stribeck_std).all()
     assert (friction.stribeck_std < 0.1).all()
-    monkeypatch.setattr(learning, "STRIBECK_NATS", np.inf)
+    monkeypatch.setattr(learning, "OPTIONS", replace(learning.OPTIONS, min_stribeck_nats=np.inf))
     without, unseen = trained(0.5), recorded(2, 0.5)
     assert without.fit["friction_terms"] == 3
     assert errors(rubbing, unseen).mean() < 0.8 * errors(without, unseen).mean()

@@ -18,8 +18,8 @@ from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.robots.urdf import RigidBody
-from lipcore.training import auto
-from lipcore.training.held_out import LEAST_ROWS, hold_out
+from lipcore.training import auto, held_out
+from lipcore.training.held_out import hold_out
 from lipcore.training.train import train
 from tests.choosing import slow
 
@@ -212,7 +212,7 @@ def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
 
 
 def test_few_rows_are_not_held_out():
-    model = train(recorded(LEAST_ROWS - 10), TYPES, options=OPTIONS)
+    model = train(recorded(held_out.OPTIONS.min_rows - 10), TYPES, options=OPTIONS)
     found = model.selection
     assert found["chosen"] == model.estimator.name == "rigid-body"
     assert found["reason"].startswith("too little to hold some out and judge by: rows is 50, expected at least 60")

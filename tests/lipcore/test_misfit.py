@@ -8,13 +8,14 @@ import pytest
 
 from lipcore import FitOptions, Samples, load, save, train
 from lipcore.arm.learning import learn
+from lipcore.data.independence import INDEPENDENT_HZ
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
 from lipcore.estimators.task import Task
 from lipcore.kernels.fast.answer import ACCELERATED
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.torque_model import TorqueModel
-from lipcore.posterior.misfit import AT_REST, ROWS, Misfit, estimate, low_speed_variance, shared_rows
+from lipcore.posterior.misfit import OPTIONS, Misfit, estimate, low_speed_variance, shared_rows
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
@@ -83,7 +84,8 @@ def test_rows_of_one_second_share_what_lasts() -> None:
     one = np.ones(2)
     misfit = Misfit(0.5 * one, one, np.array([0.25, 1.0]), one, one)
     counted = misfit.of_row(noise, dq)
-    expected = [0.75 + ROWS * (0.25 + 0.5), ROWS * (1.0 + 0.5 * np.exp(-9.0))]
+    rows = INDEPENDENT_HZ * OPTIONS.lasting_s
+    expected = [0.75 + rows * (0.25 + 0.5), rows * (1.0 + 0.5 * np.exp(-9.0))]
     np.testing.assert_allclose(counted, np.array([expected]))
 
 
@@ -113,7 +115,7 @@ def test_at_rest_friction_may_hold_any_torque(model: TorqueModel) -> None:
     from lipcore.model.parameters import friction_coefficients
 
     coulomb = friction_coefficients(model.posterior, model.estimator).coulomb
-    assert (model.posterior.misfit.rest >= 0.9 * AT_REST * coulomb**2).all()
+    assert (model.posterior.misfit.rest >= 0.9 * OPTIONS.rest_share * coulomb**2).all()
     held = dirty(7, course="rests", speed=0.5)
     answer = model.predict(held.q, held.dq, held.ddq)
     still = (np.abs(held.dq) < 0.01).all(axis=1)

@@ -100,10 +100,9 @@ def test_samples_without_a_course_keep_all_rows_but_absurd_ones(seed):
     assert corrupt_rows(spoilt(samples, ("tau", 9, 1, 1e12), ("tau", 40, 0, 1e5))) == [9, 40]
 
 
-def test_a_long_recording_is_looked_at_in_blocks(monkeypatch):
-    monkeypatch.setattr(outliers, "BLOCK", 110)
+def test_a_long_recording_is_looked_at_in_blocks():
     samples = spoilt(CLEAN, ("tau", 109, 0, 3.0), ("tau", 110, 1, 1e12), ("tau", 250, 0, 3.0))
-    found = of_long(300, lambda first, last: samples.rows(slice(first, last)))
+    found = of_long(300, lambda first, last: samples.rows(slice(first, last)), block=110)
     assert np.flatnonzero(found.rows).tolist() == [109, 110, 250]
 
 

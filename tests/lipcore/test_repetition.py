@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.data.repetition import NEAREST, distinct, features, groups, period, repetition, share_repeated
+from lipcore.data.repetition import OPTIONS, distinct, features, groups, period, repetition, share_repeated
 from lipcore.data.samples import Samples
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
@@ -73,10 +73,15 @@ def test_shares_are_those_of_distances_taken_one_by_one() -> None:
     known = np.repeat(rng.standard_normal((40, 5)), 2, axis=0)  # every other step is none: the limit is the least one
     usual = np.sqrt(2 * np.concatenate([known]).var(axis=0).sum())
     away = rng.standard_normal((40, 5))
-    away *= NEAREST * usual / np.linalg.norm(away, axis=1)[:, None] * np.where(np.arange(40) < 30, 0.5, 2.0)[:, None]
+    away *= (
+        OPTIONS.min_near
+        * usual
+        / np.linalg.norm(away, axis=1)[:, None]
+        * np.where(np.arange(40) < 30, 0.5, 2.0)[:, None]
+    )
     states = known[1::2] + away
     nearest = [min(np.linalg.norm(state - each) for each in known) for state in states]
-    expected = np.mean(np.array(nearest[:30]) <= NEAREST * usual) * 0.75
+    expected = np.mean(np.array(nearest[:30]) <= OPTIONS.min_near * usual) * 0.75
     assert share_repeated(known[1::2].repeat(3, axis=0), states) >= expected > 0.7
 
 

@@ -12,7 +12,6 @@ from lipcore.arm.learning import Learnt, learn
 from lipcore.arm.problem import Expected
 from lipcore.arm.right_angles import (
     DIRECTIONS,
-    TURN_WIDTH,
     Candidate,
     certainty,
     expected_layout,
@@ -70,7 +69,7 @@ def test_a_layout_expects_its_axes_closely_and_the_others_anywhere() -> None:
     assert isinstance(prior, Expected)
     turns = np.split(prior.widths, np.cumsum(geometry.screws)[:-1])
     for joint, widths in enumerate(turns):
-        assert (widths[:2] == (TURN_WIDTH if joint % 2 == 0 else 1.0)).all()
+        assert (widths[:2] == (right_angles.OPTIONS.turn_width_rad if joint % 2 == 0 else 1.0)).all()
     # of its own geometry nothing but the shifts is unexpected
     flat = replace(geometry, translation=np.zeros_like(geometry.translation))
     assert prior.value(flat) == pytest.approx(0.0, abs=1e-20)
