@@ -52,11 +52,10 @@ class _ResidualChainKernel(ChainKernel):
     """Energies for what rigid bodies leave over: the fit starts from a share of the torque, not from all of it."""
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """Those of the chain kernel for RESIDUAL_SHARE of the torque."""
-        return super().initial(motion, RESIDUAL_SHARE * tau)
+        """Those of the chain kernel for a tenth of the torque."""
+        return super().initial(motion, 0.1 * tau)
 
 
-RESIDUAL_SHARE = 0.1
 Maker = Callable[[tuple[JointType, ...], bool], dict[str, TorqueKernel]]
 
 ESTIMATORS: dict[str, Maker] = {

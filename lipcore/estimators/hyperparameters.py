@@ -20,15 +20,9 @@ from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.posterior.selection import spread_out
 from lipcore.vocabulary import Place
 
-PRIOR_STD = {"noise.log_std": noise.PRIOR_STD, "logits": 4.0, "log": 3.0}
+PRIOR_STD = {"noise.log_std": noise.OPTIONS.prior_std, "logits": 4.0, "log": 3.0}
 """Widths of the Gaussian priors on hyperparameters around their starting values: weak, but for the noise, which a
 small data set cannot tell from misfit. 3 on a logarithm admits a factor of 20 either way within one deviation."""
-LINE_SEARCH_PENALTY = 1e4
-TOLERANCE = 1e-7
-"""The fit has converged when an iteration improves the objective by less than this share of it."""
-MEMORY = 30
-"""Corrections that L-BFGS keeps."""
-SCREENING_SAMPLES, SCREENING_ITERATIONS = 60, 15
 START_SPREAD = 0.3
 """How far other starts lie from the kernel's own, in widths of the prior."""
 
@@ -130,7 +124,7 @@ def fit(
         iteration += 1
         report_progress("hyperparameters", float(intermediate_result.fun))
 
-    few = spread_out(motion, min(SCREENING_SAMPLES, options.hyperparameter_samples))
+    few = spread_out(motion, min(60, options.hyperparameter_samples))
     screening = _Search(kernel, start, floor, motion[few], tau[few], stop, device)
     chosen, origin = _best_start(screening, options.starts)
     result = search.run(origin, options.max_iterations, callback)
@@ -139,7 +133,7 @@ def fit(
 
     used = spread_out(motion, options.posterior_samples)
     # evenly among those of the posterior: spread-out samples are the odd ones
-    even = used[np.linspace(0, len(used) - 1, min(len(used), noise.SAMPLES)).round().astype(np.int64)]
+    even = used[np.linspace(0, len(used) - 1, min(len(used), noise.OPTIONS.samples)).round().astype(np.int64)]
     params = search.unpack(result.x)
     params = noise.refine(kernel, params, motion[even], tau[even], start["noise.log_std"], floor)
     report = FitReport(
@@ -171,7 +165,7 @@ def _best_start(screening: _Search, starts: int) -> tuple[int, Array]:
         begin = centre if number == 0 else centre + START_SPREAD * width * rng.standard_normal(len(centre))
         screening.best = np.inf
         try:
-            result = screening.run(begin, SCREENING_ITERATIONS)
+            result = screening.run(begin, 15)
         except NotPositiveDefiniteError:
             if number == 0 and starts == 1:
                 raise
@@ -213,7 +207,7 @@ class _Search:
             if not np.isfinite(self.best):
                 raise  # not even the starting point is well posed
             self.rejected += 1
-            return self.best + LINE_SEARCH_PENALTY, np.zeros_like(flat)
+            return self.best + 1e4, np.zeros_like(flat)
         value, gradient = evidence.value, evidence.gradient
         for name, centre in self.start.items():
             width = self.widths[name]
@@ -236,7 +230,7 @@ class _Search:
             method="L-BFGS-B",
             callback=callback,
             bounds=[(low, np.inf) for low in lower.tolist()],
-            options={"maxiter": iterations, "maxcor": MEMORY, "ftol": TOLERANCE},
+            options={"maxiter": iterations, "maxcor": 30, "ftol": 1e-7},
         )
 
     def width_tensors(self) -> dict[str, Array]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from lipcore.data.motion import Motion
@@ -10,24 +12,33 @@ from lipcore.data.signals import noise_level
 from lipcore.kernels.base import Params, TorqueKernel
 from lipcore.posterior.linalg import add_diagonal, cholesky
 
-START_SHARE = 0.01
-"""Smallest noise std that a fit starts from, relative to the joint's torque spread: what no model explains is noise
-too, and filtered torques look free of noise though they are not. Data that deserve less are fitted with less."""
-FLOOR_JOINT = 1e-4
-FLOOR_ROBOT = 1e-5
-"""Smallest noise std admitted, relative to the joint's torque spread and to the largest root mean square of all joints:
-below the second, a Gram matrix in float64 can no longer be factored faithfully."""
-PRIOR_STD = 1.0
-"""Width of the prior on the logarithm: a small data set cannot tell noise from misfit."""
-LARGEST_STEP = 0.7
-NEWTON_STEPS, SMALLEST_STEP = 8, 0.01
-WIDENINGS = 3
-STRETCHES = 25
-"""Contiguous parts of the samples that are left out one after another."""
-TOLERATED = 1.15
-"""Squared error over expected variance that chance explains."""
-SAMPLES = 250
-"""Samples that tell the noise: its estimate is then good to about five per cent."""
+
+@dataclass(frozen=True)
+class NoiseOptions:
+    """Limits of a joint's noise, and the effort of its estimate."""
+
+    start_share: float = 0.01
+    """Min noise std that a fit starts from, relative to the joint's torque spread: what no model explains is noise too,
+    and filtered torques look free of noise though they are not. A fit to cleaner data ends with less."""
+    min_joint_share: float = 1e-4
+    min_robot_share: float = 1e-5
+    """Min noise std, relative to the joint's torque spread and to the max root mean square of all joints: below the
+    second, a Gram matrix in float64 can no longer be factored faithfully."""
+    prior_std: float = 1.0
+    """Width of the prior on the logarithm: a small data set cannot tell noise from misfit."""
+    max_step: float = 0.7
+    max_newton_steps: int = 8
+    converged_step: float = 0.01
+    max_widenings: int = 3
+    stretches: int = 25
+    """Contiguous parts of the samples that are left out one after another."""
+    chance_ratio: float = 1.15
+    """Squared error over expected variance that chance explains."""
+    samples: int = 250
+    """Max samples of the estimate, which is then good to about five per cent."""
+
+
+OPTIONS = NoiseOptions()
 
 
 def white(samples: Samples, stretches: Samples | None = None) -> Array:
@@ -45,19 +56,21 @@ def start(samples: Samples, stretches: Samples | None = None) -> Array:
     stretches: see `white`.
     """
     level = white(samples, stretches)
-    return np.asarray(np.maximum.reduce([level, START_SHARE * samples.tau.std(axis=0), floor(samples)]))
+    return np.asarray(np.maximum.reduce([level, OPTIONS.start_share * samples.tau.std(axis=0), floor(samples)]))
 
 
 def floor(samples: Samples) -> Array:
     """Smallest noise std admitted for these samples, (n,) N·m."""
     largest = float(np.sqrt(np.mean(samples.tau**2, axis=0)).max())
-    return np.asarray(np.maximum(FLOOR_JOINT * samples.tau.std(axis=0), FLOOR_ROBOT * max(largest, 1e-6)))
+    return np.asarray(
+        np.maximum(OPTIONS.min_joint_share * samples.tau.std(axis=0), OPTIONS.min_robot_share * max(largest, 1e-6))
+    )
 
 
 def refine(
     kernel: TorqueKernel, params: Params, motion: Motion, tau: Array, centre: Array, lowest: Array
 ) -> dict[str, Array]:
-    """What up to SAMPLES samples say of the noise, all else held: two steps, returned as new hyperparameters.
+    """What some samples say of the noise, all else held: two steps, returned as new hyperparameters.
 
     First the penalised evidence is maximised over the noise by Newton steps on log σ_j. With K = k(X, X) + R and
     α = K⁻¹y, its slope is σ_j²(Σα² − tr K⁻¹) over joint j; σ_j² tr K⁻¹ is the number of samples left to tell the noise,
@@ -71,23 +84,23 @@ def refine(
     n, gram = kernel.n_joints, kernel.symmetric_gram(params, motion)
     y = (tau - kernel.mean(motion)).reshape(-1)
     log_std = params["noise.log_std"]
-    for _ in range(NEWTON_STEPS):
+    for _ in range(OPTIONS.max_newton_steps):
         inverse, alpha = _inverse(gram, log_std, y)
         variance = np.exp(2 * log_std)
         free = variance * inverse.diagonal().reshape(-1, n).sum(0)
         explained = variance * np.square(alpha.reshape(-1, n)).sum(0)
-        slope = explained - free - (log_std - centre) / PRIOR_STD**2
-        step = (slope / (2 * free + 1 / PRIOR_STD**2)).clip(-LARGEST_STEP, LARGEST_STEP)
+        slope = explained - free - (log_std - centre) / OPTIONS.prior_std**2
+        step = (slope / (2 * free + 1 / OPTIONS.prior_std**2)).clip(-OPTIONS.max_step, OPTIONS.max_step)
         before, log_std = log_std, np.maximum(log_std + step, lowest)
-        if (np.abs(log_std - before) < SMALLEST_STEP).all():
+        if (np.abs(log_std - before) < OPTIONS.converged_step).all():
             break
-    for _ in range(WIDENINGS):
+    for _ in range(OPTIONS.max_widenings):
         excess = _left_out(*_inverse(gram, log_std, y), n)
-        if (excess <= TOLERATED).all():
+        if (excess <= OPTIONS.chance_ratio).all():
             break
-        log_std = log_std + np.where(excess > TOLERATED, 0.5 * np.log(excess.clip(TOLERATED)), 0.0).clip(
-            max=LARGEST_STEP
-        )
+        log_std = log_std + np.where(
+            excess > OPTIONS.chance_ratio, 0.5 * np.log(excess.clip(OPTIONS.chance_ratio)), 0.0
+        ).clip(max=OPTIONS.max_step)
     return {**params, "noise.log_std": log_std}
 
 
@@ -105,7 +118,7 @@ def _left_out(inverse: Array, alpha: Array, n: int) -> Array:
     Leaving out block B, the error is [K⁻¹]_BB⁻¹ α_B and its covariance [K⁻¹]_BB⁻¹ (Rasmussen & Williams, eq. 5.12).
     """
     ratios = []
-    for block in np.array_split(np.arange(len(alpha)).reshape(-1, n), STRETCHES):
+    for block in np.array_split(np.arange(len(alpha)).reshape(-1, n), OPTIONS.stretches):
         rows = block.reshape(-1)
         covariance = np.linalg.inv(inverse[np.ix_(rows, rows)])
         ratios.append((np.square(covariance @ alpha[rows]) / covariance.diagonal()).reshape(-1, n))

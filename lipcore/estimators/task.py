@@ -16,8 +16,6 @@ from lipcore.vocabulary import TORQUE_CONVENTIONS, JointType, TorqueConvention
 
 MIN_SAMPLES = 10
 """Fewer samples say too little to fit anything to."""
-STRETCHES = 20
-"""Places of a long recording that contiguous samples are taken from."""
 
 
 @dataclass(frozen=True)
@@ -72,13 +70,13 @@ class Task:
         return self.samples if self.stretches is None else self.stretches
 
     def contiguous(self, most: int) -> Samples:
-        """`signals`, or of more than `most` so many, in STRETCHES from all over them, each an episode of its own."""
-        signals, length = self.signals, most // STRETCHES
+        """`signals`, or of more than `most` so many, in 20 stretches from all over them, each an episode of its own."""
+        signals, length = self.signals, most // 20
         if len(signals) <= most:
             return signals
-        begins = np.linspace(0, len(signals) - length, STRETCHES).round().astype(np.int64)
+        begins = np.linspace(0, len(signals) - length, 20).round().astype(np.int64)
         rows = (begins[:, None] + np.arange(length)).reshape(-1)
-        stretch = np.repeat(np.arange(STRETCHES), length)
+        stretch = np.repeat(np.arange(len(begins)), length)
         episode = np.unique(np.stack([signals.episode[rows], stretch]), axis=1, return_inverse=True)[1]
         return replace(signals.rows(rows), episode=episode.reshape(-1))
 

@@ -28,17 +28,7 @@ from lipcore.robots.library import Robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
 
-STEP = 1e-6
-"""Of finite differences, rad and its rates. Covariances are smooth over far more, all but friction's sign (0.02)."""
-LEAST = 1e-9
-"""Share of the variance that rounding may not go below: a logarithm is taken of it."""
-PRIOR_MOTIONS = 80
-"""Motions whose torques, as the URDF has them, tell a prior's hyperparameters."""
-NOISE_SHARE = 0.01
-"""Standard deviation of the noise that is expected, as a share of a joint's torque spread, where none is given."""
-PRIOR_FIT = FitOptions(
-    hyperparameter_samples=PRIOR_MOTIONS, posterior_samples=PRIOR_MOTIONS, max_iterations=60, starts=1, device="cpu"
-)
+PRIOR_FIT = FitOptions(hyperparameter_samples=80, posterior_samples=80, max_iterations=60, starts=1, device="cpu")
 """Short: where hyperparameters start, all motions would seem hopeless, and nothing be gained by choosing one."""
 
 
@@ -74,13 +64,13 @@ class Belief:
 
         The URDF need not be right: it tells how large and how smooth torques are, not what they are.
 
-        noise_std: N·m, of all joints or (n,); NOISE_SHARE of the torque's spread by default. bodies: for estimators
+        noise_std: N·m, of all joints or (n,); 1 % of the torque's spread by default. bodies: for estimators
         of rigid bodies. estimator: `rigid-body` with bodies and `lip-chain` without by default.
         """
         estimator = estimator or ("lip-chain" if bodies is None else "rigid-body")
-        motion = draw(limits, PRIOR_MOTIONS, seed)
+        motion = draw(limits, PRIOR_FIT.hyperparameter_samples, seed)
         tau = inverse_dynamics(robot, motion.q, motion.dq, motion.ddq)
-        std = NOISE_SHARE * tau.std(0) if noise_std is None else np.broadcast_to(noise_std, tau.shape[1:])
+        std = 0.01 * tau.std(0) if noise_std is None else np.broadcast_to(noise_std, tau.shape[1:])
         if not (np.isfinite(std).all() and (std > 0).all()):
             raise ValueError(f"noise_std is {noise_std}, expected positive numbers, one or one a joint")
         tau += std * np.random.default_rng(seed).standard_normal(tau.shape)
@@ -158,16 +148,17 @@ class Information:
         size, n = motion.q.shape
         parts = {"q": motion.q, "dq": motion.dq, "ddq": motion.ddq}
         slopes = {name: np.empty_like(part) for name, part in parts.items()}
+        step = 1e-6  # rad and its rates: covariances are smooth over far more, all but friction's sign (0.02)
         for name, part in parts.items():
             for joint in range(n):
                 moved = part.copy()
-                moved[:, joint] += STEP
+                moved[:, joint] += step
                 near = Motion(**{**parts, name: moved})
                 # a sample moves both its row and its column
                 total = 2 * (by_own * (kernel.gram(params, near, motion) - own)).sum(1)
                 total += (by_other * (self._with_reference(near) - other)).sum(1)
                 total += (by_cross * (belief.cross(near) - cross)).sum(0)
-                slopes[name][:, joint] = total.reshape(size, n).sum(1) / STEP
+                slopes[name][:, joint] = total.reshape(size, n).sum(1) / step
         return float(np.log(self._share(after)).mean()), Motion(**slopes)
 
     def _with_reference(self, motion: Motion) -> Array:
@@ -183,7 +174,7 @@ class Information:
         return solved, np.square(whitened).sum(0).reshape(self.now.shape)
 
     def _after(self, explained: Array) -> Array:
-        return np.maximum(np.maximum(self.now - explained, self.floor), LEAST * self.now)
+        return np.maximum(np.maximum(self.now - explained, self.floor), 1e-9 * self.now)
 
     def _share(self, after: Array) -> Array:
         """Geometric mean over the references: what is left of the largest variances alone would tell of extremes."""

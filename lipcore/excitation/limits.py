@@ -12,12 +12,6 @@ from lipcore.data.samples import Array
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
 
-USUAL_SPEED: dict[str, float] = {"revolute": 1.0, "prismatic": 0.2}
-"""Speed limit of a joint of which none is known, rad/s (m/s)."""
-RISE_S = 0.25
-"""A joint of which no acceleration limit is known reaches its speed limit in this time from rest. The Panda's data
-sheet allows 0.13 to 0.29 s."""
-
 
 @dataclass(frozen=True)
 class Limits:
@@ -58,11 +52,15 @@ class Limits:
         acceleration: Array,
         torque: Array,
     ) -> Limits:
-        """Limits of which some are unknown, NaN, infinite or not above zero; usual ones stand in, see the constants."""
-        usual = np.array([USUAL_SPEED[kind] for kind in joint_types])
-        speed = np.where(_given(speed), speed, usual)
-        acceleration = np.where(_given(acceleration), acceleration, speed / RISE_S)
-        span = np.where(np.array(joint_types) == "prismatic", 0.5, np.pi)
+        """Limits of which some are unknown, NaN, infinite or not above zero, and replaced by usual ones.
+
+        These are 1 rad/s (0.2 m/s), reached within 0.25 s from rest (the Panda's data sheet allows 0.13 to 0.29 s),
+        and half a turn (0.5 m) to either side.
+        """
+        slides = np.array(joint_types) == "prismatic"
+        speed = np.where(_given(speed), speed, np.where(slides, 0.2, 1.0))
+        acceleration = np.where(_given(acceleration), acceleration, speed / 0.25)
+        span = np.where(slides, 0.5, np.pi)
         lower, upper = np.where(np.isfinite(lower), lower, -span), np.where(np.isfinite(upper), upper, span)
         return cls(tuple(joint_names), lower, upper, speed, acceleration, np.where(_given(torque), torque, np.inf))
 

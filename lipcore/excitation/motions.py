@@ -16,19 +16,6 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.excitation.limits import Limits
 
-DENSE = 64
-"""Instants for each harmonic that peaks are looked for at: the bound then lies 0.12 % above them."""
-INSTANTS = 12
-"""Instants for each harmonic that limits are watched at while searching."""
-LEAST_HARMONICS, MOST_HARMONICS = 5, 60
-SHARPNESS = 40
-"""Exponent of the norm that stands for the largest share of a limit: large is near, but its slope jumps."""
-SPREAD = 1 / 3
-"""Standard deviation of speed and acceleration, as a share of their limits."""
-SECONDS = 50.0
-"""Length of the random motions."""
-PER_MOTION = 5
-"""Instants that are taken of each of them."""
 Coefficients = tuple[Array, Array, Array]
 """Shift (n,), sine and cosine amplitudes (K, n)."""
 
@@ -71,7 +58,7 @@ class Series:
 
     def used(self, limits: Limits) -> Array:
         """Upper bound on the share of the limits that is used at any time: (3, n) of position, speed, acceleration."""
-        m = DENSE * self.harmonics
+        m = 64 * self.harmonics  # the bound then lies 0.12 % above the peaks
         q, dq, ddq = self.at(np.arange(m) / m * self.seconds)
         peaks = [np.abs(q - limits.middle).max(0), np.abs(dq).max(0), np.abs(ddq).max(0)]
         shares = np.array(peaks) / np.array([limits.half, limits.speed, limits.acceleration])
@@ -188,15 +175,16 @@ class Shape:
         shares = np.abs(motion) / unit
         # every joint by the largest share first: powers overflow otherwise
         largest = shares.max((0, 1)).clip(1.0)
-        powers = ((shares / largest) ** SHARPNESS).sum((0, 1)) + largest**-SHARPNESS
-        shrink = largest * powers ** (1 / SHARPNESS)
-        slopes = powers ** (1 / SHARPNESS - 1) * (shares / largest) ** (SHARPNESS - 1)
+        p = 40  # a large norm is near the largest share, but its slope jumps
+        powers = ((shares / largest) ** p).sum((0, 1)) + largest**-p
+        shrink = largest * powers ** (1 / p)
+        slopes = powers ** (1 / p - 1) * (shares / largest) ** (p - 1)
         return shrink, slopes * np.sign(motion) / unit
 
     @cached_property
     def _watched(self) -> Array:
         """Instants (m,) at which limits are watched."""
-        m = INSTANTS * len(self.omega)
+        m = 12 * len(self.omega)
         return np.arange(m) / m * self.seconds
 
     def _motion(self, shift: Array, sine: Array, cosine: Array, t: Array) -> tuple[Array, Array, Array]:
@@ -219,26 +207,27 @@ def harmonics(limits: Limits, seconds: float) -> int:
     Up to the frequency at which the acceleration limit takes over from the speed limit.
     """
     fastest = float(np.max(limits.acceleration / limits.speed)) / (2 * np.pi)
-    return int(np.clip(np.ceil(fastest * seconds), LEAST_HARMONICS, MOST_HARMONICS))
+    return int(np.clip(np.ceil(fastest * seconds), 5, 60))
 
 
 def draw(limits: Limits, count: int, seed: int) -> Motion:
     """`count` instants of motion: one half from anywhere, the other half from random motions within the limits.
 
-    Anywhere: positions evenly over the range, speeds and accelerations Gaussian and cut off at the limits. That is more
-    than tasks ask for: joints seldom are at the ends of their ranges and fast at the same time. Random motions, some
-    slow and far, some fast and short, leave corners out that a task may ask for. Against one half alone, plans for both
-    did better at what neither half holds.
+    Anywhere: positions evenly over the range, speeds and accelerations Gaussian, of a third of the limits and cut off
+    there. That is more than tasks ask for: joints seldom are at the ends of their ranges and fast at the same time.
+    Random motions, some slow and far, some fast and short, leave corners out that a task may ask for. Against one half
+    alone, plans for both did better at what neither half holds.
     """
     rng = np.random.default_rng(seed)
     some = count - count // 2
     q = rng.uniform(limits.lower, limits.upper, (some, limits.n_joints))
     dq, ddq = (
-        np.clip(SPREAD * rng.standard_normal(q.shape), -1, 1) * limit for limit in (limits.speed, limits.acceleration)
+        np.clip(1 / 3 * rng.standard_normal(q.shape), -1, 1) * limit for limit in (limits.speed, limits.acceleration)
     )
-    shape, parts = Shape.build(limits, SECONDS, harmonics(limits, SECONDS)), [np.stack([q, dq, ddq])]
+    seconds, parts = 50.0, [np.stack([q, dq, ddq])]
+    shape = Shape.build(limits, seconds, harmonics(limits, seconds))
     while some < count:
-        instants = rng.uniform(0, SECONDS, min(PER_MOTION, count - some))
+        instants = rng.uniform(0, seconds, min(5, count - some))
         parts.append(np.stack(shape.series(shape.random(rng)).at(instants)))
         some += len(instants)
     return Motion.from_arrays(*np.concatenate(parts, axis=1))

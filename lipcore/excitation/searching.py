@@ -19,17 +19,12 @@ from lipcore.excitation.motions import Series, Shape
 from lipcore.robots.library import Robot, pinocchio
 from lipcore.robots.simulation import inverse_dynamics
 
-WATCHED = 16
-"""Instants for each harmonic that the torque is looked at: between them it may rise a little, hence the margin."""
 MARGIN = 0.99
-"""Share of a torque limit that is used at most at those instants."""
-HALVINGS = 30
+"""Max share of a torque limit that is used at the instants that are checked."""
 INSTANTS = 128
 """Instants that a motion is judged by: samples between them tell little more."""
 OVER_WEIGHT = 100.0
 """Of the squared share by which a torque exceeds its limit, against nats of variance."""
-MEMORY = 20
-"""Corrections that L-BFGS keeps."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +36,7 @@ class TorqueCheck:
 
     def used(self, series: Series) -> Array:
         """Largest share of each joint's torque limit, (n,); 0 where there is none."""
-        m = WATCHED * series.harmonics
+        m = 16 * series.harmonics  # between these instants the torque may rise a little, hence the margin
         tau = inverse_dynamics(self.robot, *series.at(np.arange(m) / m * series.seconds))
         return np.asarray(np.abs(tau).max(0) / self.limits.torque)
 
@@ -81,7 +76,7 @@ class TorqueCheck:
                 f"joint {self.limits.joint_names[joint]!r} needs {still[joint]:.0%} of its torque limit "
                 f"{self.limits.torque[joint]:.3g} N·m to hold the robot still in the middle of its range, expected less"
             )
-        for _ in range(HALVINGS):
+        for _ in range(30):
             factor = (low + high) / 2
             low, high = (factor, high) if (self.used(series.scaled(middle, factor)) <= MARGIN).all() else (low, factor)
         return series.scaled(middle, low)
@@ -180,7 +175,7 @@ class _Walk:
 
         if iterations == 0:
             return SearchResult(self.best, 0, False)
-        options = {"maxiter": iterations, "maxcor": MEMORY, "ftol": 0.0, "gtol": 0.0}
+        options = {"maxiter": iterations, "maxcor": 20, "ftol": 0.0, "gtol": 0.0}
         try:
             minimize(self, self.begin.ravel(), jac=True, method="L-BFGS-B", callback=self._step, options=options)
         except _OutOfTimeError:

@@ -79,7 +79,7 @@ class Misfit:
         return Misfit.unpacked(self.packed()[:, joints])
 
     def with_friction(self, coulomb: Array) -> Misfit:
-        """The same with at least `rest_share` of the squared Coulomb torques, (n,) N·m, at rest, moved so far or not."""
+        """The same with at least `rest_share` of the squared Coulomb torques at rest, (n,) N·m, moved so far or not."""
         return replace(self, rest=np.maximum(self.rest, OPTIONS.rest_share * coulomb**2))
 
     def with_rest(self, other: Misfit) -> Misfit:

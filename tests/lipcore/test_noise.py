@@ -1,5 +1,6 @@
 """The noise that all samples tell: draws of a prior whose noise is known, and a search by brute force."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -61,7 +62,7 @@ def test_known_noise_is_recovered_from_a_wrong_start(seed: int, factor: float) -
 def penalised(case: Draw, log_std: np.ndarray, centre: np.ndarray) -> float:
     """−log evidence − log prior of the noise, by the evidence that fits maximise."""
     evidence = negative_log_evidence(case.kernel, case.starting_at(np.exp(log_std)), case.motion, case.tau).value
-    return evidence + 0.5 * float(np.sum((log_std - np.log(centre)) ** 2)) / noise.PRIOR_STD**2
+    return evidence + 0.5 * float(np.sum((log_std - np.log(centre)) ** 2)) / noise.OPTIONS.prior_std**2
 
 
 @pytest.mark.each_once
@@ -70,7 +71,7 @@ def penalised(case: Draw, log_std: np.ndarray, centre: np.ndarray) -> float:
 def test_first_step_climbs_to_the_maximum_that_brute_force_finds(
     seed: int, factor: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(noise, "TOLERATED", np.inf)  # no second step
+    monkeypatch.setattr(noise, "OPTIONS", replace(noise.OPTIONS, chance_ratio=np.inf))  # no second step
     case, centre = draw(12, seed), 2.5 * TRUE
     options = {"xatol": 1e-7, "fatol": 1e-11, "maxiter": 4000, "maxfev": 4000}
     best = minimize(lambda x: penalised(case, x, centre), np.log(TRUE), method="Nelder-Mead", options=options)
@@ -78,8 +79,7 @@ def test_first_step_climbs_to_the_maximum_that_brute_force_finds(
     # steps that are small end near enough to gain nothing that matters by more of them
     near = np.log(refined(case, begin, centre))
     assert penalised(case, near, centre) < best.fun + 0.1
-    monkeypatch.setattr(noise, "NEWTON_STEPS", 100)
-    monkeypatch.setattr(noise, "SMALLEST_STEP", 1e-6)
+    monkeypatch.setattr(noise, "OPTIONS", replace(noise.OPTIONS, max_newton_steps=100, converged_step=1e-6))
     assert np.allclose(refined(case, begin, centre), np.exp(best.x), rtol=1e-4)
 
 
@@ -90,7 +90,7 @@ def test_second_step_judges_stretches_predicted_from_all_others(samples: int) ->
     gram = noisy_gram(case.kernel, case.params, case.motion)
     y = case.tau.ravel()
     ratios = []
-    for rows in np.array_split(np.arange(samples), noise.STRETCHES):
+    for rows in np.array_split(np.arange(samples), noise.OPTIONS.stretches):
         out = (3 * rows[:, None] + np.arange(3)).ravel()
         rest = np.setdiff1d(np.arange(3 * samples), out)
         gain = np.linalg.solve(gram[np.ix_(rest, rest)], gram[np.ix_(rest, out)]).T
@@ -122,7 +122,7 @@ def test_noise_that_lasts_over_samples_is_not_taken_for_the_function() -> None:
         found[name] = refined(noisy, level) / level
     assert np.allclose(found["white"], 1.0, rtol=0.2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(noise, "TOLERATED", np.inf)
+        patch.setattr(noise, "OPTIONS", replace(noise.OPTIONS, chance_ratio=np.inf))
         first = refined(noisy, level) / level
     assert (found["lasting"] >= first).all()
     assert found["lasting"].mean() > 1.2 * first.mean()
