@@ -25,7 +25,7 @@ import lipcore
 from benchmarks.arms import another_unit, random_arm
 from benchmarks.studies.dirty_arms import CASES, RATE, recorded, recording, unseen
 from lipcore import FitOptions
-from lipcore.arm.learning import OPTIONS
+from lipcore.arm import learning
 from lipcore.arm.posing import make_problem
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import motion_arrays
@@ -74,7 +74,7 @@ def best_known(robot: Robot, samples: Samples, options: FitOptions) -> float:
     order = np.arange(robot.n_joints)
     problem = make_problem(samples.rows(rows), robot.joint_types, order, True, every=samples)
     sigma = np.full(robot.n_joints, NOISE)
-    return problem.descend(true_geometry(robot), sigma, OPTIONS.polish_steps).value
+    return problem.descend(true_geometry(robot), sigma, learning.OPTIONS.polish_steps).value
 
 
 def rows(seeds: int) -> None:

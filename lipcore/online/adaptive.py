@@ -12,29 +12,40 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.online.record import HALF_WIDTH, LEVEL
 
-RATE = 10.0
-"""What a second of misses moves log s by; where everything lies inside it falls by 0.5 a second.
 
-This and the three below were chosen with benchmarks/studies/adaptive_intervals.py on its streams for tuning, so that
-every minute holds 93 to 97 % and each joint at least 85 % from 0.3 s after a payload on, and for the least width then.
-With 5 some minutes held 98 %.
-"""
-SHARE, FEWEST = 0.7, 5
-"""Where so large a share of so many rows or more lies outside, the scale leaps to what would have held the batch."""
-MARGIN = 1.5
-"""Times the largest error of such a batch: those of a new payload go on growing with the motion."""
-MOST_STEP = 0.25
-"""Of log s by one batch, up or down, unless its errors say more: a batch may bring many seconds of rows."""
-MOST_OWED = 30.0
-"""A minute in which everything lies inside pays as much."""
-MOST_GAIN = 0.5
-"""Of one row, however long ago the row before it was."""
-LONGEST_GAP_S = 1.0
-"""A longer time between two batches is a pause, in which nothing was observed."""
-USUAL_STEP_S = 0.01
-"""Between rows that have no times."""
-SMALLEST, LARGEST = 0.1, 1e4
-"""Of s. A small one is no danger to the stream that has earned it, whose next misses leap; see `widest`."""
+@dataclass(frozen=True)
+class AdaptiveOptions:
+    """How fast a scale s follows measurements, and how far.
+
+    `rate`, `share`, `min_rows` and `margin` were tuned with benchmarks/studies/adaptive_intervals.py on its streams for
+    tuning, so that every minute holds 93 to 97 % and each joint at least 85 % from 0.3 s after a payload on, and for
+    the min width then.
+    """
+
+    rate: float = 10.0
+    """What a second of misses moves log s by; if everything lies inside, it falls by 0.5 a second. With 5 some minutes
+    held 98 %."""
+    share: float = 0.7
+    min_rows: int = 5
+    """If this share of so many rows or more lies outside, the scale leaps to what would have held the batch."""
+    margin: float = 1.5
+    """Factor on the max error of such a batch: those of a new payload go on growing with the motion."""
+    max_step: float = 0.25
+    """Max change of log s by one batch, unless its errors say more: a batch may bring many seconds of rows."""
+    max_owed: float = 30.0
+    """A minute in which everything lies inside pays as much."""
+    max_gain: float = 0.5
+    """Max change of log s by one row, however long ago the row before it was."""
+    max_gap_s: float = 1.0
+    """A longer time between two batches is a pause, in which nothing was observed."""
+    usual_step_s: float = 0.01
+    """Time between rows that have no times."""
+    min_scale: float = 0.1
+    max_scale: float = 1e4
+    """A small scale is no danger to the stream that has earned it, whose next misses leap; see `widest`."""
+
+
+OPTIONS = AdaptiveOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,14 +53,14 @@ class Adaptive:
     """The scale s of a stream's intervals, mean ± s · 1.96 · √(std² + noise_std²), joint by joint; immutable.
 
     Quantile tracking (adaptive conformal inference, Gibbs & Candès 2021, with a step for log s): rows that stand for dt
-    seconds each move log s by RATE · dt · (miss − 0.05), where `miss` says whether one lay outside the interval that it
+    seconds each move log s by rate · dt · (miss − 0.05), where `miss` says whether one lay outside the interval that it
     was answered with. So, whatever the errors are, over a stretch of T seconds
 
-        |share of misses − 0.05| ≤ (|change of log s| + |change of owed| + leaps) / (RATE · T)
+        |share of misses − 0.05| ≤ (|change of log s| + |change of owed| + leaps) / (rate · T)
 
-    with the leaps that SHARE adds: a scale that grows tenfold shifts the coverage of that minute by 0.4 to 0.8 %. What
+    with the leaps that are added: a scale that grows tenfold shifts the coverage of that minute by 0.4 to 0.8 %. What
     the misses of a long batch ask for beyond the errors in it is not paid by a larger scale but `owed`: the scale does
-    not fall before that is paid. It holds for rows that are evenly spaced, within SMALLEST and LARGEST.
+    not fall before that is paid. It holds for rows that are evenly spaced, within the min and max scale.
 
     log: (n,), of s; owed: (n,), in the same unit; last: event time of the latest row, s.
     """
@@ -76,20 +87,20 @@ class Adaptive:
         if not len(score):
             return self
         missed = outside(score, self.factor if answered is None else answered)
-        moved = min(RATE * self._spacing(time), MOST_GAIN) * (missed - (1 - LEVEL)).sum(axis=0)
-        size = np.log(np.maximum(score, SMALLEST))
-        leap = size.max(axis=0) + np.log(MARGIN) - self.log
-        sudden = (missed.mean(axis=0) >= SHARE) & (len(score) >= FEWEST)
+        moved = min(OPTIONS.rate * self._spacing(time), OPTIONS.max_gain) * (missed - (1 - LEVEL)).sum(axis=0)
+        size = np.log(np.maximum(score, OPTIONS.min_scale))
+        leap = size.max(axis=0) + np.log(OPTIONS.margin) - self.log
+        sudden = (missed.mean(axis=0) >= OPTIONS.share) & (len(score) >= OPTIONS.min_rows)
         moved = np.where(sudden, np.maximum(moved, leap), moved)
-        most = np.maximum(leap, MOST_STEP)
+        most = np.maximum(leap, OPTIONS.max_step)
         paid = np.minimum(self.owed, np.maximum(-moved, 0.0))
-        owed = np.minimum(self.owed - paid + np.maximum(moved - most, 0.0), MOST_OWED)
+        owed = np.minimum(self.owed - paid + np.maximum(moved - most, 0.0), OPTIONS.max_owed)
         place = int(np.ceil(LEVEL * len(size))) - 1
-        least = np.minimum(np.partition(size, place, axis=0)[place] - self.log, -MOST_STEP)
+        least = np.minimum(np.partition(size, place, axis=0)[place] - self.log, -OPTIONS.max_step)
         log = self.log + np.clip(moved + paid, least, most)
         latest = float(time.max())
         last = latest if self.last is None else max(latest, self.last)
-        return Adaptive(np.clip(log, np.log(SMALLEST), np.log(LARGEST)), owed, last)
+        return Adaptive(np.clip(log, np.log(OPTIONS.min_scale), np.log(OPTIONS.max_scale)), owed, last)
 
     def to_json(self) -> dict[str, Any]:
         """Its state as numbers and lists; `from_json` gives back the same to the last bit."""
@@ -104,9 +115,9 @@ class Adaptive:
     def _spacing(self, time: Array) -> float:
         """Seconds that each of these rows stands for."""
         first, latest = float(time.min()), float(time.max())
-        if self.last is not None and first - LONGEST_GAP_S <= self.last < latest:
+        if self.last is not None and first - OPTIONS.max_gap_s <= self.last < latest:
             first = self.last
-        return (latest - first) / len(time) or USUAL_STEP_S
+        return (latest - first) / len(time) or OPTIONS.usual_step_s
 
 
 def scores(error: Array, std: Array, noise_std: Array) -> Array:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel, TrainingTorque
 from lipcore.online.batch import Rows
-from lipcore.online.regime import COLD, Regime, Walk
+from lipcore.online.regime import WALK, Regime, Walk
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.statistics import Statistics, add_to, empty
 
@@ -120,7 +120,7 @@ class OnlineModel:
             return self
         # what has been learnt so far is the past of the first epoch, from one step before it
         fresh = self.since is None or self.reference <= self.since
-        now, before = (each and each.closed(self.walk, -COLD if fresh else -1) for each in (self.now, self.before))
+        now, before = (each and each.closed(self.walk, -WALK.cold if fresh else -1) for each in (self.now, self.before))
         assert now is not None
         walk = None
         if friction_walk_s is not None:

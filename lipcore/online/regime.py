@@ -15,28 +15,36 @@ from lipcore.posterior.drift import Drift
 from lipcore.posterior.linalg import mirror
 from lipcore.posterior.statistics import Solution, Statistics, copied, decay, empty, solve
 
-SHARE = 0.3
-"""Of its size, by which a coefficient of friction changes in one time constant of its walk: standard deviation."""
-FLOOR = 0.03
-"""Least size of a coefficient, in its prior standard deviations."""
-EPOCHS = 10
-"""In a time constant: friction is taken to stand still for as long as an epoch lasts.
 
-On benchmarks/studies/drifting_friction.py (seeds 50 and 51), a third or three times SHARE, ten times FLOOR, and half or
-twice as many epochs moved the nMSE of no case by more than 1 %.
-"""
-KEPT = 4
-"""Epochs whose rows can still come; earlier ones are folded into what is known of before."""
-COLD = 10
-"""Epochs between a version's own samples and the first row of a stream: the arm may have been switched off. One epoch
-or four time constants did as well there over the first two minutes, within 2 % of the nMSE."""
+@dataclass(frozen=True)
+class WalkOptions:
+    """How friction drifts.
+
+    On benchmarks/studies/drifting_friction.py (seeds 50 and 51), a third or three times `share`, ten times `min_size`,
+    and half or twice `epochs` moved the nMSE of no case by more than 1 %.
+    """
+
+    share: float = 0.3
+    """Standard deviation of a coefficient's change in one time constant of its walk, as a share of its size."""
+    min_size: float = 0.03
+    """Min size of a coefficient, in its prior standard deviations."""
+    epochs: int = 10
+    """Epochs in a time constant: friction is taken to stand still for as long as an epoch lasts."""
+    kept: int = 4
+    """Epochs whose rows can still come; earlier ones are folded into what is known of before."""
+    cold: int = 10
+    """Epochs between a version's own samples and the first row of a stream: the arm may have been switched off. One
+    epoch or four time constants did as well there over the first two minutes, within 2 % of the nMSE."""
+
+
+WALK = WalkOptions()
 
 
 @dataclass(frozen=True)
 class Walk:
     """How friction drifts: a random walk in steps of one epoch.
 
-    time_s: s in which a coefficient changes by SHARE of its trained size; since: event time, s, at which epoch 0
+    time_s: s in which a coefficient changes by `share` of its trained size; since: event time, s, at which epoch 0
     begins, None before the first row.
     """
 
@@ -55,13 +63,13 @@ class Walk:
             raise ValueError(f"estimator {base.estimator.name!r} has no friction that could drift")
         places = np.arange(len(basis))[basis.rows(term)]
         # whitened, a coefficient is in units of its prior deviation, and B is diagonal for it
-        size = np.abs((basis.root.diagonal() * base.posterior.weights)[places]).clip(FLOOR)
-        return cls(time_s, since, Drift(places, np.minimum(np.square(SHARE * size) / EPOCHS, 1.0)))
+        size = np.abs((basis.root.diagonal() * base.posterior.weights)[places]).clip(WALK.min_size)
+        return cls(time_s, since, Drift(places, np.minimum(np.square(WALK.share * size) / WALK.epochs, 1.0)))
 
     def number(self, time: Array) -> NDArray[np.int64]:
         """Epochs of event times, (N,): those before the first belong to it."""
         assert self.since is not None  # there are rows
-        return np.maximum(np.floor((time - self.since) * (EPOCHS / self.time_s)), 0.0).astype(np.int64)
+        return np.maximum(np.floor((time - self.since) * (WALK.epochs / self.time_s)), 0.0).astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -107,7 +115,7 @@ class Regime:
         """Posterior of the whitened variables, friction that of the newest epoch. first: see `Solution`."""
         return solve(self.sums(walk), self.centre, first)
 
-    def folded(self, walk: Walk | None, kept: int = KEPT) -> Regime:
+    def folded(self, walk: Walk | None, kept: int = WALK.kept) -> Regime:
         """The same knowledge with at most `kept` epochs left: friction of the others is eliminated for good."""
         regime = self
         while walk is not None and len(regime.epochs) > kept:

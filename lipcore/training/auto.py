@@ -10,9 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from lipcore.arm import search
 from lipcore.arm.learning import Learnt, learn
 from lipcore.arm.posing import mode_of
-from lipcore.arm.search import OPTIONS, known_geometries
+from lipcore.arm.search import known_geometries
 from lipcore.data.metrics import Answer, compare, evaluate
 from lipcore.data.samples import Samples
 from lipcore.data.signals import noise_level
@@ -242,7 +243,7 @@ class Contest:
             return False
         q, tau = (noise_level([array[part] for part in signals.episodes()]) for array in (signals.q, signals.tau))
         error = np.sqrt(np.square(self.held.samples.tau - answer.mean).mean(axis=0))
-        return bool((q < 0.01 * signals.q.std(axis=0)).all() and (error <= OPTIONS.explained_ratio * tau).all())
+        return bool((q < 0.01 * signals.q.std(axis=0)).all() and (error <= search.OPTIONS.explained_ratio * tau).all())
 
     def _chain_leads(self) -> bool:
         """Whether the chain predicts most joints better than the arm, by more than chance."""

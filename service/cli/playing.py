@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.online.changes.opening import BAND, LENGTH, Opening
+from lipcore.online.changes.opening import OPENING, Opening
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
 from lipcore.vocabulary import TorqueConvention
@@ -60,7 +60,10 @@ class Tally:
         self._trips.append(seconds)
         inside = own = np.zeros(tau.shape, np.bool_)
         if answer.tau_std is not None:
-            scale, half = 1.0 if answer.scale is None else answer.scale, BAND * np.hypot(answer.tau_std, self._noise)
+            scale, half = (
+                1.0 if answer.scale is None else answer.scale,
+                OPENING.band * np.hypot(answer.tau_std, self._noise),
+            )
             inside, own = np.abs(error) <= scale * half, np.abs(error) <= half
         self._sums += np.array((inside, error**2, tau, tau**2, own))
 
@@ -94,7 +97,7 @@ class Tally:
 
     def opening(self, seconds: float) -> Opening:
         """What the model's own band, which no stream has widened, held of the first seconds of a stream."""
-        rows = min(LENGTH * seconds, float(self.rows))
+        rows = min(OPENING.rows * seconds, float(self.rows))
         return Opening(rows, rows * self._sums[4] / max(self.rows, 1))
 
     def joints(self, joint_names: Sequence[str]) -> list[dict[str, Any]]:

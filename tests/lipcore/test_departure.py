@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lipcore.online.changes.departure import BOUND, SLACK, Departure
+from lipcore.online.changes.departure import OPTIONS, Departure
 from tests.choosing import slow
 
 HOUR = 36_000
@@ -30,19 +30,19 @@ def test_an_honest_hour_is_quiet(seed, bias, persist):
         keep = np.exp(-1 / persist)
         white = lfilter([np.sqrt(1 - keep**2)], [1, -keep], white, axis=0)
     std = 0.5 * NOISE
-    assert step(Departure.start(1, 2), NOISE * white + bias * std, std).level.max() < BOUND
+    assert step(Departure.start(1, 2), NOISE * white + bias * std, std).level.max() < OPTIONS.bound
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_errors_that_stay_beyond_what_is_stated_add_up(sign):
-    """An error of one standard deviation gains 1 − SLACK a row, less STATED shares of the function's own."""
+    """An error of one standard deviation gains 1 − slack a row, less the stated shares of the function's own."""
     error = sign * np.tile([1.0, 0.0], (200, 1)) * NOISE
     state = Departure.start(3, 2)
     for count in range(1, 101):
         state = step(state, error[:1], at=float(count))
-        gained = (1 - SLACK) * count
+        gained = (1 - OPTIONS.slack) * count
         assert state.level == pytest.approx([gained, 0.0])
-        assert bool(state.joints) is (gained > BOUND) or gained == pytest.approx(BOUND)
+        assert bool(state.joints) is (gained > OPTIONS.bound) or gained == pytest.approx(OPTIONS.bound)
     assert state.joints == (0,)
     assert (state.began, state.drift[0]) == (1.0, pytest.approx(sign))
     evidence = state.evidence(("a", "b"))

@@ -97,9 +97,9 @@ def test_the_rate_of_a_stream_changes_nothing_of_what_is_promised(rate, batch):
 
 def test_what_a_long_batch_cannot_pay_is_owed():
     state = Adaptive.start(np.ones(1)).step(np.arange(500) / RATE, np.full((500, 1), 3.0))
-    assert state.log[0] == pytest.approx(np.log(3.0 * adaptive.MARGIN))
+    assert state.log[0] == pytest.approx(np.log(3.0 * adaptive.OPTIONS.margin))
     assert state.owed[0] == pytest.approx(
-        min(0.95 * 500 / RATE * adaptive.RATE - state.log[0], adaptive.MOST_OWED), rel=0.01
+        min(0.95 * 500 / RATE * adaptive.OPTIONS.rate - state.log[0], adaptive.OPTIONS.max_owed), rel=0.01
     )
     still = state.step(5.0 + np.arange(1, 11) / RATE, np.full((10, 1), 0.1))  # they stand for 0.11 s
     assert still.log[0] == pytest.approx(state.log[0])
@@ -117,7 +117,7 @@ def test_frames_count_by_what_they_were_answered_with():
 def test_rows_without_times_or_after_a_pause_count_as_usual():
     score = np.full((1, 1), 5.0)
     at_once = Adaptive.start(np.ones(1)).step(np.full(1, 7.0), score)
-    assert at_once.log[0] == pytest.approx(0.95 * adaptive.RATE * adaptive.USUAL_STEP_S)
+    assert at_once.log[0] == pytest.approx(0.95 * adaptive.OPTIONS.rate * adaptive.OPTIONS.usual_step_s)
     paused = at_once.step(np.full(1, 1000.0), score)
     assert paused.log[0] - at_once.log[0] == pytest.approx(at_once.log[0])
     none = paused.step(np.empty(0), np.empty((0, 1)))

@@ -146,7 +146,7 @@ def test_no_walk_is_what_it_was(base: TorqueModel, rows: Rows, monkeypatch: pyte
     assert transfer.dump(unset.learn(rows)) != transfer.dump(plain.with_walk(300.0).learn(rows))
     same_answers(unset.learn(rows).model(), plain.learn(rows).model(), rows, 0.0)
     assert plain.learn(rows).now.epochs == ()
-    monkeypatch.setattr(regime, "SHARE", 1e-6)
+    monkeypatch.setattr(regime, "WALK", replace(regime.WALK, share=1e-6))
     same_answers(plain.with_walk(5.0).learn(rows).model(), plain.learn(rows).model(), rows, 1e-5)
 
 

@@ -15,22 +15,30 @@ import numpy as np
 
 from lipcore.data.samples import Array
 
-STATED = 1.0
-"""Standard deviations by which the mean of the trained version may be off: those of its function, which are the same
-for long, and not those of the noise, which averages out."""
-SLACK = 0.5
-"""Mean standardised error that is let pass besides."""
-FARTHEST = 1.0
-"""Standardised errors count up to here: rows far off are what the gates are for, and a misfit that lasts for seconds,
-as of slow moves with stiction, would add up as if many had seen it."""
-BOUND = 36.0
-"""Of the sums, in effective rows: errors of one standard deviation pass it after 72 of them, 7 s, where the function
-is sure.
 
-All four were tuned on 300 s each of slow and fast motion of a double pendulum and a UR5 with `Dirt` (arms 1 to 3, and
-1 and 2), trained on 60 s, where the sums came up to 28, and on labels one standard deviation above every answer
-(seeds 1, 2 and 11 to 13)."""
-CAUSE = "drift against the trained version"
+@dataclass(frozen=True)
+class DepartureOptions:
+    """Limits of the sums that find a departure.
+
+    All were tuned on 300 s each of slow and fast motion of a double pendulum and a UR5 with `Dirt` (arms 1 to 3, and 1
+    and 2), trained on 60 s, where the sums came up to 28, and on labels one standard deviation above every answer
+    (seeds 1, 2 and 11 to 13).
+    """
+
+    stated: float = 1.0
+    """Standard deviations by which the mean of the trained version may be off: those of its function, which are the
+    same for long, and not those of the noise, which averages out."""
+    slack: float = 0.5
+    """Mean standardised error that is ignored besides."""
+    max_error: float = 1.0
+    """Max standardised error of a row: rows far off are what the gates are for, and a misfit that lasts for seconds, as
+    of slow moves with stiction, would add up as if many had seen it."""
+    bound: float = 36.0
+    """Bound of the sums, in effective rows: errors of one standard deviation pass it after 72 of them, 7 s, where the
+    function is sure."""
+
+
+OPTIONS = DepartureOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +48,10 @@ class Departure:
     With u = (tau − mean) / √(std² + noise²), mean and std of the version as trained, c its accepted mean and r the
     share of std in the root, a row of weight w adds
 
-        S± ← max(0, S± + w (±(u − c) − SLACK − STATED r)),    u − c clipped to ±FARTHEST,
+        S± ← max(0, S± + w (±(u − c) − slack − stated r)),    u − c clipped to ±max_error,
 
     so that only what its stated uncertainty does not allow adds up. Weights count effective rows
-    (`data.independence`). Once S exceeds BOUND the alarm is raised, once, until `decided`.
+    (`data.independence`). Once S exceeds the bound the alarm is raised, once, until `decided`.
 
     version: whose; retired: whether the robot is known to be another than it was trained on, so that nothing is
     compared with it any more; above, below: S+ and S−, (n,); total, rows: sums of w (u − c), (n,), and of w since both
@@ -71,8 +79,8 @@ class Departure:
             return self
         spread = np.sqrt(std**2 + noise_std**2)
         error = error / spread - self.centre
-        ratio = np.clip(error, -FARTHEST, FARTHEST)
-        slack, weighs = SLACK + STATED * std / spread, weight[:, None]
+        ratio = np.clip(error, -OPTIONS.max_error, OPTIONS.max_error)
+        slack, weighs = OPTIONS.slack + OPTIONS.stated * std / spread, weight[:, None]
         above, below = (_reflected(weighs * (sign * ratio - slack), start) for sign, start in self._sides)
         idle = (above == 0) & (below == 0)
         count, rows = len(time), np.arange(len(time))[:, None]
@@ -96,11 +104,11 @@ class Departure:
     @property
     def joints(self) -> tuple[int, ...]:
         """Joints whose torque has drifted from what was trained on by more than the version's uncertainty allows."""
-        return tuple(int(joint) for joint in np.flatnonzero(self.level > BOUND))
+        return tuple(int(joint) for joint in np.flatnonzero(self.level > OPTIONS.bound))
 
     @property
     def level(self) -> Array:
-        """The larger of both sums, (n,), which is to stay below BOUND."""
+        """The larger of both sums, (n,), which is to stay below the bound."""
         return np.maximum(self.above, self.below)
 
     @property
@@ -117,7 +125,7 @@ class Departure:
         """What speaks for it, for JSON: the version that was departed from, and per alarmed joint the mean error in its
         stated standard deviations."""
         drift = {joint_names[joint]: float(self.drift[joint]) for joint in self.joints}
-        return {"cause": CAUSE, "trained": {"version": self.version, "drift": drift}}
+        return {"cause": "drift against the trained version", "trained": {"version": self.version, "drift": drift}}
 
     def decided(self) -> Departure:
         """The same after a change was decided about: where it is the departure itself, what it drifted to is where it
@@ -125,7 +133,7 @@ class Departure:
         if not self.joints:
             return replace(self, retired=True)
         fresh = Departure.start(self.version, len(self.centre))
-        return replace(fresh, centre=self.centre + np.where(self.level > BOUND, self.drift, 0.0))
+        return replace(fresh, centre=self.centre + np.where(self.level > OPTIONS.bound, self.drift, 0.0))
 
     def to_json(self) -> dict[str, Any]:
         """All fields as numbers and lists; `from_json` gives back the same to the last bit."""

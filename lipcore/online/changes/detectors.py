@@ -15,33 +15,48 @@ from lipcore.online.record import Record, number
 
 Kind = Literal["sudden", "drift", "departure"]
 
-BUCKET_S, BUCKET_ROWS = 0.5, 50
-"""A bucket holds at least both. The mean of 50 squared standard normals deviates by 0.2 from 1."""
-RECENT_S, RECENT_BUCKETS = 2.0, 2
-REFERENCE_S, SHORTEST_REFERENCE_S, FEWEST_REFERENCE_ROWS = 20.0, 10.0, 200
-MOST_BUCKETS = round((RECENT_S + REFERENCE_S) / BUCKET_S)
 RATIO = 4.0
 """Errors twice as large as before and as stated: 30 standard errors of the mean of 200 independent rows."""
-DEVIATIONS = 5.0
-"""Of the Gaussian that the tail of the bucket means is mapped to: one chance in 3 million where RATIO is not enough."""
-PRIOR_VARIATION, PRIOR_BUCKETS = 0.5, 10
-"""Variation of the buckets' means assumed while few have been seen, and how many buckets it counts for."""
-SHARE = 0.75
-"""Share of the recent buckets that must exceed each by itself: 3 of 4, where a collision of 0.5 s touches 2."""
-ALLOWANCE = float(np.log(2.0))
-"""Drift that is let pass: squared errors up to twice those of the best two minutes."""
-LARGEST_RATIO = 8.0
-"""Ratios count up to here, so that no single bucket moves the sum by more than log 4 = 1.4."""
-DRIFT_BOUND = 10.0
-"""Eight buckets of the largest step. On independent rows nothing comes near it (a step is −0.7 ± 0.2)."""
-FIRST_EPOCH_S, EPOCH_S = 20.0, 120.0
-LONGEST_BUCKET_S = 10.0
-"""A bucket that took longer contains a pause, of which no more than this is counted as time observed."""
+
+
+@dataclass(frozen=True)
+class DetectorOptions:
+    """Lengths of buckets and windows, and bounds of sudden changes and drift."""
+
+    bucket_s: float = 0.5
+    bucket_rows: int = 50
+    """Min duration and rows of a bucket. The mean of 50 squared standard normals deviates by 0.2 from 1."""
+    recent_s: float = 2.0
+    recent_buckets: int = 2
+    reference_s: float = 20.0
+    min_reference_s: float = 10.0
+    min_reference_rows: int = 200
+    ratio: float = RATIO
+    deviations: float = 5.0
+    """Bound in the Gaussian that the tail of the bucket means is mapped to: one chance in 3 million if `ratio` is not
+    enough."""
+    prior_variation: float = 0.5
+    prior_buckets: int = 10
+    """Assumed variation of the buckets' means, and how many buckets it counts for."""
+    share: float = 0.75
+    """Min share of the recent buckets that exceed the bound: 3 of 4, since a collision of 0.5 s touches 2."""
+    allowance: float = float(np.log(2.0))
+    """Drift that is ignored: squared errors up to twice those of the best two minutes."""
+    max_ratio: float = 8.0
+    """Max ratio of a bucket, so that no single one moves the sum by more than log 4 = 1.4."""
+    drift_bound: float = 10.0
+    """Eight buckets of the max step. On independent rows nothing comes near it (a step is −0.7 ± 0.2)."""
+    first_epoch_s: float = 20.0
+    epoch_s: float = 120.0
+    max_bucket_s: float = 10.0
+    """A bucket that took longer contains a pause, of which no more than this counts as time observed."""
+
+
+OPTIONS = DetectorOptions()
 FRICTION_SHARE = 0.6
 """Between what was measured over 10 s (three simulated arms, three speeds, noise 0.05 N·m): new friction explains 0.98
 or more of the median joint, a payload 0.03 to 0.5. Over 4 s a tenth of the slow motions do not reverse a joint, whose
 friction then looks like a weight (0.5)."""
-FEWEST_FRICTION_ROWS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +157,10 @@ class ChangeDetector:
         current = Bucket(last, max(at, last), record)
         if self.open:
             current = Bucket(self.open.start, current.end, self.open.record + record)
-        if current.record.rows < BUCKET_ROWS or current.end - current.start < BUCKET_S * (1 - 1e-6):
+        if current.record.rows < OPTIONS.bucket_rows or current.end - current.start < OPTIONS.bucket_s * (1 - 1e-6):
             return replace(self, open=current), None
-        buckets = (*self.buckets, current)[-MOST_BUCKETS:]
+        max_buckets = round((OPTIONS.recent_s + OPTIONS.reference_s) / OPTIONS.bucket_s)
+        buckets = (*self.buckets, current)[-max_buckets:]
         if self.alarm:
             return replace(self, open=None, buckets=buckets), None
         following = replace(self, open=None, buckets=buckets)._accumulate(current)
@@ -179,13 +195,16 @@ class ChangeDetector:
         if self.best is not None:
             ratio = bucket.record.standardised / _level(self.best)
             weight = (1 + _variation(self._split()[1])) ** 2
-            step = (np.log(np.clip(ratio, 1 / LARGEST_RATIO, LARGEST_RATIO)) - ALLOWANCE) / weight
+            step = (np.log(np.clip(ratio, 1 / OPTIONS.max_ratio, OPTIONS.max_ratio)) - OPTIONS.allowance) / weight
             since = np.where(excess > 0, since, bucket.start)
             excess = np.maximum(excess + step, 0.0)
         epoch = bucket.record if self.epoch is None else self.epoch + bucket.record
         seconds = self.epoch_s + _observed(bucket)
         best = self.best
-        if seconds >= (FIRST_EPOCH_S if best is None else EPOCH_S) and epoch.rows >= FEWEST_REFERENCE_ROWS:
+        if (
+            seconds >= (OPTIONS.first_epoch_s if best is None else OPTIONS.epoch_s)
+            and epoch.rows >= OPTIONS.min_reference_rows
+        ):
             if best is None or np.log(_level(epoch)).sum() < np.log(_level(best)).sum():
                 best = epoch
             return replace(self, excess=excess, since=since, best=best, epoch=None, epoch_s=0.0)
@@ -194,32 +213,39 @@ class ChangeDetector:
     def _sudden(self) -> Change | None:
         recent, used = self._split()
         seconds, rows = sum(_observed(b) for b in used), sum(b.record.rows for b in used)
-        if seconds < SHORTEST_REFERENCE_S * (1 - 1e-6) or rows < FEWEST_REFERENCE_ROWS:
+        if seconds < OPTIONS.min_reference_s * (1 - 1e-6) or rows < OPTIONS.min_reference_rows:
             return None
         variation = _variation(used)
-        tail = (1 - variation / 9 + DEVIATIONS * np.sqrt(variation) / 3) ** 3
-        bound = np.maximum(RATIO, tail) * np.maximum(_mean(used), 1.0)
+        tail = (1 - variation / 9 + OPTIONS.deviations * np.sqrt(variation) / 3) ** 3
+        bound = np.maximum(OPTIONS.ratio, tail) * np.maximum(_mean(used), 1.0)
         exceeding = np.array([bucket.record.standardised > bound for bucket in recent])
-        joints = (_mean(recent) > bound) & (exceeding.sum(axis=0) >= np.ceil(SHARE * len(recent)))
+        joints = (_mean(recent) > bound) & (exceeding.sum(axis=0) >= np.ceil(OPTIONS.share * len(recent)))
         if not joints.any():
             return None
         first = int(exceeding[:, joints].any(axis=1).argmax())
         return Change(recent[first].start, _places(joints), _sum(used), _sum(recent), "sudden")
 
     def _drift(self) -> Change | None:
-        if self.best is None or self.excess is None or self.since is None or not (self.excess > DRIFT_BOUND).any():
+        if (
+            self.best is None
+            or self.excess is None
+            or self.since is None
+            or not (self.excess > OPTIONS.drift_bound).any()
+        ):
             return None
-        joints = self.excess > DRIFT_BOUND
+        joints = self.excess > OPTIONS.drift_bound
         recent, _ = self._split()
         return Change(float(self.since[joints].min()), _places(joints), self.best, _sum(recent), "drift")
 
     def _split(self) -> tuple[tuple[Bucket, ...], tuple[Bucket, ...]]:
         """The recent buckets, and those of the 20 s before them."""
-        recent = min(RECENT_BUCKETS, len(self.buckets))
-        while recent < len(self.buckets) and self.buckets[-1].end - self.buckets[-recent].start < RECENT_S * (1 - 1e-6):
+        recent = min(OPTIONS.recent_buckets, len(self.buckets))
+        while recent < len(self.buckets) and self.buckets[-1].end - self.buckets[-recent].start < OPTIONS.recent_s * (
+            1 - 1e-6
+        ):
             recent += 1
         first, seconds = len(self.buckets) - recent, 0.0
-        while first and seconds < REFERENCE_S * (1 - 1e-6):
+        while first and seconds < OPTIONS.reference_s * (1 - 1e-6):
             first -= 1
             seconds += _observed(self.buckets[first])
         return self.buckets[-recent:], self.buckets[first:-recent]
@@ -234,7 +260,7 @@ def friction_share(dq: Array, error: Array) -> Array:
     """
     rows, n = error.shape
     out = np.zeros(n)
-    if rows < FEWEST_FRICTION_ROWS:
+    if rows < 20:
         return out
     for j in range(n):
         features = np.column_stack([dq[:, j], np.sign(dq[:, j]), np.ones(rows)])
@@ -251,7 +277,7 @@ def suspect(friction: Array, joints: tuple[int, ...]) -> str:
 
 
 def _observed(bucket: Bucket) -> float:
-    return min(bucket.end - bucket.start, LONGEST_BUCKET_S)
+    return min(bucket.end - bucket.start, OPTIONS.max_bucket_s)
 
 
 def _variation(buckets: Sequence[Bucket]) -> Array:
@@ -259,7 +285,9 @@ def _variation(buckets: Sequence[Bucket]) -> Array:
     means = np.array([bucket.record.standardised for bucket in buckets])
     centre = means.mean(axis=0) if len(means) else np.ones(1)
     seen = means.var(axis=0) / np.where(centre > 0, centre, 1.0) ** 2 if len(means) else np.zeros(1)
-    return np.asarray((len(means) * seen + PRIOR_BUCKETS * PRIOR_VARIATION) / (len(means) + PRIOR_BUCKETS))
+    return np.asarray(
+        (len(means) * seen + OPTIONS.prior_buckets * OPTIONS.prior_variation) / (len(means) + OPTIONS.prior_buckets)
+    )
 
 
 def _mean(buckets: Sequence[Bucket]) -> Array:

@@ -15,15 +15,22 @@ import numpy as np
 from lipcore.data.coverage import clopper_pearson
 from lipcore.data.samples import Array
 
-LENGTH = 10.0
-"""Effective rows (`lipcore.data.independence`) of an opening: a second, of a stream of ten rows a second and more."""
-BAND = 1.959963984540054
-"""Standard deviations on both sides that hold 95 %."""
-LEAST = 0.5
-"""Share of the measurements of all joints that the 95 % intervals of a stream which fits hold at least, as far as
-LENGTH rows tell: with ten, up to 15 % are too few. Half, and not 95 %, as errors last for seconds where friction is not
-quite as learnt, and a payload takes a third of a second to be noticed."""
-CAUSE = "the stream's first second lies outside the band"
+
+@dataclass(frozen=True)
+class OpeningOptions:
+    """How long an opening is, and what intervals hold of one that fits."""
+
+    rows: float = 10.0
+    """Effective rows (`lipcore.data.independence`): a second, of a stream of ten rows a second and more."""
+    band: float = 1.959963984540054
+    """Standard deviations on both sides that hold 95 %."""
+    min_share: float = 0.5
+    """Min share of the measurements of all joints inside the 95 % intervals, as far as so few rows tell: with ten, up
+    to 15 % are too few. Half, and not 95 %, as errors last for seconds where friction is not quite as learnt, and a
+    payload takes a third of a second to be noticed."""
+
+
+OPENING = OpeningOptions()
 
 
 @dataclass(frozen=True)
@@ -44,20 +51,20 @@ class Opening:
         return Opening(0.0, np.zeros(n))
 
     def step(self, time: Array, weight: Array, error: Array, spread: Array) -> Opening:
-        """Take in rows until there are LENGTH. time: (N,) s; weight: (N,) effective rows; error: tau − mean, (N, n);
+        """Take in rows until there are enough. time: (N,) s; weight: (N,) effective rows; error: tau − mean, (N, n);
         spread: standard deviation of a measurement as stated, its scale included, (N, n), N·m."""
         before = self.rows + np.cumsum(weight) - weight
-        taken = before < LENGTH
+        taken = before < OPENING.rows
         if not taken.any():
             return self
-        held = weight[taken, None] * (np.abs(error) <= BAND * spread)[taken]
+        held = weight[taken, None] * (np.abs(error) <= OPENING.band * spread)[taken]
         since = float(time[taken][0]) if self.since is None else self.since
         return Opening(self.rows + float(weight[taken].sum()), self.inside + held.sum(axis=0), since)
 
     @property
     def over(self) -> bool:
         """Whether it is complete, and can be judged."""
-        return self.rows >= LENGTH * (1 - 1e-9)
+        return self.rows >= OPENING.rows * (1 - 1e-9)
 
     @property
     def coverage(self) -> Array:
@@ -66,22 +73,27 @@ class Opening:
 
     @property
     def misfit(self) -> bool:
-        """Whether it is complete, and the share that was held is known to be below LEAST.
+        """Whether it is complete, and the share that was held is known to be too small.
 
         Joints share their motion: their mean counts for as many trials as there are effective rows, and no more.
         """
         _, high = clopper_pearson(np.array([self.coverage.mean()]), np.array([self.rows]))
-        return self.over and bool(high[0] < LEAST)
+        return self.over and bool(high[0] < OPENING.min_share)
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """Joints whose intervals held less than LEAST."""
-        return tuple(int(joint) for joint in np.flatnonzero(self.coverage < LEAST))
+        """Joints whose intervals held less than the min share."""
+        return tuple(int(joint) for joint in np.flatnonzero(self.coverage < OPENING.min_share))
 
     def evidence(self, joint_names: Sequence[str]) -> dict[str, Any]:
         """What speaks against the stream, for JSON: the share of its first second that the 95 % intervals held."""
         per_joint = dict(zip(joint_names, self.coverage.tolist(), strict=True))
-        return {"kind": "opening", "cause": CAUSE, "coverage": float(self.coverage.mean()), "joint_coverage": per_joint}
+        return {
+            "kind": "opening",
+            "cause": "the stream's first second lies outside the band",
+            "coverage": float(self.coverage.mean()),
+            "joint_coverage": per_joint,
+        }
 
     def to_json(self) -> dict[str, Any]:
         """All fields as numbers and lists; `from_json` gives back the same to the last bit."""

@@ -19,14 +19,10 @@ CENTRE = np.array([0.0, 0, 0, 0, *[np.log(0.04)] * 3, 0, 0, 0])
 WIDTH = np.array([1.2, 0.15, 0.15, 0.15, 0.7, 0.7, 0.7, 0.03, 0.03, 0.03])
 """Prior of η: log kg; m; log m; m. Nineteen of twenty payloads weigh 0.1 to 10 kg, lie within 0.3 m of the last
 link's frame and spread over 1 to 16 cm."""
-STEPS, DAMPING = 50, 1e-3
-LEAST_EXTENT = 1e-3
-"""Of a body, m: none is a point."""
-
-LEVER, RADIUS = 0.13, 0.14
-SHAPE = np.array([1.0, *[LEVER] * 3, *[RADIUS**2] * 6])
+SHAPE = np.array([1.0, *[0.13] * 3, *[0.14**2] * 6])
+"""Parameters of a body of 1 kg, about 0.13 m away and with a radius of gyration of 0.14 m."""
 CONTACTS = (1.0, 3.0)
-"""Scales of a contact's torque, in units of what is usual."""
+"""Scales of a contact's torque, in units of the usual torque, see `usual`."""
 
 
 def body(eta: Array) -> tuple[Array, Array]:
@@ -49,8 +45,9 @@ def body(eta: Array) -> tuple[Array, Array]:
 
 
 DIAGONAL, BELOW = (np.arange(3), np.arange(3)), (np.array([1, 2, 2]), np.array([0, 0, 1]))
-_UNITS = np.eye(9).reshape(9, 3, 3)
-INERTIA = np.array([(np.trace(unit) * np.eye(3) - 0.5 * (unit + unit.T))[np.tril_indices(3)] for unit in _UNITS]).T
+INERTIA = np.array(
+    [(np.trace(unit) * np.eye(3) - 0.5 * (unit + unit.T))[np.tril_indices(3)] for unit in np.eye(9).reshape(9, 3, 3)]
+).T
 """What makes xx, xy, yy, xz, yz, zz of a second moment, flat: tr(S) 1 − S, symmetrised, (6, 9)."""
 
 
@@ -70,7 +67,7 @@ def eta_of(carried: Body) -> Array:
     """η of a body, (10,): one without extent has a little."""
     inertia = np.zeros((3, 3)) if carried.inertia is None else carried.inertia
     spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / carried.mass
-    root = np.linalg.cholesky(spread + LEAST_EXTENT**2 * np.eye(3))
+    root = np.linalg.cholesky(spread + 1e-6 * np.eye(3))  # (1 mm)²
     return np.concatenate([[np.log(carried.mass)], carried.com, np.log(root[DIAGONAL]), root[BELOW]])
 
 
@@ -81,10 +78,10 @@ def most_likely(told: Array, pull: Array, prior: Known, start: Array) -> tuple[A
         payload, off = body(eta)[0], eta - prior.centre
         return float(0.5 * payload @ told @ payload - pull @ payload + 0.5 * off @ prior.precision @ off)
 
-    eta, damping = start, DAMPING
+    eta, damping = start, 1e-3
     value = cost(eta)
     payload, slope = body(eta)
-    for _ in range(STEPS):
+    for _ in range(50):
         gradient = slope.T @ (told @ payload - pull) + prior.precision @ (eta - prior.centre)
         curvature = slope.T @ told @ slope + prior.precision
         step = -np.linalg.solve(curvature + damping * np.diag(np.diagonal(curvature)), gradient)

@@ -24,18 +24,33 @@ from lipcore.online.payload.bodies import ANY, WIDTH
 from lipcore.online.payload.estimate import Seen, rows_of
 from lipcore.robots.urdf import PARAMETERS
 
-STILL = 0.01
-"""Least that a step gains, nats."""
-DAMPING, LESS, MORE = 1e-3, 0.15, 8.0
-"""At first, as a share of the curvature; its factors after a step that gains, and after one that does not."""
-LEAST_DAMPING, WORST = 1e-9, 1e8
-"""It is not less; and from which on nothing is gained."""
-REACH = 0.5
-"""Longest step of the geometry, rad or m."""
-DRAWS, WIDE, RELAXED, SEED = 10, (1.0, 6.0), 20, 0
-"""Draws from the posterior by which it is judged how far it is from linear, followed from estimate to estimate; how
-many deviations of the linear posterior wide they begin, from and to, as where it is bent it is wider; steps in which
-they become arms that the training allows; and what they are drawn by."""
+
+@dataclass(frozen=True)
+class DrawOptions:
+    """Steps of a descent, and draws from the posterior, which show how far it is from linear."""
+
+    min_gain_nats: float = 0.01
+    """Min gain of a step after which another one follows."""
+    damping: float = 1e-3
+    """Damping of the first step, as a share of the curvature."""
+    less: float = 0.15
+    more: float = 8.0
+    """Factors on the damping after a step that gains, and after one that does not."""
+    min_damping: float = 1e-9
+    max_damping: float = 1e8
+    """From the max on nothing is gained."""
+    max_step: float = 0.5
+    """Max step of the geometry, rad or m."""
+    count: int = 10
+    """Draws, followed from estimate to estimate."""
+    wide: tuple[float, float] = (1.0, 6.0)
+    """Range of the deviations of the linear posterior at which draws begin: where the posterior bends, it is wider."""
+    steps: int = 20
+    """Max steps in which draws become arms that the training allows."""
+    seed: int = 0
+
+
+DRAWS = DrawOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +65,7 @@ class Place:
         """The place a whitened step away, (M + 10,), or as far in its direction as is gone at once."""
         size, steps = len(self.w), carrier.steps
         by, eta = carrier.memory.root @ step[:size], step[size:]
-        longest = max(np.abs(eta / WIDTH).max() / 2, np.abs(carrier.root[steps] * by[steps]).max() / REACH)
+        longest = max(np.abs(eta / WIDTH).max() / 2, np.abs(carrier.root[steps] * by[steps]).max() / DRAWS.max_step)
         return self.shifted(carrier, by / max(1.0, longest), eta / max(1.0, longest))
 
     def shifted(self, carrier: Carrier, by: Array, eta: Array) -> Place:
@@ -121,25 +136,27 @@ def minimum(problem: Energy, at: Point, rounds: int, shift: Array | float = 0.0)
 
 def descent(problem: Energy, at: Point, rounds: int, shift: Array | float = 0.0) -> Generator[None, None, Point]:
     """The same; it yields after each step."""
-    damping, carrier = DAMPING, problem.carrier
+    damping, carrier = DRAWS.damping, problem.carrier
     for _ in range(rounds):
         off = at.residual - shift
         energy = 0.5 * float(off @ off)
         curvature, gradient = at.derivative.T @ at.derivative, at.derivative.T @ off
-        while damping < WORST:
+        while damping < DRAWS.max_damping:
             step = np.asarray(np.linalg.solve(curvature + damping * np.diag(np.diagonal(curvature)), -gradient))
-            if damping <= DAMPING and -0.5 * float(gradient @ step) < STILL:  # what it gains where torque is linear
+            if (
+                damping <= DRAWS.damping and -0.5 * float(gradient @ step) < DRAWS.min_gain_nats
+            ):  # what it gains where torque is linear
                 return at
             trial = problem.at(at.place.moved(carrier, step))
             left = trial.residual - shift
             gained = energy - 0.5 * float(left @ left)
             if gained >= 0:
                 break
-            damping *= MORE
+            damping *= DRAWS.more
         else:
             break
-        at, damping = trial, max(LESS * damping, LEAST_DAMPING)
-        if gained < STILL:
+        at, damping = trial, max(DRAWS.less * damping, DRAWS.min_damping)
+        if gained < DRAWS.min_gain_nats:
             break
         yield
     return at
@@ -182,11 +199,11 @@ class Training:
         if carrier.open_tip:
             layout = (*[None] * (geometry.n_joints - 1), number % len(DIRECTIONS))
             return Draw(replace(learnt, geometry=laid_out(geometry, layout)), None)  # which is as likely beforehand
-        by = draw.uniform(*WIDE) * carrier.memory.root @ draw.standard_normal(len(carrier.mean))
+        by = draw.uniform(*DRAWS.wide) * carrier.memory.root @ draw.standard_normal(len(carrier.mean))
         at = self.at(learnt.shifted(carrier, by, np.zeros(PARAMETERS)))
         noise = draw.standard_normal(len(at.residual))
         still = np.concatenate([noise[:-PARAMETERS], np.zeros(PARAMETERS)])
-        at = yield from descent(self, at, RELAXED, still)
+        at = yield from descent(self, at, DRAWS.steps, still)
         return Draw(at.place, noise)
 
     @cached_property
@@ -209,9 +226,9 @@ def arms(carrier: Carrier) -> Generator[None, None, tuple[Draw, ...]]:
     size = len(carrier.memory.slope) + len(carrier.memory.outside) + len(carrier.mean) + PARAMETERS
     known = _ARMS.get(carrier.term, ())
     if not known or not all(each.usable(size) for each in known):
-        training, draw = Training.of(carrier), np.random.default_rng(SEED)
+        training, draw = Training.of(carrier), np.random.default_rng(DRAWS.seed)
         found = []
-        for number in range(len(DIRECTIONS) if carrier.open_tip else DRAWS):
+        for number in range(len(DIRECTIONS) if carrier.open_tip else DRAWS.count):
             found.append((yield from training.begun(number, draw)))
         known = _ARMS[carrier.term] = tuple(found)
     return known

@@ -12,8 +12,6 @@ from lipcore.posterior.linalg import solve_lower
 
 LIKE = 0.3, 0.3
 """See `likeness`. Chosen on the dirty Panda of seed 50 among three pairs."""
-LEAST_WHITE = 1e-3
-"""Share of the noise's variance that is new in every row at least."""
 
 
 def noise_parts(carrier: Carrier, motion: Motion) -> tuple[Array, Array, Array]:
@@ -21,7 +19,7 @@ def noise_parts(carrier: Carrier, motion: Motion) -> tuple[Array, Array, Array]:
     are, and those of faster motion, (N, n); and that of joints at rest, (N, n), which may break away at any time."""
     posterior = carrier.model.posterior
     noise, misfit = posterior.noise_variance, posterior.misfit
-    white = np.maximum(noise - misfit.lasting, LEAST_WHITE * noise)
+    white = np.maximum(noise - misfit.lasting, 1e-3 * noise)
     rest = misfit.at_rest(motion.dq)
     return white, (misfit.lasting + misfit.variance(motion) - rest), rest
 

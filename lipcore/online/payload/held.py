@@ -17,12 +17,25 @@ from lipcore.online.payload.bodies import ANY, Known, eta_of, inverse
 from lipcore.online.payload.estimate import Estimate, known
 from lipcore.online.payload.payload import estimate, refine
 
-MOST_ROWS, BEFORE_ROWS, GROWTH, ANEW = 100, 10, 1.45, 2.0
-"""Rows that a payload is estimated from, evenly spread over the time since; rows before it; by how many times they have
-to grow until it is estimated or refined again, and until draws begin anew."""
-DECLARED, WRONG = np.array([0.02, *[0.005] * 3, *[0.3] * 3, *[0.005] * 3]), 4.0
-"""Standard deviations of η of a payload that was declared: of log mass, m, of log m, m; and how many of them it lies
-off where rows show that something else is carried."""
+
+@dataclass(frozen=True)
+class HeldOptions:
+    """Rows that a payload is estimated from, and when it is estimated again."""
+
+    max_rows: int = 100
+    """Max rows with the payload, evenly spread over the time since."""
+    max_rows_before: int = 10
+    growth: float = 1.45
+    """A payload is estimated, or refined, again once its rows have grown by this factor."""
+    growth_anew: float = 2.0
+    """Draws begin anew once the rows have grown by this factor."""
+    max_stds: float = 4.0
+    """A declared payload is wrong if rows show it further off, in standard deviations."""
+
+
+OPTIONS = HeldOptions()
+DECLARED = np.array([0.02, *[0.005] * 3, *[0.3] * 3, *[0.005] * 3])
+"""Standard deviations of η of a payload that was declared: of log mass, m, of log m, m."""
 MOVED = np.array([0.02, *[0.1] * 3, *[0.3] * 3, *[0.02] * 3])
 """What η of a payload may differ by from one version's frame to another's: of log mass, m, of log m, m."""
 
@@ -52,9 +65,9 @@ class Held:
     @staticmethod
     def of_rows(carrier: Carrier, rows: Rows, before: Rows) -> Held:
         """What rows show, beside those before them."""
-        before = before.take(slice(None, None, max(1, -(-len(before) // BEFORE_ROWS))))
+        before = before.take(slice(None, None, max(1, -(-len(before) // OPTIONS.max_rows_before))))
         first, count = estimate(carrier, rows, before), len(rows)
-        return Held(float(rows.time[0]), False, rows, before, 1, count, GROWTH * count, ANY, first)
+        return Held(float(rows.time[0]), False, rows, before, 1, count, OPTIONS.growth * count, ANY, first)
 
     @staticmethod
     def of_declaration(carrier: Carrier, body: Body, at: float) -> Held:
@@ -105,45 +118,45 @@ class Held:
             return Held(
                 since, values["declared"], nothing, nothing, 1, count, count + 1.0, prior, known(carrier, prior)
             )
-        rows = rows.take(evenly(0, len(rows), MOST_ROWS))
+        rows = rows.take(evenly(0, len(rows), OPTIONS.max_rows))
         seen = replace(estimate(carrier, rows), eta=eta, covariance=covariance)
         every = max(1, round(count / len(rows)))
-        return Held(since, values["declared"], rows, nothing, every, count, GROWTH * count, ANY, seen)
+        return Held(since, values["declared"], rows, nothing, every, count, OPTIONS.growth * count, ANY, seen)
 
     def more(self, carrier: Carrier, rows: Rows) -> Held:
         """The same with more rows."""
         first = -self.count % self.every
         kept = Rows.concatenate([self.rows, rows.take(slice(first, None, self.every))])
         every, count = self.every, self.count + len(rows)
-        if len(kept) > MOST_ROWS:
+        if len(kept) > OPTIONS.max_rows:
             kept, every = kept.take(slice(0, None, 2)), 2 * every
         held = replace(self, rows=kept, every=every, count=count)
         if count < self.due or (self.estimate.draws and carrier.open_tip):  # its valleys are followed by refining alone
             return held
         moved = replace(estimate(carrier, kept, self.before, self.prior, self.estimate), draws=self.estimate.draws)
-        if self.declared and np.abs((moved.eta - self.prior.centre) / DECLARED).max() > WRONG:
+        if self.declared and np.abs((moved.eta - self.prior.centre) / DECLARED).max() > OPTIONS.max_stds:
             held, moved = replace(held, declared=False, prior=ANY), estimate(carrier, kept, self.before)
-        return replace(held, due=GROWTH * count, estimate=moved)
+        return replace(held, due=OPTIONS.growth * count, estimate=moved)
 
     def refinement(self, carrier: Carrier) -> Generator[None, None, Held] | None:
         """The same with a refined estimate, step by step; None where that would tell nothing new."""
         if not carrier.bends or self.declared or not len(self.rows):
             return None
         # with more rows, what was as good as linear stays so for long
-        if self.count >= (GROWTH if self.estimate.draws else ANEW) * self.refined:
+        if self.count >= (OPTIONS.growth if self.estimate.draws else OPTIONS.growth_anew) * self.refined:
             return self._refined(carrier, anew=False)
-        if self.estimate.draws and self.count >= ANEW * self.begun:
+        if self.estimate.draws and self.count >= OPTIONS.growth_anew * self.begun:
             return self._refined(carrier, anew=True)
         return None
 
     def _refined(self, carrier: Carrier, anew: bool) -> Generator[None, None, Held]:
         found = yield from refine(carrier, self.rows, self.before, self.prior, self.estimate, anew)
         begun = self.count if anew else self.begun
-        return replace(self, estimate=found, refined=self.count, begun=begun, due=GROWTH * self.count)
+        return replace(self, estimate=found, refined=self.count, begun=begun, due=OPTIONS.growth * self.count)
 
     def with_refined(self, refined: Held) -> Held:
         """The same, refined from fewer rows while these came."""
-        if self.due > GROWTH * refined.due:  # it was estimated again, from many more rows
+        if self.due > OPTIONS.growth * refined.due:  # it was estimated again, from many more rows
             newer = replace(self.estimate, draws=refined.estimate.draws)
             return replace(self, estimate=newer, refined=refined.refined, begun=refined.begun)
         return replace(self, estimate=refined.estimate, refined=refined.refined, begun=refined.begun, due=refined.due)

@@ -14,45 +14,38 @@ from lipcore.model.payload import Carrier, Linearised, Load
 from lipcore.online.batch import Rows
 from lipcore.online.payload.bodies import ANY, WIDTH
 from lipcore.online.payload.held import Held, evenly, no_rows
-from lipcore.online.payload.hypotheses import AFTER, BEFORE, CELL_S, LEAST_BEFORE, Cell, Window, cells_of, parted
-from lipcore.online.payload.verdict import (
-    ALIKE,
-    AT_ONCE,
-    BETTER,
-    KINDS,
-    LASTING,
-    LIKELY,
-    NEARLY,
-    POSITIVE,
-    PRECISE,
-    SURE,
-    Gains,
-    probabilities,
-    state_of,
-    taken,
-)
+from lipcore.online.payload.hypotheses import WINDOW, Cell, Window, cells_of, parted
+from lipcore.online.payload.verdict import PRIOR, VERDICT, Gains, probabilities, state_of, taken
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.vocabulary import PayloadState
 
-CELLS, SPARSE = BEFORE + AFTER[-1], (2, 4)
-"""Cells that are looked at together; and of how many there is one, where something lasts that a contact explains."""
-TOGETHER, IN_BULK = 3, 6
-"""Cells of one batch that are judged together, and of one that brings many: an instant within the last AFTER is seen
-all the same."""
-CELL_ROWS = 5
-"""Rows of a cell that are looked at, evenly spread: a robot moves little within one, however often it is measured."""
-STRANGE = 2.5
-"""Standard deviations of what is known of any payload beyond which a body is none: heavier than 20 kg, or with its
-centre of mass further than 0.37 m from the last link's frame. A push looks like such a one."""
-OFF = 12
-"""Cells one after the other that a payload does not explain, 0.6 s, after which it is estimated anew from them."""
-GAP_S = 0.5
-"""A longer time between two rows: what came before is not compared with what comes after."""
 
-SETTLED_S = 1.0
-"""A contact, or other friction, is named at once, and something else once rows have shown that for so long, s."""
-BACK_S = 60.0
-"""Rows that are older than the latest by more, s, are those of a clock that was set back: they begin anew."""
+@dataclass(frozen=True)
+class WatchOptions:
+    """Cells that are judged, and how long states last."""
+
+    sparse: tuple[int, ...] = (2, 4)
+    """Of how many cells one is compared, where something lasts that a contact explains."""
+    together: int = 3
+    together_in_bulk: int = 6
+    """Cells of one batch that are judged together, and of one that brings more than the second: an instant within the
+    last cells is seen all the same."""
+    cell_rows: int = 5
+    """Max rows of a cell, evenly spread: a robot moves little within one, however often it is measured."""
+    max_stds: float = 2.5
+    """Standard deviations of what is known of any payload beyond which a body is none: heavier than 20 kg, or with its
+    centre of mass further than 0.37 m from the last link's frame. A push looks like such a one."""
+    max_off: int = 12
+    """Successive cells that a payload does not explain, 0.6 s, after which it is estimated anew from them."""
+    gap_s: float = 0.5
+    """A longer time between two rows: what came before is not compared with what comes after."""
+    settled_s: float = 1.0
+    """A contact, or other friction, is named at once, and something else once rows have shown that for so long."""
+    back_s: float = 60.0
+    """Rows that are older than the latest by more are those of a clock that was set back: they begin anew."""
+
+
+OPTIONS = WatchOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,16 +75,16 @@ class Watch:
         watch = self._seen_by(carrier)
         assert watch.around is not None
         carrier = watch.around.carrier
-        if watch._last is not None and len(rows) and rows.time[-1] < watch._last - BACK_S:
+        if watch._last is not None and len(rows) and rows.time[-1] < watch._last - OPTIONS.back_s:
             watch = replace(watch, waiting=None, recent=(), cells=())
         if watch._last is not None:
             rows = rows.take(rows.time > watch._last)
         if not len(rows):
             return watch
-        for places in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(rows.time) > GAP_S) + 1):
+        for places in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(rows.time) > OPTIONS.gap_s) + 1):
             part = rows.take(places)
             last = watch._last
-            if last is not None and part.time[0] - last > GAP_S:
+            if last is not None and part.time[0] - last > OPTIONS.gap_s:
                 watch = replace(watch, waiting=None, recent=(), cells=())
             watch = watch._run(carrier, part)
         return watch
@@ -136,15 +129,15 @@ class Watch:
         step = float(np.median(np.diff(rows.time))) if len(rows) > 1 else 0.0
         ends, first = [], 0
         while first < len(rows):
-            until = rows.time[first] + CELL_S - 0.5 * step
+            until = rows.time[first] + WINDOW.cell_s - 0.5 * step
             last = max(int(np.searchsorted(rows.time, until, side="left")), first + 1)
             if last == len(rows) and rows.time[-1] + step < until:
                 break
             ends.append((first, last))
             first = last
-        parts = [rows.take(evenly(*each, CELL_ROWS)) for each in ends]
+        parts = [rows.take(evenly(*each, OPTIONS.cell_rows)) for each in ends]
         watch = replace(self, waiting=rows.take(slice(first, None)) if first < len(rows) else None)
-        together = TOGETHER if len(parts) <= IN_BULK else IN_BULK
+        together = OPTIONS.together if len(parts) <= OPTIONS.together_in_bulk else OPTIONS.together_in_bulk
         for at in range(0, len(parts), together):
             watch = watch._take(carrier, parts[at : at + together])
         return watch
@@ -153,14 +146,14 @@ class Watch:
         """Take in cells, and judge the last ones."""
         assert self.around is not None
         parts, new = parted(self.around, parts)
-        kept = CELLS * SPARSE[-1] if self.held is None else CELLS
+        kept = WINDOW.cells * OPTIONS.sparse[-1] if self.held is None else WINDOW.cells
         cells = (*self.cells, *new)[-kept:]
         watch = replace(self, recent=(*self.recent, *parts)[-kept:], cells=cells)
-        if len(cells) <= LEAST_BEFORE:
+        if len(cells) <= WINDOW.min_before:
             return watch if watch.held is None else watch._learn(carrier, parts)
-        window = Window.of(self.around, cells[-CELLS:])
+        window = Window.of(self.around, cells[-WINDOW.cells :])
         # an arm that carries nothing as far as is known may have carried something from before the first cell on
-        gains = window.gains((*AFTER, CELLS) if self.held is None else AFTER)
+        gains = window.gains((*WINDOW.after, WINDOW.cells) if self.held is None else WINDOW.after)
         watch = replace(watch, probabilities=probabilities(gains))
         return watch._free(carrier, window, gains) if self.held is None else watch._carry(carrier, parts, window, gains)
 
@@ -178,9 +171,9 @@ class Watch:
         state = state_of(gains)
         if state == "contact":  # it may be a payload that is heavier than the arm is known to: that lasts
             assert self.around is not None
-            for every in SPARSE:
-                cells = self.cells[(len(self.cells) - 1) % every :: every][-CELLS:]
-                if len(cells) < LASTING + LEAST_BEFORE:
+            for every in OPTIONS.sparse:
+                cells = self.cells[(len(self.cells) - 1) % every :: every][-WINDOW.cells :]
+                if len(cells) < VERDICT.lasting_cells + WINDOW.min_before:
                     break
                 window = Window.of(self.around, cells)
                 if (after := taken(window, window.gains(), every=every)) is not None:
@@ -192,7 +185,9 @@ class Watch:
         if state == self.state:
             return replace(self, unsettled=None)
         at = float(self.recent[-1].time[-1])
-        if self.state in ("none", "payload") or (self.unsettled is not None and at - self.unsettled >= SETTLED_S):
+        if self.state in ("none", "payload") or (
+            self.unsettled is not None and at - self.unsettled >= OPTIONS.settled_s
+        ):
             return replace(self, state=state, unsettled=None)
         return self if self.unsettled is not None else replace(self, unsettled=at)
 
@@ -200,13 +195,13 @@ class Watch:
         """Carry what the last cells show, so many. every: of how many cells one was looked at."""
         rows, before = Rows.concatenate(self.recent[-after:]), no_rows(self.n)
         if self.held is None and len(self.recent) > after:  # rows with another payload tell another beginning
-            before = Rows.concatenate(self.recent[:-after][-every * BEFORE :])
+            before = Rows.concatenate(self.recent[:-after][-every * WINDOW.before :])
         held = Held.of_rows(carrier, rows, before)
         estimate = held.estimate
-        vague = 1 / POSITIVE if estimate.gain < AT_ONCE else np.inf
-        if after < LASTING or self.held is not None:
-            vague = PRECISE if estimate.gain - estimate.contact >= BETTER else 0.0
-        strange = np.abs((estimate.eta - ANY.centre) / WIDTH).max() > STRANGE
+        vague = 1 / VERDICT.positive if estimate.gain < VERDICT.at_once_nats else np.inf
+        if after < VERDICT.lasting_cells or self.held is not None:
+            vague = VERDICT.precise if estimate.gain - estimate.contact >= VERDICT.better_nats else 0.0
+        strange = np.abs((estimate.eta - ANY.centre) / WIDTH).max() > OPTIONS.max_stds
         if strange or np.sqrt(estimate.covariance[0, 0]) > vague * estimate.doubt:
             return self._named("contact")
         watch = replace(
@@ -217,21 +212,21 @@ class Watch:
     def _carry(self, carrier: Carrier, parts: Sequence[Rows], window: Window, gains: Gains) -> Watch:
         """Judge cells of an arm that carries a payload."""
         assert self.held is not None
-        best = {kind: max(each[kind] for each in gains.values()) for kind in KINDS}
-        if max(best.values()) > LIKELY:
+        best = {kind: max(each[kind] for each in gains.values()) for kind in PRIOR}
+        if max(best.values()) > VERDICT.likely_nats:
             down, after = self._without(carrier, window, gains)
             # nothing is free about an arm without a payload: what explains as much with ten numbers explains less
-            share = NEARLY if after >= LASTING else ALIKE
-            if down >= SURE and down >= share * max(gains[after].values()):
+            share = VERDICT.lasting_share if after >= VERDICT.lasting_cells else VERDICT.alike_share
+            if down >= VERDICT.sure_nats and down >= share * max(gains[after].values()):
                 since = float(self.recent[-after].time[0])
                 fresh = Watch(self.n, "none", {"none": 1.0}, since, None, self.waiting, self.recent[-after:])
                 return fresh._around(carrier)
             if (changed := taken(window, gains, self.held.estimate.load.payload)) is not None:
                 return self._take_up(carrier, changed)
-        if max(best.values()) <= SURE:
+        if max(best.values()) <= VERDICT.sure_nats:
             return replace(self, off=0)._learn(carrier, parts)
         off = self.off + len(parts)
-        if off >= OFF:  # no contact lasts so long: it was estimated wrongly, or is another one
+        if off >= OPTIONS.max_off:  # no contact lasts so long: it was estimated wrongly, or is another one
             again = self._take_up(carrier, len(self.recent))
             if again.held is not self.held:
                 return again
@@ -246,7 +241,7 @@ class Watch:
         mean = load.mean.copy()
         mean[-PARAMETERS:] = 0.0
         bare = Linearised(carrier, replace(load, mean=mean, others=()))  # which carry it, too
-        parts, size = self.recent[-AFTER[-1] :], len(window.cells[-1].features)
+        parts, size = self.recent[-WINDOW.after[-1] :], len(window.cells[-1].features)
         seen = [replace(each, features=_unloaded(each.features, size)) for each in cells_of(bare, parts)]
         first, count = len(window.cells), len(window.cells) + len(seen)
         choices = [[*range(first - after), *range(count - after, count)] for after in gains]

@@ -1,6 +1,6 @@
 """What has happened to an arm: nothing, a payload taken up or put down, a contact, other friction. Weighed by evidence.
 
-Rows are averaged in cells of CELL_S: torque is linear in what is unknown, so that nothing is lost but what white noise
+Rows are averaged in cells of 50 ms: torque is linear in what is unknown, so that nothing is lost but what white noise
 there is. Of the last cells, those before an instant and those after it, the residual r has the covariance
 
     C = Φ Σ Φᵀ + errors like in motion that is alike + white noise,
@@ -30,20 +30,38 @@ from lipcore.online.payload.bodies import ANY, CONTACTS, SHAPE, evidence, most_l
 from lipcore.online.payload.errors import likeness, noise_parts
 from lipcore.robots.urdf import PARAMETERS
 
-CELL_S = 0.05
-LIKE, REST_S = (1.0, 0.5), 0.3
-"""Of errors that change with motion, see `errors.likeness`, and of what holds a joint at rest, s. Chosen on the dirty
-Panda of seed 50: with those of `errors` 0.5 kg are not seen, with twice as much fast motion looks like a payload."""
-LEAP = 6.0
-"""Deviations of the noise by which the residual differs from row to row where something has happened."""
-BEFORE, LEAST_BEFORE = 6, 4
-AFTER = (1, 2, 3, 4, 5, 6)
-"""Cells that are compared: before the instant, at most and at least; and after it."""
-MASSES = (0.5, 1.5, 5.0)
-"""Scales of a payload's mass, kg; first moment and inertia as of a body about LEVER and RADIUS away."""
-FRICTIONS = (0.1, 0.3)
-"""Scales of a change of friction, in units of what is usual, see `bodies.usual`."""
 Kind = Literal["payload", "contact", "friction"]
+
+
+@dataclass(frozen=True)
+class WindowOptions:
+    """Cells that are compared, and scales of what may have happened."""
+
+    cell_s: float = 0.05
+    like: tuple[float, float] = (1.0, 0.5)
+    rest_s: float = 0.3
+    """Lengths of errors that change with motion, see `errors.likeness`, and of what holds a joint at rest. Tuned on the
+    dirty Panda of seed 50: with those of `errors` 0.5 kg are not seen, with twice as much fast motion looks like a
+    payload."""
+    min_leap: float = 6.0
+    """Min deviations of the noise by which the residual differs from row to row if something has happened."""
+    before: int = 6
+    min_before: int = 4
+    """Max and min number of cells before the instant."""
+    after: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
+    """Numbers of cells after the instant."""
+    masses: tuple[float, ...] = (0.5, 1.5, 5.0)
+    """Scales of a payload's mass, kg; first moment and inertia are those of `bodies.SHAPE`."""
+    frictions: tuple[float, ...] = (0.1, 0.3)
+    """Scales of a change of friction, in units of the usual torque, see `bodies.usual`."""
+
+    @property
+    def cells(self) -> int:
+        """Cells that are compared together."""
+        return self.before + self.after[-1]
+
+
+WINDOW = WindowOptions()
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +88,7 @@ def parted(around: Linearised, parts: Sequence[Rows]) -> tuple[list[Rows], tuple
     features, expected = around.all_rows(rows.motion())
     white, lasting, rest = noise_parts(around.carrier, rows.motion())
     usual = np.sqrt(2 * white + (lasting + rest)[1:])
-    leaps = (np.abs(np.diff(rows.tau - expected, axis=0)) > LEAP * usual).any(axis=1)
+    leaps = (np.abs(np.diff(rows.tau - expected, axis=0)) > WINDOW.min_leap * usual).any(axis=1)
     ends = np.cumsum([len(each) for each in parts])[:-1]
     edges = np.union1d(ends, np.flatnonzero(leaps) + 1)
     parts = [rows.take(each) for each in np.split(np.arange(len(rows)), edges)]
@@ -133,9 +151,9 @@ class Window:
         features = np.stack([each.features for each in cells], axis=1).reshape(len(cells[0].features), -1)
         covariance = (features.T @ around.covariance @ features).reshape(count, n, count, n)
         q, dq = np.array([each.q for each in cells]), np.array([each.dq for each in cells])
-        alike = likeness(around.carrier, q, dq, *LIKE)
+        alike = likeness(around.carrier, q, dq, *WINDOW.like)
         end, places = np.array([each.end for each in cells]), np.arange(count)
-        near = np.exp(-np.abs(np.subtract.outer(end, end)) / REST_S)
+        near = np.exp(-np.abs(np.subtract.outer(end, end)) / WINDOW.rest_s)
         lasting, rest = (np.sqrt([getattr(each, name) for each in cells]) for name in ("lasting", "rest"))
         for j in range(n):
             covariance[:, j, :, j] += alike[j] * np.outer(lasting[:, j], lasting[:, j])
@@ -177,9 +195,9 @@ class Window:
     def mass(self, after: int) -> tuple[float, float]:
         """Mean and standard deviation, kg, of the mass that is carried more for the last cells, of either sign."""
         gram, pull = self._of_payload(after)
-        scale = MASSES[1] * SHAPE
+        scale = WINDOW.masses[1] * SHAPE
         spread = np.linalg.inv(np.eye(PARAMETERS) + scale[:, None] * gram * scale)
-        return MASSES[1] * float(spread[0] @ (scale * pull)), MASSES[1] * float(np.sqrt(spread[0, 0]))
+        return WINDOW.masses[1] * float(spread[0] @ (scale * pull)), WINDOW.masses[1] * float(np.sqrt(spread[0, 0]))
 
     def _evidence(self, features: Array, scales: Sequence[Array]) -> Array:
         """Nats gained by each of K sets of whitened features, (K, N n, p), see `bodies.evidence`."""
@@ -194,10 +212,10 @@ class Window:
         whitened = solve_triangular(self.root, columns, lower=True, check_finite=False)
         return whitened.T @ whitened, whitened.T @ self.residual
 
-    def gains(self, after: Sequence[int] = AFTER) -> dict[int, dict[Kind, float]]:
+    def gains(self, after: Sequence[int] = WINDOW.after) -> dict[int, dict[Kind, float]]:
         """Nats by which hypotheses explain the cells better than nothing does, by the number of cells that they hold
         for: of a payload, of a contact, and of other friction. after: numbers that are looked at, where at least
-        LEAST_BEFORE cells come before, or none does."""
+        `min_before` cells come before, or none does."""
         n, count = len(self.cells[0].q), len(self.cells)
         payload = np.stack([each.features[-PARAMETERS:] for each in self.cells], axis=1)  # (10, N, n)
         contact = np.broadcast_to(np.eye(n)[:, None], (n, count, n))
@@ -205,12 +223,12 @@ class Window:
         friction = contact * turns
         typical = usual(self.cells[-1].features[-PARAMETERS:])
         scales: dict[Kind, list[Array]] = {
-            "payload": [mass * SHAPE for mass in MASSES],
+            "payload": [mass * SHAPE for mass in WINDOW.masses],
             "contact": [np.full(n, each * typical) for each in CONTACTS],
-            "friction": [np.full(n, each * typical) for each in FRICTIONS],
+            "friction": [np.full(n, each * typical) for each in WINDOW.frictions],
         }
         kinds: dict[Kind, Array] = {"payload": payload, "contact": contact, "friction": friction}
-        spans = [each for each in after if count - each >= LEAST_BEFORE or count == each]
+        spans = [each for each in after if count - each >= WINDOW.min_before or count == each]
         columns = []
         for each in kinds.values():
             for span in spans:

@@ -6,7 +6,7 @@ Given the variables w of the arm, N(ŵ, Σ), torque is linear in the payload's t
     V = (Σ⁻¹ + Fᵀ R⁻¹ F)⁻¹,    Λ = bᵀ R⁻¹ b − bᵀ R⁻¹ F V Fᵀ R⁻¹ b,    ξ = bᵀ R⁻¹ r − bᵀ R⁻¹ F V Fᵀ R⁻¹ r,
 
 is all that the rows say of π, of which the most likely body is sought (`bodies.most_likely`); the rows are linearised
-anew around it until it stays.
+anew around it, six times at most, until it stays within 0.05 of its standard deviations.
 """
 
 from __future__ import annotations
@@ -22,9 +22,6 @@ from lipcore.online.payload.errors import correlation_roots, whitened
 from lipcore.online.payload.estimate import Estimate, alone
 from lipcore.robots.urdf import PARAMETERS
 
-ROUNDS, STILL = 6, 0.05
-"""Linearisations at most, and the change in standard deviations from which on there is no other."""
-
 
 def linear(carrier: Carrier, rows: Rows, before: Rows | None, prior: Known, start: Estimate | None) -> Estimate:
     """The payload that rows carry, arguments as of `payload.estimate`."""
@@ -37,7 +34,7 @@ def linear(carrier: Carrier, rows: Rows, before: Rows | None, prior: Known, star
     eta = prior.centre if start is None else start.eta
     load = empty if start is None else carrier.known(body(eta)[0])
     root = carrier.covariance_root
-    for _ in range(ROUNDS):
+    for _ in range(6):
         features, base = Linearised(carrier, load).rows(*loaded)
         if free is not None:
             others, torque = Linearised(carrier, empty).rows(*free)
@@ -66,7 +63,7 @@ def linear(carrier: Carrier, rows: Rows, before: Rows | None, prior: Known, star
         w = mean + open_ @ score[:size] + back @ payload
         left = residual - features.T @ np.concatenate([w - mean, payload])
         load = Load(np.concatenate([w, payload]), joint, room)
-        if np.sqrt(np.max((eta - last) ** 2 / np.diagonal(spread))) < STILL:
+        if np.sqrt(np.max((eta - last) ** 2 / np.diagonal(spread))) < 0.05:
             break
     contact = alone(carrier, free, loaded, both.tau, roots)[2]
     return Estimate(eta, max(1.0, float((left**2).mean())) * spread, load, gain, contact)

@@ -26,27 +26,39 @@ from lipcore.kernels.arm_prior import Alternative
 from lipcore.model.payload import Carrier, Load
 from lipcore.online.batch import Rows
 from lipcore.online.payload.bodies import ANY, Known, body, inverse
-from lipcore.online.payload.draws import SEED, Draw, Place, Point, Training, arms, descent, linearised_around, minimum
+from lipcore.online.payload.draws import DRAWS, Draw, Place, Point, Training, arms, descent, linearised_around, minimum
 from lipcore.online.payload.errors import correlation_roots, whitened
 from lipcore.online.payload.estimate import Estimate, Seen, alone, rows_of
 from lipcore.online.payload.linear import linear
 from lipcore.robots.urdf import PARAMETERS
 
-FIRST, NEXT, ROUNDS, FEW = 30, 2, 8, 2
-"""Steps at most of an estimate from nothing and of one that begins at another; of a refined one, and of a draw from its
-posterior."""
-LINEAR, HOT, FAR = 2.0, 30.0, 100.0
-"""The mean square, in deviations of the linear posterior, up to which it is as good; and the energies, nats, by which a
-draw counts e times less, as what the training is taken to say of arms far away is off by as much, and from which on
-rows have ruled it out."""
-DOUBT = 5.0
-"""Times by which an estimate takes its rows and the arm's training for less exact than they are, without draws and
-where the last axis is open: linear posteriors of bent valleys are too narrow, and draws come into few valleys. Chosen
-on simulated arms (seed 1 of `benchmarks.online.arms`): after 10, 30 and 100 rows 95 % intervals hold 98, 96 and 80 %
-of an unseen motion's torques on the worst of three arms (with 1: 89, 77 and 57); those of the next rows are 1.8 to 2.3,
-1.5 to 1.7 and 1.2 to 1.3 times as wide."""
-MEDIAN = 0.6745
-"""Of the absolute value of what has a normal distribution, standard deviations."""
+
+@dataclass(frozen=True)
+class EstimateOptions:
+    """Steps of an estimate, and how far its draws and its errors are trusted."""
+
+    first_steps: int = 30
+    next_steps: int = 2
+    refined_steps: int = 8
+    draw_steps: int = 2
+    """Max steps of an estimate from nothing, of one that begins at another, of a refined one, and of a draw from its
+    posterior."""
+    max_square: float = 2.0
+    """Mean square of draws, in deviations of the linear posterior, up to which that is as good."""
+    hot_nats: float = 30.0
+    """Energy by which a draw counts e times less: what the training is taken to say of arms far away is off by as
+    much."""
+    far_nats: float = 100.0
+    """Energy from which on rows have ruled a draw out."""
+    doubt: float = 5.0
+    """Factor by which an estimate takes its rows and the arm's training for less exact than they are, without draws and
+    where the last axis is open: linear posteriors of bent valleys are too narrow, and draws come into few valleys.
+    Tuned on simulated arms (seed 1 of `benchmarks.online.arms`): after 10, 30 and 100 rows 95 % intervals hold 98, 96
+    and 80 % of an unseen motion's torques on the worst of three arms (with 1: 89, 77 and 57); those of the next rows
+    are 1.8 to 2.3, 1.5 to 1.7 and 1.2 to 1.3 times as wide."""
+
+
+OPTIONS = EstimateOptions()
 
 
 def estimate(
@@ -58,7 +70,9 @@ def estimate(
         return linear(carrier, rows, before, prior, start)
     problem = _Problem.of(carrier, rows, before, prior)
     start = problem.usable(start)
-    at = minimum(problem, problem.at(problem.begin(start)), FIRST if start is None else NEXT)
+    at = minimum(
+        problem, problem.at(problem.begin(start)), OPTIONS.first_steps if start is None else OPTIONS.next_steps
+    )
     return problem.estimate(at)
 
 
@@ -74,7 +88,9 @@ def refine(
     something else can be done meanwhile. anew: whether draws that rows have ruled out begin again."""
     problem = _Problem.of(carrier, rows, before, prior)
     start = problem.usable(start)
-    at = yield from descent(problem, problem.at(problem.begin(start)), FIRST if start is None else ROUNDS)
+    at = yield from descent(
+        problem, problem.at(problem.begin(start)), OPTIONS.first_steps if start is None else OPTIONS.refined_steps
+    )
     known = () if start is None else start.draws
     # another revision of the training may know more, or less
     known = tuple(each for each in known if each.usable(len(at.residual) - problem.tau.size))
@@ -83,17 +99,17 @@ def refine(
         known = tuple(_carrying(each, at) for each in begun)
     found = []
     for number, each in enumerate(known):
-        point = yield from problem.sought(each, number, FEW)
+        point = yield from problem.sought(each, number, OPTIONS.draw_steps)
         found.append(_Found(point, each.noise))
     at = min([at, *(each.point for each in found)], key=_energy)
     if anew:
-        for number in [number for number, each in enumerate(found) if each.excess(at) > FAR]:
-            draw = np.random.default_rng([SEED, number, len(rows)])
+        for number in [number for number, each in enumerate(found) if each.excess(at) > OPTIONS.far_nats]:
+            draw = np.random.default_rng([DRAWS.seed, number, len(rows)])
             again = _carrying((yield from problem.training.begun(number, draw)), at)
-            point = yield from problem.sought(again, number, FIRST)
+            point = yield from problem.sought(again, number, OPTIONS.first_steps)
             found[number] = min(found[number], _Found(point, again.noise), key=lambda each: each.point.energy)
     # each draw is the minimum for other noise
-    other = yield from descent(problem, min((each.point for each in found), key=_energy), ROUNDS)
+    other = yield from descent(problem, min((each.point for each in found), key=_energy), OPTIONS.refined_steps)
     return problem.estimate(min(at, other, key=_energy), found)
 
 
@@ -191,7 +207,7 @@ class _Problem:
         """A draw from the posterior: the minimum for other noise of the training, of what is known of payloads and of
         the rows (randomised maximum likelihood, Kitanidis 1995, Oliver et al. 1996). number: of the draw, which has the
         same noise of the same rows each time, and is near where it was."""
-        of_rows, noise = np.random.default_rng([SEED, number]).standard_normal(self.tau.size), begin.noise
+        of_rows, noise = np.random.default_rng([DRAWS.seed, number]).standard_normal(self.tau.size), begin.noise
         yield
         return (
             yield from descent(self, self.at(begin.place), rounds, 0.0 if noise is None else np.append(noise, of_rows))
@@ -203,7 +219,7 @@ class _Problem:
         derivative, first = at.derivative, len(at.residual) - self.tau.size
         sure = bool(found) and not carrier.open_tip
         if not sure:
-            doubt = np.full(len(derivative), DOUBT)
+            doubt = np.full(len(derivative), OPTIONS.doubt)
             doubt[:size] = doubt[first - PARAMETERS : first] = 1.0  # what was expected before anything was seen
             derivative = derivative / doubt[:, None]
         # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
@@ -221,7 +237,7 @@ class _Problem:
         if others:
             wider = _wider(np.sqrt(np.diagonal(of_eta)), [each.point.place.eta - eta for each in found])
             of_eta *= np.outer(wider, wider)
-        return Estimate(eta, of_eta, load, *self.gains(at), draws, 1.0 if sure else DOUBT)
+        return Estimate(eta, of_eta, load, *self.gains(at), draws, 1.0 if sure else OPTIONS.doubt)
 
     def gains(self, at: Point) -> tuple[float, float]:
         """Nats by which a payload, and a contact of constant torque, explain the rows better than the arm does without
@@ -234,7 +250,8 @@ class _Problem:
 def _wider(std: Array, off: Sequence[Array]) -> Array:
     """How many times wider than the linear posterior's std, (10,), draws lie about its mean, at least once; by the
     median, as some have not come far enough yet. off: of each draw, (10,)."""
-    return np.maximum(1.0, np.median(np.abs(off), axis=0) / (MEDIAN * std))
+    # the median of the absolute value of what has a normal distribution is 0.6745 standard deviations
+    return np.maximum(1.0, np.median(np.abs(off), axis=0) / (0.6745 * std))
 
 
 def _others(carrier: Carrier, at: Point, root: Array, found: Sequence[_Found]) -> tuple[tuple[Alternative, ...], bool]:
@@ -243,7 +260,7 @@ def _others(carrier: Carrier, at: Point, root: Array, found: Sequence[_Found]) -
     Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
     linear posterior is tangent to it at one place.
     """
-    reached = [each for each in found if each.excess(at) < FAR and each.point is not at]
+    reached = [each for each in found if each.excess(at) < OPTIONS.far_nats and each.point is not at]
     known = [each.point.place for each in reached]
     if not known:
         return (), bool(found)
@@ -251,9 +268,9 @@ def _others(carrier: Carrier, at: Point, root: Array, found: Sequence[_Found]) -
     for each in known:
         w = solve_triangular(carrier.memory.root, each.w - at.place.w, lower=True, check_finite=False)
         off.append(solve_triangular(root, np.append(w, each.eta - at.place.eta), check_finite=False))
-    if np.square(off[1:]).mean() < LINEAR and not carrier.open_tip:
+    if np.square(off[1:]).mean() < OPTIONS.max_square and not carrier.open_tip:
         return (), False
-    shares = np.exp(-np.array([0.0, *(max(0.0, each.excess(at)) for each in reached)]) / HOT)
+    shares = np.exp(-np.array([0.0, *(max(0.0, each.excess(at)) for each in reached)]) / OPTIONS.hot_nats)
     return tuple(
         carrier.alternative(each.w, each.geometry, body(each.eta)[0], share)
         for each, share in zip((at.place, *known), shares / shares.sum(), strict=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from lipcore.online.changes.opening import BAND, LEAST, LENGTH, Opening
+from lipcore.online.changes.opening import OPENING, Opening
 from tests.service.learning import lessons
 from tests.service.learning.lessons import Pupil, apart
 from tests.service.learning.recordings import codes
@@ -14,7 +14,7 @@ OFF = 0.05
 """N·m: five times the noise, which is no contact."""
 
 
-def opened(inside: float, rows: float = LENGTH, joints: int = 3) -> Opening:
+def opened(inside: float, rows: float = OPENING.rows, joints: int = 3) -> Opening:
     """An opening of rows of a tenth of a second, that share of which the intervals of all joints held."""
     count = round(rows)
     error = np.where(np.arange(count)[:, None] < inside * count, 1.0, 3.0) * np.ones(joints)
@@ -29,20 +29,20 @@ def test_rows_count_as_far_as_they_are_independent():
     for rows in np.split(np.arange(250), [30, 31, 95, 140]):
         opening = opening.step(time[rows], weight[rows], error[rows], spread[rows])
     first = slice(0, 100)  # a second
-    held = np.abs(error[first]) <= BAND * spread[first]
+    held = np.abs(error[first]) <= OPENING.band * spread[first]
     assert opening.over
     np.testing.assert_allclose(opening.coverage, held.mean(axis=0))
-    assert (opening.rows, opening.since) == (pytest.approx(LENGTH), 0.0)
+    assert (opening.rows, opening.since) == (pytest.approx(OPENING.rows), 0.0)
     assert Opening.from_json(opening.to_json()).to_json() == opening.to_json()
 
 
 def test_only_what_is_known_to_be_far_outside_is_a_misfit():
-    """Known: where the intervals hold LEAST, so few or fewer come once in forty streams at most."""
+    """Known: where the intervals hold the min share, so few or fewer come once in forty streams at most."""
     for hits in range(11):
-        chance = binom.cdf(hits, 10, LEAST)
+        chance = binom.cdf(hits, 10, OPENING.min_share)
         assert opened(hits / 10).misfit == (chance < 0.025)
     assert opened(0.0).joints == (0, 1, 2)
-    assert not opened(0.0, rows=LENGTH - 1).misfit  # it has not been a second yet
+    assert not opened(0.0, rows=OPENING.rows - 1).misfit  # it has not been a second yet
 
 
 def test_joints_are_no_witnesses_of_their_own():
