@@ -11,16 +11,22 @@ from scipy.special import fdtri
 from lipcore.data.samples import Array
 from lipcore.data.splits import Mask
 
-MIN_COVERAGE = 0.9
-"""Least coverage of the 95 % intervals."""
-MAX_ERROR = 0.9
-"""Largest squared error, of that of answering the mean torque: the margin below it is a tenth."""
-SIGNAL = 3.0
-"""Standard deviation of a measured torque, of its noise, from which on a model has to explain it."""
-LEVEL = 0.95
-"""Probability with which the error of a joint is below MAX_ERROR."""
-MAX_NAMED = 8
-"""Most joints that are named in a sentence."""
+
+@dataclass(frozen=True)
+class AcceptanceOptions:
+    """What a model must achieve on held-out samples."""
+
+    min_coverage: float = 0.9
+    """Min coverage of the 95 % intervals."""
+    max_error: float = 0.9
+    """Max squared error, as a share of that of answering the mean torque: the margin is a tenth."""
+    min_signal: float = 3.0
+    """Standard deviation of a measured torque, in units of its noise, from which on a model has to explain it."""
+    level: float = 0.95
+    """Probability with which the error of a joint is below `max_error`."""
+
+
+OPTIONS = AcceptanceOptions()
 
 
 @dataclass(frozen=True)
@@ -83,17 +89,17 @@ def accept(figures: HeldOutFigures) -> Acceptance:
 def _error(figures: HeldOutFigures) -> Acceptance:
     """Whether the error is below the mean's, on every joint whose torque stands out of its noise.
 
-    Both errors, of N independent samples each, have a ratio below `nmse` times the LEVEL quantile of F(N, N) with that
-    probability: where this is below MAX_ERROR, it is.
+    Both errors, of N independent samples each, have a ratio below `nmse` times the `level` quantile of F(N, N) with
+    that probability: where this is below `max_error`, it is.
     """
     nmse, count = figures.nmse, np.maximum(figures.independent, 1.0)
     varies = np.isfinite(nmse) & (nmse > 0)
     spread = figures.rmse / np.sqrt(np.where(varies, nmse, 1.0))
-    judged = varies & (spread >= SIGNAL * figures.torque_noise)
+    judged = varies & (spread >= OPTIONS.min_signal * figures.torque_noise)
     if not judged.any():
         return Acceptance(unknown=("no torque of what was held out stands out of its noise",))
-    large = judged & (nmse >= MAX_ERROR)
-    open_ = judged & ~large & (nmse * fdtri(count, count, LEVEL) >= MAX_ERROR)
+    large = judged & (nmse >= OPTIONS.max_error)
+    open_ = judged & ~large & (nmse * fdtri(count, count, OPTIONS.level) >= OPTIONS.max_error)
     texts = [
         f"{value:.2g} of its variance ({number:.0f} independent errors)"
         for value, number in zip(nmse, count, strict=True)
@@ -107,18 +113,18 @@ def _error(figures: HeldOutFigures) -> Acceptance:
 
 
 def _coverage(figures: HeldOutFigures) -> Acceptance:
-    """Whether the intervals hold MIN_COVERAGE, as far as so few errors can tell."""
-    least = f"{100 * MIN_COVERAGE:.0f} %"
+    """Whether the intervals hold `min_coverage`, as far as so few errors can tell."""
+    least = f"{100 * OPTIONS.min_coverage:.0f} %"
     texts = [
         f"{100 * share:.0f} % (at most {100 * high:.0f} %, from {count:.0f} independent errors)"
         for share, high, count in zip(figures.coverage, figures.coverage_high, figures.independent, strict=True)
     ]
-    narrow = _listed(figures.joint_names, texts, figures.coverage_high < MIN_COVERAGE)
+    narrow = _listed(figures.joint_names, texts, figures.coverage_high < OPTIONS.min_coverage)
     if narrow:
         return Acceptance(against=(f"the 95 % intervals hold less than {least} of what was held out: {narrow}",))
     return Acceptance(speaks_for=(f"its 95 % intervals hold {least} of what was held out, as far as that can tell",))
 
 
-def _listed(names: Sequence[str], texts: Sequence[str], which: Mask) -> str:
+def _listed(names: Sequence[str], texts: Sequence[str], which: Mask, most: int = 8) -> str:
     chosen = [f"{name} {text}" for name, text, taken in zip(names, texts, which, strict=True) if taken]
-    return ", ".join([*chosen[:MAX_NAMED], "…"] if len(chosen) > MAX_NAMED else chosen)
+    return ", ".join([*chosen[:most], "…"] if len(chosen) > most else chosen)

@@ -8,9 +8,6 @@ import numpy as np
 
 from lipcore.data.samples import Array
 
-ROUNDING = 1e-12
-"""Share of the inertia about the link's frame that may be rounding."""
-
 
 @dataclass(frozen=True)
 class Body:
@@ -62,7 +59,8 @@ class Body:
         about[LOWER] = parameters[4:]
         about = about + np.tril(about, -1).T
         own = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
-        return cls(mass, com, None if np.abs(own).max() <= ROUNDING * np.abs(about).max() else own)
+        rounding = 1e-12 * np.abs(about).max()
+        return cls(mass, com, None if np.abs(own).max() <= rounding else own)
 
 
 LOWER = np.tril_indices(3)

@@ -24,7 +24,6 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.exact import Posterior
 from lipcore.vocabulary import COMPONENTS, ComponentName
 
-_ALWAYS: tuple[ComponentName, ...] = ("friction",)
 _TORQUES: dict[ComponentName, dict[str, float]] = {
     "gravity": {"rest": 1.0},
     "coriolis": {"moving": 1.0, "rest": -1.0},
@@ -51,7 +50,7 @@ class IndefiniteInertiaError(ValueError):
 def available(estimator: Estimator) -> tuple[ComponentName, ...]:
     """Components that an estimator can offer: all where its torque comes from energies, else friction only."""
     terms = _dynamics_terms(estimator)
-    return COMPONENTS if terms and len(_energy_terms(estimator)) == len(terms) else _ALWAYS
+    return COMPONENTS if terms and len(_energy_terms(estimator)) == len(terms) else ("friction",)
 
 
 def components(

@@ -24,8 +24,6 @@ RigidKernel = ArmKernel | PayloadKernel
 EnergyKernel = LipKernel | ChainKernel | RigidKernel
 """Priors of torques that come from priors of the energies."""
 KINETIC, POTENTIAL = 0, 1
-COLUMNS_PER_CHUNK = 512
-"""Right-hand sides whitened together: enough for fast matrix products, few enough to stay within tens of MB."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +54,8 @@ def combine_torques(
     """
     n, size, count = kernel.n_joints, len(motions), len(motions[0])
     stacked = [np.stack([getattr(m, name) for m in motions], axis=1) for name in ("q", "dq", "ddq")]  # (N, S, n)
-    step = max(1, COLUMNS_PER_CHUNK // (size * n))
+    # right-hand sides whitened together: enough for fast matrix products, few enough to stay within tens of MB
+    step = max(1, 512 // (size * n))
     means, stds = [], []
     for start in range(0, count, step):
         stack = Motion(*(part[start : start + step].reshape(-1, n) for part in stacked))

@@ -24,13 +24,6 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.posterior.linalg import eigen
 
-SHARE, SEED = 1.5, 0
-"""Torques of the virtual motions, as a share of the arm's weights; and what they are drawn by."""
-TAUGHT = 1e-6
-"""Precision from which on samples have taught a direction of w, of prior precision one."""
-SPANNED = 1e-8
-"""Singular value of features, as a share of the largest, from which on they span a direction."""
-
 
 @dataclass(frozen=True, eq=False)
 class Memory:
@@ -59,11 +52,11 @@ class Memory:
         flat = features[arm].reshape(-1, variance.size).T
         values, vectors = eigen(covariance)
         precision = 1 / values - 1
-        taught = precision > TAUGHT
+        taught = precision > 1e-6  # of prior precision one
         root, along = np.sqrt(precision[taught]), vectors[:, taught]
         slope = (along * root).T
         left, sizes, right = np.linalg.svd(flat, full_matrices=False)
-        spanned = sizes > SPANNED * sizes[0]
+        spanned = sizes > 1e-8 * sizes[0]
         left, back = left[:, spanned], right[spanned].T / sizes[spanned]
         rows = variance.reshape(-1)
         # so many samples, of the variance of each, as have taught as much as the posterior knows

@@ -25,8 +25,6 @@ STEPS = ("turn 1", "turn 2", "shift 1", "shift 2")
 """Names of a joint's numbers of geometry: about, and along, the two vectors across its axis."""
 UNDETERMINED = 0.5
 """Torque does not tell what is still as uncertain as this share of what was expected beforehand."""
-LEAST_VARIANCE = 1e-12
-"""Smallest posterior variance relative to the prior's that rounding leaves meaningful."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +154,7 @@ def precision(posterior: CompactPosterior, term: LinearKernel) -> Array:
     weights = weight_posterior(posterior, term)
     scaled = weights.covariance / np.outer(weights.scale, weights.scale)
     values, vectors = eigen(0.5 * (scaled + scaled.T))
-    return np.asarray((vectors / np.maximum(values, LEAST_VARIANCE)) @ vectors.T)
+    return np.asarray((vectors / np.maximum(values, 1e-12)) @ vectors.T)
 
 
 def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Sequence[str]) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from lipcore.kernels.friction import FrictionKernel
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.mixture import MixtureKernel
 from lipcore.kernels.payload import PayloadKernel
-from lipcore.model.memory import SEED, SHARE, Memory
+from lipcore.model.memory import Memory
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
@@ -35,18 +35,6 @@ from lipcore.posterior.linalg import block_diagonal, eigen
 from lipcore.posterior.statistics import known
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.vocabulary import ROBOT_ESTIMATORS
-
-ROOM = 10.0
-"""Prior variance that a payload's parameters get, in units of their own: Σ ≤ k diag Σ holds for every covariance of k
-numbers, so that the posterior is nowhere wider than its prior, as the evaluator has to assume."""
-
-CERTAIN = 1e-12
-"""Variance of a payload's parameter that is known."""
-TURNS, OPEN_RAD = 2, 0.1
-"""Numbers of a joint's geometry that are turns, the first ones; and a last axis of which samples tell the direction no
-better is open, standard deviation in rad."""
-LEAST = 1e-14
-"""Smallest variance of whitened variables, of prior variance one."""
 
 
 class NoArmError(ValueError):
@@ -117,10 +105,10 @@ class Carrier:
         """Covariance Σ of the whitened variables, (M, M)."""
         covariance = self.model.posterior.covariance
         values, vectors = eigen(covariance)
-        if values[0] >= LEAST:
+        if values[0] >= 1e-14:  # of prior variance one
             return np.asarray(covariance)
         # what samples tell to rounding has a variance of either sign
-        return np.asarray((vectors * np.maximum(values, LEAST)) @ vectors.T)
+        return np.asarray((vectors * np.maximum(values, 1e-14)) @ vectors.T)
 
     @cached_property
     def covariance_root(self) -> Array:
@@ -137,8 +125,8 @@ class Carrier:
     def memory(self) -> Memory:
         """What the samples behind the posterior say of arms of another geometry."""
         n, limits = self.model.n_joints, self.model.training_range
-        count = int(np.ceil(SHARE * self.term.size / n))
-        draw = np.random.default_rng(SEED).uniform
+        count = int(np.ceil(1.5 * self.term.size / n))  # torques of half as many again as the arm has weights
+        draw = np.random.default_rng(0).uniform
         q, dq, ddq = (draw(limits[name]["min"], limits[name]["max"], (count, n)) for name in ("q", "dq", "ddq"))
         motion, posterior = Motion.from_arrays(q, dq, ddq), self.model.posterior
         features, base = Linearised(self, self.known(np.zeros(PARAMETERS))).rows(motion)
@@ -158,7 +146,7 @@ class Carrier:
         arm = self.term.arm
         taught = (1 / self.covariance.diagonal()[self.steps] - 1) / arm.widths**2
         first = arm.steps - arm.geometry.screws[-1]
-        return bool((taught[first : first + TURNS] < OPEN_RAD**-2).any())
+        return bool((taught[first : first + 2] < 0.1**-2).any())  # turns, rad
 
     @property
     def step(self) -> Array:
@@ -211,8 +199,10 @@ class Carrier:
         covariance[:size, :size] = self.covariance
         if spread is not None:
             covariance[size:, size:] = spread
-        room = ROOM * np.diagonal(covariance)[size:]
-        return Load(np.concatenate([self.mean, body]), covariance, np.maximum(room, CERTAIN))
+        # Σ ≤ k diag Σ holds for every covariance of k numbers, here a payload's ten: so the posterior is nowhere wider
+        # than its prior, as the evaluator has to assume
+        room = PARAMETERS * np.diagonal(covariance)[size:]
+        return Load(np.concatenate([self.mean, body]), covariance, np.maximum(room, 1e-12))
 
     def warm_up(self) -> None:
         """Answer once with a payload, and once with several arms that carry one: what is compiled is there then."""

@@ -7,14 +7,6 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.robots.urdf import PARAMETERS
 
-LEAST_MASS = 1e-4
-"""Smallest mass of a plausible body, as a share of the arm's."""
-LEAST_EXTENT, RADIUS = 1e-3, 0.05
-"""Smallest spread of a plausible body's mass along each axis, m: no real body is a point; radius of a usual one, m."""
-BARRIERS = tuple(10.0**power for power in range(3, -4, -1))
-"""Weights of the barrier: the last leaves at most 4 n times as much of the squared distance to gain."""
-NEWTON_STEPS, SHORTEST = 30, 1e-8
-
 
 def pseudo_inertia(body: Array) -> Array:
     """The pseudo-inertia [[Σ, h], [hᵀ, m]] of ten parameters, (4, 4): positive definite for every real body."""
@@ -44,7 +36,8 @@ def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: A
     size = PARAMETERS * n
     given = np.zeros((n, PARAMETERS)) if start is None else start
     total = max(float(mean[:size:PARAMETERS].sum()), float(given[:, 0].sum()), 1e-3)
-    least = LEAST_MASS * total * np.diag([LEAST_EXTENT**2, LEAST_EXTENT**2, LEAST_EXTENT**2, 1.0])
+    # at least a ten-thousandth of the arm's mass, spread by 1 mm along each axis: no real body is a point
+    least = 1e-4 * total * np.diag([1e-6, 1e-6, 1e-6, 1.0])
     centre = mean / scale
     basis = np.array([pseudo_inertia(unit) for unit in np.eye(PARAMETERS)])
 
@@ -61,8 +54,9 @@ def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: A
 
     point = centre.copy()
     point[:size] = np.concatenate([_real(body, total / n, least) for body in given]) / scale[:size]
-    for barrier in BARRIERS:
-        for _ in range(NEWTON_STEPS):
+    # the last barrier leaves at most 4 n times as much of the squared distance to gain
+    for barrier in [10.0**power for power in range(3, -4, -1)]:
+        for _ in range(30):
             inverse = np.linalg.inv(matrices(point))
             turned = np.einsum("nij,kjl->nkil", inverse, basis)  # P⁻¹ E_k
             slope = np.einsum("nkii->nk", turned).reshape(-1) * scale[:size]
@@ -78,9 +72,9 @@ def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: A
             except np.linalg.LinAlgError:  # at the boundary, but for rounding: the point is plausible all the same
                 break
             slack, length, now = float(-gradient @ step), 1.0, value(point, barrier)
-            while length > SHORTEST and value(point + length * step, barrier) > now - 0.1 * length * slack:
+            while length > 1e-8 and value(point + length * step, barrier) > now - 0.1 * length * slack:
                 length *= 0.5
-            if length <= SHORTEST:
+            if length <= 1e-8:
                 break
             point = point + length * step
             if slack < 1e-3 * barrier:
@@ -92,5 +86,5 @@ def _real(body: Array, usual_mass: float, least: Array) -> Array:
     """A body, or a ball of the usual mass where it is none that can exist."""
     if np.linalg.eigvalsh(pseudo_inertia(body) - 2 * least)[0] > 0:
         return body
-    ball = 0.4 * usual_mass * RADIUS**2
+    ball = 0.4 * usual_mass * 0.05**2
     return np.array([usual_mass, 0, 0, 0, ball, 0, ball, 0, 0, ball])

@@ -11,7 +11,6 @@ from lipcore.vocabulary import AUTO
 MOST_TEXT = 300
 """Characters of a reason or an error."""
 MAX_NAME = 100
-MAX_CANDIDATES = 10
 
 Name = Annotated[str, Meta(min_length=1, max_length=MAX_NAME)]
 Sentence = Annotated[str, Meta(min_length=1, max_length=MOST_TEXT)]
@@ -60,7 +59,7 @@ class Selection(TypedDict):
     chosen: Name
     reason: Sentence
     held_out: HeldOut
-    table: Annotated[list[Candidate], Meta(min_length=1, max_length=MAX_CANDIDATES)]
+    table: Annotated[list[Candidate], Meta(min_length=1, max_length=10)]
 
 
 def selection(chosen: str, reason: str, table: list[Candidate], held_out: HeldOut | None = None) -> Selection:

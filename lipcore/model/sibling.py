@@ -3,7 +3,7 @@
 Units of one type have the same geometry but for machining, nearly the same masses, and friction of their own. So of a
 parameter, known as N(m, V), another unit's is expected within
 
-    N(m, V + (UNIT_SHARE · size)²),    size² = mean of m² + V over the entries of its kind and body,
+    N(m, V + (0.1 · size)²),    size² = mean of m² + V over the entries of its kind and body,
 
 and of the geometry likewise with what machining leaves. V is the variance given all other parameters, 1 / Λ_ii of the
 posterior precision Λ: among independent Gaussians those are nearest to the posterior (in KL(q | p)). What torque tells
@@ -23,9 +23,6 @@ from lipcore.kernels.fast.arm_recursion import PARAMETERS
 from lipcore.model.parameters import precision, weight_posterior
 from lipcore.model.torque_model import TorqueModel
 
-UNIT_SHARE = 0.1
-"""Relative deviation of masses and rotor inertias between units of one type, that a fit starts from."""
-
 
 def arm_of_sibling(base: TorqueModel) -> Arm:
     """The arm of another unit of a model's robot, before any samples of it; its geometry may be calibrated.
@@ -40,7 +37,7 @@ def arm_of_sibling(base: TorqueModel) -> Arm:
     variance = weights.scale**2 / precision(base.posterior, term).diagonal()
     bodies, rotors = slice(0, PARAMETERS * n), slice(PARAMETERS * n, (PARAMETERS + 1) * n)
     size = _sizes(weights.mean**2 + weights.std**2, n)
-    unit = np.sqrt(variance[: rotors.stop] + (UNIT_SHARE * size) ** 2)
+    unit = np.sqrt(variance[: rotors.stop] + (0.1 * size) ** 2)
     geometry = term.geometry(weights.mean)
     machined = widths_of(geometry)
     steps = variance[term.steps] if arm.steps else np.zeros(geometry.size)

@@ -16,22 +16,13 @@ from lipcore.model.parameters import weight_posterior
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compression import checks
 
-QUERIES = 40
-"""Motions that are looked at: half of the basis' own, half recombined from them."""
-ALWAYS_OPEN = 2
-"""Numbers of a geometry that no torque depends on: its turn about gravity, and a place along the first axis."""
-TOGETHER = 0.7
-"""Independent motions, as a share of the joints, below which joints count as moving together."""
 FARTHER = 2.0
 """How much farther, or faster, than recorded a joint moves where alternative arms, or shares of the fallback, are
 compared."""
-MOST = 0.5
-"""Share of these motions above which a joint counts as one that falls back."""
 LISTED = 8
 """Joints that are named in a sentence, at most."""
 REFIT_ERROR = "refit_error"
 """Entry of a fit's report: why the last fit, on all rows, has failed."""
-COUNTS = {2: "Two", 3: "Three", 4: "Four"}
 
 
 def linearisation_error(model: TorqueModel) -> Array | None:
@@ -49,7 +40,7 @@ def linearisation_error(model: TorqueModel) -> Array | None:
     if not isinstance(term, ArmKernel) or not term.arm.steps:
         return None
     arm, posterior, n = term.arm, model.posterior, term.n_joints
-    motion = checks(posterior.basis.inducing, QUERIES)
+    motion = checks(posterior.basis.inducing, 40)
     known, used = weight_posterior(posterior, term), term.steps.stop
     centre = known.mean.copy()
     centre[: PARAMETERS * n], centre[term.steps] = arm.parameters[arm.place].reshape(-1), 0.0
@@ -77,8 +68,9 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
         f"Its joints moved together, like {moved:.1f} independent ones of {model.n_joints}: torque of other motion may "
         "be off by more than tau_std says. A recording in which each moves by itself tells more."
     )
+    moved_together = moved < 0.7 * model.n_joints
     if arm is None:
-        return [*out, together] if moved < TOGETHER * model.n_joints else out
+        return [*out, together] if moved_together else out
     if len(arm.alternatives) > 1:
         out.append(_alternatives(model))
     if fit.get("search_ended") == "time":
@@ -92,26 +84,27 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
     joints = parameters.get("geometry", {}).get("joints", ())
     names = {each["joint"]: each["undetermined"] for each in joints if each["undetermined"]}
     count = sum(map(len, names.values()))
-    if count > ALWAYS_OPEN:
+    several = count > 2  # no torque depends on the geometry's turn about gravity, and its place along the first axis
+    if several:
         listed = "; ".join([f"{joint}: {', '.join(each)}" for joint, each in names.items()][:LISTED])
         listed += "; …" if len(names) > LISTED else ""
         stand = "are those of the URDF or the base" if arm.mode == "calibrate" else "are only a guess"
         out.append(f"The recording does not tell {count} numbers of the geometry, which {stand} ({listed}).")
-    if (count > ALWAYS_OPEN or arm.alternatives) and moved < TOGETHER * model.n_joints:
+    if (several or arm.alternatives) and moved_together:
         out.append(together)
     return out
 
 
 def _fallback(model: TorqueModel) -> list[str]:
     """Name the joints that fall back at most motions FARTHER and faster than those recombined from the basis' own."""
-    motion = checks(model.posterior.basis.inducing, QUERIES)[-QUERIES // 2 :]
+    motion = checks(model.posterior.basis.inducing, 40)[-20:]
     low, high = (np.array(model.training_range["q"][end]) for end in ("min", "max"))
     middle = 0.5 * (low + high)
     q = middle + FARTHER * (motion.q - middle)
     share = model.evaluator.many(q, FARTHER * motion.dq, FARTHER**2 * motion.ddq)[3]
     if share is None:
         return []
-    names = [name for name, often in zip(model.joint_names, (share > 0).mean(axis=0), strict=True) if often > MOST]
+    names = [name for name, often in zip(model.joint_names, (share > 0).mean(axis=0), strict=True) if often > 0.5]
     if not names:
         return []
     listed = ", ".join([*names[:LISTED], "…"] if len(names) > LISTED else names)
@@ -149,8 +142,9 @@ def _alternatives(model: TorqueModel) -> str:
     unit = "N" if model.joint_types[most] == "prismatic" else "N·m"
     shares = sorted((each.probability for each in term.arm.alternatives), reverse=True)
     percent = " and ".join(", ".join(f"{share:.0%}" for share in shares).rsplit(", ", 1))
+    counts = {2: "Two", 3: "Three", 4: "Four"}
     return (
-        f"{COUNTS.get(len(shares), str(len(shares)))} arms explain the recording about as well ({percent}); their "
+        f"{counts.get(len(shares), str(len(shares)))} arms explain the recording about as well ({percent}); their "
         f"difference is in tau_std. A recording in which {where} would tell: at twice that they differ by "
         f"{spread[most]:.2g} {unit} in {model.joint_names[most]}."
     )

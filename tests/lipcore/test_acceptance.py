@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lipcore.data.signals import noise_level
-from lipcore.model.acceptance import MAX_ERROR, SIGNAL, HeldOutFigures, accept
+from lipcore.model.acceptance import OPTIONS, HeldOutFigures, accept
 
 GOOD = HeldOutFigures(
     joint_names=("hip", "knee"),
@@ -30,7 +30,7 @@ def test_what_is_good_passes_and_says_how_good():
     )
 
 
-@pytest.mark.parametrize("nmse", [MAX_ERROR, 1.0, 14.0])
+@pytest.mark.parametrize("nmse", [OPTIONS.max_error, 1.0, 14.0])
 def test_an_error_like_that_of_the_mean_fails(nmse):
     found = changed(nmse=[0.01, nmse], rmse=[0.1, 1.0])
     assert found.passed is False
@@ -51,8 +51,8 @@ def test_few_errors_cannot_tell():
 
 def test_torque_that_is_mostly_noise_need_not_be_explained():
     spread = 1.0 / np.sqrt(1.1)
-    assert changed(nmse=[0.01, 1.1], torque_noise=[0.05, 1.01 * spread / SIGNAL]).passed is True
-    assert changed(nmse=[0.01, 1.1], torque_noise=[0.05, 0.99 * spread / SIGNAL]).passed is False
+    assert changed(nmse=[0.01, 1.1], torque_noise=[0.05, 1.01 * spread / OPTIONS.min_signal]).passed is True
+    assert changed(nmse=[0.01, 1.1], torque_noise=[0.05, 0.99 * spread / OPTIONS.min_signal]).passed is False
     assert changed(nmse=[0.01, np.nan]).passed is True
     assert changed(nmse=[np.nan, np.nan]).unknown == ("no torque of what was held out stands out of its noise",)
 
