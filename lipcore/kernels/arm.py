@@ -21,8 +21,6 @@ from lipcore.kernels.fast.views import Memory
 from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.mixture import MixtureKernel
 
-REMEMBERED = 4
-"""Motions whose features are kept: the training samples and the query in work, asked for over and over."""
 SCALES = 4
 """Kinds of weights with a scale of their own: masses, first moments, inertias, rotors."""
 
@@ -78,7 +76,8 @@ class ArmKernel(LinearKernel):
             if seen.q is x.q and seen.dq is x.dq and seen.ddq is x.ddq:
                 return features
         features = super().features(x)
-        self._recent = ((x, features), *self._recent[: REMEMBERED - 1])
+        # the training samples and the query in work are asked for over and over
+        self._recent = ((x, features), *self._recent[:3])
         return features
 
     def regressor(self) -> Regressor:

@@ -16,18 +16,6 @@ from lipcore.vocabulary import GeometryMode, Prior
 
 KINDS = (0, 1, 1, 1, 2, 2, 2, 2, 2, 2)
 """Which scale each of a body's ten parameters has: mass, first moment or inertia."""
-MASS_FLOOR = 0.02
-"""Smallest mass scale of a body, as a share of the whole arm's: a link without mass in the URDF may still have some."""
-URDF_SHARE: dict[Prior, float] = {"urdf": 0.1, "zero": 1.0}
-"""Relative deviation from a URDF's parameters that a fit starts from."""
-MACHINED_TURN, MACHINED_SHIFT = 0.005, 0.003
-"""How far the axes of two units of one type, or of a unit and its URDF, lie from each other: standard deviations in rad
-and m. Machining leaves less, but what an earlier posterior says of single numbers leaves out what is known only of
-several together. This and `UNIT_WIDTH` of `lipcore.arm.problem` were chosen on simulated arms (50 and 51 of
-`benchmarks/studies/learnt_arm.py transfer`): a fifth of it ended at times in a poor optimum that takes part of the
-torque for noise."""
-MOUNTED_TURN = 0.02
-"""How far their bases lean from each other, rad."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +98,8 @@ class Arm:
 
 
 def arm_of_robot(robot: RigidBody, gravity: bool = True, prior: Prior = "urdf", mode: GeometryMode = "fixed") -> Arm:
-    """The arm of a URDF before any samples: its masses expected within URDF_SHARE, its geometry as `mode` says.
+    """The arm of a URDF before any samples: its masses expected within a tenth of the URDF's, or within all of them if
+    the prior is "zero", its geometry as `mode` says.
 
     Raise ValueError for a URDF without masses whose prior is "urdf".
     """
@@ -119,7 +108,7 @@ def arm_of_robot(robot: RigidBody, gravity: bool = True, prior: Prior = "urdf", 
         raise ValueError(f"robot {robot.name!r} has no mass in its URDF, expected inertial parameters or prior 'zero'")
     geometry, order = Geometry.from_robot(robot, gravity), chain(robot, robot.n_joints)
     unit = unit_of(robot, ROTOR_SHARE * max(float(mass.max()), 1e-3))
-    unit[: PARAMETERS * robot.n_joints] *= URDF_SHARE[prior]
+    unit[: PARAMETERS * robot.n_joints] *= 0.1 if prior == "urdf" else 1.0
     steps = 0 if mode == "fixed" else geometry.size
     bodies = robot.parameters()[order]
     return Arm(
@@ -136,19 +125,26 @@ def arm_of_robot(robot: RigidBody, gravity: bool = True, prior: Prior = "urdf", 
 
 
 def widths_of(geometry: Geometry) -> Array:
-    """How far a unit's geometry may lie from that of its type, (g,) rad and m."""
-    widths = np.where(geometry.turns, MACHINED_TURN, MACHINED_SHIFT)
-    widths[: geometry.screws[0]] = MOUNTED_TURN
+    """How far a unit's geometry may lie from that of its type, standard deviations, (g,) rad and m.
+
+    Axes of two units, or of a unit and its URDF, lie within 0.005 rad and 0.003 m of each other, and their bases lean
+    by 0.02 rad. Machining leaves less, but what an earlier posterior says of single numbers leaves out what is known
+    only of several together. These and `WIDTHS.unit` of `lipcore.arm.problem` were tuned on simulated arms (50 and 51
+    of `benchmarks/studies/learnt_arm.py transfer`): a fifth of it ended at times in a poor optimum that takes part of
+    the torque for noise.
+    """
+    widths = np.where(geometry.turns, 0.005, 0.003)
+    widths[: geometry.screws[0]] = 0.02
     return widths
 
 
 def unit_of(robot: RigidBody, rotor: float) -> Array:
     """Usual size of a URDF's parameters, (11 n,): m_i, m_i ℓ and m_i ℓ² for mass, first moment and inertia of a body,
-    in the order of the data; rotor: kg·m².
+    in the order of the data; rotor: kg·m². A link without mass in the URDF may still have 2 % of the arm's.
     """
     mass = robot.parameters()[:, 0]
     total = float(mass.sum())
-    scale = np.maximum(mass, MASS_FLOOR * total) if total > 0 else np.ones(robot.n_joints)
+    scale = np.maximum(mass, 0.02 * total) if total > 0 else np.ones(robot.n_joints)
     powers = robot.length() ** np.array(KINDS)
     return np.concatenate([(scale[:, None] * powers).reshape(-1), np.full(robot.n_joints, rotor)])
 
@@ -158,13 +154,12 @@ def unit_anywhere(torque: float, joints: int) -> Array:
 
     The mass that makes this torque at a lever of 0.3 m, and what it has about such a lever.
     """
-    mass = max(torque, 1e-3) / (9.81 * LEVER)
-    body = mass * np.array([1.0, LEVER, 2 * LEVER**2])[list(KINDS)]
+    lever = 0.3
+    mass = max(torque, 1e-3) / (9.81 * lever)
+    body = mass * np.array([1.0, lever, 2 * lever**2])[list(KINDS)]
     return np.concatenate([np.tile(body, joints), np.full(joints, ROTOR_SHARE * mass)])
 
 
-LEVER = 0.3
-"""m."""
 ROTOR_SHARE = 0.03
 """Rotor inertia expected, m² times the mass of an arm's heaviest body."""
 

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Array, Motion, check_joint_types
 from lipcore.kernels.base import Params, State, on_diagonal
-from lipcore.kernels.energy import PRIOR_STD as WEIGHTS_PRIOR_STD
 from lipcore.kernels.energy import (
+    PRIOR_STD,
     initial_weights,
     potential_blocks,
     potential_energy_torque,
@@ -38,7 +38,6 @@ from lipcore.vocabulary import JointType
 
 SHARE = 2 / 3
 """α of a rotation about an axis that is as likely along as across: E[R c · R'c] = (1 + 2 cos(q − q')) / 3 · |c|²."""
-PRIOR_STD = {"chain.logits": 2.0, "potential.log_scales": 2.0, **WEIGHTS_PRIOR_STD}
 
 
 class ChainKernel(CompiledKernel):
@@ -113,7 +112,7 @@ class ChainKernel(CompiledKernel):
 
     def prior_std(self) -> dict[str, float]:
         """How far the weights may stray from their pattern, and the pattern from its start."""
-        return dict(PRIOR_STD)
+        return {"chain.logits": 2.0, "potential.log_scales": 2.0, **PRIOR_STD}
 
     def _links(self, params: Params, x: State, y: State) -> list[tuple[Product, LinkForm]]:
         """Kernel s_l Π_{b≤l} p_b of each link's potential, and the form h_l of its kinetic energy, base to tip."""

@@ -65,8 +65,6 @@ def kinetic_energy_torque(position: Product, weights: Array, x: State, y: State)
     return 2 * (b * h + position.value * h2) * wv - h * h * position.right
 
 
-INERTIA_PER_TORQUE = 0.1
-"""kg·m² per N·m: m d² over m g d, for an arm of length d about a metre."""
 PRIOR_STD = {
     "kinetic.log_scale": 2.0,
     "kinetic.log_link": 1.0,
@@ -119,7 +117,8 @@ def initial_weights(tau: Array) -> dict[str, Array]:
     """Inertia as arms have it that need as much torque, shared out between the links. tau: (N, n)."""
     n, torque = tau.shape[1], np.sqrt(np.square(tau).mean(0).clip(1e-12))
     return {
-        "kinetic.log_scale": np.asarray(np.log(INERTIA_PER_TORQUE * torque.max() / n)),
+        # 0.1 kg·m² per N·m: m d² over m g d, for an arm of length d about a metre
+        "kinetic.log_scale": np.asarray(np.log(0.1 * torque.max() / n)),
         **{f"kinetic.log_{name}": np.zeros(n) for name in ("link", "joint", "gap")},
         "kinetic.log_deviation": np.zeros(n * (n + 1) // 2),
     }

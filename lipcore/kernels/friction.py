@@ -14,13 +14,11 @@ SIGN_WIDTH = 0.02
 STRIBECK_SPEED = 0.1
 """Speed at which the extra friction of slow joints has faded to exp(−1), rad/s (m/s)."""
 FRICTION_TERMS = ("viscous", "coulomb", "offset")
-STRIBECK = "stribeck"
-"""A fourth term, of joints that stick: friction that fades as they speed up."""
 
 
 def friction_terms(stribeck: bool) -> tuple[str, ...]:
-    """Names of a joint's features, 3 or 4."""
-    return (*FRICTION_TERMS, STRIBECK) if stribeck else FRICTION_TERMS
+    """Names of a joint's features, 3, or 4 for joints that stick: the last is friction that fades as they speed up."""
+    return (*FRICTION_TERMS, "stribeck") if stribeck else FRICTION_TERMS
 
 
 def friction_features(dq: Array, stribeck: bool = False) -> Array:

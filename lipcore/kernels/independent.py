@@ -17,18 +17,6 @@ from lipcore.data.motion import Array, Motion, check_joint_types
 from lipcore.kernels.base import PairKernel, Params, State, on_diagonal
 from lipcore.vocabulary import JointType
 
-SPREAD_SHARE = 0.1
-"""Smallest spread credited to a joint, relative to that of the joint that moves most: some joints stand still."""
-SPREAD_FLOOR = 1e-3
-"""Smallest spread credited to any input, in its own unit."""
-LEAST_LENGTHSCALES = (2.0, 4.0, 40.0)
-"""Shortest lengthscales to start from, rad, rad/s and rad/s² (m): a turn of gravity, and speeds and accelerations at
-which inertia bears as much torque as weight. Motion within a small range tells nothing of shorter ones."""
-WEIGHTLESS_SHARE = 0.05
-"""A joint with less than this share of the torque of the joints behind it bears inertia rather than weight."""
-SE_PRIOR_STD = {"se.log_scale": 2.0, "se.log_lengthscales": 1.0}
-"""Tighter than usual: 3 n lengthscales a joint, and a motion from which few of them can be told."""
-
 
 class SquaredExponentialKernel(PairKernel):
     """k_i = s_i² exp(−½ Σ_d (x_d − x'_d)² / ℓ_{i,d}²) on x = (q, dq, ddq), independent for each joint i.
@@ -55,17 +43,21 @@ class SquaredExponentialKernel(PairKernel):
         """
         n, rms = self.n_joints, np.sqrt(power(tau))
         lengthscales = np.concatenate([spread(motion.q), spread(motion.dq), spread(motion.ddq)]) * (3 * n) ** 0.5
-        weight = np.minimum(rms / (WEIGHTLESS_SHARE * largest_behind(rms)), 1.0)
+        # with less than 5 % of the torque of the joints behind it a joint bears inertia rather than weight
+        weight = np.minimum(rms / (0.05 * largest_behind(rms)), 1.0)
         factors = np.stack([np.ones_like(weight), np.sqrt(weight), weight], axis=1)
-        least = np.repeat(factors * LEAST_LENGTHSCALES, n, axis=1)
+        # rad, rad/s and rad/s² (m): a turn of gravity, and speeds and accelerations at which inertia bears as much
+        # torque as weight; motion within a small range tells nothing of shorter lengthscales
+        least = np.repeat(factors * (2.0, 4.0, 40.0), n, axis=1)
         return {
             "se.log_scale": np.log(power(tau)),
             "se.log_lengthscales": np.log(np.maximum(lengthscales, least)),
         }
 
     def prior_std(self) -> dict[str, float]:
-        """How far scales and lengthscales may stray from their start."""
-        return dict(SE_PRIOR_STD)
+        """How far scales and lengthscales may stray from their start: less far than usual, since motion tells few of
+        the 3 n lengthscales a joint."""
+        return {"se.log_scale": 2.0, "se.log_lengthscales": 1.0}
 
 
 def per_joint(values: Array, like: Array) -> Array:
@@ -74,9 +66,10 @@ def per_joint(values: Array, like: Array) -> Array:
 
 
 def spread(values: Array) -> Array:
-    """Standard deviation of each joint's values, (N, n) to (n,), floored for joints that stand still."""
+    """Standard deviation of each joint's values, (N, n) to (n,): at least 1e-3 and a tenth of that of the joint that
+    moves most, as some joints stand still."""
     std = values.std(0)
-    return np.maximum(std, max(SPREAD_SHARE * std.max(), SPREAD_FLOOR))
+    return np.maximum(std, max(0.1 * std.max(), 1e-3))
 
 
 def power(tau: Array) -> Array:
@@ -93,20 +86,6 @@ FACTOR_LOGITS = (0.0, -4.0)
 """Starting logits of a joint's two position factors: gravity is of degree one, so the second is nearly constant. Were
 they equal, their gradients would keep them equal."""
 DEGREE = len(FACTOR_LOGITS)
-INERTIA_PER_TORQUE = 0.05
-"""kg·m² per N·m of root mean square torque: where the weights of accelerations start."""
-GIP_PRIOR_STD = {
-    "gip.log_constant": 2.0,
-    "gip.log_row": 1.0,
-    "gip.log_column": 0.5,
-    "gip.log_acceleration": 0.5,
-    "gip.log_speed": 1.0,
-    "gip.log_velocity": 0.5,
-    "gip.logits": 1.0,
-    "gip.logits_deviation": 1.0,
-}
-"""Chosen on fits to simulated data of a Panda. With logits tied more closely, a torque cannot tell the joints that do
-not turn it."""
 
 
 class GeometricallyInspiredKernel(PairKernel):
@@ -145,8 +124,8 @@ class GeometricallyInspiredKernel(PairKernel):
         n, zeros = self.n_joints, np.zeros
         logits = zeros((n, DEGREE, 2)) + np.array(FACTOR_LOGITS)[:, None]
         position = self._position(np.broadcast_to(logits, (n, n, DEGREE, 2)), motion.q.T, motion.q.T).mean(1)
-        # w is the square of an inertia, half of its logarithm from either joint
-        half = 0.5 * np.log(INERTIA_PER_TORQUE * largest_behind(np.sqrt(power(tau))))
+        # w is the square of an inertia, 0.05 kg·m² per N·m, half of its logarithm from either joint
+        half = 0.5 * np.log(0.05 * largest_behind(np.sqrt(power(tau))))
         return {
             "gip.log_constant": np.log(power(tau) / position),
             "gip.log_row": half,
@@ -159,8 +138,21 @@ class GeometricallyInspiredKernel(PairKernel):
         }
 
     def prior_std(self) -> dict[str, float]:
-        """How far the weights and shares may stray from their pattern, and the pattern from its start."""
-        return dict(GIP_PRIOR_STD)
+        """How far the weights and shares may stray from their pattern, and the pattern from its start.
+
+        Tuned on fits to simulated data of a Panda. With logits tied more closely, a torque cannot tell the joints that
+        do not turn it.
+        """
+        return {
+            "gip.log_constant": 2.0,
+            "gip.log_row": 1.0,
+            "gip.log_column": 0.5,
+            "gip.log_acceleration": 0.5,
+            "gip.log_speed": 1.0,
+            "gip.log_velocity": 0.5,
+            "gip.logits": 1.0,
+            "gip.logits_deviation": 1.0,
+        }
 
     def _log_weights(self, params: Params) -> tuple[Array, Array]:
         """log w and log u, each (n, n), joint i × joint a."""

@@ -12,10 +12,6 @@ from lipcore.kernels.fast.local import local_cross
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.kernels.independent import per_joint, power, spread
 
-LENGTH = 0.3
-"""Lengthscale in standard deviations of an input times √(4 n), as squared distances add up over 4 n inputs: a fifth of
-the distance between two samples at random, so that all samples are far from unknown motion."""
-
 
 class LocalKernel(PairKernel):
     """k_ij = δ_ij s_i² exp(−½ Σ_d (x_d − x'_d)² / ℓ_d²) on x = (q, dq, ddq, tanh(dq / SIGN_WIDTH)).
@@ -48,8 +44,9 @@ class LocalKernel(PairKernel):
         return _LocalCross(params, inducing)
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """All of the power of tau, (N, n); LENGTH in every input's spread."""
-        lengths = LENGTH * (4 * self.n_joints) ** 0.5 * np.concatenate([spread(each) for each in _inputs(motion)])
+        """All of the power of tau, (N, n); 0.3 of every input's spread, times √(4 n) as squared distances add up over
+        4 n inputs: a fifth of the distance of two random samples, so that all are far from unknown motion."""
+        lengths = 0.3 * (4 * self.n_joints) ** 0.5 * np.concatenate([spread(each) for each in _inputs(motion)])
         return {"local.log_scale": np.log(power(tau)), "local.log_lengthscales": np.log(lengths)}
 
 
