@@ -23,7 +23,6 @@ from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 COMPILED = ("lip", "lip-chain", *ROBOT_ESTIMATORS)
 """Estimators with compiled terms. What all have in common comes with each."""
-SAMPLES = 60
 LEAST = FitOptions(
     hyperparameter_samples=20, posterior_samples=40, max_iterations=3, starts=1, device="cpu", search_seconds=0.01
 )
@@ -46,11 +45,11 @@ def warm_up(*names: str) -> None:
 
 def _swinging() -> Samples:
     """Two joints that swing at frequencies of their own, under gravity."""
-    time, frequency = np.linspace(0.0, 10.0, SAMPLES), np.array([1.0, 1.7])
+    time, frequency = np.linspace(0.0, 10.0, 60), np.array([1.0, 1.7])
     phase = time[:, None] * frequency
     q, dq, ddq = np.sin(phase), np.cos(phase) * frequency, -np.sin(phase) * frequency**2
     tau = 3.0 * np.sin(np.cumsum(q, axis=1)) + ddq + 0.1 * dq
-    return Samples(("first", "second"), time, np.zeros(SAMPLES, np.int64), q, dq, ddq, tau)
+    return Samples(("first", "second"), time, np.zeros(len(time), np.int64), q, dq, ddq, tau)
 
 
 def _of_arm(arm: Arm) -> None:

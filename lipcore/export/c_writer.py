@@ -31,12 +31,9 @@ from lipcore.model.body import Body
 from lipcore.model.torque_model import TorqueModel
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
-TEMPLATES = Path(__file__).parent / "c"
 SOURCE, HEADER = "lipserve_model.c", "lipserve_model.h"
 WIDE = 8
 """Columns of a panel of the root."""
-LINE = 100
-"""Characters of a line of numbers."""
 VECTORS = 16
 """Queries that the self-test asks, half of them with PAYLOAD."""
 PAYLOAD = Body(1.3, np.array([0.02, -0.03, 0.11]), np.diag([0.004, 0.005, 0.003]))
@@ -69,7 +66,7 @@ def c_files(model: TorqueModel, origin: Origin) -> dict[str, str]:
 
 
 def _template(name: str) -> Template:
-    return Template((TEMPLATES / f"{name}.in").read_text(encoding="ascii"))
+    return Template((Path(__file__).parent / "c" / f"{name}.in").read_text(encoding="ascii"))
 
 
 def _tables(model: TorqueModel, learnt: Learnt) -> dict[str, str]:
@@ -247,7 +244,7 @@ def _braced(values: Any) -> str:
         return "{" + ",\n".join(_braced(each) for each in values) + "}"
     texts, lines, line = [repr(float(each)) for each in values], list[str](), ""
     for text in texts:
-        if len(line) + len(text) > LINE:
+        if len(line) + len(text) > 100:
             lines.append(line.rstrip())
             line = ""
         line += f"{text}, "

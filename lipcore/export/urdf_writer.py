@@ -23,13 +23,6 @@ from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, aligned, rotati
 Element = ElementTree.Element
 
 ROOT, BASE = "world", "base"
-DENSITY = 2700.0
-"""kg/m³, of aluminium: how large the sphere of a mass is drawn."""
-LINE = 0.02
-"""Radius of a link's line over the arm's reach."""
-ROOM = 10.0
-"""The effort limit is so many times what holds the stretched arm: far above what the training has seen."""
-DRAKE = "http://drake.mit.edu"
 ABOUT = (
     "Learnt from torque by LIPServe.",
     "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.",
@@ -86,10 +79,10 @@ def urdf_text(
     for joint, mass in zip(joints.names, bodies[:, 0], strict=True):
         if not mass > 0:
             raise ValueError(f"the mass that joint {joint!r} moves is {mass:g} kg, expected more than zero")
-    robot = Element("robot", {"name": name, "xmlns:drake": DRAKE})
+    robot = Element("robot", {"name": name, "xmlns:drake": "http://drake.mit.edu"})
     _comments(robot, [*ABOUT, *_about_gravity(geometry), *notes])
     parent, reach = BASE, _reach(geometry, bodies, joints)
-    line = max(LINE * float(reach[0]), 1e-3)
+    line = max(0.02 * float(reach[0]), 1e-3)
     upright = _upright(geometry.gravity)
     if not np.array_equal(upright, np.eye(3)):
         ElementTree.SubElement(robot, "link", name=ROOT)
@@ -202,7 +195,7 @@ def _effort(bodies: Array, joints: ArmJoints, reach: Array) -> Array:
     carried = np.cumsum(bodies[::-1, 0])[::-1] * STANDARD_GRAVITY
     lever = np.maximum(reach, 1.0)
     friction = np.abs(joints.viscous) * joints.velocity + np.abs(joints.coulomb) + np.abs(joints.offset)
-    return ROOM * (carried * lever + friction)
+    return 10.0 * (carried * lever + friction)  # far above what the training has seen
 
 
 def _joint(
@@ -242,8 +235,8 @@ def _link(robot: Element, name: str, body: Array | None, end: Array | None, line
         about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) + mass * arm @ arm
         entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
         ElementTree.SubElement(inertial, "inertia", {key: _text(about[at]) for key, at in entries.items()})
-        sphere = _visual(link, centre)
-        ElementTree.SubElement(sphere, "sphere", radius=f"{(0.75 * mass / (np.pi * DENSITY)) ** (1 / 3):.4f}")
+        sphere = _visual(link, centre)  # as large as if it were of aluminium
+        ElementTree.SubElement(sphere, "sphere", radius=f"{(0.75 * mass / (np.pi * 2700.0)) ** (1 / 3):.4f}")
     length = 0.0 if end is None else float(np.linalg.norm(end))
     if end is not None and length > line:
         cylinder = _visual(link, 0.5 * end, aligned((end / length).tolist()))

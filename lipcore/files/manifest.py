@@ -31,7 +31,6 @@ from lipcore.vocabulary import GEOMETRY_MODES, PRIORS, TORQUE_CONVENTIONS
 FORMAT = "lipserve-model"
 FORMAT_VERSION = 3
 MANIFEST, TENSORS, ROBOT = "manifest.json", "model.safetensors", "robot.urdf"
-MATCHINGS = ("name", "order", "list")
 
 
 class ModelFormatError(ValueError):
@@ -159,7 +158,7 @@ class RobotFile(File):
     file: Annotated[str, one_of([ROBOT])]
     name: Annotated[str, Meta(max_length=200)]
     joints: list[str]
-    matched: Annotated[str, one_of(MATCHINGS)]
+    matched: Annotated[str, one_of(("name", "order", "list"))]
     prior: Annotated[str, one_of(PRIORS)]
 
 

@@ -46,9 +46,6 @@ from lipcore.posterior.statistics import Statistics
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import GEOMETRY_MODES, ROBOT_ESTIMATORS
 
-SAME = 1e-6
-"""Relative difference of the noise in the manifest and in the tensors that another processor may make."""
-
 
 def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Write the model as a new folder, all of it or nothing, and return its manifest.
@@ -312,7 +309,8 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: Rigi
     )
     if manifest["hyperparameters"] != {name: value.tolist() for name, value in params.items()}:
         raise ModelFormatError("hyperparameters are not those of the tensors")
-    if not np.allclose(model.noise_std, manifest["noise_std"], rtol=SAME, atol=0):
+    # another processor may make a difference
+    if not np.allclose(model.noise_std, manifest["noise_std"], rtol=1e-6, atol=0):
         raise ModelFormatError(f"noise_std is not that of the tensors, {model.noise_std.tolist()}")
     return model
 

@@ -9,9 +9,6 @@ from lipcore.files.entries import LARGEST
 from lipcore.files.manifest import TENSORS, ModelFormatError
 from lipcore.model.torque_model import TorqueModel
 
-INDUCING = 20
-"""Inducing samples that it is asked at: there its answers are furthest from the prior's."""
-
 
 def probe(model: TorqueModel) -> None:
     """Ask a model where it should know and where it cannot; raise ModelFormatError for an answer that is none.
@@ -46,6 +43,7 @@ def _motions(model: TorqueModel) -> Array:
     ranges = [model.training_range[name] for name in ("q", "dq", "ddq")]
     low, high = (np.array([each[end] for each in ranges]) for end in ("min", "max"))
     inducing = model.posterior.basis.inducing
-    seen = np.stack([part[:INDUCING] for part in (inducing.q, inducing.dq, inducing.ddq)])
+    # at inducing samples its answers are furthest from the prior's
+    seen = np.stack([part[:20] for part in (inducing.q, inducing.dq, inducing.ddq)])
     fixed = np.stack([np.zeros_like(low), low, high, 0.5 * (low + high)], axis=1)
     return np.concatenate([fixed, seen], axis=1)

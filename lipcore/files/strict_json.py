@@ -15,7 +15,6 @@ MAX_DEPTH = 32
 """Objects and lists within one another: what is written again or checked recurses as deep."""
 MAX_QUOTE = 80
 """Characters of a quoted value."""
-MAX_INTEGER = 2**63
 
 
 class StrictJsonError(ValueError):
@@ -69,7 +68,7 @@ def quote(value: object) -> str:
 
 def _check_tree(value: Any, left: int) -> None:
     """Raise StrictJsonError for a deep nest, and for whole numbers that no float holds."""
-    if isinstance(value, int) and not -MAX_INTEGER <= value < MAX_INTEGER:
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise StrictJsonError(f"the number {quote(value)} is too large")
     if isinstance(value, list | dict):
         if not left:

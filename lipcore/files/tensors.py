@@ -15,11 +15,8 @@ from lipcore.files.strict_json import quote
 from lipcore.model.selection import Count
 
 MAX_HEADER = 256 * 1024
-MAX_TENSORS = 1000
 LENGTH = 8
 """Bytes that hold the header's length."""
-WIDTH = 8
-"""Bytes of a number: all are float64 but the places of outputs, which are int64."""
 OUTPUTS = "inducing/outputs"
 INDUCING = ("inducing/q", "inducing/dq", "inducing/ddq")
 A, B, FLOOR, MISFIT = "statistics/a", "statistics/b", "floor", "misfit"
@@ -35,7 +32,7 @@ class Tensor(Struct, frozen=True, forbid_unknown_fields=True):
     data_offsets: tuple[Count, Count]
 
 
-_HEADER = msgspec.json.Decoder(Annotated[dict[str, msgspec.Raw], Meta(max_length=MAX_TENSORS)])
+_HEADER = msgspec.json.Decoder(Annotated[dict[str, msgspec.Raw], Meta(max_length=1000)])
 _TENSOR = msgspec.json.Decoder(Tensor)
 
 
@@ -104,7 +101,7 @@ def _entry(name: str, value: msgspec.Raw) -> Tensor:
     if entry.dtype != expected:
         raise _bad(f"tensor {quote(name)} is of type {quote(entry.dtype)}, expected {expected}")
     begin, end = entry.data_offsets
-    if end - begin != WIDTH * math.prod(entry.shape):
+    if end - begin != 8 * math.prod(entry.shape):
         raise _bad(f"tensor {quote(name)} has {end - begin} bytes, expected those of its shape {entry.shape}")
     return entry
 

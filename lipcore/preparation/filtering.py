@@ -15,12 +15,8 @@ from lipcore.preparation.resampling import BLOCK, SAME_RATE
 QUANTITIES = ("q", "dq", "ddq", "tau")
 Read = Callable[[str], Array]
 """A quantity → its column, read when it is asked for: no more than one has to be in memory."""
-FILTERED = ("q", "tau", "dq", "ddq")
-"""The same, as sentences tell them."""
 SHORTEST = 3 * (2 * ((ORDER + 1) // 2) + 1) + 1
 """Fewest samples that can be low-passed."""
-ALIAS = 0.4
-"""Cut-off, as a share of a lower rate, of what a recording is low-passed with before it is thinned to that rate."""
 SETTLED = 2.0
 """Periods of the cut-off that a causal filter needs to forget how a part began.
 
@@ -75,7 +71,7 @@ def filters(given: tuple[str, ...], recipe: Recipe) -> bool:
 def settle(rate: float, given: tuple[str, ...], recipe: Recipe) -> Filters:
     """What the recipe comes to on signals at `rate` Hz; raise PreparationError where that is impossible.
 
-    What is thinned is low-passed before, at ALIAS times the new rate where nothing lower is asked for: then all of it,
+    What is thinned is low-passed before, at 0.4 times the new rate where nothing lower is asked for: then all of it,
     and otherwise recorded accelerations only where all is to be filtered or samples are late.
     """
     missing = derived(given)
@@ -88,9 +84,9 @@ def settle(rate: float, given: tuple[str, ...], recipe: Recipe) -> Filters:
     if cutoff is not None and cutoff >= rate / 2 * (1 - 1e-6):  # a rate read off times is never exact
         raise PreparationError("cutoff", f"{cutoff:g} Hz", f"less than half the rate of {rate:g} Hz")
     if thins and asked_rate is not None:
-        cutoff = min(cutoff or np.inf, ALIAS * asked_rate)
+        cutoff = min(cutoff or np.inf, 0.4 * asked_rate)
     everything = thins or recipe.filtering == "always" or recipe.form == "causal"
-    low_passed = tuple(name for name in FILTERED if name in given and (name != "ddq" or everything))
+    low_passed = tuple(name for name in ("q", "tau", "dq", "ddq") if name in given and (name != "ddq" or everything))
     return Filters(
         rate,
         given,

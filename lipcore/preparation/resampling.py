@@ -16,10 +16,6 @@ SAME_RATE = 0.01
 """Rates that differ by less than this share are the same."""
 BLOCK = 65_536
 """Rows that are interpolated between at a time: the cubics of all would take four times the memory of the values."""
-AROUND = 3
-"""Rows beyond a block that its cubics depend on."""
-NEAR = 0.5
-"""A step that differs from the usual one by less than this share is one tick of the clock."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +56,7 @@ def clock_of(t: Array, episode: Array, gap_steps: float, jitter: float, bridge_s
     ticks = ticks[within & ~gap]
     deviation = np.abs(ticks - 1)
     worst = float(deviation.max(initial=0.0))
-    single = ticks[deviation < NEAR]  # rows that are not there would make the clock seem slow
+    single = ticks[deviation < 0.5]  # rows that are not there would make the clock seem slow
     mean = float(single.mean()) if len(single) else 1.0
     even = worst <= jitter and abs(mean - 1) <= SAME_RATE
     return Sampling(usual, most * usual, ~within | gap, int(gap.sum()), worst, 1 / (usual * mean), even)
@@ -89,7 +85,7 @@ def interpolate(t: Array, values: Array, at: Array) -> Array:
     values_at = np.empty(len(at))
     for begin in range(0, len(t) - 1, BLOCK):
         end = min(begin + BLOCK, len(t) - 1)
-        around = slice(max(0, begin - AROUND), end + AROUND + 1)
+        around = slice(max(0, begin - 3), end + 4)  # cubics depend on three rows beyond
         last = len(at) if end == len(t) - 1 else int(np.searchsorted(at, t[end]))
         inside = slice(int(np.searchsorted(at, t[begin])) if begin else 0, last)
         curve = Akima1DInterpolator(t[around] - t[begin], values[around])

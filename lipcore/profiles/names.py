@@ -11,9 +11,6 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
 
-MOST_NAMES = 1000
-"""Of so many names none but equal ones are looked for: no robot has that many joints."""
-
 Words = tuple[str, ...]
 Assignment = dict[int, int]
 """Joint of the robot → place among the names."""
@@ -62,7 +59,7 @@ def assignments(
     if len(exact) == len(aliases) and len(place_of) == len(names):
         yield exact
         return
-    if len(names) > MOST_NAMES:
+    if len(names) > 1000:  # no robot has that many joints
         return
     split = [words(name) for name in names]
     by_words = _by_words(split, aliases)

@@ -136,9 +136,6 @@ class Profile:
         )
 
 
-NOTE = "A URDF does not say what the effort field means: say it with `effort`."
-
-
 @dataclass(frozen=True)
 class Limits:
     """Types and limits of joints in the order they were asked for, (n,) each, SI units.
@@ -173,7 +170,7 @@ def from_urdf(text: str, name: str) -> Profile:
         acceleration=np.full(n_joints, np.nan),
         torque=limits.torque,
         effort="unknown",
-        effort_note=NOTE,
+        effort_note="A URDF does not say what the effort field means: say it with `effort`.",
         torque_constants=None,
         joint_aliases=((),) * n_joints,
         urdf=text,

@@ -19,13 +19,8 @@ FUNDAMENTAL = 0.02
 """ω_f of eq. 16 of TR2023-063, rad/s."""
 MIDDLE_AMPLITUDE = 0.5
 """Half range of a joint under `middle` motion, rad (m)."""
-FULL_SHARE = 0.95
-"""Share of the joint's range that `full` motion uses."""
-PERIOD, HARMONICS = 10.0, 5
-"""Of periodic motion: s at speed 1, and sinusoids."""
-MOVE, REST = (1.0, 2.5), (0.5, 2.0)
-"""Of motion with rests: s that a move takes at speed 1, and that a rest takes, drawn evenly from least to most."""
-SMALLEST_SHARE = 0.1
+PERIOD = 10.0
+"""Period of periodic motion at speed 1, s."""
 FAST = 10.0
 """`speed` of the faster-moving variant: the same sums of sinusoids at ten times the frequency."""
 
@@ -88,11 +83,11 @@ def simulate(robot: Robot, stream: Stream, seed: int) -> Samples:
 def usual_torque(robot: Robot) -> Array:
     """How large each joint's torque usually is, (n,) N·m: its standard deviation over one fast stream.
 
-    At least SMALLEST_SHARE of the largest: a joint about a vertical axis has friction, too.
+    At least a tenth of the largest: a joint about a vertical axis has friction, too.
     """
     motion = sinusoids(robot, Stream(speed=FAST), np.arange(100) / 10.0, np.random.default_rng(0))
     spread = inverse_dynamics(robot, *motion).std(0)
-    return np.asarray(np.maximum(spread, SMALLEST_SHARE * spread.max()))
+    return np.asarray(np.maximum(spread, 0.1 * spread.max()))
 
 
 def inverse_dynamics(
@@ -125,8 +120,8 @@ def sinusoids(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) 
 
 
 def periodic(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) -> tuple[Array, Array, Array]:
-    """Sums of HARMONICS sinusoids that repeat every PERIOD / speed seconds: q, dq, ddq, each (N, n)."""
-    return _summed(robot, stream, t, rng, 2 * np.pi * stream.speed / PERIOD, HARMONICS)
+    """Sums of five sinusoids that repeat every PERIOD / speed seconds: q, dq, ddq, each (N, n)."""
+    return _summed(robot, stream, t, rng, 2 * np.pi * stream.speed / PERIOD, 5)
 
 
 def _summed(
@@ -151,7 +146,7 @@ def rests(robot: Robot, stream: Stream, t: Array, rng: np.random.Generator) -> t
     begin, here = 0.0, rng.uniform(-1, 1, robot.n_joints)
     while begin <= t[-1]:
         there = rng.uniform(-1, 1, robot.n_joints)
-        move, rest = rng.uniform(*MOVE) / stream.speed, rng.uniform(*REST)
+        move, rest = rng.uniform(1.0, 2.5) / stream.speed, rng.uniform(0.5, 2.0)
         rows = (t >= begin) & (t < begin + move + rest)
         s = np.minimum((t[rows] - begin) / move, 1.0)[:, None]
         way = there - here
@@ -168,7 +163,7 @@ COURSES = {"sinusoids": sinusoids, "periodic": periodic, "rests": rests}
 def _within(robot: Robot, stream: Stream, q: Array, dq: Array, ddq: Array) -> tuple[Array, Array, Array]:
     """The same motion within the joints' range and speed."""
     half = (robot.upper - robot.lower) / 2
-    reach = np.minimum(MIDDLE_AMPLITUDE, half) if stream.motion == "middle" else FULL_SHARE * half
+    reach = np.minimum(MIDDLE_AMPLITUDE, half) if stream.motion == "middle" else 0.95 * half
     top, bottom = q.max(0), q.min(0)
     scale = np.minimum(2 * reach / np.maximum(top - bottom, 1e-9), robot.speed / np.maximum(np.abs(dq).max(0), 1e-9))
     middle = (robot.upper + robot.lower) / 2

@@ -18,8 +18,6 @@ from lipcore.vocabulary import JointType
 Matching = Literal["name", "order", "list"]
 """How the data's joints were matched with the URDF's: by name, by order (profiles only), by an explicit list."""
 
-MIN_LENGTH, DEFAULT_LENGTH = 0.01, 0.3
-"""Below the first, m, the placements say nothing about the links' size, and the second stands in."""
 PARAMETERS = 10
 """Inertial parameters of a body: mass, first moment (3), inertia (xx, xy, yy, xz, yz, zz) about its joint's frame."""
 
@@ -146,15 +144,7 @@ class RigidBody:
         """Characteristic length, m: the mean distance from one joint to the next."""
         steps = [float(np.linalg.norm(place.translation)) for place in tuple(self.model.jointPlacements)[2:]]
         mean = float(np.mean(steps)) if steps else 0.0
-        return mean if mean > MIN_LENGTH else DEFAULT_LENGTH
-
-
-MAX_DENSITY = 25_000.0
-"""kg/m³, more than osmium's."""
-TRIANGLE = 1.05
-"""How far numbers that were rounded may miss the inequality of principal moments."""
-MIN_REACH, MIN_RADIUS = 1.0, 1e-6
-"""A shorter robot counts as this long, m; an inertia of a smaller radius of gyration, m, as none."""
+        return mean if mean > 0.01 else 0.3  # shorter ones say nothing about the links
 
 
 def describe(urdf: str) -> Description:
@@ -171,22 +161,22 @@ def _check_bodies(model: Any) -> None:
     """Raise UrdfError where no body of its mass and size can have an inertia; zero inertia counts as not given.
 
     Of principal moments I₁ ≤ I₂ ≤ I₃ about the centre of mass, I₃ ≤ I₁ + I₂; the radius of gyration √(I₃/m) is within
-    the robot's reach; and no matter is denser than MAX_DENSITY: of all bodies of one mass and density a ball has the
-    smallest I₁ + I₂ + I₃ = 6/5 m r².
+    the robot's reach; and no matter is denser than 25 000 kg/m³, more than osmium: of all bodies of one mass and
+    density a ball has the smallest I₁ + I₂ + I₃ = 6/5 m r². The first may be missed by rounding, by 5 %.
     """
-    reach = max(MIN_REACH, sum(float(np.linalg.norm(place.translation)) for place in tuple(model.jointPlacements)))
+    reach = max(1.0, sum(float(np.linalg.norm(place.translation)) for place in tuple(model.jointPlacements)))
     for name, inertia in tuple(zip(tuple(model.names), tuple(model.inertias), strict=True))[1:]:  # what is fixed first
         mass, moments = float(inertia.mass), np.linalg.eigvalsh(inertia.inertia)
-        if mass <= 0 or moments[2] <= mass * MIN_RADIUS**2:
+        if mass <= 0 or moments[2] <= mass * 1e-6**2:
             continue
         body, about = f"the body that joint {name!r} moves has", "expected kg·m² about its centre of mass"
         radius, ball = float(np.sqrt(moments[2] / mass)), float(np.sqrt(5 / 6 * moments.sum() / mass))
-        if moments[2] > TRIANGLE * (moments[0] + moments[1]):
+        if moments[2] > 1.05 * (moments[0] + moments[1]):
             listed = ", ".join(f"{each:.3g}" for each in moments)
             raise UrdfError(f"{body} principal moments of inertia {listed}, expected none above the sum of the others")
         if radius > reach:
             raise UrdfError(f"{body} a radius of gyration of {radius:.3g} m for a robot of {reach:.3g} m, {about}")
-        if mass / (4 / 3 * np.pi * ball**3) > MAX_DENSITY:
+        if mass / (4 / 3 * np.pi * ball**3) > 25_000.0:
             raise UrdfError(
                 f"{body} {mass:.3g} kg within {1e3 * ball:.2g} mm, denser than any metal; {about}, mass in kg"
             )

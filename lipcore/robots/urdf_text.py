@@ -24,11 +24,8 @@ MAX_DEPTH = 32
 MAX_LINKS = 500
 """Links of a URDF: parsers and Pinocchio recurse from link to link, and a long enough chain would exhaust the stack."""
 LARGEST = {"mass": 1e6, "inertia": 1e9, "limit": 1e18}
-FARTHEST = 1e4
-"""Largest numbers of a URDF by element, kg, kg·m² and of any unit, and of every other, m and rad: what is computed with
+"""Max numbers of a URDF by element, kg, kg·m² and of any unit, and 1e4 of every other, m and rad: what is computed with
 them stays a number."""
-DIRECTION = 1e-3, 1e3
-"""Shortest and longest axis of a joint: a direction, whose length says nothing."""
 NUMBERS = {
     "origin": {"xyz": 3, "rpy": 3},
     "mass": {"value": 1},
@@ -173,10 +170,10 @@ class _Scanner:
         kept = {name: _name(attributes.get(name, ""), f"the {tag} of {where}") for name in NAMES.get(tag, ())}
         for name, count in NUMBERS.get(tag, {}).items():
             if (text := attributes.get(name)) is not None:
-                numbers = _numbers(text, count, LARGEST.get(tag, FARTHEST), f"<{tag} {name}> of {where}")
+                numbers = _numbers(text, count, LARGEST.get(tag, 1e4), f"<{tag} {name}> of {where}")
                 kept[name] = " ".join(repr(each) for each in numbers)
                 moves = tag == "axis" and top.get("type") in MOVABLE  # a fixed joint's is often 0 0 0
-                if moves and not DIRECTION[0] <= (length := float(np.hypot.reduce(numbers))) <= DIRECTION[1]:
+                if moves and not 1e-3 <= (length := float(np.hypot.reduce(numbers))) <= 1e3:
                     raise UrdfError(
                         f"<axis xyz> of {where} is {text[:80]!r}, of length {length:g}, expected a direction"
                     )
