@@ -26,12 +26,6 @@ class HoldOutOptions:
     """Min rows of a block."""
     block_s: float = 4 * GUARD_S
     """Min duration of a block, s."""
-    share: float = 0.25
-    """Share of the blocks that is held out."""
-    max_episodes: int = 50
-    """Max number of episodes that count as blocks."""
-    max_share: float = 0.5
-    """Max share of the rows that is held out, unless more is asked for; never more than twice what is asked for."""
 
 
 OPTIONS = HoldOutOptions()
@@ -68,7 +62,7 @@ def hold_out(samples: Samples, joint_types: Sequence[str]) -> HoldOut:
             "seconds", round(lasts, 3), f"at least {OPTIONS.min_blocks * OPTIONS.block_s:g} to hold some out"
         )
     edges = np.linspace(0, len(samples), count + 1).round().astype(np.int64)
-    number = max(1, round(OPTIONS.share * count))
+    number = max(1, round(0.25 * count))
     states = features(samples.rows(order), joint_types)
     outer = _outer_blocks(states, edges, number // 2)
     new = repeated(states, edges) < repetition.OPTIONS.repeated_share
@@ -90,7 +84,8 @@ def unrepeated(samples: Samples, joint_types: Sequence[str], share: float, seed:
     else is better.
 
     A block is a period of the motion, an episode, or one of equal stretches. samples: in order of episode and time;
-    joint_types: (n,); share, seed: see `splits.choose`.
+    joint_types: (n,); share, seed: see `splits.choose`. Of the rows up to twice the share is held out, half at most
+    unless more is asked for.
     """
     if len(samples) < OPTIONS.min_rows:
         return None
@@ -107,7 +102,7 @@ def unrepeated(samples: Samples, joint_types: Sequence[str], share: float, seed:
         return None
     held = np.repeat(choose(sizes, share, seed)[group], lengths)
     if (
-        held.mean() > max(share, min(OPTIONS.max_share, 2 * share))
+        held.mean() > max(share, min(0.5, 2 * share))
         or share_repeated(states[~held], states[held]) >= repetition.OPTIONS.repeated_share
     ):
         return None
@@ -118,7 +113,7 @@ def unrepeated(samples: Samples, joint_types: Sequence[str], share: float, seed:
 def _edges(samples: Samples, joint_types: Sequence[str]) -> Numbers | None:
     """Where blocks begin and end that may repeat each other; None where there is too little for any."""
     episodes = samples.episodes()
-    if OPTIONS.min_blocks <= len(episodes) <= OPTIONS.max_episodes:
+    if OPTIONS.min_blocks <= len(episodes) <= 50:
         return np.array([0, *(each.stop for each in episodes)], np.int64)
     again = period(samples, joint_types) if len(episodes) == 1 else None
     if again is not None:

@@ -31,10 +31,9 @@ class DetectorOptions:
     reference_s: float = 20.0
     min_reference_s: float = 10.0
     min_reference_rows: int = 200
-    ratio: float = RATIO
     deviations: float = 5.0
-    """Bound in the Gaussian that the tail of the bucket means is mapped to: one chance in 3 million if `ratio` is not
-    enough."""
+    """Bound in the Gaussian that the tail of the bucket means is mapped to: one chance in 3 million if RATIO is too
+    low."""
     prior_variation: float = 0.5
     prior_buckets: int = 10
     """Assumed variation of the buckets' means, and how many buckets it counts for."""
@@ -217,7 +216,7 @@ class ChangeDetector:
             return None
         variation = _variation(used)
         tail = (1 - variation / 9 + OPTIONS.deviations * np.sqrt(variation) / 3) ** 3
-        bound = np.maximum(OPTIONS.ratio, tail) * np.maximum(_mean(used), 1.0)
+        bound = np.maximum(RATIO, tail) * np.maximum(_mean(used), 1.0)
         exceeding = np.array([bucket.record.standardised > bound for bucket in recent])
         joints = (_mean(recent) > bound) & (exceeding.sum(axis=0) >= np.ceil(OPTIONS.share * len(recent)))
         if not joints.any():
