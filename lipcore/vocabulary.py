@@ -31,7 +31,6 @@ COMPONENTS: tuple[ComponentName, ...] = get_args(ComponentName)
 
 AUTO = "auto"
 """Of several estimators, the simplest unless another one is surely better (`lipcore.training.auto`)."""
-DEFAULT_ESTIMATOR = AUTO
 RIGID, LOCAL, CHAINED_ARM = "rigid-body", "rigid-body+local", "rigid-body+lip-chain"
 ROBOT_ESTIMATORS = (RIGID, LOCAL, CHAINED_ARM)
 """Estimators with the term `rigid_body`, which take a robot."""

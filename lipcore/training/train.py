@@ -21,13 +21,13 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.training import conditioning
 from lipcore.training.auto import choose
 from lipcore.training.fit import fit_estimator
-from lipcore.vocabulary import AUTO, DEFAULT_ESTIMATOR, TorqueConvention
+from lipcore.vocabulary import AUTO, TorqueConvention
 
 
 def train(
     samples: Samples,
     joint_types: Sequence[str],
-    estimator: str = DEFAULT_ESTIMATOR,
+    estimator: str = AUTO,
     options: FitOptions | None = None,
     torque_convention: TorqueConvention = "gravity_included",
     on_progress: Progress | None = None,
@@ -80,7 +80,7 @@ def train(
     return conditioning.condition(model, samples, weights, cancelled)
 
 
-def fit_model(task: Task, estimator: str = DEFAULT_ESTIMATOR, geometries: Sequence[Geometry] = ()) -> TorqueModel:
+def fit_model(task: Task, estimator: str = AUTO, geometries: Sequence[Geometry] = ()) -> TorqueModel:
     """Train as `train` does, on the chosen samples alone: where there are too many for memory, on a thinned table.
 
     estimator: as in `train`; geometries: base to tip, that a search for one looks at first, as of an earlier version;

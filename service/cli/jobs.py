@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 from rich.table import Column, Table
 
-from lipcore.vocabulary import CHOICES, DEFAULT_ESTIMATOR
+from lipcore.vocabulary import AUTO, CHOICES
 from lipserve.address import DEFAULT_URL
 from service.cli import connecting
 from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, watch
@@ -122,7 +122,7 @@ def train(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help=f"One of {', '.join(CHOICES)}; {DEFAULT_ESTIMATOR} by default, which compares arms and `lip-chain` "
+            help=f"One of {', '.join(CHOICES)}; {AUTO} by default, which compares arms and `lip-chain` "
             "on held-out rows and takes the simplest unless another one is surely better.",
             autocompletion=lambda: list(CHOICES),
         ),

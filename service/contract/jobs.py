@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from lipcore.estimators.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
-from lipcore.vocabulary import AUTO, CHOICES, DEFAULT_ESTIMATOR, DIFFERENTIATED, ROBOT_ESTIMATORS, JointType
+from lipcore.vocabulary import AUTO, CHOICES, DIFFERENTIATED, ROBOT_ESTIMATORS, JointType
 from service.contract.models import VERSION, HeldOutQuality, Holdout, ModelName
 from service.contract.states import JobState, PromotionOption
 from service.foundation.fields import LONGEST, MOST_NAMED
@@ -81,7 +81,7 @@ class JobRequest(BaseModel):
     model: ModelName = Field(description="Name of the model; a new version of it is made")
     datasets: list[DatasetName] = Field(min_length=1, max_length=MOST_NAMED, description="Ids or names of data sets")
     estimator: str = Field(
-        DEFAULT_ESTIMATOR,
+        AUTO,
         max_length=40,
         description=f"One of {', '.join(CHOICES)}; `auto` compares arms and `lip-chain` on held-out rows and takes "
         "the simplest unless another one is surely better",
