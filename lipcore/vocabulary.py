@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Literal, get_args
 
 JointType = Literal["revolute", "prismatic"]
@@ -53,14 +54,35 @@ PRIORS: tuple[Prior, ...] = get_args(Prior)
 PayloadState = Literal["none", "payload", "contact", "friction"]
 """What the last rows of a stream show: something carried, a contact, other friction, or none of these."""
 
-CODES = (
-    *("learnt", "non_finite", "limit", "time_jump", "saturation", "stationary"),
-    *("contact", "change", "edge", "payload", "late", "paused", "implausible"),
-)
-"""What may become of a row. All but the first keep it out of learning: a number that is not finite; a position,
-velocity, acceleration or torque beyond its limit; time that goes backwards or leaps; torque at its actuator's limit; a
-robot at rest, whose stiction hides its torque; a contact; a changed robot whose owner has not decided yet; the edge of
-a recording, where an acceleration cannot be derived; an arm that carries something, of which it teaches instead; a row
-that came so late that by forgetting it no longer counts; one that came while learning was paused; a torque that nobody
-has measured."""
-LEARNT = 0
+
+class Code(IntEnum):
+    """What becomes of a row. All but `LEARNT` keep it out of learning; the log stores the numbers."""
+
+    LEARNT = 0
+    NON_FINITE = 1
+    """A number is not finite."""
+    LIMIT = 2
+    """A position, velocity, acceleration or torque is beyond its limit."""
+    TIME_JUMP = 3
+    """Time goes backwards or leaps."""
+    SATURATION = 4
+    """Torque is at its actuator's limit."""
+    STATIONARY = 5
+    """The robot is at rest: stiction hides its torque."""
+    CONTACT = 6
+    CHANGE = 7
+    """The robot has changed, and its owner has not decided yet."""
+    EDGE = 8
+    """The acceleration cannot be derived, at the edge of what has come."""
+    PAYLOAD = 9
+    """The arm carries something, of which the row teaches instead."""
+    LATE = 10
+    """The row came so late that by forgetting it no longer counts."""
+    PAUSED = 11
+    """Learning was paused."""
+    IMPLAUSIBLE = 12
+    """Nobody has measured this torque."""
+
+
+CODES = tuple(code.name.lower() for code in Code)
+"""The names of codes, in the order of their numbers."""

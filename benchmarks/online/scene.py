@@ -13,7 +13,7 @@ from lipcore.data.samples import Array, Samples
 from lipcore.online.batch import Rows
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
-from lipcore.vocabulary import LEARNT
+from lipcore.vocabulary import Code
 
 SINUSOIDS, UNSEEN_SINUSOIDS = 50, 100
 """The unseen trajectory has twice the bandwidth, as in the paper's tests."""
@@ -115,5 +115,5 @@ class Scene:
 
 def rows_of(samples: Samples) -> Rows:
     """Rows to learn from, all of them."""
-    code: NDArray[np.uint8] = np.full(len(samples), LEARNT, dtype=np.uint8)
+    code: NDArray[np.uint8] = np.full(len(samples), Code.LEARNT, dtype=np.uint8)
     return Rows(samples.t, samples.q, samples.dq, samples.ddq, samples.tau, code, independence.even_weights(samples.t))

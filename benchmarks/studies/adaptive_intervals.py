@@ -32,7 +32,7 @@ from lipcore.online.record import LEVEL
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
-from lipcore.vocabulary import LEARNT
+from lipcore.vocabulary import Code
 
 STREAMS = {"tune": ("panda:0", "ur10:1"), "report": ("kinova:10", "xarm7:10", "panda:11", "ur5:12")}
 RATE, BATCH, NOISE = 100.0, 10, 0.05
@@ -68,7 +68,7 @@ def played(arm: str, seed: int, dirty: bool, learning: bool) -> Array:
         parts.append(measured(robot, stream, 1000 * seed + 7 + number, cold))
     samples = Samples.concatenate(parts)
     time = np.arange(len(samples.q)) / RATE
-    codes, weights = np.full(len(time), LEARNT, np.uint8), stream_weights(time)
+    codes, weights = np.full(len(time), Code.LEARNT, np.uint8), stream_weights(time)
     rows = Rows(time, samples.q, samples.dq, samples.ddq, samples.tau, codes, weights)
     changes = {round((at + NOTICED_S) * RATE) for at in (LOADED_S, LOADED_S + 60.0)}
     online, out = OnlineModel.start(model, 60.0), []

@@ -32,7 +32,7 @@ from lipcore.online.learner import OnlineModel
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Stream, simulate
-from lipcore.vocabulary import LEARNT
+from lipcore.vocabulary import Code
 
 RATE, KEEP, EVERY_S, MINUTES, JUDGED = 100.0, 5, 2.0, 30, 5
 NOISE = 0.05
@@ -114,7 +114,7 @@ def _noisy(tau: Array, rng: np.random.Generator) -> Array:
 def rows_of(part: Part) -> Rows:
     """All rows, each with its weight."""
     samples = part.samples
-    codes = np.full(len(samples), LEARNT, np.uint8)
+    codes = np.full(len(samples), Code.LEARNT, np.uint8)
     return Rows(samples.t, samples.q, samples.dq, samples.ddq, part.tau, codes, stream_weights(samples.t))
 
 

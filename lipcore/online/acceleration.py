@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
 from lipcore.online.gates import RowLimits, check_rows
-from lipcore.vocabulary import CODES, LEARNT
-
-EDGE = CODES.index("edge")
+from lipcore.vocabulary import Code
 
 MIN_RATE = 50.0
 RATE_SLACK = 0.95
@@ -167,10 +165,10 @@ def derive_rows(
     known = np.isfinite(everything.ddq).all(axis=1)
     codes = everything.code.copy()
     # 2 half rows on either side are so few that every window that is complete reaches into the batch: none was before
-    decided = known & ~own & (codes == EDGE)
-    codes[~known & (codes == LEARNT)] = EDGE
-    codes[decided] = LEARNT
-    fresh = codes == LEARNT
+    decided = known & ~own & (codes == Code.EDGE)
+    codes[~known & (codes == Code.LEARNT)] = Code.EDGE
+    codes[decided] = Code.LEARNT
+    fresh = codes == Code.LEARNT
     again = everything.take(fresh)
     codes[fresh] = check_rows(None, again.q, again.dq, again.ddq, again.tau, limits)
     start = int(decided[:first].sum())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.vocabulary import CODES, LEARNT
+from lipcore.vocabulary import CODES, Code
 
 AHEAD_S = 1.0
 """By how much the rows of a batch may be dated after its arrival, s, where they are learnt."""
@@ -52,7 +52,7 @@ class Rows:
     @property
     def learnt(self) -> Rows:
         """The rows that teach."""
-        teaches = self.code == LEARNT
+        teaches = self.code == Code.LEARNT
         return self if teaches.all() else self.take(teaches)
 
     def motion(self) -> Motion:
@@ -62,7 +62,7 @@ class Rows:
     def rejected(self) -> dict[str, int]:
         """How many rows each code other than `learnt` keeps out."""
         counts = np.bincount(self.code, minlength=len(CODES))
-        return {code: int(count) for code, count in zip(CODES, counts, strict=True) if count and code != CODES[LEARNT]}
+        return {code: int(count) for code, count in zip(CODES, counts, strict=True) if count and code != "learnt"}
 
     @staticmethod
     def concatenate(parts: Sequence[Rows]) -> Rows:

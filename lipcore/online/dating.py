@@ -15,9 +15,7 @@ from lipcore.data import independence
 from lipcore.data.samples import Array
 from lipcore.online.batch import Placement, Rows
 from lipcore.online.gates import RowLimits, check_rows, time_span
-from lipcore.vocabulary import CODES, LEARNT
-
-NON_FINITE, LIMIT, TIME_JUMP, LATE = (CODES.index(code) for code in ("non_finite", "limit", "time_jump", "late"))
+from lipcore.vocabulary import Code
 
 FAR_AHEAD = 86400.0
 """How far ahead of its arrival a row may be dated, s: as long a recording may be sent in one go."""
@@ -133,22 +131,22 @@ def date_rows(
     t = measured.t
     numbers = measured.q, measured.dq, measured.ddq, measured.tau
     codes = check_rows(t, *numbers, bounds, clock.after, clock.before)
-    usable = ~np.isin(codes, (NON_FINITE, TIME_JUMP))
+    usable = ~np.isin(codes, (Code.NON_FINITE, Code.TIME_JUMP))
     gap = bounds.max_gap_s
     offset, span, leap = clock.settled(t, usable, gap), None, None
     if t is not None:
-        codes[clock.leaps(t, usable, offset, gap) & (codes != LIMIT)] = TIME_JUMP
+        codes[clock.leaps(t, usable, offset, gap) & (codes != Code.LIMIT)] = Code.TIME_JUMP
         span = time_span(t, codes)
-        leap = clock.leap(t, usable & (codes != TIME_JUMP), offset, gap)
+        leap = clock.leap(t, usable & (codes != Code.TIME_JUMP), offset, gap)
     if t is not None and leap is not None:
-        codes[(np.arange(len(t)) >= leap[0]) & (codes != NON_FINITE)] = TIME_JUMP
+        codes[(np.arange(len(t)) >= leap[0]) & (codes != Code.NON_FINITE)] = Code.TIME_JUMP
         span = time_span(t[: leap[0]], codes[: leap[0]])
         if span is None and clock.after is not None:
             span = clock.after, clock.after  # the next batch is compared with what came before the leap, too
     ddq = np.full_like(measured.q, np.nan) if measured.ddq is None else measured.ddq
     time = clock.event_time(t, offset, len(measured))
     if forgetting_s is not None:
-        codes[(codes == LEARNT) & (time < clock.arrived - FORGOTTEN * forgetting_s)] = LATE
+        codes[(codes == Code.LEARNT) & (time < clock.arrived - FORGOTTEN * forgetting_s)] = Code.LATE
     if t is None or len(measured) == 1:
         weights = independence.stream_weights(time, previous)
     else:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lipcore.data.outliers import LARGEST_TORQUE
 from lipcore.data.samples import Array
 from lipcore.model.external import external
-from lipcore.vocabulary import CODES, LEARNT
+from lipcore.vocabulary import Code
 
 Codes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
@@ -77,19 +77,19 @@ def check_rows(
     # the codes of rows that are not finite are set last; numbers in their place keep comparisons quiet
     q, dq, tau = (np.nan_to_num(array) for array in (q, dq, tau))
 
-    codes = np.full(len(q), LEARNT, dtype=np.uint8)
-    codes[(np.abs(dq) < limits.stationary_speed).all(axis=1)] = CODES.index("stationary")
+    codes = np.full(len(q), Code.LEARNT, dtype=np.uint8)
+    codes[(np.abs(dq) < limits.stationary_speed).all(axis=1)] = Code.STATIONARY
     most = np.full(q.shape[1], LARGEST_TORQUE) if limits.torque is None else limits.torque
     if limits.torque is not None:
         saturated = np.abs(tau) >= limits.saturation_share * most
-        codes[saturated.any(axis=1)] = CODES.index("saturation")
+        codes[saturated.any(axis=1)] = Code.SATURATION
     if t is not None:
-        codes[_time_jumps(t, after, before)] = CODES.index("time_jump")
+        codes[_time_jumps(t, after, before)] = Code.TIME_JUMP
     beyond = (np.abs(q) > limits.position) | (np.abs(dq) > limits.velocity) | (np.abs(tau) > most)
     if ddq is not None:
         beyond |= np.abs(np.nan_to_num(ddq)) > limits.acceleration
-    codes[beyond.any(axis=1)] = CODES.index("limit")
-    codes[~finite] = CODES.index("non_finite")
+    codes[beyond.any(axis=1)] = Code.LIMIT
+    codes[~finite] = Code.NON_FINITE
     return codes
 
 
@@ -100,7 +100,7 @@ def time_span(time: Array, code: Codes) -> tuple[float, float] | None:
     is to follow the new one. So a wrong time at the end of a batch costs one row, and a clock set back one batch.
     """
     known = np.isfinite(time)
-    believed = known & (code != CODES.index("time_jump"))
+    believed = known & (code != Code.TIME_JUMP)
     times = time[believed] if believed.any() else time[known]
     return (float(times[0]), float(times[-1])) if len(times) else None
 

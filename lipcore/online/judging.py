@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.online.batch import AHEAD_S, Rows
 from lipcore.online.changes.departure import Departure
-from lipcore.online.changes.detectors import RATIO, Change
+from lipcore.online.changes.detectors import OPTIONS, Change
 from lipcore.online.changes.opening import Opening
 from lipcore.online.gates import ContactGate, is_contact
 from lipcore.online.judgement import LoggedJudgement, ModelRecord
@@ -20,10 +20,9 @@ from lipcore.online.record import Record
 from lipcore.online.scale import HeldIntervals, ScaleRecord
 from lipcore.online.screening import Screened, Trained
 from lipcore.online.stream import StreamRecord
-from lipcore.vocabulary import CODES, LEARNT
+from lipcore.vocabulary import Code
 
-CONTACT, CHANGE, PAYLOAD, PAUSED = (CODES.index(code) for code in ("contact", "change", "payload", "paused"))
-ACCEPTED = (LEARNT, CODES.index("stationary"), PAYLOAD)
+ACCEPTED = (Code.LEARNT, Code.STATIONARY, Code.PAYLOAD)
 """Codes of rows that are not kept out: the model, with the payload it knows of, is to explain them."""
 
 
@@ -201,13 +200,13 @@ def _coded(
     batch: Screened, gated: Gated, gate: ContactGate, held: bool, options: JudgeOptions, carried: float | None
 ) -> Rows:
     """The rows of a batch with their final codes. gate: once a change was decided about."""
-    learnt = np.where(gated.contact & (not (gated.passing or gate.open)), CONTACT, LEARNT)
+    learnt = np.where(gated.contact & (not (gated.passing or gate.open)), Code.CONTACT, Code.LEARNT)
     if carried is not None:
-        learnt = np.where((learnt == LEARNT) & (gated.rows.time >= carried), PAYLOAD, learnt)
+        learnt = np.where((learnt == Code.LEARNT) & (gated.rows.time >= carried), Code.PAYLOAD, learnt)
     if not options.enabled:
-        learnt = np.where(learnt == LEARNT, PAUSED, learnt)
+        learnt = np.where(learnt == Code.LEARNT, Code.PAUSED, learnt)
     codes = batch.rows.code.copy()
-    codes[batch.predicted] = CHANGE if held else learnt
+    codes[batch.predicted] = Code.CHANGE if held else learnt
     return replace(batch.rows, code=codes)
 
 
@@ -253,7 +252,7 @@ def _compared(
 
 def _lasting(gate: ContactGate, record: Record, usual: Record, rows: Rows) -> Change:
     """A change that shows as contacts without end."""
-    far = np.flatnonzero(record.standardised > RATIO)
+    far = np.flatnonzero(record.standardised > OPTIONS.ratio)
     joints = far if len(far) else [record.standardised.argmax()]
     at = float(rows.time[0]) if gate.began is None else gate.began
     return Change(at, tuple(int(joint) for joint in joints), usual, record, "sudden")

@@ -13,9 +13,7 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.online.adaptive import scores
 from lipcore.online.batch import Rows
 from lipcore.online.gates import is_implausible
-from lipcore.vocabulary import CODES, LEARNT
-
-LIMIT, STATIONARY, IMPLAUSIBLE = (CODES.index(code) for code in ("limit", "stationary", "implausible"))
+from lipcore.vocabulary import Code
 
 COMPARED, LEAST_COMPARED = 4.0, 10
 """Rows that are compared with the version as trained, for each effective row, and of a batch at least: neighbours of a
@@ -123,8 +121,8 @@ def predict(
     a stream has answered them already; carrying: the version with what the arm carries, where it does: it is compared
     with the version as trained no more."""
     model = version.model if carrying is None else carrying
-    codes, predicted = rows.code.copy(), rows.code == LEARNT
-    asked = predicted | ((codes == STATIONARY) & np.isfinite(rows.ddq).all(axis=1))
+    codes, predicted = rows.code.copy(), rows.code == Code.LEARNT
+    asked = predicted | ((codes == Code.STATIONARY) & np.isfinite(rows.ddq).all(axis=1))
     good, floor = rows.take(asked), model.posterior.floor
     given = None if answered is None else answered.take(asked)
     if given is None or given.other_load:
@@ -145,8 +143,8 @@ def predict(
     answerable = asked.copy()
     answerable[asked] = known
     judged, known = known & predicted[asked], known[predicted[asked]]
-    codes[predicted] = np.where(known, LEARNT, LIMIT)
-    codes[np.flatnonzero(asked)[invented]] = IMPLAUSIBLE
+    codes[predicted] = np.where(known, Code.LEARNT, Code.LIMIT)
+    codes[np.flatnonzero(asked)[invented]] = Code.IMPLAUSIBLE
     predicted[predicted] = known
     mean, std, bare = mean[judged], std[judged], bare[judged]
     return Screened(

@@ -7,13 +7,13 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, WithJsonSchema
 
 from lipcore.online.record import LEVEL
-from lipcore.vocabulary import CODES, LEARNT, JointType
+from lipcore.vocabulary import CODES, JointType
 from service.contract.models import VersionNumber
 from service.contract.observations import MOST_SEQUENCE, LearningOptions, State
 from service.contract.payload import LivePayload
 from service.foundation.errors import invalid_request
 
-REPLAYABLE = tuple(code for code in CODES if code not in (CODES[LEARNT], "non_finite", "edge", "late"))
+REPLAYABLE = tuple(code for code in CODES if code not in ("learnt", "non_finite", "edge", "late"))
 """Codes whose rows are complete, so that they can be learnt after all."""
 Nullable = list[float | None]
 
@@ -137,7 +137,7 @@ def _code(value: Any) -> str:
     return str(value)
 
 
-Code = Annotated[str, PlainValidator(_code), WithJsonSchema({"type": "string", "enum": list(REPLAYABLE)})]
+ReplayCode = Annotated[str, PlainValidator(_code), WithJsonSchema({"type": "string", "enum": list(REPLAYABLE)})]
 
 
 class ReplayRequest(BaseModel):
@@ -145,7 +145,7 @@ class ReplayRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"codes": ["contact"]}]})
 
-    codes: list[Code] | None = Field(
+    codes: list[ReplayCode] | None = Field(
         None, min_length=1, max_length=len(CODES), description="Rows kept out by these codes; by any code by default"
     )
 

@@ -19,14 +19,14 @@ from sqlalchemy.orm import Session, undefer
 
 from lipcore.data.samples import Array
 from lipcore.online.batch import AHEAD_S, Placement, Rows
-from lipcore.vocabulary import CODES, LEARNT
+from lipcore.vocabulary import Code
 from service.journal.arrivals import NewBatch, note_arrival
 from service.storage.database import EventRow, LearnerRow, LearningRow, StreamRow, fetch
 from service.storage.rows import Page
 from service.storage.rows import newest as newest_rows
 
 EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings", "payload"]
-UNTIMED = [CODES.index("non_finite"), CODES.index("time_jump")]
+UNTIMED = [Code.NON_FINITE, Code.TIME_JUMP]
 """Codes of rows whose own time says nothing."""
 ARRAYS = tuple(field.name for field in fields(Rows))
 """Of the safetensors archive that an event's rows are kept as."""
@@ -283,7 +283,7 @@ def _append(
     event.model, event.kind, event.received = model, kind, received
     event.clock = clock(session, model, received)
     if rows is not None:
-        event.payload, event.rows, event.learnt = encode(rows), len(rows), int(np.sum(rows.code == LEARNT))
+        event.payload, event.rows, event.learnt = encode(rows), len(rows), int(np.sum(rows.code == Code.LEARNT))
         times = rows.time[np.isfinite(rows.time) & ~np.isin(rows.code, UNTIMED)]
         if len(times):
             event.first, event.last = float(times.min()), float(times.max())

@@ -15,7 +15,7 @@ from lipcore.online.batch import Rows
 from lipcore.online.payload.estimate import Estimate
 from lipcore.online.payload.holding import Watch
 from lipcore.online.stream import PayloadRecord
-from lipcore.vocabulary import CODES, LEARNT
+from lipcore.vocabulary import Code
 from service.journal import log
 from service.learning.streams import Streams
 from service.models.loads import Carried
@@ -23,7 +23,7 @@ from service.storage.database import EventRow
 
 MOST_BATCHES = 40
 """That are read again to know what a stream carries."""
-TEACHING = [LEARNT, CODES.index("payload")]
+TEACHING = [Code.LEARNT, Code.PAYLOAD]
 """Codes of rows that tell of a payload."""
 
 

@@ -23,7 +23,7 @@ from lipcore.posterior.misfit import shared_rows
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Stream, simulate
 from lipcore.robots.urdf import RigidBody
-from lipcore.vocabulary import CODES, ROBOT_ESTIMATORS
+from lipcore.vocabulary import ROBOT_ESTIMATORS, Code
 from tests.choosing import few
 from tests.lipcore.arm_oracles import as_rows, same_answers
 
@@ -101,7 +101,7 @@ def test_revision_answers_alike(model: TorqueModel, rows: Rows) -> None:
 
 def test_only_rows_to_learn_teach(model: TorqueModel, rows: Rows) -> None:
     code = np.zeros(len(rows), np.uint8)
-    code[::2] = CODES.index("contact")
+    code[::2] = Code.CONTACT
     spoilt = replace(rows, code=code, tau=np.where(code[:, None] > 0, rows.tau + 1e3, rows.tau))
     online = OnlineModel.start(model).learn(spoilt)
     assert online.samples == len(rows) // 2

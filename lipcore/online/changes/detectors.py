@@ -15,9 +15,6 @@ from lipcore.online.record import Record, number
 
 Kind = Literal["sudden", "drift", "departure"]
 
-RATIO = 4.0
-"""Errors twice as large as before and as stated: 30 standard errors of the mean of 200 independent rows."""
-
 
 @dataclass(frozen=True)
 class DetectorOptions:
@@ -31,8 +28,11 @@ class DetectorOptions:
     reference_s: float = 20.0
     min_reference_s: float = 10.0
     min_reference_rows: int = 200
+    ratio: float = 4.0
+    """Bound of squared errors over those before and as stated: 30 standard errors of the mean of 200 independent
+    rows."""
     deviations: float = 5.0
-    """Bound in the Gaussian that the tail of the bucket means is mapped to: one chance in 3 million if RATIO is too
+    """Bound in the Gaussian that the tail of the bucket means is mapped to: one chance in 3 million if `ratio` is too
     low."""
     prior_variation: float = 0.5
     prior_buckets: int = 10
@@ -216,7 +216,7 @@ class ChangeDetector:
             return None
         variation = _variation(used)
         tail = (1 - variation / 9 + OPTIONS.deviations * np.sqrt(variation) / 3) ** 3
-        bound = np.maximum(RATIO, tail) * np.maximum(_mean(used), 1.0)
+        bound = np.maximum(OPTIONS.ratio, tail) * np.maximum(_mean(used), 1.0)
         exceeding = np.array([bucket.record.standardised > bound for bucket in recent])
         joints = (_mean(recent) > bound) & (exceeding.sum(axis=0) >= np.ceil(OPTIONS.share * len(recent)))
         if not joints.any():

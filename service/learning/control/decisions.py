@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from lipcore.estimators.base import RobotKind
 from lipcore.online.batch import Rows
-from lipcore.vocabulary import CODES, LEARNT
+from lipcore.vocabulary import CODES, Code
 from service.contract import learning as schema
 from service.contract.observations import LearningOptions
 from service.foundation.errors import ConflictError, invalid_request, not_found, problem
@@ -168,7 +168,6 @@ def _to_version(learners: Learners, model: str, version: int) -> schema.RolledBa
     return schema.RolledBack(**revised.model_dump(), undone=0, complete=complete)
 
 
-TIME_JUMP = CODES.index("time_jump")
 CHANGE = "change"
 CHUNK = 50
 """Batches whose rows are learnt after all in one transaction, so that observations do not wait long for the lock."""
@@ -250,8 +249,8 @@ def admit(session: Session, batch: EventRow, codes: Collection[str], received: f
     counts = taken.rejected()
     if counts:
         arrived = batch.received if batch.clock is None else batch.clock
-        times = np.where(taken.code == TIME_JUMP, arrived, taken.time)
-        learnt = replace(taken, time=times, code=np.full(len(taken), LEARNT, np.uint8))
+        times = np.where(taken.code == Code.TIME_JUMP, arrived, taken.time)
+        learnt = replace(taken, time=times, code=np.full(len(taken), Code.LEARNT, np.uint8))
         detail = {"event": batch.number, "codes": list(counts)}
         log.append(session, batch.model, "replay", detail, received, learnt)
     return counts

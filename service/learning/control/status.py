@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from lipcore.online.batch import Rows
 from lipcore.online.record import Record
 from lipcore.online.window import Window
-from lipcore.vocabulary import CODES, LEARNT
+from lipcore.vocabulary import CODES
 from service.contract import learning as schema
 from service.contract.observations import ObservationResponse
 from service.foundation.errors import NotFoundError, not_found
@@ -79,7 +79,7 @@ def quality(learners: Learners, model: str) -> schema.Quality:
 def window(sums: Window, now: float) -> schema.QualityWindow:
     """Return the figures and counts of a window before a Unix time, s."""
     counts = sums.counts(now)
-    accepted = counts.pop(CODES[LEARNT], 0)
+    accepted = counts.pop("learnt", 0)
     return schema.QualityWindow(
         **figures(sums.record(now)).model_dump(),
         seconds=sums.seconds,

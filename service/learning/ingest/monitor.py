@@ -17,7 +17,6 @@ from lipcore.online.judging import Judgement
 from lipcore.online.record import Record
 from lipcore.online.stream import StreamRecord
 from lipcore.online.window import Window
-from lipcore.vocabulary import CODES, LEARNT
 from service.journal import log
 from service.learning import owner
 from service.learning.payloads import Payloads
@@ -165,4 +164,4 @@ def _batches(
 
 def _counts(report: Mapping[str, Any]) -> dict[str, int]:
     """Rows by code, those that are learnt too."""
-    return {CODES[LEARNT]: report["accepted"], **report["rejected"]}
+    return {"learnt": report["accepted"], **report["rejected"]}

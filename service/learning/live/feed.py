@@ -19,10 +19,9 @@ from anyio import to_thread
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
-from lipcore.online.acceleration import EDGE
 from lipcore.online.batch import Rows
 from lipcore.online.learner import uncovered
-from lipcore.vocabulary import CODES, LEARNT
+from lipcore.vocabulary import CODES, Code
 from service.contract.learning import DECIMALS, LiveLost, LiveNovelty, LivePart, LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
 from service.learning.ingest.append import Judged
@@ -66,10 +65,10 @@ def thinned(batches: Iterable[Judged], most: int) -> list[tuple[LivePart, Picked
 def pick(code: NDArray[np.uint8], most: int) -> NDArray[np.int64]:
     """Places of at most so many rows (at least one) of these codes, in order, those at an edge left out. One of each
     stretch: the first that was kept out where there is one, so that no stretch looks calmer than it was."""
-    places = np.flatnonzero(code != EDGE)
+    places = np.flatnonzero(code != Code.EDGE)
     if len(places) <= most:
         return places
-    kept_out = code[places] != LEARNT
+    kept_out = code[places] != Code.LEARNT
     starts = np.linspace(0, len(places), max(most, 1), endpoint=False).astype(np.int64)
     chosen = [start + int(kept_out[start:end].argmax()) for start, end in zip(starts, [*starts[1:], None], strict=True)]
     return places[chosen]

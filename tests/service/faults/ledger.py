@@ -14,7 +14,7 @@ import lipcore
 from lipcore.data import independence
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from lipcore.vocabulary import LEARNT
+from lipcore.vocabulary import Code
 from lipserve.states import ACTIVE
 from tests.service.data import eventually, job, stream
 from tests.service.faults.injection import PATIENCE
@@ -131,7 +131,7 @@ class Ledger:
         teach = [s for s, state in sorted(self.batches.items()) if state == "learnt"]
         places = np.concatenate([np.arange(s * ROWS, (s + 1) * ROWS) for s in teach] or [np.arange(0)])
         numbers = [getattr(taught, name)[:last] for name in ("q", "dq", "ddq", "tau")]
-        code = np.full(last, LEARNT, np.uint8)
+        code = np.full(last, Code.LEARNT, np.uint8)
         every = Rows(times[:last], *numbers, code, independence.even_weights(times[:last]))
         model = OnlineModel.start(base).learn(every.take(places)).model()
         return model.predict(*(np.array(QUERIES[name]) for name in ("q", "dq", "ddq")))

@@ -8,7 +8,7 @@ import pytest
 from sqlalchemy import select
 
 from lipcore import NotPositiveDefiniteError
-from lipcore.vocabulary import CODES
+from lipcore.vocabulary import Code
 from service.journal import log
 from service.learning.learner import follower as following
 from service.learning.learner import publication
@@ -149,7 +149,7 @@ def test_novelty_is_told_with_what_is_published(arm, follower):
     """Motion far faster than the version has seen; rows that are not learnt do not count."""
     quick = rows(0, size=40)
     quick.dq[:] = 50.0
-    quick.code[30:] = CODES.index("contact")
+    quick.code[30:] = Code.CONTACT
     arm.batch(0, rows=quick)
     message = caught_up(follower).publish()
     assert (message.novel_rows, message.novel_share) == (30, 0.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lipcore.online.batch import Rows
-from lipcore.vocabulary import CODES
+from lipcore.vocabulary import Code
 from service.journal import log
 from service.journal.arrivals import NewBatch
 from tests.service.learning.lessons import LESSON, lesson
@@ -75,7 +75,7 @@ def test_rows_come_as_they_were_sent_with_their_codes(pupil):
 
 def test_a_frame_is_found_in_the_batch_it_was_logged_with(school):
     pupil = school.enrol("framed")
-    rows = Rows(100.0 + np.arange(5), *np.ones((4, 5, 2)), np.full(5, CODES.index("contact"), np.uint8))
+    rows = Rows(100.0 + np.arange(5), *np.ones((4, 5, 2)), np.full(5, Code.CONTACT, np.uint8))
     said = {
         "accepted": 0,
         "rejected": {"contact": 5},

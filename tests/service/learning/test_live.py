@@ -8,7 +8,7 @@ import pytest
 
 from lipcore.online.batch import Rows
 from lipcore.online.screening import Screened
-from lipcore.vocabulary import CODES
+from lipcore.vocabulary import Code
 from service.contract.learning import LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
 from service.learning.ingest.append import Judged
@@ -110,9 +110,6 @@ def test_a_service_that_is_told_to_stop_ends_the_events(home):
         eventually(lambda: server.process.poll() is not None)
 
 
-CONTACT = CODES.index("contact")
-
-
 def served(revision=0, noise=(0.1, 0.2)):
     model = SimpleNamespace(noise_std=np.array(noise), joint_names=("a", "b"))
     return SimpleNamespace(name="arm", version=1, revision=revision, model=model, base="base")
@@ -121,7 +118,7 @@ def served(revision=0, noise=(0.1, 0.2)):
 def judged(count=4, codes=(), stream_id="one", of=None, seed=0, bare=0.05):
     """A batch whose rows with a code, contacts aside, were not predicted; each mean is half a torque away."""
     found: Rows = rows(count, seed=seed, codes=codes)
-    predicted = np.isin(found.code, (0, CONTACT))
+    predicted = np.isin(found.code, (0, Code.CONTACT))
     mean = found.tau[predicted] - 0.5
     std = np.full(mean.shape, 0.3)
     noise = np.array([0.1, 0.2])
@@ -133,7 +130,7 @@ def judged(count=4, codes=(), stream_id="one", of=None, seed=0, bare=0.05):
 
 def test_a_row_that_was_kept_out_stands_for_its_stretch():
     code = np.zeros(100, np.uint8)
-    code[[37, 38, 80]] = CONTACT
+    code[[37, 38, 80]] = Code.CONTACT
     chosen = pick(code, 10)
     assert len(chosen) == 10
     assert {37, 80} <= set(chosen.tolist())

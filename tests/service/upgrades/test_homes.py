@@ -14,7 +14,7 @@ import lipcore
 from lipcore.data import independence
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from lipcore.vocabulary import LEARNT
+from lipcore.vocabulary import Code
 from service.api.access import keys
 from service.app import create_app
 from service.cli.verify import verify_home
@@ -127,7 +127,7 @@ def learnt(home, count):
     lessons = TOLD["lessons"][:count]
     times = np.concatenate([each["t"] for each in lessons])
     numbers = [np.concatenate([each[name] for each in lessons]) for name in ("q", "dq", "ddq", "tau")]
-    every = Rows(times, *numbers, np.full(len(times), LEARNT, np.uint8), independence.even_weights(times))
+    every = Rows(times, *numbers, np.full(len(times), Code.LEARNT, np.uint8), independence.even_weights(times))
     size = len(times) // count
     kept = np.flatnonzero(np.arange(len(times)) // size != TAKEN_BACK)
     model = OnlineModel.start(base).learn(every.take(kept)).model()
