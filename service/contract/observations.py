@@ -82,9 +82,6 @@ MOST_SEQUENCE = 2**53 - 1
 """The largest whole number that every JSON reader takes for what it is."""
 State = Literal["learnt", "unlearnt", "rolled_back"]
 
-_NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": ["number", "null"]}}
-_ROWS: dict[str, Any] = {"type": "array", "items": _NUMBERS}
-
 StreamId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 SequenceNumber = Annotated[int, Field(strict=True, ge=0, le=MOST_SEQUENCE)]
 
@@ -94,13 +91,13 @@ def _to_times(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
     return np.array(numbers(info.field_name or "value", value if isinstance(value, list) else [value], nullable=True))
 
 
+_Numbers = list[Annotated[float | None, WithJsonSchema({"type": ["number", "null"]})]]
 Matrix = Annotated[
-    NDArray[np.float64], PlainValidator(rows_of_numbers(nullable=True)), WithJsonSchema({"anyOf": [_NUMBERS, _ROWS]})
+    NDArray[np.float64],
+    PlainValidator(rows_of_numbers(nullable=True), json_schema_input_type=_Numbers | list[_Numbers]),
 ]
 """JSON array of shape (N, n), or (n,) for one row; null where there is no number."""
-Times = Annotated[
-    NDArray[np.float64], PlainValidator(_to_times), WithJsonSchema({"anyOf": [{"type": "number"}, _NUMBERS]})
-]
+Times = Annotated[NDArray[np.float64], PlainValidator(_to_times, json_schema_input_type=float | _Numbers)]
 """JSON array of shape (N,), or a number for one row."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +12,6 @@ from pydantic import (
     ConfigDict,
     Field,
     PlainValidator,
-    WithJsonSchema,
     model_validator,
 )
 
@@ -23,12 +22,8 @@ from service.contract.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import LONGEST, each_once, rows_of_numbers
 
-_NUMBERS: dict[str, Any] = {"type": "array", "items": {"type": "number"}}
-_ROWS: dict[str, Any] = {"type": "array", "items": _NUMBERS}
-
-
 Vectors = Annotated[
-    NDArray[np.float64], PlainValidator(rows_of_numbers()), WithJsonSchema({"anyOf": [_NUMBERS, _ROWS]})
+    NDArray[np.float64], PlainValidator(rows_of_numbers(), json_schema_input_type=list[float] | list[list[float]])
 ]
 """JSON array of shape (n,) for one query or (N, n) for a batch."""
 

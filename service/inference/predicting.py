@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from math import isfinite
-from typing import Annotated, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from lipcore.data.motion import Motion
@@ -16,12 +16,11 @@ from lipcore.model import dynamics
 from lipcore.model.functionals import Estimate
 from lipcore.model.payload import NoArmError
 from lipcore.model.torque_model import TorqueModel
-from lipcore.vocabulary import ROBOT_ESTIMATORS, ComponentName, TorqueConvention
-from service.contract.models import ALIAS
+from lipcore.vocabulary import ROBOT_ESTIMATORS, ComponentName
+from service.contract.decoding import HotDecoder, struct_of
 from service.contract.payload import Payload
-from service.contract.predictions import PredictRequest
+from service.contract.predictions import PredictRequest, PredictResponse
 from service.foundation.errors import invalid_request
-from service.foundation.json_text import each_once
 from service.models.loaded import LoadedModels, Served
 
 Array = NDArray[np.float64]
@@ -134,96 +133,30 @@ def carrying(served: Served, payload: Payload | None) -> TorqueModel:
         raise invalid_request(f"payload.{name}", payload.model_dump(mode="json")[name], text) from error
 
 
-_ALIAS = ALIAS.replace("$", r"\Z")  # Python's own expressions let a line end follow
-Numbers = list[float | list[float]]
-"""One query or a batch; that it is one of the two, and not some of each, is left to be checked."""
-
-
-class PredictBody(Struct, forbid_unknown_fields=True):
-    """A PredictRequest as it comes: types are right and numbers finite, shapes are left to be checked."""
-
-    q: Numbers
-    dq: Numbers
-    ddq: Numbers
-    version: Annotated[int, Meta(ge=1, lt=2**31)] | None = None
-    alias: Annotated[str, Meta(pattern=_ALIAS)] | None = None
-    covariance: bool = False
-    components: list[ComponentName] = []
-    tau: Numbers | None = None
-    min_revision: Annotated[int, Meta(ge=0, lt=2**31)] | None = None
-    payload: Payload | None = None
-
-    def single(self) -> Array | None:
-        """Return the motion (3, n) where this is one query for a torque and no more."""
-        batch = bool(self.q) and isinstance(self.q[0], list)
-        if batch or self.covariance or self.components or self.tau is not None:
-            return None
-        try:
-            return np.array((self.q, self.dq, self.ddq), np.float64)
-        except ValueError:  # shapes differ
-            return None
-
-    def request(self) -> PredictRequest | None:
-        """Return what it says with arrays (n,) or (N, n), or None where a list is ragged or a component comes twice."""
-        if len(set(self.components)) < len(self.components):
-            return None
-        try:
-            arrays = {name: to_array(values) for name in QUANTITIES if (values := getattr(self, name)) is not None}
-        except ValueError:
-            return None
-        return PredictRequest.model_construct(**(msgspec.structs.asdict(self) | arrays))
-
-
-class Prediction(Struct, omit_defaults=True):
-    """A PredictResponse as it goes out; what was not asked for is left out."""
-
-    model: str
-    version: int
-    revision: int
-    joint_names: tuple[str, ...]
-    torque_convention: TorqueConvention
-    tau: list[Any]
-    tau_std: list[Any]
-    noise_std: list[float]
-    scale: list[float]
-    guaranteed: list[float] | None = None
-    covariance: list[Any] | None = None
-    components: dict[ComponentName, dict[str, Any]] | None = None
-    fallback: list[Any] | None = None
-
-
-_decoder = msgspec.json.Decoder(PredictBody, dec_hook=lambda _, value: Payload.model_validate(value))
-_FIELDS = tuple(name.encode() for name in (*PredictBody.__struct_fields__, *Payload.model_fields))
+queries: HotDecoder[PredictRequest] = HotDecoder(PredictRequest)
+_Response: Callable[..., Struct] = struct_of(PredictResponse)
 _encoder = msgspec.json.Encoder()
 
 
-def decode(body: bytes) -> PredictBody | None:
-    """Decode a query, or return None where anything in it is not as it should be."""
+def one_motion(query: Any) -> Array | None:
+    """Return the motion (3, n) of a decoded query, or None if it asks for more than the torque of one motion."""
+    batch = bool(query.q) and isinstance(query.q[0], list)
+    if batch or query.covariance or query.components or query.tau is not None:
+        return None
     try:
-        query = _decoder.decode(body)
-    except (msgspec.MsgspecError, RecursionError):
+        return np.array((query.q, query.dq, query.ddq), np.float64)
+    except ValueError:  # shapes differ
         return None
-    if query.alias is not None and query.version is not None:
-        return None
-    # the usual query has the quotes of q, dq and ddq, which are all there, and no others
-    return query if body.count(b'"') == 6 or each_once(body, *_FIELDS) else None
 
 
-def encode(answer: Prediction) -> bytes:
-    """Encode an answer; its numbers read back are the same numbers."""
+def encode(answer: Struct) -> bytes:
+    """Encode a PredictResponse, what was not asked for left out; its numbers read back are the same numbers."""
     return _encoder.encode(answer)
 
 
-def to_array(values: Sequence[Any]) -> Array:
-    """Numbers (n,) or rows of them (N, n), null as NaN; raise ValueError where there are none, or rows differ."""
-    if not values:
-        raise ValueError("no rows")
-    return np.array(values, np.float64)
-
-
-def at_once(served: Served, motion: Array, max_position: float, payload: Payload | None = None) -> Prediction | None:
-    """Torque at one motion (3, n), for the event loop; None where the motion or the answer is not as it should be, or
-    what answers with a payload has to be made first."""
+def at_once(served: Served, motion: Array, max_position: float, payload: Payload | None = None) -> Struct | None:
+    """Return a PredictResponse to one motion (3, n), for the event loop; None where the motion or the answer is not as
+    it should be, or what answers with a payload has to be made first."""
     model = served.asked if payload is None else served.declared.known(payload.numbers)
     if model is None or motion.shape[1] != model.n_joints:
         return None
@@ -234,13 +167,11 @@ def at_once(served: Served, motion: Array, max_position: float, payload: Payload
     tau, tau_std = answer.tau.tolist(), answer.tau_std.tolist()
     if not isfinite(sum(tau) + sum(tau_std)):
         return None
-    return _prediction_of(
-        served, tau, tau_std, fallback=None if answer.fallback is None else answer.fallback.share.tolist()
-    )
+    return _answer(served, tau, tau_std, None if answer.fallback is None else answer.fallback.share.tolist())
 
 
-def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None = None) -> Prediction:
-    """Torque with uncertainty at the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
+def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None = None) -> Struct:
+    """Return a PredictResponse to the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
     served: what answers, where that is found already."""
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model
@@ -260,31 +191,31 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
         arrays["covariance"] = answer.covariance
     if answer.fallback is not None:
         arrays["fallback"] = answer.fallback.share
-    lists: dict[str, list[Any]] = {}
+    lists: dict[str, Any] = {}
     for name, values in arrays.items():
         shaped = values[0] if single else values
         check_answer(name, shaped)
         lists[name] = shaped.tolist()
-    prediction = _prediction_of(served, **lists)
     if request.components:
         of_query = 0 if single else slice(None)
         estimates = query.components(known, request.components)
-        prediction.components = {
+        lists["components"] = {
             name: {part: getattr(estimates[name], part)[of_query].tolist() for part in ("mean", "std")}
             for name in request.components
         }
-    return prediction
+    return _answer(served, **lists)
 
 
-def _prediction_of(
+def _answer(
     served: Served,
     tau: list[Any],
     tau_std: list[Any],
-    covariance: list[Any] | None = None,
     fallback: list[Any] | None = None,
-) -> Prediction:
+    covariance: list[Any] | None = None,
+    components: dict[str, Any] | None = None,
+) -> Struct:
     model = served.model
-    return Prediction(
+    return _Response(
         model=served.name,
         version=served.version,
         revision=served.revision,
@@ -296,5 +227,6 @@ def _prediction_of(
         scale=served.scales.asked,
         guaranteed=served.guaranteed,
         covariance=covariance,
+        components=components,
         fallback=fallback,
     )

@@ -11,13 +11,10 @@ import subprocess
 import sys
 import weakref
 
-import msgspec
 import numpy as np
 import pytest
 
-from service.contract.predictions import PredictRequest, PredictResponse
 from service.inference import predicting as inference
-from service.inference.predicting import PredictBody, Prediction
 from tests.service.data import DEADLINE, error, service_of
 
 QUERY = {"q": [0.25, -1.5], "dq": [1, 0.125], "ddq": [-2.0, 3e-1]}
@@ -155,12 +152,6 @@ def test_an_answer_that_is_no_number_is_refused(api, trained, dq, field):
     assert problem["field"].startswith(field)
     assert problem["value"] in ("nan", "inf", "-inf")
     assert problem["expected"] == "a finite number: are dq in rad/s and ddq in rad/s²?"
-
-
-def test_what_is_decoded_and_encoded_is_what_is_documented():
-    for wire, documented in ((PredictBody, PredictRequest), (Prediction, PredictResponse)):
-        fields = {item.name: item.required for item in msgspec.structs.fields(wire)}
-        assert fields == {name: field.is_required() for name, field in documented.model_fields.items()}
 
 
 @pytest.mark.parametrize(

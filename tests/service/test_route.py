@@ -71,10 +71,10 @@ def test_what_comes_twice_is_found_in_linear_time():
 
 
 def test_fields_are_counted_once():
-    assert each_once(b'{"q": [0], "dq": [0]}', b"q", b"dq")
-    assert each_once(b'{"dq": [0]}', b"q", b"dq")
-    assert not each_once(b'{"q": [0], "dq": [0], "q": 0}', b"q", b"dq")
-    assert not each_once(b'{"q": [0], "\\u0071": [0]}', b"q", b"dq")
+    assert each_once(b'{"q": [0], "dq": [0]}')
+    assert not each_once(b'{"q": [0], "dq": [0], "q": 0}')
+    assert not each_once(b'{"q": [0], "\\u0071": [0]}')
+    assert not each_once(b'{"q": [0], "alias": "q"}')  # not clear
 
 
 @given(st.text())

@@ -23,7 +23,7 @@ from service.foundation.errors import (
     UnreadableVersionError,
 )
 from service.inference import comparison, evaluating, predicting
-from service.inference.predicting import decode, encode
+from service.inference.predicting import encode, one_motion, queries
 from service.models.loaded import LoadedModels
 from service.models.served import Served, reached
 
@@ -77,20 +77,20 @@ hot = APIRouter(prefix="/v1/models", tags=_TAGS, responses=_ERRORS)
 
 async def _answer(scope: Scope, body: bytes) -> Reply | None:
     """Answer a query that can be read as it stands: one of a control loop here, any other in a thread."""
-    query = decode(body) if is_json(scope) else None
+    query = queries.decode(body) if is_json(scope) else None
     if query is None:
         return None
     state = scope["app"].state
     loaded: LoadedModels = state.loaded
     model: str = scope["path_params"]["model"]
-    served, motion = loaded.hot(model, query.version, query.alias), query.single()
+    served, motion = loaded.hot(model, query.version, query.alias), one_motion(query)
     if query.min_revision is not None:
         served = await reached(loaded, model, query.version, query.alias, query.min_revision)
     if served is not None and motion is not None:
         at_once = predicting.at_once(served, motion, loaded.storage.settings.max_position, query.payload)
         if at_once is not None:
             return Reply(encode(at_once))
-    request = query.request()
+    request = queries.request(query)
     return None if request is None else Reply(await _in_thread(loaded, state.turns.predictions, model, request, served))
 
 

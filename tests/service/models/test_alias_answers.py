@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from service.inference.predicting import decode
+from service.inference.predicting import queries
 from tests.service.data import service_of, stream, upload
 from tests.service.models.versions import QUERY, predict, publish, worse
 
@@ -33,11 +33,11 @@ def test_queries_are_answered_by_where_an_alias_points(api, arm):
 
 
 def test_the_hot_route_knows_aliases(api, arm):
-    query = decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production"}')
+    query = queries.decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production"}')
     assert query.alias == "production"
     assert service_of(api).loaded.hot(arm, query.version, query.alias).version == 1
-    assert decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production\\n"}') is None
-    assert decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production", "version": 1}') is None
+    assert queries.decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production\\n"}') is None
+    assert queries.decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production", "version": 1}') is None
 
 
 def test_evaluations_follow_an_alias(api, arm):
