@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 MAX_BATCH, MAX_COMPONENT_BATCH = 1000, 100
 """Queries of one prediction request, and of one that asks for components."""
 QUANTITIES = ("q", "dq", "ddq", "tau")
+FORWARD: ComponentName = "forward_dynamics"
 
 
 class Query(NamedTuple):
@@ -55,7 +56,7 @@ class Query(NamedTuple):
     def components(self, model: TorqueModel, names: Sequence[ComponentName]) -> dict[str, Estimate]:
         """Estimates of parts of the dynamics by name, (N, …) each; raise InvalidRequestError where inertia cannot be
         inverted. Torque is for forward dynamics alone."""
-        parts = self.values if "forward_dynamics" in names else self.values[:3]
+        parts = self.values if FORWARD in names else self.values[:3]
         q, dq, ddq, *tau = parts
         try:
             return dynamics.components(model, Motion(q, dq, ddq), names, *tau)
@@ -63,7 +64,7 @@ class Query(NamedTuple):
             raise invalid_request(
                 "q" if self.single else f"q[{error.index}]",
                 "a posture whose learnt inertia matrix is not positive definite",
-                "for forward_dynamics a posture whose inertia the training data tell",
+                f"for {FORWARD} a posture whose inertia the training data tell",
             ) from error
 
     def _name(self, name: str, row: np.intp, joint: np.intp) -> str:
@@ -104,17 +105,20 @@ def check_offered(model: TorqueModel, components: Sequence[ComponentName]) -> No
             raise invalid_request(f"components[{index}]", name, expected)
 
 
-def check_components(model: TorqueModel, request: PredictRequest) -> None:
-    """Raise InvalidRequestError for components the model lacks, too many queries, or a torque missing or in vain."""
-    check_offered(model, request.components)
-    if request.components and request.q.ndim == 2 and len(request.q) > MAX_COMPONENT_BATCH:
-        expected = f"at most {MAX_COMPONENT_BATCH} in one request with components"
-        raise invalid_request("q", f"{len(request.q)} queries", expected)
-    forward = "forward_dynamics" in request.components
-    if forward and request.tau is None:
-        raise invalid_request("tau", "missing", "the torque that forward_dynamics is asked for, shaped as q")
-    if request.tau is not None and not forward:
-        raise invalid_request("tau", "given", "no tau, or forward_dynamics among the components")
+def check_count(field: str, given: Any, count: int, components: bool, noun: str = "") -> None:
+    """Raise InvalidRequestError if there are too many queries for one request. given: the value of the field."""
+    most, kind = (MAX_COMPONENT_BATCH, " with components") if components else (MAX_BATCH, "")
+    if count > most:
+        raise invalid_request(field, given, f"at most {most}{noun} in one request{kind}")
+
+
+def check_torque(given: bool, needed: bool, users: str, place: str) -> None:
+    """Raise InvalidRequestError for a torque that is missing, or given although nothing needs it.
+    users: what needs it; place: the field that asks for them."""
+    if needed and not given:
+        raise invalid_request("tau", "missing", f"the torque that {users} is asked for, shaped as q")
+    if given and not needed:
+        raise invalid_request("tau", "given", f"no tau, or {users} among the {place}")
 
 
 def carrying(served: Served, payload: Payload | None) -> TorqueModel:
@@ -176,11 +180,12 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model
     single = request.q.ndim == 1
-    check_components(known, request)
+    check_offered(known, request.components)
+    check_torque(request.tau is not None, FORWARD in request.components, FORWARD, "components")
     parts = check_shapes(request, known)
     query = Query(np.stack([np.atleast_2d(values) for values in parts]), single)
-    if (count := query.values.shape[1]) > MAX_BATCH:
-        raise invalid_request("q", f"{count} queries", f"at most {MAX_BATCH} in one request")
+    count = query.values.shape[1]
+    check_count("q", f"{count} queries", count, bool(request.components))
     query.check(served.model.position_limits(loaded.storage.settings.max_position))
 
     known = carrying(served, request.payload)

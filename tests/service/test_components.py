@@ -8,7 +8,6 @@ import pytest
 from lipcore.data.motion import Motion
 from lipcore.kernels.independent import SquaredExponentialKernel
 from lipcore.model import dynamics
-from service.contract.predictions import PredictRequest
 from service.inference import predicting
 from service.inference.predicting import MAX_COMPONENT_BATCH
 from tests.service.data import error
@@ -83,14 +82,11 @@ def test_batches_with_components_are_smaller(api, trained, motion):
     assert len(ask(api, trained.name, most, components=["gravity"])["components"]["gravity"]["mean"]) == limit
 
 
-def test_components_that_an_estimator_lacks_are_refused_naming_what_it_offers(trained, motion):
+def test_components_that_an_estimator_lacks_are_refused_naming_what_it_offers(trained):
     terms = {"torque": SquaredExponentialKernel(2), "friction": trained.model.estimator.terms["friction"]}
     black_box = replace(trained.model, estimator=replace(trained.model.estimator, name="se", terms=terms))
-    request = PredictRequest.model_validate(
-        {name: values.tolist() for name, values in motion.items()} | {"components": ["friction", "gravity"]}
-    )
     with pytest.raises(Exception, match="components") as caught:
-        predicting.check_components(black_box, request)
+        predicting.check_offered(black_box, ["friction", "gravity"])
     (problem,) = caught.value.detail
     assert (problem.field, problem.value) == ("components[1]", "gravity")
     assert problem.expected == "what a model with the estimator se offers: friction"

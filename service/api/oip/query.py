@@ -18,7 +18,7 @@ from service.api.oip.tensors import Answer, Header, Message
 from service.api.route import Reply
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
-from service.inference.predicting import MAX_BATCH, MAX_COMPONENT_BATCH, Query, check_answer
+from service.inference.predicting import FORWARD, QUANTITIES, Query, check_answer, check_count, check_torque
 from service.models.loaded import Served
 
 Array = NDArray[np.float64]
@@ -37,7 +37,6 @@ _MEAN = "mean"
 """Posterior mean, which is no output: external torque is compared with it."""
 QUICK = OF_MODEL | EXTERNAL.keys() | {"tau", "tau_std", FALLBACK}
 """Outputs of which one query is answered on the event loop."""
-FORWARD: ComponentName = "forward_dynamics"
 _STD = "_std"
 _TORQUES = ("gravity", "coriolis", "inertial", "friction")
 
@@ -145,21 +144,17 @@ def _binary(output: schema.InferOutput, field: str, usual: bool) -> bool:
 
 def _inputs(request: schema.InferRequest, torque: bool) -> tuple[str, ...]:
     """Names of the tensors that the query needs; they are all there, each once, and no other."""
-    needed = (*schema.INPUTS, schema.TORQUE) if torque else schema.INPUTS
+    needed = QUANTITIES if torque else schema.INPUTS
     names = [tensor.name for tensor in request.inputs]
+    check_torque(schema.TORQUE in names, torque, f"{FORWARD} or tau_external", "outputs")
     for index, name in enumerate(names):
-        if name == schema.TORQUE and not torque:
-            raise invalid_request(schema.TORQUE, "given", f"no tau, or {FORWARD} or tau_external among the outputs")
         if name not in needed:
             raise invalid_request(f"inputs[{index}].name", name, f"one of {', '.join(needed)}")
         if name in names[:index]:
             raise invalid_request(f"inputs[{index}].name", name, "each input once")
     for name in needed:
         if name not in names:
-            expected = f"the inputs {', '.join(needed)}"
-            if name == schema.TORQUE:
-                expected = f"the torque that {FORWARD} or tau_external is asked for, shaped as q"
-            raise invalid_request(name, "missing", expected)
+            raise invalid_request(name, "missing", f"the inputs {', '.join(needed)}")
     return needed
 
 
@@ -168,11 +163,8 @@ def _check_shape(tensor: schema.InferInput, shape: list[int], model: TorqueModel
     if len(shape) not in (1, 2) or shape[-1] != n or shape[0] == 0:
         joints = ", ".join(model.joint_names)
         raise invalid_request(field, shape, f"[{n}] for one query or [N, {n}] for a batch: the joints are {joints}")
-    if len(shape) == 2 and shape[0] > MAX_BATCH:
-        raise invalid_request(field, shape, f"at most {MAX_BATCH} queries in one request")
-    if len(shape) == 2 and components and shape[0] > MAX_COMPONENT_BATCH:
-        expected = f"at most {MAX_COMPONENT_BATCH} queries in one request with components"
-        raise invalid_request(field, shape, expected)
+    if len(shape) == 2:
+        check_count(field, shape, shape[0], components, " queries")
 
 
 def _dtype(tensor: schema.InferInput) -> np.dtype[np.floating]:
