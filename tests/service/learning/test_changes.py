@@ -175,13 +175,15 @@ def test_adapting_begins_a_new_regime_before_the_batch_that_told(school):
 
 
 @pytest.mark.slow
-def test_errors_below_a_contact_are_a_change_too(school):
+def test_errors_below_a_contact_are_a_change_too(school, monkeypatch):
     """What is off by a few standard deviations passes as no contact; together it is told.
 
     The errors are such that nothing can be learnt of them: the stated uncertainty grows until they fit, which must not
     hide them.
     """
     pupil = school.enrol("rattling", **WATCHFUL, on_change="hold")
+    arrivals = (time.time() + 0.5 * number for number in range(80))  # as late as the rows were measured
+    monkeypatch.setattr(school.service.learners._log.clocks, "arrival", lambda: next(arrivals))
     pupil.settled(drive(pupil, range(60))[-1]["revision"])
     for number in range(60, 80):
         (said,) = drive(pupil, range(number, number + 1), noise=RATTLE)
