@@ -108,10 +108,10 @@ def _stream_client(bed: Bed, stack: ExitStack) -> Subject:
     count = len(queries)
 
     def answer(number: int) -> Answer:
-        found = client.ask(*queries[number])
+        found = client.predict(*queries[number])
         return found.tau, found.tau_std
 
-    return _subject(CLIENT, lambda number: client.ask(*queries[number % count]), answer)
+    return _subject(CLIENT, lambda number: client.predict(*queries[number % count]), answer)
 
 
 def _http(bed: Bed, address: Address, suffix: str, stack: ExitStack) -> list[Subject]:

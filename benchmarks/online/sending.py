@@ -119,7 +119,7 @@ def stream_frames(client: StreamClient, samples: Samples) -> list[Ack]:
     for row, at in enumerate(samples.t - samples.t[0]):
         _sleep_until(first + round(1e9 * at))
         sent.append(time.monotonic_ns())
-        client.ask(samples.q[row], samples.dq[row], samples.ddq[row], std=False, tau=samples.tau[row])
+        client.predict(samples.q[row], samples.dq[row], samples.ddq[row], std=False, tau=samples.tau[row])
         if client.learnt is not before:
             acks.append(_frames_ack(before, client.learnt, sent))
             before = client.learnt

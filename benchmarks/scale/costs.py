@@ -155,7 +155,7 @@ def _http_query(subject: Subject, query: Samples, count: int) -> float:
 
 def _stream_query(subject: Subject, query: Samples, count: int) -> float:
     with StreamClient(MODEL, url=subject.service.url) as stream:
-        return _each(subject, lambda: stream.ask(query.q[0], query.dq[0], query.ddq[0]), count)
+        return _each(subject, lambda: stream.predict(query.q[0], query.dq[0], query.ddq[0]), count)
 
 
 def _each(subject: Subject, ask: Callable[[], object], count: int) -> float:

@@ -139,7 +139,7 @@ class Streaming(Connection):
     def work(self, turn: int) -> None:
         """Ask one query of the steady model."""
         expected, at = self._expected, (self.number + turn) % len(self._expected.q)
-        answer = self._client.ask(expected.q[at], expected.dq[at], expected.ddq[at])
+        answer = self._client.predict(expected.q[at], expected.dq[at], expected.ddq[at])
         _check_torque(np.asarray(answer.tau), expected.tau[at])
 
     def close(self) -> None:

@@ -181,7 +181,7 @@ def loop(day: Day) -> None:
     def frames(client: StreamClient, number: int) -> None:
         rows = day.rows(number, 1)
         for row in range(0, day.rate, day.rate // FRAMES):
-            client.ask(rows.q[row], rows.dq[row], rows.ddq[row], tau=rows.tau[row])
+            client.predict(rows.q[row], rows.dq[row], rows.ddq[row], tau=rows.tau[row])
 
     def connected(start: int) -> None:
         first = 1 + start * FRAMES

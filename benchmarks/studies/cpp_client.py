@@ -119,7 +119,7 @@ def python_round_trip(motions: np.ndarray, **address: object) -> tuple[float, fl
         for tick in range(TICKS):
             q, dq, ddq = motions[tick % len(motions), :3]
             began = time.perf_counter()
-            client.ask(q, dq, ddq)
+            client.predict(q, dq, ddq)
             trips.append(1e6 * (time.perf_counter() - began))
             due += PERIOD_S
             time.sleep(max(0.0, due - time.perf_counter()))

@@ -49,7 +49,7 @@ def run(stream: StreamClient, robot: Rehearsal, cycles: int) -> Counter[str]:
         q, dq, ddq = robot.desired()
         tau = robot.own_torque(q, dq, ddq)
         try:
-            answer = stream.ask(q, dq, ddq, deadline=BUDGET_S)
+            answer = stream.predict(q, dq, ddq, deadline=BUDGET_S)
         except StreamError as error:  # no answer in time, a motion that is refused, or the service is gone: go on
             why = error.code
         else:

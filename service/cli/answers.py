@@ -164,7 +164,7 @@ def latency(
         )
         motions = np.random.default_rng(0).uniform(low, high, (queries + WARM_UP, *low.shape))
         with client.stream(model) as stream:
-            times = {"stream": _timed(lambda k: stream.ask(*motions[k]), queries)}
+            times = {"stream": _timed(lambda k: stream.predict(*motions[k]), queries)}
         times["HTTP"] = _timed(lambda k: client.predict(model, *motions[k]), queries)
     figures = {
         name: dict(zip(("p50", "p99", "largest"), np.percentile(each, (50, 99, 100)).tolist(), strict=True))

@@ -23,7 +23,7 @@ def playing(url: str, model: str, rows: Iterable[Row], rate: float) -> Iterator[
             with StreamClient(model, url, stream_id="cell") as client:
                 begin = time.monotonic()
                 for number, (q, dq, ddq, tau) in enumerate(rows):
-                    client.ask(q, dq, ddq, tau=tau)
+                    client.predict(q, dq, ddq, tau=tau)
                     if stop.wait(max(0.0, begin + number / rate - time.monotonic())):
                         return
         except Exception as error:

@@ -78,7 +78,7 @@ def test_streams_go_to_the_service_of_the_environment(server, monkeypatch, tmp_p
     monkeypatch.setenv("LIPSERVE_URL", server.url)
     with StreamClient("panda-sim") as stream, Client() as client:
         expected = client.predict("panda-sim", zeros, zeros, zeros).tau.tolist()
-        assert stream.ask(zeros, zeros, zeros).tau.tolist() == pytest.approx(expected, abs=1e-12)
+        assert stream.predict(zeros, zeros, zeros).tau.tolist() == pytest.approx(expected, abs=1e-12)
     monkeypatch.setenv("LIPSERVE_URL", f"unix://{tmp_path}/none.sock")
     with pytest.raises(StreamError, match=r"no service answers at .*none\.sock"):
         StreamClient("panda-sim")

@@ -87,7 +87,7 @@ def test_nothing_runs_to_learn_until_something_is_taught_and_a_stream_teaches(se
     with StreamClient("panda-sim", url=server.url, stream_id="robot") as stream:
         for _ in range(5):
             q, dq, ddq = (rng.uniform(-0.5, 0.5, 7) for _ in range(3))
-            stream.ask(q, dq, ddq, tau=client.predict("panda-sim", q, dq, ddq).tau)
+            stream.predict(q, dq, ddq, tau=client.predict("panda-sim", q, dq, ddq).tau)
         assert stream.flush().revision > 0
     eventually(lambda: client.predict("panda-sim", ZEROS, ZEROS, ZEROS).revision > 0, DEADLINE)
     assert len(server.started()) == 2

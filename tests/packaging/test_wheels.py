@@ -45,7 +45,7 @@ async def again():
     async with AsyncClient() as client:
         return (await client.predict("panda-sim", zeros, zeros, zeros)).tau.tolist()
 with StreamClient("panda-sim") as stream:
-    frame = stream.ask(zeros, zeros, zeros)
+    frame = stream.predict(zeros, zeros, zeros)
 try:
     import lipserve.progress
 except ModuleNotFoundError as error:

@@ -61,7 +61,7 @@ def test_frames_that_ask_are_answered_it_after_all_else(streaming, measured, que
 def test_a_pinned_stream_is_told_too(streaming, measured):
     queries, tau, expected = measured
     with StreamClient("pendulum", streaming.server.url, version=1, timeout=DEADLINE) as client:
-        seen = client.ask(*queries[3], std=False, tau=tau[3], external=True)
+        seen = client.predict(*queries[3], std=False, tau=tau[3], external=True)
     assert (seen.tau_std, seen.scale) == (None, None)
     of = seen.external
     assert_is([*of.tau, *of.std, *of.z, of.statistic, of.p], expected, 3)
@@ -75,12 +75,12 @@ def test_clients_compare_and_teach_as_they_are_told(streaming, measured):
             AsyncClient(streaming.server.url) as client,
             client.stream("pendulum", stream_id="pushed", scale=True, timeout=DEADLINE) as opened,
         ):
-            only = await opened.ask(*queries[2], tau=tau[2], external=True, learn=False)
+            only = await opened.predict(*queries[2], tau=tau[2], external=True, learn=False)
             assert not opened._exchange.unsettled
-            taught = await opened.ask(*queries[2], tau=tau[2] * np.nan)
+            taught = await opened.predict(*queries[2], tau=tau[2] * np.nan)
             settled = await opened.flush()
             with pytest.raises(StreamError, match=r"tau\[0\] is nan, expected a finite number"):
-                await opened.ask(*queries[2], tau=tau[2] * np.nan, external=True)
+                await opened.predict(*queries[2], tau=tau[2] * np.nan, external=True)
             assert (await opened.flush()).through == settled.through  # a refused torque is waited for by nobody
             return only, taught, settled
 
@@ -104,7 +104,7 @@ def test_clients_refuse_what_makes_no_sense_before_it_is_sent(streaming, options
     with StreamClient("pendulum", streaming.server.url) as client:
         with pytest.raises(ValueError, match=message):
             client.send(*motions(1)[0], **options)
-        assert client.ask(*motions(1)[0]).sequence == 1
+        assert client.predict(*motions(1)[0]).sequence == 1
 
 
 @pytest.mark.parametrize("names", [JOINTS, ARM, (*ARM, "tau", "scale", *JOINTS, "tau_gravity")])

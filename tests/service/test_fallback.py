@@ -85,4 +85,4 @@ def test_the_clients_read_it(streaming):
         share = client.predict("pendulum", *FAR).fallback
     assert_allclose(share, streaming.model.answer_fully(FAR).fallback.share, **EXACT)
     with StreamClient("pendulum", streaming.server.url) as stream:
-        assert [stream.ask(*motion).fallback for motion in (NEAR, FAR)] == [False, True]
+        assert [stream.predict(*motion).fallback for motion in (NEAR, FAR)] == [False, True]

@@ -134,7 +134,7 @@ def test_streams_follow_the_newest_version_and_pinned_ones_stay(streaming):
 
         def swapped():
             for motion in queries:
-                answers.append((client.ask(*motion), motion))
+                answers.append((client.predict(*motion), motion))
             return answers[-1][0].version == 2
 
         eventually(swapped)

@@ -97,9 +97,9 @@ def test_deadlines_are_reported(streaming):
     with client_of(streaming) as client:
         assert client._socket.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY) != 0
         with pytest.raises(StreamError, match=r"no answer within") as missed:  # nor has one come before
-            client.ask(*PAIR, deadline=1e-9)
+            client.predict(*PAIR, deadline=1e-9)
         assert missed.value.code == "timeout"
-        seen = [client.ask(*PAIR, deadline=budget) for budget in (60.0, 1e-9, 60.0)]
+        seen = [client.predict(*PAIR, deadline=budget) for budget in (60.0, 1e-9, 60.0)]
     assert [(answer.late, answer.late_answers) for answer in seen] == [(False, 1), (True, 2), (False, 2)]
     assert [answer.sequence for answer in seen] == [2, 2, 4]  # the last that came in time
     assert all(answer.seconds > 0 for answer in seen)
@@ -108,7 +108,7 @@ def test_deadlines_are_reported(streaming):
 def test_deadlines_are_those_of_the_client_that_is_awaited_too(streaming):
     async def ask():
         async with AsyncStreamClient("pendulum", streaming.server.url, timeout=DEADLINE) as client:
-            return [await client.ask(*PAIR, deadline=budget) for budget in (60.0, 1e-9, 60.0)]
+            return [await client.predict(*PAIR, deadline=budget) for budget in (60.0, 1e-9, 60.0)]
 
     seen = asyncio.run(ask())
     assert [(answer.late, answer.late_answers, answer.sequence) for answer in seen] == [
@@ -118,11 +118,26 @@ def test_deadlines_are_those_of_the_client_that_is_awaited_too(streaming):
     ]
 
 
+def test_ask_is_a_deprecated_name_of_predict(streaming):
+    async def ask():
+        async with AsyncStreamClient("pendulum", streaming.server.url, timeout=DEADLINE) as client:
+            with pytest.warns(DeprecationWarning, match=r"Use AsyncStreamClient\.predict") as warned:
+                return await client.ask(*PAIR, std=False), warned[0].filename
+
+    with client_of(streaming) as client:
+        expected = client.predict(*PAIR, std=False)
+        with pytest.warns(DeprecationWarning, match=r"Use StreamClient\.predict") as warned:
+            answer = client.ask(*PAIR, std=False)
+    for found, place in ((answer, warned[0].filename), asyncio.run(ask())):
+        np.testing.assert_array_equal(found.tau, expected.tau)
+        assert (found.tau_std, place) == (None, __file__)
+
+
 def test_an_answer_that_was_on_its_way_for_too_long_is_late_though_the_service_was_quick(scripted):
     with scripted([answer(1)], [], [answer(2), answer(3)]) as server, server.client() as client:
-        first = client.ask(*MOTION, deadline=DEADLINE)
-        held = client.ask(*MOTION, deadline=0.01)
-        last = client.ask(*MOTION, deadline=DEADLINE)
+        first = client.predict(*MOTION, deadline=DEADLINE)
+        held = client.predict(*MOTION, deadline=0.01)
+        last = client.predict(*MOTION, deadline=DEADLINE)
     assert [(each.sequence, each.late, each.late_answers) for each in (first, held, last)] == [
         (1, False, 0),
         (1, True, 1),
@@ -134,13 +149,13 @@ def test_an_answer_that_was_on_its_way_for_too_long_is_late_though_the_service_w
 def test_what_is_refused_names_the_field_and_the_next_is_answered(streaming):
     with client_of(streaming) as client:
         with pytest.raises(StreamError, match=r"dq\[1\] is nan, expected a finite number") as refused:
-            client.ask(PAIR[0], [0.0, np.nan], PAIR[2])
+            client.predict(PAIR[0], [0.0, np.nan], PAIR[2])
         assert (refused.value.code, refused.value.sequence) == ("invalid_request", 1)
         assert refused.value.detail == [{"field": "dq[1]", "value": "nan", "expected": "a finite number"}]
         for bad in (([0.0, 0.0], [0.0], [0.0, 0.0]), ([[0.0, 0.0]], [[0.0, 0.0]], [[0.0, 0.0]])):
             with pytest.raises(ValueError, match=r"expected \(n,\) each"):  # before it is sent
-                client.ask(*bad)
-        assert client.ask(*PAIR).sequence == 2
+                client.predict(*bad)
+        assert client.predict(*PAIR).sequence == 2
 
 
 @pytest.mark.parametrize(
@@ -164,7 +179,7 @@ def test_a_service_that_closes_the_stream_is_quoted(scripted):
         client = server.client()
         for _ in range(2):
             with pytest.raises(StreamError, match="the service closed the stream: the service stops") as gone:
-                client.ask(*MOTION)
+                client.predict(*MOTION)
             assert gone.value.code == "closed"
         client.close()
 
@@ -179,19 +194,19 @@ def test_an_answer_that_comes_too_late_is_not_taken_for_the_next(scripted):
     with scripted([], [answer(1), answer(2)]) as server, server.client() as client:
         client.timeout = 0.01
         with pytest.raises(StreamError, match=r"no answer within 0.01 s") as missed:
-            client.ask(*MOTION)
+            client.predict(*MOTION)
         assert missed.value.code == "timeout"
         client.timeout = DEADLINE
-        late = client.ask(*MOTION)
+        late = client.predict(*MOTION)
     assert (late.sequence, late.tau.tolist(), late.version, late.revision) == (2, [2.0], 3, 4)
     assert len(server.requests) == 2
 
 
 def test_torque_goes_out_after_the_motion_with_its_flag(scripted):
     with scripted([answer(1)], [answer(2)], [answer(3)]) as server, server.client() as client:
-        client.ask(*MOTION, tau=[7.0])
-        client.ask(*MOTION, std=False, deadline=0.5, tau=[8.0])
-        client.ask(*MOTION)
+        client.predict(*MOTION, tau=[7.0])
+        client.predict(*MOTION, std=False, deadline=0.5, tau=[8.0])
+        client.predict(*MOTION)
     assert server.address == "/v1/models/m/stream?stream_id=arm-1"
     assert server.requests == [
         struct.pack("<IHHddddd", 1, 3, 1, 0.0, 0.25, 0.5, 1.0, 7.0),
@@ -210,7 +225,7 @@ def test_acknowledgements_add_up(scripted):
     with scripted(*script) as server, server.client() as client:
         assert (client.learnt.through, client.learnt.accepted) == (0, 0)
         for _ in range(4):
-            client.ask(*MOTION, tau=[0.0])
+            client.predict(*MOTION, tau=[0.0])
         total = client.flush()
         assert total == client.learnt
         assert (total.through, total.accepted, total.duplicates, total.revision) == (5, 1, 2, 9)
@@ -238,8 +253,8 @@ def test_flush_waits_for_the_last_torque_and_keeps_answers_for_later(scripted):
 
 def test_flush_gives_up_and_may_be_called_again(scripted):
     with scripted([answer(1)], [answer(2)], [learnt(2, 2), answer(3)]) as server, server.client() as client:
-        client.ask(*MOTION, tau=[0.0])
-        client.ask(*MOTION, tau=[0.0])
+        client.predict(*MOTION, tau=[0.0])
+        client.predict(*MOTION, tau=[0.0])
         with pytest.raises(StreamError, match=r"2 torques are neither acknowledged nor refused within 0.01 s") as late:
             client.flush(0.01)
         assert late.value.code == "timeout"
@@ -251,11 +266,11 @@ def test_flush_gives_up_and_may_be_called_again(scripted):
 def test_a_client_goes_on_from_the_sequence_it_is_given(scripted):
     with scripted([answer(41), learnt(41, 0, 1)]) as server, server.client(first_sequence=41) as client:
         assert client.learnt.through == 40
-        assert client.ask(*MOTION, tau=[0.0]).sequence == 41
+        assert client.predict(*MOTION, tau=[0.0]).sequence == 41
         assert client.flush().through == 41
         server.script.append([answer(0)])
         with server.client(first_sequence=0) as other:
-            assert other.ask(*MOTION).sequence == 0
+            assert other.predict(*MOTION).sequence == 0
 
 
 @pytest.mark.parametrize("first", [-1, 2**32])

@@ -234,7 +234,7 @@ class Exchange:
         external: bool = False,
         learn: bool = True,
     ) -> tuple[int, bytes]:
-        """Return a query's sequence and the frame to send; raise ValueError. Arguments: see `StreamClient.ask`."""
+        """Return a query's sequence and the frame to send; raise ValueError. Arguments: see `StreamClient.predict`."""
         parts = [np.ascontiguousarray(part, NUMBER) for part in (q, dq, ddq) + (() if tau is None else (tau,))]
         n = parts[0].size
         if any(part.shape != (n,) for part in parts):

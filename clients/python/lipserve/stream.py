@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 from typing import Any, Self
+from warnings import warn
 
 from numpy.typing import ArrayLike
 from websockets.asyncio import client as awaited
@@ -47,6 +48,7 @@ __all__ = [
 
 PATIENCE_S = 10.0
 """Shortest that this wait may be, s: a control loop's `timeout` may be shorter."""
+ASK_WARNING = "{0}.ask is called predict since 0.3. Use {0}.predict: 0.4 removes ask."
 
 
 class _Stream(StreamSide):
@@ -170,7 +172,7 @@ class StreamClient(_Stream):
         """Close the connection."""
         self._stack.close()
 
-    def ask(
+    def predict(
         self,
         q: ArrayLike,
         dq: ArrayLike,
@@ -198,6 +200,11 @@ class StreamClient(_Stream):
             except StreamError as error:
                 return self._late(sequence, deadline, error)
         return self._in_time(answer)
+
+    def ask(self, *args: Any, **options: Any) -> StreamAnswer:
+        """Deprecated name of `predict`."""
+        warn(ASK_WARNING.format("StreamClient"), DeprecationWarning, stacklevel=2)
+        return self.predict(*args, **options)
 
     def send(
         self,
@@ -287,7 +294,7 @@ class AsyncStreamClient(_Stream):
         if self._connection is not None:
             await self._connection.close()
 
-    async def ask(
+    async def predict(
         self,
         q: ArrayLike,
         dq: ArrayLike,
@@ -298,8 +305,8 @@ class AsyncStreamClient(_Stream):
         external: bool = False,
         learn: bool = True,
     ) -> StreamAnswer:
-        """Return the torque at one motion; see `StreamClient.ask`. Where the task is cancelled meanwhile, the answer is
-        dropped by the next call."""
+        """Return the torque at one motion; see `StreamClient.predict`. Where the task is cancelled meanwhile, the
+        answer is dropped by the next call."""
         end = self._until(deadline)
         sequence = await self.send(q, dq, ddq, std, deadline, tau, external, learn)
         while (answer := self._answer_to(sequence)) is None:
@@ -308,6 +315,11 @@ class AsyncStreamClient(_Stream):
             except StreamError as error:
                 return self._late(sequence, deadline, error)
         return self._in_time(answer)
+
+    async def ask(self, *args: Any, **options: Any) -> StreamAnswer:
+        """Deprecated name of `predict`."""
+        warn(ASK_WARNING.format("AsyncStreamClient"), DeprecationWarning, stacklevel=2)
+        return await self.predict(*args, **options)
 
     async def send(
         self,

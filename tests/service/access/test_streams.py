@@ -149,7 +149,7 @@ def test_the_python_clients(locked, make, monkeypatch):
     assert caught.value.code == "unauthorized"
     secret = make("predict", "read")[1]
     with Client(locked.url, key=secret) as client, StreamClient("panda-sim", locked.url, key=secret) as frames:
-        np.testing.assert_allclose(frames.ask(*MOTION).tau, client.predict("panda-sim", *MOTION).tau, rtol=1e-9)
+        np.testing.assert_allclose(frames.predict(*MOTION).tau, client.predict("panda-sim", *MOTION).tau, rtol=1e-9)
 
 
 def test_keys_are_in_no_log(locked, make):

@@ -145,18 +145,18 @@ def test_streams(streaming):
         async with client.stream("pendulum", stream_id="awaited") as opened:
             assert opened.hello.joint_names == streaming.model.joint_names
             tau, std = streaming.model.answer(MOTION)
-            answer = await opened.ask(*MOTION)
+            answer = await opened.predict(*MOTION)
             np.testing.assert_allclose(answer.tau, tau, rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(answer.tau_std, std, rtol=1e-12, atol=1e-12)
             with pytest.raises(StreamError, match="q"):
-                await opened.ask(MOTION[0] * np.inf, *MOTION[1:])
+                await opened.predict(MOTION[0] * np.inf, *MOTION[1:])
             with pytest.raises(ValueError, match="expected"):
                 await opened.send(MOTION[0], MOTION[1], [1.0])
             numbers = [await opened.send(*(MOTION * scale), std=False) for scale in (0.5, 1.0)]
             assert [(await opened.receive()).sequence for _ in numbers] == numbers
             assert (await opened.flush()).accepted == 0
-            await opened.ask(*MOTION, deadline=1e-9)
-            assert (await opened.ask(*MOTION)).late_answers == 1
+            await opened.predict(*MOTION, deadline=1e-9)
+            assert (await opened.predict(*MOTION)).late_answers == 1
             assert opened.refusals == ()
 
     ask(streaming.server, work)
@@ -169,11 +169,11 @@ def test_streams_that_cannot_be_had(streaming):
                 pass
         async with client.stream("pendulum") as opened:
             with pytest.raises(ValueError, match="stream_id"):
-                await opened.ask(*MOTION, tau=TAU)
+                await opened.predict(*MOTION, tau=TAU)
         with pytest.raises(StreamError, match=r"lost|closed"):
-            await opened.ask(*MOTION)
+            await opened.predict(*MOTION)
         with pytest.raises(StreamError, match="not open"):
-            await AsyncStreamClient("pendulum").ask(*MOTION)
+            await AsyncStreamClient("pendulum").predict(*MOTION)
         with pytest.raises(StreamError, match="no service answers"):
             async with AsyncStreamClient("pendulum", f"http://127.0.0.1:{free_port()}"):
                 pass

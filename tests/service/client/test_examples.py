@@ -32,7 +32,7 @@ class Scripted:
     def __init__(self, *answers):
         self.answers, self.commanded, self.timeout = list(answers), [], None
 
-    def ask(self, *_, deadline):
+    def predict(self, *_, deadline):
         given = self.answers.pop(0)
         if isinstance(given, Exception):
             raise given

@@ -99,14 +99,14 @@ def test_a_stream_is_told_what_was_not_logged_and_can_send_it_again(house):
     with StreamClient(model, house.server.url, stream_id="frames") as client:
         with locked(house.home / "lipserve.sqlite3"):
             for each in sent:
-                client.ask(**each)
-            eventually(lambda: client.ask(**sent[0] | {"tau": None}) and client.refusals)
+                client.predict(**each)
+            eventually(lambda: client.predict(**sent[0] | {"tau": None}) and client.refusals)
         assert client.refusals[0].code == "storage_unavailable"
         assert client.learnt.through == 0
     with StreamClient(model, house.server.url, stream_id="frames") as client:
         for each in sent:
-            client.ask(**each)
-        eventually(lambda: client.ask(**sent[0] | {"tau": None}) and client.learnt.through == len(sent))
+            client.predict(**each)
+        eventually(lambda: client.predict(**sent[0] | {"tau": None}) and client.learnt.through == len(sent))
     house.verify()
 
 

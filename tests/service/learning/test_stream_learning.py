@@ -59,10 +59,10 @@ def sent_once(found: Rows, measured: Measured, indices: list[int]) -> None:
 def test_what_a_controller_measures_is_learnt_while_it_asks(learning, measured):
     count, unseen = 400, measured.motions[400:]
     with client_of(learning, "arm-1") as client:
-        answers = [client.ask(*measured.motions[k], tau=measured.tau[k]) for k in range(count)]
+        answers = [client.predict(*measured.motions[k], tau=measured.tau[k]) for k in range(count)]
         learnt = client.flush()
-        eventually(lambda: client.ask(*unseen[0]).revision >= learnt.revision)
-        after = [client.ask(*motion) for motion in unseen]
+        eventually(lambda: client.predict(*unseen[0]).revision >= learnt.revision)
+        after = [client.predict(*motion) for motion in unseen]
     assert (learnt.through, learnt.duplicates, client.refusals) == (count, 0, ())
     assert learnt.accepted + sum(learnt.rejected.values()) == count
     assert learnt.accepted > count // 2
@@ -109,7 +109,7 @@ def test_no_acknowledged_frame_is_lost_or_learnt_twice_when_the_service_is_kille
         with Server(home, LIPSERVE_STREAM_FLUSH_S="0.02", LIPSERVE_STREAM_FLUSH_ROWS="20") as server:
             with client_of(server, "killed", "panda-sim", first_sequence=known + 1) as client:
                 for k in range(known, count if kill_at is None else kill_at):
-                    client.ask(*measured.motions[k], tau=measured.tau[k])
+                    client.predict(*measured.motions[k], tau=measured.tau[k])
                     if k % 80 == 79:
                         client.flush()
                 if kill_at is None:

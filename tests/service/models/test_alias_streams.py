@@ -13,18 +13,18 @@ STREAM = "/v1/models/pendulum/stream"
 def test_a_stream_follows_its_alias_and_learns_nothing(streaming):
     server = streaming.server
     with Client(server.url) as client, StreamClient("pendulum", server.url, alias="serving") as served:
-        assert served.ask(*MOTION).version == 1
+        assert served.predict(*MOTION).version == 1
         client.set_alias("pendulum", "arm-cell", 1)
         with StreamClient("pendulum", server.url, alias="arm-cell", stream_id="arm-1") as talk:
-            assert talk.hello.version == talk.ask(*MOTION).version == 1
+            assert talk.hello.version == talk.predict(*MOTION).version == 1
             with pytest.raises(StreamError, match="only the version that serves learns"):
-                talk.ask(*MOTION, tau=TAU)
+                talk.predict(*MOTION, tau=TAU)
             client.remove_alias("pendulum", "arm-cell")
             with pytest.raises(StreamError, match="no alias 'arm-cell'") as caught:
-                talk.ask(*MOTION)
+                talk.predict(*MOTION)
             assert caught.value.code == "not_found"
             assert client.rollback_alias("pendulum", "arm-cell").version == 1
-            assert talk.ask(*MOTION).version == 1
+            assert talk.predict(*MOTION).version == 1
 
 
 @pytest.mark.parametrize(

@@ -186,8 +186,8 @@ class Story:
         wanted = {name: f"learnt {digest(*row.values())}" for name, row in zip(names, sent, strict=True)}
         with self.asking("observation", **wanted), StreamClient(ARM, self.server.url, stream_id=FRAMES) as client:
             for row in sent:
-                client.ask(**row)
-            eventually(lambda: client.ask(**sent[0] | {"tau": None}) and client.learnt.through >= size, PATIENCE)
+                client.predict(**row)
+            eventually(lambda: client.predict(**sent[0] | {"tau": None}) and client.learnt.through >= size, PATIENCE)
 
     def rollback(self, revision: int, undone: Iterable[int]) -> None:
         """Take back what was learnt after a revision: batches of these sequences."""
