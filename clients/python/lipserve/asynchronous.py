@@ -111,7 +111,7 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
             else:
                 pause = attempts.answered(answer)
             if pause is None:
-                return call.read(answer)
+                return sending.result_of(call, answer)
             await asyncio.sleep(pause)
 
     async def follow(self, call: Call[T]) -> AsyncIterator[T]:
@@ -126,7 +126,7 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
                         begun, events = True, sending.Events()
                         async for line in response.aiter_lines():
                             if (event := events.take(line)) is not None:
-                                yield call.read(event)
+                                yield sending.result_of(call, event)
             except httpx.TransportError as error:
                 pause = attempts.lost(error, begun)
             if pause is not None:

@@ -17,8 +17,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import httpx
+import msgspec
 
-from lipserve.call import Answer, Call
+from lipserve import __version__
+from lipserve.call import Answer, Call, T
 
 
 class ServiceUnreachableError(ConnectionError):
@@ -26,7 +28,7 @@ class ServiceUnreachableError(ConnectionError):
 
 
 class ApiError(RuntimeError):
-    """The service refused a request.
+    """The service refused a request, or answered it as another release does: code `unreadable_answer`.
 
     status: of HTTP; code, message, detail: as the service says; retry_after: seconds after which it may be tried again,
     where the service says so.
@@ -48,6 +50,18 @@ def refused(status: int, body: bytes, retry_after: float | None = None) -> ApiEr
         return ApiError(status, error["code"], error["message"], error["detail"], retry_after)
     except (ValueError, KeyError, TypeError):
         return ApiError(status, "http_error", body[:500].decode(errors="replace"), [], retry_after)
+
+
+def result_of(call: Call[T], answer: Answer) -> T:
+    """Return what an answer or a server-sent event says; raise ApiError if this release cannot read it."""
+    try:
+        return call.read(answer)
+    except msgspec.DecodeError as error:
+        message = (
+            f"The answer to {call.method} {call.path} cannot be read: {error}. "
+            f"Use the client of the service's release; this is {__version__}."
+        )
+        raise ApiError(answer.status, "unreadable_answer", message, []) from error
 
 
 CHUNK = 1 << 18

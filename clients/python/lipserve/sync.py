@@ -110,7 +110,7 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
             else:
                 pause = attempts.answered(answer)
             if pause is None:
-                return call.read(answer)
+                return sending.result_of(call, answer)
             time.sleep(pause)
 
     def follow(self, call: Call[T]) -> Iterator[T]:
@@ -130,7 +130,7 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
                         begun, events = True, sending.Events()
                         for line in response.iter_lines():
                             if (event := events.take(line)) is not None:
-                                yield call.read(event)
+                                yield sending.result_of(call, event)
             except httpx.TransportError as error:
                 pause = attempts.lost(error, begun)
             if pause is not None:

@@ -1,6 +1,7 @@
 """Both Python clients against a real server: the synchronous one, then the asynchronous one and its streams."""
 
 import asyncio
+import re
 
 import httpx
 import numpy as np
@@ -138,6 +139,36 @@ def test_the_asynchronous_client_tries_again_after_a_lost_connection(monkeypatch
 
     assert asyncio.run(work()) == []
     assert len(sent) == 3
+
+
+def test_an_answer_of_another_release_is_refused_with_the_remedy():
+    """Status and live events as 0.2.0 sends them, and the page of a proxy."""
+    bodies = {
+        "/v1/models/arm/learning": b'{"model": "arm", "options": {}, "status": {"version": 1}}',
+        "/v1/models/arm/live": b'event: status\ndata: {"model": "arm"}\n\n',
+        "/v1/models/arm": b"<html>",
+    }
+    transport = httpx.MockTransport(lambda request: httpx.Response(200, content=bodies[request.url.path]))
+
+    async def work():
+        client = AsyncClient()
+        client._http = httpx.AsyncClient(transport=transport, base_url="http://localhost")
+        with pytest.raises(ApiError) as learning:
+            await client.learning("arm")
+        with pytest.raises(ApiError) as live:
+            await anext(client.live("arm"))
+        return [learning, live]
+
+    with Client() as client:
+        client._http = httpx.Client(transport=transport, base_url="http://localhost")
+        errors = asyncio.run(work())
+        for call in (client.learning, client.model, lambda model: next(client.live(model))):
+            with pytest.raises(ApiError) as caught:
+                call("arm")
+            errors.append(caught)
+    for error in errors:
+        assert (error.value.status, error.value.code) == (200, "unreadable_answer")
+        assert re.match(r"The answer to GET /v1/models/arm\S* cannot be read: .* Use the", error.value.message)
 
 
 def test_streams(streaming):
