@@ -28,6 +28,8 @@ logger = logging.getLogger(__name__)
 IDENTITY = "replica"
 BEATS = 10
 """Signs of life in the time after which a service counts as lost."""
+RECONCILE_S = 30.0
+"""Seconds between two searches for jobs that nobody has, of a service alone: only a fault leaves some."""
 KEPT_S = 3600.0
 """Seconds for which a service that is gone is remembered."""
 _SECONDS = cast(func.extract("epoch", func.clock_timestamp()), Float)
@@ -37,13 +39,14 @@ class Replicas:
     """A service among those that share its database; a thread gives its signs of life until it is closed.
 
     id: of this service, the same again after a restart on the same home, so that it knows its own jobs; beat_s: seconds
-    between two signs of life.
+    between two signs of life; reconcile_s: between two searches for jobs that nobody has.
     """
 
     def __init__(self, settings: Settings, database: Database) -> None:
         self.settings, self.database = settings, database
         self.beat_s = settings.replica_lost_s / BEATS
         self.id = identity(settings.home) if database.shared else "alone"
+        self.reconcile_s = self.beat_s if database.shared else RECONCILE_S
         self._started = now()
         self._since, self._last = float("inf"), -float("inf")  # monotonic, s: no sign was missed since; the last one
         self._closing = threading.Event()

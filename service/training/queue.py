@@ -33,9 +33,6 @@ logger = logging.getLogger(__name__)
 
 WATCH_S = 0.2
 """Seconds between two looks at the jobs that run."""
-RECONCILE_S = 30.0
-"""Seconds between two searches for jobs that nobody has: there are none, unless something went very wrong, or other
-services share the database: then it is as often as these give signs of life."""
 AGAIN_S = 1.0
 """Seconds after which the clerk tries again to write what the database did not take."""
 
@@ -58,7 +55,6 @@ class JobQueue:
         self._settler = Settler(database, storage.files, self.replicas.mine)
         self.cluster: Cluster | None = None
         self._slots = self._places()
-        self._reconcile_s = self.replicas.beat_s if database.shared else RECONCILE_S
         self._hands: list[Hand] = []
         self._waiting: dict[str, float] = {}  # when each may be handed out, monotonic, in the order of coming
         self._settling: set[str] = set()
@@ -129,7 +125,7 @@ class JobQueue:
     def _watch(self) -> None:
         while not self._closing.is_set():
             try:
-                self._inbox.get(timeout=WATCH_S if self._hands or self._waiting else self._reconcile_s)()
+                self._inbox.get(timeout=WATCH_S if self._hands or self._waiting else self.replicas.reconcile_s)()
             except queue.Empty:
                 pass
             except Exception:
@@ -222,7 +218,7 @@ class JobQueue:
 
     def _reconcile(self) -> None:
         clock = time.monotonic()
-        if clock - self._reconciled < self._reconcile_s:
+        if clock - self._reconciled < self.replicas.reconcile_s:
             return
         self._reconciled = clock
         known = {hand.job for hand in self._hands} | self._settling | self._waiting.keys()

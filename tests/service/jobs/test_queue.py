@@ -1,5 +1,6 @@
 """The queue of jobs, with processes that hang, die and do not listen: every job ends or goes on."""
 
+from service.storage import replicas
 from service.training import metrics, queue
 from service.training.lifecycle import JobLimits
 from tests.service.data import eventually
@@ -101,7 +102,7 @@ def test_what_becomes_of_a_job_is_written_once_the_database_can_be(bench, monkey
 
 
 def test_jobs_that_nobody_has_are_found(bench, monkeypatch):
-    monkeypatch.setattr(queue, "RECONCILE_S", 0.05)
+    monkeypatch.setattr(replicas, "RECONCILE_S", 0.05)
     jobs = bench(workers.well, JobLimits(heartbeat_s=30))
     forgotten = jobs.add("forgotten")
     orphan = jobs.add("orphan", state="running", attempts=1, heartbeat_at="2020-01-01T00:00:00.000+00:00")
