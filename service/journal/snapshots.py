@@ -42,16 +42,10 @@ def save(
 
 
 def sweep(database: Database, files: Files) -> int:
-    """Delete the files that an interrupted `save` has left; return how many. Only for the process that saves. None
-    where several services store snapshots: one whose row is not there yet may be another's."""
-    if database.shared:
-        return 0
+    """Delete the files that an interrupted `save` has left; return how many. Only for the process that saves."""
     with database.session() as session:
-        known = {f"{snapshot}.safetensors" for snapshot in session.scalars(select(SnapshotRow.id))}
-    left = [path for path in files.learning.iterdir() if path.is_file() and path.name not in known]
-    for path in left:
-        path.unlink(missing_ok=True)
-    return len(left)
+        named = set(session.scalars(select(SnapshotRow.id)))
+    return files.sweep_snapshots(named)
 
 
 def latest(session: Session, model: str, version: int, at_most: int | None) -> SnapshotRow | None:

@@ -170,16 +170,12 @@ def new_folder(job: str) -> str:
 
 
 def remove_leftovers(database: Database, files: Files, job: str) -> int:
-    """Delete what a job that runs nowhere has written and no version names; return how many folders. Where several
-    services share the files it is done once the job has ended, else when they are swept."""
+    """Delete what a job that runs nowhere has written and no version names; return how many folders."""
+    with database.session() as session:
+        state = session.scalar(select(JobRow.state).where(JobRow.id == job))
     try:
-        names = files.versions_marked(_folder_mark(job))
-        if not names:
-            return 0
+        names = files.versions_marked(_folder_mark(job), ended=state not in ACTIVE)
         with database.session() as session:
-            state = session.scalar(select(JobRow.state).where(JobRow.id == job))
-            if files.shared and state in ACTIVE:  # another service may be about to publish them
-                return 0
             known = set(session.scalars(select(VersionRow.folder).where(VersionRow.folder.in_(names))))
         left = [name for name in names if name not in known]
         for name in left:

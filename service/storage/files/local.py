@@ -102,7 +102,7 @@ class Local:
         """Delete a version's folder; raise FileNotFoundError where there is none."""
         shutil.rmtree(self.versions / name)
 
-    def versions_marked(self, mark: str) -> list[str]:
+    def versions_marked(self, mark: str, ended: bool = True) -> list[str]:
         """Names of folders of versions, and of drafts of such, that have `mark` in them."""
         return [path.name for path in self.versions.glob(f"*{mark}*") if path.is_dir()]
 
@@ -114,8 +114,14 @@ class Local:
         """Delete what is none of these; return how many."""
         left = [path for path in self.datasets.iterdir() if path.name.removesuffix(".safetensors") not in datasets]
         left += [path for path in self.versions.iterdir() if path.name not in versions]
+        for path in left:
+            remove(path)
+        return len(left) + self.sweep_snapshots(snapshots)
+
+    def sweep_snapshots(self, named: Collection[str]) -> int:
+        """Delete all snapshots but those named; return how many."""
         stored = (path for path in self.snapshots.iterdir() if path.is_file())
-        left += [path for path in stored if path.name.removesuffix(".safetensors") not in snapshots]
+        left = [path for path in stored if path.name.removesuffix(".safetensors") not in named]
         for path in left:
             remove(path)
         return len(left)

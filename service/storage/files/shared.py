@@ -123,8 +123,10 @@ class Shared:
         for path in (self.versions / name, *self._drafts.glob(f"{name}-*")):
             shutil.rmtree(path, ignore_errors=True)
 
-    def versions_marked(self, mark: str) -> list[str]:
-        """Names of versions, also of those begun here, that begin with `mv_` and `mark`."""
+    def versions_marked(self, mark: str, ended: bool = True) -> list[str]:
+        """Names of versions, also of those begun here, that begin with `mv_` and `mark`; once their job has ended."""
+        if not ended:
+            return []
         names = {each.key.split("/")[1] for each in self.objects.list(f"versions/mv_{mark}")}
         return sorted(names | {path.name.rpartition("-")[0] for path in self._drafts.glob(f"mv_{mark}*")})
 
@@ -141,6 +143,10 @@ class Shared:
         for each in left:
             self.objects.delete(each.key)
         return len(left)
+
+    def sweep_snapshots(self, named: Collection[str]) -> int:
+        """Nothing: another service may be about to name the others."""
+        return 0
 
     @contextmanager
     def fresh(self) -> Iterator[Shared]:

@@ -199,9 +199,13 @@ class Files:
         with _forgiven():
             self._place.delete_version(name)
 
-    def versions_marked(self, mark: str) -> list[str]:
-        """Names of versions, be they complete or not, that begin with `mv_` and `mark`."""
-        return self._place.versions_marked(mark)
+    def versions_marked(self, mark: str, ended: bool = True) -> list[str]:
+        """Names of versions, be they complete or not, that begin with `mv_` and `mark`.
+
+        ended: whether their job has ended. Until then those of a shared store are left out: another service may be
+        about to publish them.
+        """
+        return self._place.versions_marked(mark, ended)
 
     def upload(self) -> Path:
         """Create an empty temporary file for an upload; the caller deletes it."""
@@ -222,6 +226,10 @@ class Files:
         In a shared store, where others are writing, only what is a day old.
         """
         return self._place.sweep(datasets, versions, snapshots)
+
+    def sweep_snapshots(self, named: Collection[str]) -> int:
+        """Delete all snapshots but those named, at once; return how many. None in a shared store, see `sweep`."""
+        return self._place.sweep_snapshots(named)
 
     def check(self) -> None:
         """See that a shared store answers, in seconds; raise FilesUnreachableError. Nothing where all is local."""

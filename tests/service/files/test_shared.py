@@ -171,6 +171,7 @@ def test_versions_of_a_job_are_found_by_their_mark_and_deleted(one, other, publi
     for name in ("mv_job1_a", "mv_job2_a"):
         publish(one, name)
     (one._place._drafts / "mv_job1_b-x1y2").mkdir()  # of a process that was killed
+    assert other.versions_marked("job1", ended=False) == []
     assert other.versions_marked("job1") == ["mv_job1_a"]
     assert one.versions_marked("job1") == ["mv_job1_a", "mv_job1_b"]
     for name in one.versions_marked("job1"):
