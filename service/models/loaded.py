@@ -17,7 +17,7 @@ from lipcore.data.samples import Array
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online.transfer import Revision
 from service.contract.states import PartState
-from service.foundation.errors import NotFoundError, UnreadableVersionError, not_found
+from service.foundation.errors import NotFoundError, UnreadableVersionError
 from service.models import registry
 from service.models.lineage import learnt_from
 from service.models.loads import Loads
@@ -350,10 +350,7 @@ class LoadedModels:
         try:
             return self.files.load_version(row.folder, row.checksums)
         except lipcore.ModelFormatError as error:
-            if self.is_deleted(row.model, row.version):
-                raise not_found("version", row.version) from error
-            if self.database.shared:  # another service may have deleted it
-                registry.find(self.database, row.model, row.version)
+            registry.find(self.database, row.model, row.version)  # it may have been deleted meanwhile
             message = f"version {row.version} of model {row.model!r} cannot be loaded: {error}"
             raise UnreadableVersionError(message) from error
 
