@@ -51,7 +51,7 @@ from service.runtime.confinement import protections
 from service.runtime.process import SERVING_THREADS
 from service.storage.audit import cleaned
 from service.storage.files.store import start_sweeping
-from service.storage.storage import Storage, hold_home, look_database, look_files, look_home
+from service.storage.storage import Storage, hold_home
 from service.telemetry.meters import Meters
 from service.telemetry.readiness import Look, Readiness, Stopping
 from service.training.metrics import JobMetrics
@@ -83,7 +83,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         storage, jobs, learners = await to_thread.run_sync(_open, settings)
         threadpool_limits(SERVING_THREADS)  # of BLAS, whose libraries the models have brought in
         _share(app, storage, jobs, learners)
-        replication = Replication(learners) if storage.database.shared else None
+        stop_following = storage.database.follow_others(lambda: Replication(learners).close)
         try:
             async with AsyncExitStack() as serving:
                 if keyring is not None:
@@ -97,8 +97,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                 rest.callback(lock.close)
                 rest.callback(storage.database.close)
                 rest.push_async_callback(to_thread.run_sync, learners.close)
-                if replication is not None:
-                    rest.push_async_callback(to_thread.run_sync, replication.close)
+                rest.push_async_callback(to_thread.run_sync, stop_following)
                 await to_thread.run_sync(jobs.close)  # first: what learns needs the CPU to store its state
 
     hot = [*predictions.hot.routes, *predictions.echo_hot.routes, *oip.hot.routes, *observations.hot.routes]
@@ -206,9 +205,7 @@ def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners) -
     """Put the parts where routes ask for them, each for those that it uses."""
     state, loaded, settings = app.state, learners.loaded, storage.settings
     looks: dict[str, Look] = {
-        "database": lambda _: look_database(storage),
-        "home": lambda _: look_home(storage),
-        **({"files": lambda _: look_files(storage)} if storage.files.shared else {}),
+        **storage.looks(),
         "models": loaded.look,
         "learner": learners.look,
         "training": lambda lasting: look_jobs(jobs, lasting),

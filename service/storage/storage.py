@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from sqlalchemy import text
@@ -21,6 +22,7 @@ from service.storage.database.engine import FILE, Database
 from service.storage.database.migrations import DatabaseVersionError
 from service.storage.disk import Disk
 from service.storage.files import Files, FilesUnreachableError
+from service.telemetry.readiness import Lasting, Look
 
 WAIT_S = 10.0
 """Longest wait in s of a request for another writer of the database; then it gets a 503."""
@@ -40,13 +42,18 @@ class Storage:
         """Open, or make, what the settings name."""
         return cls(settings, Database.of(settings, WAIT_S), Files.of(settings), Disk(settings))
 
+    def looks(self) -> dict[str, Look]:
+        """How readiness looks at each part, by its name."""
+        parts = {"database": look_database, "home": look_home} | ({"files": look_files} if self.files.shared else {})
+        return {name: partial(look, self) for name, look in parts.items()}
+
 
 WRITE_S = 2.0
 """Longest wait in s for another writer of the database: commits take milliseconds."""
 PROBE = bytes(4096)
 
 
-def look_database(storage: Storage) -> tuple[PartState, str]:
+def look_database(storage: Storage, _: Lasting) -> tuple[PartState, str]:
     """Whether the database answers, and can be written in time."""
     with storage.database.session() as session:
         session.execute(text("SELECT 1"))
@@ -54,7 +61,7 @@ def look_database(storage: Storage) -> tuple[PartState, str]:
     return "ok", "can be read and written"
 
 
-def look_home(storage: Storage) -> tuple[PartState, str]:
+def look_home(storage: Storage, _: Lasting) -> tuple[PartState, str]:
     """Whether the home can be written, and has room."""
     path = storage.files.upload()
     try:
@@ -65,7 +72,7 @@ def look_home(storage: Storage) -> tuple[PartState, str]:
     return ("ok", "can be written") if shortage is None else ("failed", shortage)
 
 
-def look_files(storage: Storage) -> tuple[PartState, str]:
+def look_files(storage: Storage, _: Lasting) -> tuple[PartState, str]:
     """Whether the shared store answers: without it, what is in memory and what has a copy here still does."""
     try:
         storage.files.check()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import AbstractContextManager, closing, contextmanager
 from itertools import chain
 from pathlib import Path
@@ -279,6 +279,10 @@ class Database:
             notice = None if payload is None else read_notice(payload)
             if payload is None or notice is not None:
                 yield notice
+
+    def follow_others(self, start: Callable[[], Callable[[], None]]) -> Callable[[], None]:
+        """Start what follows the changes of others, and return what stops it. A service alone starts nothing."""
+        return start() if self.shared else lambda: None
 
     def close(self) -> None:
         """Close all connections."""
