@@ -167,11 +167,10 @@ class Learners:
         return self._log.turn(self._monitor(self.loaded.get(model, None)), model)
 
     def follow(self, models: Collection[str] | None = None) -> None:
-        """Bring the monitors of these models up to the batches that other services have logged, of all that there are
+        """Bring the monitors of these models up to the batches that other services have logged, of all models in memory
         where None. Not for the event loop."""
         if models is None:
-            for model, monitor in self.monitors().items():
-                self._log.follow(monitor, model)
+            self.watched()
         else:
             for model in models:
                 self.monitor(model)
