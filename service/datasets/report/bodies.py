@@ -24,27 +24,38 @@ from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.fast.arm import arm_torques
 from lipcore.kernels.friction import SIGN_WIDTH
 from lipcore.robots.urdf import RigidBody
-from service.datasets.report.fit import EIGHTHS
+from service.datasets.report.fit import FIT
 from service.datasets.report.signals import Limits
 
-RIDGE = 1e-10
-"""Of a column's mean square: columns that depend on each other get weights that no two eighths agree on."""
-FLOOR = 1e-4
-"""Error, as a share of a torque's variance, below which less is no better: what units and clocks leave."""
-SELDOM = 0.2
-"""Share of rows that a joint has to move in for the others to be left out."""
-FEW = 400
-"""Rows that are enough to compare orders of joints by."""
-FREE = 5
-"""Columns of a joint's fit: gravity, inertia, velocity, its smoothed sign, a constant."""
-EARTH = 9.81
+
+@dataclass(frozen=True)
+class BodiesOptions:
+    """Numbers of the comparison of torque with a robot's rigid bodies."""
+
+    ridge: float = 1e-10
+    """Penalty, as a share of a column's mean square: collinear columns get weights that no two eighths agree on."""
+    floor: float = 1e-4
+    """Error, as a share of a torque's variance, that units and clocks leave: less is no better."""
+    min_moving: float = 0.2
+    """Share of rows in which a joint has to move for the others to be ignored."""
+    rows: int = 400
+    """Rows that are enough to compare orders of joints by."""
+    visible: float = 0.2
+    """Share of a torque's standard deviation above which a part of it is visible."""
+    gain: float = 3.0
+    """Ratio of errors that another order of joints has to reach, in the mean over those that change place."""
+    explained: float = 0.5
+    """Share of each such joint's torque that the other order has to explain."""
+
+
+BODIES = BodiesOptions()
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """Least squares of k columns y with p columns x, and again without each of EIGHTHS blocks of rows.
+    """Least squares of k columns y with p columns x, and again without each of eight blocks of rows.
 
-    weights: (p, k); std: (p, k), by leaving out blocks; errors: (EIGHTHS, k), mean squares on the block left out.
+    weights: (p, k); std: (p, k), by leaving out blocks; errors: (8, k), mean squares on the block left out.
     """
 
     weights: Array
@@ -56,14 +67,14 @@ class Blocks:
         """Fit y (R, k) with x (R, p)."""
         scale = np.sqrt(np.mean(x**2, axis=0))
         x = x / np.where(scale > 0, scale, 1.0)
-        edges = np.linspace(0, len(x), EIGHTHS + 1).astype(np.int64)
+        edges = np.linspace(0, len(x), FIT.parts + 1).astype(np.int64)
         parts = [slice(*each) for each in pairwise(edges)]
         gram = np.array([x[part].T @ x[part] for part in parts])
         product = np.array([x[part].T @ y[part] for part in parts])
-        ridge = RIDGE * len(x) * np.eye(x.shape[1])
+        ridge = BODIES.ridge * len(x) * np.eye(x.shape[1])
         weights = np.linalg.solve(gram.sum(0) + ridge, product.sum(0))
         without = np.linalg.solve(gram.sum(0) - gram + ridge, product.sum(0) - product)
-        std = np.sqrt((EIGHTHS - 1) / EIGHTHS * np.sum((without - without.mean(0)) ** 2, axis=0))
+        std = np.sqrt((FIT.parts - 1) / FIT.parts * np.sum((without - without.mean(0)) ** 2, axis=0))
         errors = np.array(
             [np.mean((y[part] - x[part] @ w) ** 2, axis=0) for part, w in zip(parts, without, strict=True)]
         )
@@ -109,12 +120,12 @@ class Bodies:
         """Torques of gravity along two horizontal axes of the URDF's base, (R, n) each."""
         still = np.zeros_like(q)
         along = np.eye(3)[np.argsort(np.abs(self._arm.geometry.gravity))[:2]]
-        first, second = (self.torque(q, still, still, EARTH * axis) for axis in along)
+        first, second = (self.torque(q, still, still, 9.81 * axis) for axis in along)
         return first, second
 
 
 def design(gravity: Array, rest: Array, dq: Array) -> Array:
-    """Columns that a joint's torque is fitted with, (R, FREE), from its own (R,)."""
+    """Columns (R, 5) of a joint's fit: gravity, inertia, velocity, its smoothed sign, a constant; from its own (R,)."""
     return np.column_stack([gravity, rest, dq, np.tanh(dq / SIGN_WIDTH), np.ones(len(dq))])
 
 
@@ -123,7 +134,7 @@ class Against:
     """Factors of gravity and of the rest by joint, (n,) each, with standard deviations, and how well they are known.
 
     visible: (n, 2) standard deviation of gravity's and the rest's torque, as far as the other columns do not explain
-    it, over that of the measured torque; errors: (EIGHTHS, n) mean squares on eighths left out, as shares of its
+    it, over that of the measured torque; errors: (8, n) mean squares on eighths left out, as shares of its
     variance.
     """
 
@@ -140,25 +151,27 @@ class Against:
         return np.asarray(np.clip(1 - self.errors.mean(0), 0.0, 1.0))
 
     @property
+    def visible_gravity(self) -> NDArray[np.bool_]:
+        """Whether gravity is a visible part of each joint's torque, (n,)."""
+        return np.asarray(self.visible[:, 0] > BODIES.visible)
+
+    @property
     def error(self) -> float:
         """Mean logarithm of the errors."""
-        return float(np.log(self.errors + FLOOR).mean())
+        return float(np.log(self.errors + BODIES.floor).mean())
 
     def steady(self, joint: int, part: int) -> bool:
         """Whether a factor, of gravity (0) or the rest (1), is told from 0 by three standard deviations, and its
         torque is a visible part of the joint's."""
         value, std = ((self.gravity, self.gravity_std), (self.inertia, self.inertia_std))[part]
-        return bool(abs(value[joint]) > 3 * std[joint] and abs(value[joint]) * self.visible[joint, part] > VISIBLE)
-
-
-VISIBLE = 0.2
-"""Share of a torque's standard deviation from which on a part of it is told apart."""
+        size = abs(value[joint])
+        return bool(size > 3 * std[joint] and size * self.visible[joint, part] > BODIES.visible)
 
 
 def moving(dq: Array) -> NDArray[np.int64]:
     """Rows in which a joint with velocities (R,) moves; all where it seldom does. At rest it holds any torque."""
     rows = np.flatnonzero(np.abs(dq) > SIGN_WIDTH)
-    return rows if len(rows) > SELDOM * len(dq) else np.arange(len(dq))
+    return rows if len(rows) > BODIES.min_moving * len(dq) else np.arange(len(dq))
 
 
 def _fits(bodies: Bodies, signals: Signals) -> Iterator[tuple[Array, float, Blocks]]:
@@ -188,12 +201,6 @@ def compare(bodies: Bodies, signals: Signals) -> Against:
     return Against(gravity, gravity_std, inertia, inertia_std, np.array(visible), np.transpose(errors))
 
 
-BETTER = 3.0
-"""How many times smaller errors have to be in another order of joints, in the mean over those that change place."""
-EXPLAINED = 0.5
-"""Share of each such joint's torque that the other order has to explain."""
-
-
 @dataclass(frozen=True)
 class Order:
     """Column of the data that belongs to each joint, (n,), and the mean logarithm of the errors so."""
@@ -211,12 +218,12 @@ def torque_order(bodies: Bodies, signals: Signals) -> Order | None:
 
     gravity, rest = bodies.parts(signals)
     dq, tau, n = signals.dq, signals.tau, signals.q.shape[1]
-    errors = np.empty((EIGHTHS, n, n))
+    errors = np.empty((FIT.parts, n, n))
     for joint in range(n):
         rows = moving(dq[:, joint])
         fit = Blocks.fit(design(gravity[rows, joint], rest[rows, joint], dq[rows, joint]), tau[rows])
         errors[:, joint] = fit.errors / np.maximum(tau[rows].var(axis=0), 1e-300)
-    logs = np.log(errors + FLOOR)
+    logs = np.log(errors + BODIES.floor)
     _, column = linear_sum_assignment(logs.mean(0))
     moved = np.flatnonzero(column != np.arange(n))
     if not len(moved):
@@ -224,7 +231,7 @@ def torque_order(bodies: Bodies, signals: Signals) -> Order | None:
     gain = logs[:, moved, moved] - logs[:, moved, column[moved]]
     # columns of joints without much torque might go anywhere: all that change have to be explained
     explained = 1 - errors.mean(0)[moved, column[moved]]
-    clear = (gain.mean(1) > 0).all() and gain.mean() > np.log(BETTER) and (explained > EXPLAINED).all()
+    clear = (gain.mean(1) > 0).all() and gain.mean() > np.log(BODIES.gain) and (explained > BODIES.explained).all()
     return Order(tuple(column.tolist()), float(logs.mean(0)[np.arange(n), column].mean())) if clear else None
 
 
@@ -234,13 +241,13 @@ def joint_order(bodies: Bodies, signals: Signals, against: Against) -> Order | N
     Tried are the order of the alphabet, the reverse and rotations; the best of them is bettered by exchanging two.
     """
     rows, n = signals.q.shape
-    few = Signals(*(each[np.linspace(0, rows - 1, min(rows, FEW)).astype(np.int64)] for each in signals))
+    few = Signals(*(each[np.linspace(0, rows - 1, min(rows, BODIES.rows)).astype(np.int64)] for each in signals))
     scores: dict[tuple[int, ...], float] = {}
 
     def error(order: tuple[int, ...]) -> float:
         if order not in scores:
             fits = _fits(bodies, few.take(order))
-            scores[order] = float(np.mean([np.log(fit.errors / variance + FLOOR) for _, variance, fit in fits]))
+            scores[order] = float(np.mean([np.log(fit.errors / variance + BODIES.floor) for _, variance, fit in fits]))
         return scores[order]
 
     here = tuple(range(n))
@@ -256,15 +263,16 @@ def joint_order(bodies: Bodies, signals: Signals, against: Against) -> Order | N
     # joints with little torque stay where they are, unless another place is clearly better
     for a, b in combinations(range(n), 2):
         back = _exchanged(best, a, b)
-        if _moved(back) < _moved(best) and n * (error(back) - error(best)) < 2 * np.log(BETTER):
+        if _moved(back) < _moved(best) and n * (error(back) - error(best)) < 2 * np.log(BODIES.gain):
             best = back
     moved = [joint for joint in range(n) if best[joint] != joint]
     if not moved:
         return None
     there = compare(bodies, signals.take(best))
-    gain = (np.log(against.errors + FLOOR) - np.log(there.errors + FLOOR)).sum(1) / len(moved)
+    gain = (np.log(against.errors + BODIES.floor) - np.log(there.errors + BODIES.floor)).sum(1) / len(moved)
     steady = [joint for joint in range(n) if there.steady(joint, 0)]
-    clear = (gain > 0).all() and gain.mean() > np.log(BETTER) and np.median(there.explained[moved]) > EXPLAINED
+    explained = np.median(there.explained[moved])
+    clear = (gain > 0).all() and gain.mean() > np.log(BODIES.gain) and explained > BODIES.explained
     return Order(best, there.error) if clear and steady and (there.gravity[steady] > 0).all() else None
 
 

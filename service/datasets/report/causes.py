@@ -2,9 +2,6 @@
 
 Each cause has a sentence only where the evidence is clear, and only the gravest has one: an order of joints that
 explains the torque makes all factors of the order that does not meaningless.
-
-The thresholds were set on simulated recordings of panda, ur5, z1, kinova, baxter-left, pr2-right, so101 and
-double-pendulum, clean and dirty; tests look at other arms.
 """
 
 from __future__ import annotations
@@ -18,8 +15,7 @@ from lipcore.data.samples import Array
 from service.contract.datasets import Cause, JointExcitation, Remedy
 from service.datasets.report.advice import listed
 from service.datasets.report.bodies import (
-    FREE,
-    VISIBLE,
+    BODIES,
     Against,
     Blocks,
     Bodies,
@@ -28,28 +24,40 @@ from service.datasets.report.bodies import (
     joint_order,
     torque_order,
 )
-from service.datasets.report.excitation import CLEAR, NOTICED
+from service.datasets.report.excitation import FRICTION
 from service.datasets.report.remedies import Upload, remedy
-from service.datasets.report.robots import LIKE, TRUSTED, heavy, other_robot
+from service.datasets.report.robots import MATCH, heavy, other_robot
 
-NEAR = 0.35
-"""How far from 0 a factor may be that counts as 0."""
-OTHER = 2.0
-"""How many times too large or too small all torques have to be before they count as something else."""
-DOUBLE = (1.6, 2.5)
-"""Factors of gravity that count as 2."""
-WELL = 0.9
-"""Share of the torque of joints with visible gravity that is explained where their order is right."""
-MOST = 2 / 3
-"""Share of the joints with visible gravity that have to lack it."""
-SURE = 3.0
-"""Standard deviations of a factor."""
-TREND = 1.0
-"""How far work has to go one way, over what it goes to and fro: 0.01 to 0.23 on frictionless arms, 0.7 to 42 else."""
-GAIN = 3.0
-"""How many times smaller errors have to be with gravity along another direction."""
-DIRECTION = [0, FREE, FREE + 1]
-"""Columns of gravity downwards and along two horizontal axes."""
+
+@dataclass(frozen=True)
+class CauseOptions:
+    """When the evidence for a cause is clear.
+
+    Set on simulated recordings of panda, ur5, z1, kinova, baxter-left, pr2-right, so101 and double-pendulum, clean and
+    dirty; tests look at other arms.
+    """
+
+    zero: float = 0.35
+    """Size below which a factor counts as 0."""
+    other: float = 2.0
+    """Ratio from which torques that are all too large, or all too small, count as something else."""
+    double: tuple[float, float] = (1.6, 2.5)
+    """Factors of gravity that count as 2."""
+    explained: float = 0.9
+    """Share of the torque of joints with visible gravity that is explained if their order is right."""
+    absent: float = 2 / 3
+    """Share of the joints with visible gravity that have to lack it."""
+    stds: float = 3.0
+    """Standard deviations by which a factor has to differ."""
+    trend: float = 1.0
+    """Trend of work over its swing: 0.01 to 0.23 on frictionless arms, 0.7 to 42 on others."""
+    gain: float = 3.0
+    """Ratio of errors that gravity along another direction has to reach."""
+
+
+CAUSE = CauseOptions()
+
+
 BASE = "Give a URDF with the base as it stands, or train with geometry=learn"
 
 
@@ -92,7 +100,7 @@ def causes(
         out = out or case.factor()
     out = out or _taken(upload, signals, work)
     # friction beside bodies that do not explain the torque is none
-    if against is None or (against.explained[against.visible[:, 0] > VISIBLE] > WELL).all():
+    if against is None or (against.explained[against.visible_gravity] > CAUSE.explained).all():
         out = out or _negative_friction(upload, drags)
     return [] if out is None else [out]
 
@@ -106,13 +114,14 @@ def _drag(joint: JointExcitation, dq: Array, tau: Array) -> int:
         return 0
     speed = float(np.sqrt(np.mean(dq**2)))
     drag, std = viscous.value * speed + coulomb.value, viscous.std * speed + coulomb.std
-    return int(np.sign(drag)) if abs(drag) > max(CLEAR * std, NOTICED * tau.std()) else 0
+    clear = abs(drag) > max(FRICTION.negative_stds * std, FRICTION.negative_share * tau.std())
+    return int(np.sign(drag)) if clear else 0
 
 
 def _taken(upload: Upload, signals: Signals, work: TorqueWork) -> Remedy | None:
     """Torques whose work on the motion is negative, which needs no robot to be known."""
     usual = float(np.sqrt(np.mean(signals.dq**2, axis=0)) @ np.sqrt(np.mean(signals.tau**2, axis=0)))
-    if work.trend > -TREND or work.power > -NOTICED * usual:
+    if work.trend > -CAUSE.trend or work.power > -FRICTION.negative_share * usual:
         return None
     return remedy(
         "torque_sign",
@@ -151,7 +160,7 @@ class _Case:
         names, robot = self.upload.names, self.bodies.name
         torques = torque_order(self.bodies, self.signals)
         joints = None
-        if torques is not None or (self.against.explained[self.against.visible[:, 0] > VISIBLE] < WELL).any():
+        if torques is not None or (self.against.explained[self.against.visible_gravity] < CAUSE.explained).any():
             joints = joint_order(self.bodies, self.signals, self.against)
         if torques is not None and (joints is None or torques.error < joints.error):
             moved = [(names[joint], names[k]) for joint, k in enumerate(torques.column) if k != joint]
@@ -181,7 +190,7 @@ class _Case:
         n, against = self.upload.n_joints, self.against
         signs = np.zeros((n, 3), np.int64)
         for j in range(n):
-            if against.explained[j] > TRUSTED:
+            if against.explained[j] > MATCH.explained:
                 signs[j, 0] = np.sign(against.gravity[j]) if against.steady(j, 0) else 0
                 signs[j, 1] = np.sign(against.inertia[j]) if against.steady(j, 1) else 0
             signs[j, 2] = self.drags[j]
@@ -202,22 +211,23 @@ class _Case:
 
     def gravity(self) -> Remedy | None:
         """Gravity that is missing, there twice, there though it should not be, or along another direction."""
-        g, robot, visible = self.against.gravity, self.bodies.name, self.against.visible[:, 0]
+        g, robot = self.against.gravity, self.bodies.name
         plain, inertia = heavy(self.against), self._inertia()
         if not self.upload.gravity:
-            there = plain and all(g[j] - SURE * self.against.gravity_std[j] > NEAR for j in plain)
-            if not there or not LIKE[0] < float(np.median(g[plain])) < LIKE[1]:
+            there = plain and all(g[j] - CAUSE.stds * self.against.gravity_std[j] > CAUSE.zero for j in plain)
+            if not there or not MATCH.one[0] < float(np.median(g[plain])) < MATCH.one[1]:
                 return None
             text = f"holds gravity ({self._times(plain)} times that of {robot}) though it should be without"
             return self._remedy("gravity_included", plain, text, {"torque_convention": "gravity_included"})
-        expected = [j for j, std in enumerate(self.against.gravity_std) if visible[j] > VISIBLE and std < NEAR]
+        seen = np.flatnonzero(self.against.visible_gravity).tolist()
+        expected = [j for j in seen if self.against.gravity_std[j] < CAUSE.zero]
         absent = [j for j in expected if self._absent(j)]
         # where inertia is not as it should be either, all of the torque may be too small
-        none = inertia is not None and inertia > 1 / OTHER and bool(absent) and len(absent) >= MOST * len(expected)
-        none = none and float(np.abs(g[expected]).max()) < 1 / OTHER
+        none = inertia is not None and inertia > 1 / CAUSE.other
+        none = none and bool(absent) and len(absent) >= CAUSE.absent * len(expected)
+        none = none and float(np.abs(g[expected]).max()) < 1 / CAUSE.other
         turned = bool(plain) and bool((g[plain] < 0).all())
-        seen = [j for j in range(self.upload.n_joints) if visible[j] > VISIBLE]
-        if seen and (self.against.explained[seen] < WELL).any() and self._leans(seen):
+        if seen and (self.against.explained[seen] < CAUSE.explained).any() and self._leans(seen):
             text = f"has gravity along another direction than {robot}'s base: is it on a wall, or tilted? {BASE}"
             return self._remedy("mounting", seen, text)
         if turned:
@@ -226,8 +236,8 @@ class _Case:
         if none:
             text = f"is without gravity ({self._times(absent)} times that of {robot})"
             return self._remedy("no_gravity", absent, text, {"torque_convention": "gravity_compensated"})
-        if plain and all(DOUBLE[0] < g[j] < DOUBLE[1] for j in plain):
-            if inertia is not None and not LIKE[0] < inertia < LIKE[1]:
+        if plain and all(CAUSE.double[0] < g[j] < CAUSE.double[1] for j in plain):
+            if inertia is not None and not MATCH.one[0] < inertia < MATCH.one[1]:
                 return None
             other = "cannot be seen" if inertia is None else f"{inertia:.2g} times"
             text = (
@@ -241,7 +251,9 @@ class _Case:
         """All torques too large or too small by factors, as motor currents are."""
         plain, against = heavy(self.against), self.against
         g = against.gravity[plain]
-        if not self.upload.gravity or not plain or not ((g > OTHER).all() or ((g > 0) & (g < 1 / OTHER)).all()):
+        if not self.upload.gravity or not plain:
+            return None
+        if not ((g > CAUSE.other).all() or ((g > 0) & (g < 1 / CAUSE.other)).all()):
             return None
         factors = [
             against.gravity[j] if against.steady(j, 0) else against.inertia[j] if against.steady(j, 1) else np.nan
@@ -264,26 +276,27 @@ class _Case:
 
     def _absent(self, joint: int) -> bool:
         size = abs(self.against.gravity[joint])
-        most = size + SURE * self.against.gravity_std[joint]
-        return bool(most < NEAR and size * self.against.visible[joint, 0] < VISIBLE)
+        most = size + CAUSE.stds * self.against.gravity_std[joint]
+        return bool(most < CAUSE.zero and size * self.against.visible[joint, 0] < BODIES.visible)
 
     def _leans(self, joints: Sequence[int]) -> bool:
         """Whether gravity along one other direction explains the torque of these joints far better."""
         gravity, rest = self.bodies.parts(self.signals)
         sides = self.bodies.sideways(self.signals.q)
         gains, directions = [], []
+        axes = [0, -2, -1]  # columns of gravity downwards and along two horizontal axes
         for j in joints:
             columns = design(gravity[:, j], rest[:, j], self.signals.dq[:, j])
             both = np.column_stack([columns, sides[0][:, j], sides[1][:, j]])
             upright, leaning = (Blocks.fit(x, self.signals.tau[:, j, None]) for x in (columns, both))
             gains.append(float(np.log(upright.errors.mean()) - np.log(leaning.errors.mean())))
-            if (leaning.std[DIRECTION] < NEAR).all():
-                directions.append(leaning.weights[DIRECTION, 0])
-        if len(directions) < 2 or np.mean(gains) < np.log(GAIN):
+            if (leaning.std[axes] < CAUSE.zero).all():
+                directions.append(leaning.weights[axes, 0])
+        if len(directions) < 2 or np.mean(gains) < np.log(CAUSE.gain):
             return False
         middle = np.median(directions, axis=0)
         off = np.median(np.abs(directions - middle).max(axis=1))
-        return bool(LIKE[0] < np.linalg.norm(middle) < LIKE[1] and off < NEAR)
+        return bool(MATCH.one[0] < np.linalg.norm(middle) < MATCH.one[1] and off < CAUSE.zero)
 
     def _remedy(self, cause: Cause, joints: Sequence[int], text: str, options: dict[str, str] | None = None) -> Remedy:
         names = [self.upload.names[j] for j in joints]

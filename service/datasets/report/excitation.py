@@ -2,7 +2,7 @@
 
 A friction weight's standard deviation is that of least squares with the noise that the fit leaves, over as many
 independent rows as the recording has: two a period of the low-pass. It is judged by the torque it stands for (viscous:
-at the usual speed) as a share of the spread of the joint's torque, see DETERMINED.
+at the usual speed) as a share of the spread of the joint's torque, see FrictionOptions.
 
 Rigid bodies are judged by the regressor of the robot's URDF at few rows, against that of random motion over its whole
 range. In coordinates in which random motion excites every base parameter by 1, the recording excites some more and some
@@ -25,22 +25,29 @@ from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.friction import FRICTION_TERMS, SIGN_WIDTH
 from lipcore.robots.urdf import PARAMETERS, RigidBody
 from service.contract.datasets import JointExcitation, Verdict, Weight, WholeExcitation
-from service.datasets.report.fit import OWN, Fit, friction_terms, own_features
+from service.datasets.report.fit import FIT, OWN_FEATURES, Fit, friction_terms, own_features
 from service.datasets.report.signals import Limits, Rows, spread
 
-DETERMINED: tuple[tuple[float, Verdict], ...] = ((0.02, "well"), (0.1, "poorly"))
-"""Largest share of the torque's spread that a weight's standard deviation may stand for, by verdict."""
-CLEAR, NOTICED = 2.0, 0.03
-"""Standard deviations below zero, and share of the torque's spread, from which on friction counts as negative."""
-SLOW = 0.1
-"""rad/s or m/s below which motion is slow: Coulomb friction and stiction show there."""
-SELDOM = 0.005
-"""Share of samples below which a direction, or slow motion, counts as absent."""
-BINS = 20
-STANDSTILL = 1e-9
-PRIOR = 3.0
-"""Times the root mean square of a joint's torque: what gravity or inertia may be at most, as a standard deviation."""
-TERMS = ("dq", "sign dq", "ddq", "cos q", "sin q")
+
+@dataclass(frozen=True)
+class FrictionOptions:
+    """When a recording determines a joint's friction."""
+
+    max_shares: tuple[tuple[float, Verdict], ...] = ((0.02, "well"), (0.1, "poorly"))
+    """Max share of the torque's spread that a weight's standard deviation stands for, by verdict."""
+    negative_stds: float = 2.0
+    """Min standard deviations below zero of negative friction."""
+    negative_share: float = 0.03
+    """Min share of the torque's spread of negative friction."""
+    slow: float = 0.1
+    """Speed in rad/s or m/s below which motion is slow: Coulomb friction and stiction show there."""
+    seldom: float = 0.005
+    """Share of samples below which a direction, or slow motion, counts as absent."""
+    prior: float = 3.0
+    """Standard deviation of gravity and inertia, over the root mean square of a joint's torque."""
+
+
+FRICTION = FrictionOptions()
 
 
 def joint_excitation(
@@ -53,7 +60,7 @@ def joint_excitation(
     q, dq, ddq, tau = (columns[quantity] for quantity in ("q", "dq", "ddq", "tau"))
     stds = friction_stds(fit, joint, noise, float(np.sqrt(np.mean(tau**2))))
     worst, term = collinearity(q[fit.rows], dq[fit.rows], ddq[fit.rows])
-    slow = np.abs(dq) < SLOW
+    slow = np.abs(dq) < FRICTION.slow
     forwards, backwards = float(np.mean(dq > SIGN_WIDTH)), float(np.mean(dq < -SIGN_WIDTH))
     speed = float(np.sqrt(np.mean(dq**2)))
     return JointExcitation(
@@ -68,7 +75,7 @@ def joint_excitation(
         reversals=reversals(dq, part),
         slow_forwards=float(np.mean(slow & (dq > SIGN_WIDTH))),
         slow_backwards=float(np.mean(slow & (dq < -SIGN_WIDTH))),
-        **weights([(None, std) for std in stds], speed, spread(tau), min(forwards, backwards) < SELDOM),
+        **weights([(None, std) for std in stds], speed, spread(tau), min(forwards, backwards) < FRICTION.seldom),
         collinear=worst,
         collinear_term=term,
     )
@@ -100,12 +107,13 @@ def friction_stds(fit: Fit, joint: int, noise: float, torque: float) -> tuple[fl
 
     The weights themselves, beside terms that may be any function of motion, are not worth much: on simulated arms some
     were many standard deviations off. torque: root mean square of the joint's, N·m; nothing else that is fitted may be
-    more than PRIOR of it.
+    more than FRICTION.prior times it.
     """
     variance = noise**2 * len(fit.rows) / fit.independent
     known = np.isfinite(fit.scales)
-    prior = np.full(len(fit.scales), PRIOR * torque)
-    waves = np.flatnonzero(np.arange(len(prior)) % OWN >= OWN - 2)  # cos q, sin q: their raw weights are torques
+    prior = np.full(len(fit.scales), FRICTION.prior * torque)
+    # cos q, sin q: their raw weights are torques
+    waves = np.flatnonzero([name in ("cos q", "sin q") for name in OWN_FEATURES] * (len(prior) // len(OWN_FEATURES)))
     prior[waves] *= np.where(known[waves], fit.scales[waves], 1.0)
     information = variance / np.maximum(prior, 1e-150) ** 2
     own = friction_terms(joint)
@@ -131,53 +139,62 @@ def reversals(dq: Array, part: Rows) -> int:
 
 
 def collinearity(q: Array, dq: Array, ddq: Array) -> tuple[float, str]:
-    """Largest share of one of TERMS that the other four explain, and which one; 1 where one does not vary."""
+    """Largest share of one of OWN_FEATURES that the other four explain, and which one; 1 where one does not vary."""
     raw = np.column_stack(own_features(q, dq, ddq))
     centred = raw - raw.mean(axis=0)
     scale = centred.std(axis=0)
-    still = scale <= STANDSTILL * (1 + np.abs(raw).max(axis=0))
+    still = scale <= FIT.min_spread * (1 + np.abs(raw).max(axis=0))
     if still.any():
-        return 1.0, TERMS[int(still.argmax())]
+        return 1.0, OWN_FEATURES[int(still.argmax())]
     correlation = np.corrcoef(centred, rowvar=False)
     inflation = np.diag(np.linalg.pinv(correlation, hermitian=True, rcond=1e-12))
     shares = np.clip(1 - 1 / np.maximum(inflation, 1.0), 0.0, 1.0)
     if np.linalg.eigvalsh(correlation)[0] < 1e-12:
-        return 1.0, TERMS[int(np.abs(np.linalg.eigh(correlation)[1][:, 0]).argmax())]
-    return float(shares.max()), TERMS[int(shares.argmax())]
+        return 1.0, OWN_FEATURES[int(np.abs(np.linalg.eigh(correlation)[1][:, 0]).argmax())]
+    return float(shares.max()), OWN_FEATURES[int(shares.argmax())]
 
 
 def _visited(q: Array, lower: float, upper: float) -> float | None:
     if not np.isfinite(upper - lower):
         return None
-    bins = np.clip(((q - lower) * (BINS / (upper - lower))).astype(np.int64), 0, BINS - 1)
-    return float(np.count_nonzero(np.bincount(bins, minlength=BINS))) / BINS
+    bins = 20  # of a joint's range
+    visited = np.clip(((q - lower) * (bins / (upper - lower))).astype(np.int64), 0, bins - 1)
+    return float(np.count_nonzero(np.bincount(visited, minlength=bins))) / bins
 
 
 def _weight(value: float | None, std: float | None, factor: float, torque: float, friction: bool) -> Weight:
     if std is None or torque == 0:
         return Weight(value=value, std=std, share=None, verdict="not determined")
     share = std * factor / torque
-    verdict = next((v for most, v in DETERMINED if share <= most), "not determined")
-    negative = friction and verdict == "well" and value is not None and value < -CLEAR * std
-    negative = negative and -(value or 0.0) * factor > NOTICED * torque
+    verdict = next((v for most, v in FRICTION.max_shares if share <= most), "not determined")
+    negative = friction and verdict == "well" and value is not None and value < -FRICTION.negative_stds * std
+    negative = negative and -(value or 0.0) * factor > FRICTION.negative_share * torque
     return Weight(value=value, std=std, share=share, verdict=verdict, implausible=negative)
 
 
-MOST_EQUATIONS = 14_000
-"""Rows times joints of the recording that are looked at: 2000 rows of 7 joints."""
-CHUNK = 1000
-"""Equations held at a time."""
-REFERENCE_EQUATIONS = 3500
-STRUCTURAL = 1e-8
-"""Relative size below which a combination of parameters has no effect on torques."""
-RESOLUTION = 1e-13
-"""Smallest information about a weight, relative, that is told from none."""
-EXCITED = 0.01
-"""Share of random motion's excitation from which on a base parameter counts as excited."""
-SPEED, TURN_S = 1.0, 0.5
-"""Speed of random motion where no limit is known, rad/s or m/s, and the time in which it reverses, s."""
-SEED = 7
-N_TERMS = len(FRICTION_TERMS)
+@dataclass(frozen=True)
+class ReferenceOptions:
+    """Random motion that a recording's excitation of rigid bodies is compared with."""
+
+    max_equations: int = 14_000
+    """Max rows times joints of the recording: 2000 rows of 7 joints."""
+    chunk: int = 1000
+    """Equations in memory at a time."""
+    equations: int = 3500
+    """Rows times joints of random motion."""
+    min_effect: float = 1e-8
+    """Relative size below which a combination of parameters has no effect on torques."""
+    resolution: float = 1e-13
+    """Smallest relative information about a weight that differs from none."""
+    excited: float = 0.01
+    """Share of random motion's excitation above which a base parameter counts as excited."""
+    speed: float = 1.0
+    """Speed in rad/s or m/s where no limit is known."""
+    turn_s: float = 0.5
+    """Time in s in which the speed reverses."""
+
+
+REFERENCE = ReferenceOptions()
 
 
 @dataclass(frozen=True)
@@ -224,10 +241,10 @@ def judge_rigid_bodies(
         return f"the rigid bodies of robot {name} were not used: {error}"
     n, size = len(names), len(names) * PARAMETERS
     reference = _reference(kernel, limits)
-    rows = np.linspace(0, len(motion[0]) - 1, min(len(motion[0]), MOST_EQUATIONS // n)).astype(np.int64)
+    rows = np.linspace(0, len(motion[0]) - 1, min(len(motion[0]), REFERENCE.max_equations // n)).astype(np.int64)
     q, dq, ddq, tau = (each[rows] for each in (*motion, tau))
-    gram, information = np.zeros((size, size)), np.zeros((size + N_TERMS * n, size + N_TERMS * n))
-    projected = np.zeros(len(information))
+    gram, projected = np.zeros((size, size)), np.zeros(size + len(FRICTION_TERMS) * n)
+    information = np.zeros((len(projected), len(projected)))
     loudness = np.maximum(noise, 1e-9 * max(float(noise.max()), 1e-9))
     for first, block in _regressors(kernel, q, dq, ddq):
         gram += block.T @ block
@@ -241,7 +258,7 @@ def judge_rigid_bodies(
     weakest = (reference.regressor * (reference.back @ modes[:, 0])).reshape(-1, n, PARAMETERS).sum(axis=2)
     whole = WholeExcitation(
         parameters=len(reference.base),
-        rank=int(np.sum(shares > EXCITED)),
+        rank=int(np.sum(shares > REFERENCE.excited)),
         condition=_condition(gram[np.ix_(reference.base, reference.base)]),
         weakest=float(shares[0]),
         weakest_body=names[int(np.square(weakest).sum(axis=0).argmax())],
@@ -251,12 +268,12 @@ def judge_rigid_bodies(
 
 
 def _reference(kernel: ArmKernel, limits: Limits) -> _Reference:
-    motion = _random_motion(limits, max(1, REFERENCE_EQUATIONS // kernel.n_joints))
+    motion = _random_motion(limits, max(1, REFERENCE.equations // kernel.n_joints))
     regressor = np.concatenate([block for _, block in _regressors(kernel, *motion)])
     size = np.linalg.norm(regressor, axis=0)
     scale = np.where(size > 0, size, 1.0)
     _, values, directions = np.linalg.svd(regressor / scale, full_matrices=False)
-    count = int(np.sum(values > STRUCTURAL * values[0]))
+    count = int(np.sum(values > REFERENCE.min_effect * values[0]))
     back = directions[:count].T / values[:count] * np.sqrt(len(regressor)) / scale[:, None]
     from scipy.linalg import qr  # noqa: PLC0415 - serving does without it
 
@@ -267,10 +284,10 @@ def _reference(kernel: ArmKernel, limits: Limits) -> _Reference:
 def _friction(dq: Array) -> Array:
     """Friction's features as equations, row by row and joint by joint: (R n, 3 n)."""
     rows, n = dq.shape
-    out = np.zeros((rows, n, n, N_TERMS))
+    out = np.zeros((rows, n, n, len(FRICTION_TERMS)))
     joints = np.arange(n)
     out[:, joints, joints] = np.stack([dq, np.tanh(dq / SIGN_WIDTH), np.ones_like(dq)], axis=2)
-    return out.reshape(rows * n, N_TERMS * n)
+    return out.reshape(rows * n, len(FRICTION_TERMS) * n)
 
 
 def _friction_weights(information: Array, projected: Array, back: Array) -> list[list[Estimate]]:
@@ -281,11 +298,11 @@ def _friction_weights(information: Array, projected: Array, back: Array) -> list
     base = turn.T @ information @ turn
     scale = np.sqrt(np.maximum(np.diag(base), 1e-300))
     values, vectors = np.linalg.eigh(base / np.outer(scale, scale))
-    inverse = (vectors / np.maximum(values, RESOLUTION)) @ vectors.T
+    inverse = (vectors / np.maximum(values, REFERENCE.resolution)) @ vectors.T
     std = (np.sqrt(np.diag(inverse)) / scale)[count:].tolist()
     mean = (inverse @ (turn.T @ projected / scale) / scale)[count:].tolist()
     estimates: list[Estimate] = list(zip(mean, std, strict=True))
-    return [estimates[first : first + N_TERMS] for first in range(0, len(estimates), N_TERMS)]
+    return [estimates[first : first + len(FRICTION_TERMS)] for first in range(0, len(estimates), len(FRICTION_TERMS))]
 
 
 def _condition(gram: Array) -> float | None:
@@ -298,8 +315,8 @@ def _condition(gram: Array) -> float | None:
 
 
 def _regressors(kernel: ArmKernel, q: Array, dq: Array, ddq: Array) -> Iterator[tuple[int, Array]]:
-    """The joint-torque regressor in blocks of equations, (CHUNK, 10 n) each, with the first row of motion of each."""
-    rows = max(1, CHUNK // q.shape[1])
+    """The joint-torque regressor in blocks of equations, (E, 10 n) each, with the first row of motion of each."""
+    rows = max(1, REFERENCE.chunk // q.shape[1])
     for first in range(0, len(q), rows):
         part = slice(first, first + rows)
         features = kernel.features(Motion.from_arrays(q[part], dq[part], ddq[part]))
@@ -309,13 +326,13 @@ def _regressors(kernel: ArmKernel, q: Array, dq: Array, ddq: Array) -> Iterator[
 
 def _random_motion(limits: Limits, rows: int) -> tuple[Array, Array, Array]:
     """Positions over the whole range, speeds up to the limits and accelerations that reverse them soon, (rows, n)."""
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(7)
     lower = np.where(np.isnan(limits.lower), -np.pi, limits.lower)
     upper = np.where(np.isnan(limits.upper), np.pi, limits.upper)
-    speed = np.where(np.isnan(limits.speed), SPEED, limits.speed)
+    speed = np.where(np.isnan(limits.speed), REFERENCE.speed, limits.speed)
     shape = (rows, len(speed))
     return (
         rng.uniform(lower, upper, shape),
         rng.uniform(-speed, speed, shape),
-        rng.uniform(-1, 1, shape) * speed / TURN_S,
+        rng.uniform(-1, 1, shape) * speed / REFERENCE.turn_s,
     )

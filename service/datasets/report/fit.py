@@ -17,23 +17,29 @@ from lipcore.data.samples import Array
 from lipcore.kernels.friction import SIGN_WIDTH
 from service.datasets.report.signals import Rows
 
-OWN = 5
+OWN_FEATURES = ("dq", "sign dq", "ddq", "cos q", "sin q")
 """Features of each joint alone."""
-PRODUCTS = 100
-"""Random angles, with three features each."""
-NEIGHBOURS = 3
-"""Most joints whose angles are summed."""
-PENALTIES = 10.0 ** np.arange(-8.0, 3.0)
-"""Tried, as shares of a feature's variance."""
-RIDGE = 1e-9
-"""The same for what is not penalised: features that depend on each other stay harmless."""
-USABLE = 0.5
-"""Share of the independent rows that may be used up by weights."""
-STILL = 1e-9
-"""Spread below which a feature is constant."""
-SEED = 5
-EIGHTHS = 8
-"""Parts of a recording that are left out one at a time."""
+
+
+@dataclass(frozen=True)
+class MotionFitOptions:
+    """Numbers of the fit of torque to motion."""
+
+    products: int = 100
+    """Random angles, with three features each."""
+    max_neighbours: int = 3
+    """Max joints whose angles are summed."""
+    ridge: float = 1e-9
+    """Penalty of the joints' own features, as a share of their variance: collinear features stay harmless."""
+    max_used: float = 0.5
+    """Max share of the independent rows that the weights use up."""
+    min_spread: float = 1e-9
+    """Spread, relative to the size, at which a feature is constant."""
+    parts: int = 8
+    """Parts of a recording that are held out one at a time."""
+
+
+FIT = MotionFitOptions()
 
 
 @dataclass(frozen=True)
@@ -58,23 +64,23 @@ class Fit:
         return np.asarray(centred - self.whitened.T @ (self.whitened @ centred))
 
     def held_out(self, y: Array) -> Array:
-        """Squared error on each eighth of the rows of fits without it, of torques y (R, k): (EIGHTHS, k).
+        """Squared error on each eighth of the rows of fits without it, of torques y (R, k): (8, k).
 
         With the residual r and the hat matrix H of all rows, that on a part B is (I − H_BB)⁻¹ r_B.
         """
         left, rows = self.residuals(y), len(y)
         hat = np.vstack([np.full(rows, rows**-0.5), self.whitened])
         out = []
-        for first, last in pairwise(np.linspace(0, rows, EIGHTHS + 1).astype(np.int64)):
+        for first, last in pairwise(np.linspace(0, rows, FIT.parts + 1).astype(np.int64)):
             part, own = hat[:, first:last], left[first:last]
-            inner = (1 + RIDGE) * np.eye(len(hat)) - part @ part.T
+            inner = (1 + FIT.ridge) * np.eye(len(hat)) - part @ part.T
             out.append(np.sum((own + part.T @ np.linalg.solve(inner, part @ own)) ** 2, axis=0))
         return np.array(out)
 
 
 def friction_terms(joint: int) -> tuple[int, int]:
     """Places of a joint's velocity and of its smoothed sign among the joints' own features."""
-    return OWN * joint, OWN * joint + 1
+    return len(OWN_FEATURES) * joint, len(OWN_FEATURES) * joint + 1
 
 
 def make_fit(rows: Rows, q: Array, dq: Array, ddq: Array, tau: Array, independent: float) -> Fit:
@@ -84,7 +90,7 @@ def make_fit(rows: Rows, q: Array, dq: Array, ddq: Array, tau: Array, independen
     """
     joints = q.shape[1]
     own, means, scales = _scaled([f for j in range(joints) for f in own_features(q[:, j], dq[:, j], ddq[:, j])])
-    lower = np.linalg.cholesky(own.T @ own + RIDGE * len(rows) * np.eye(own.shape[1]))
+    lower = np.linalg.cholesky(own.T @ own + FIT.ridge * len(rows) * np.eye(own.shape[1]))
     inverse = np.asarray(np.linalg.inv(lower), np.float64)  # not that of the product: features may be nearly collinear
     free, whitened = inverse.T @ inverse, inverse @ own.T
     products, _, _ = _scaled(_products(q, dq, ddq))
@@ -115,12 +121,12 @@ def own_features(q: Array, dq: Array, ddq: Array) -> tuple[Array, ...]:
 
 
 def _products(q: Array, dq: Array, ddq: Array) -> list[Array]:
-    """Random terms of an arm's torque, the same every time: 3 PRODUCTS columns (R,)."""
-    rng = np.random.default_rng(SEED)
+    """Random terms of an arm's torque, the same every time: three columns (R,) a product."""
+    rng = np.random.default_rng(5)
     joints = q.shape[1]
     out = []
-    for _ in range(PRODUCTS):
-        first, count = rng.integers(joints), rng.integers(1, NEIGHBOURS + 1)
+    for _ in range(FIT.products):
+        first, count = rng.integers(joints), rng.integers(1, FIT.max_neighbours + 1)
         neighbours = slice(first, first + count)
         signs = rng.choice([-1.0, 1.0], len(q[0, neighbours]))
         wave = np.cos(q[:, neighbours] @ signs + np.pi / 2 * rng.integers(2))
@@ -134,7 +140,7 @@ def _scaled(columns: list[Array]) -> tuple[Array, Array, Array]:
     raw = np.column_stack(columns)
     means: Array = raw.mean(axis=0)
     wide = raw.std(axis=0)
-    scales: Array = np.where(wide > STILL * (1 + np.abs(means)), wide, np.inf)
+    scales: Array = np.where(wide > FIT.min_spread * (1 + np.abs(means)), wide, np.inf)
     raw -= means
     raw /= scales
     return raw, means, scales
@@ -147,9 +153,9 @@ def _penalty(values: Array, projected: Array, rest: Array, own: int, independent
     """
     squares = np.sum(rest**2, axis=0)
     chosen, lowest = None, np.inf
-    for penalty in len(rest) * PENALTIES:
+    for penalty in len(rest) * 10.0 ** np.arange(-8.0, 3.0):  # shares of a feature's variance
         used = own + float(np.sum(values / (values + penalty)))
-        if used > USABLE * independent:
+        if used > FIT.max_used * independent:
             continue
         share = 1 / (values + penalty) + penalty / (values + penalty) ** 2
         left = np.maximum(squares - share @ projected**2, 1e-12 * squares + 1e-300)

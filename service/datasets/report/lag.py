@@ -10,42 +10,53 @@ friction and noise, torque late by 0 or 20 ms, a joint's lag was wrong by 0.6 to
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from lipcore.data.samples import Array
 from service.contract.datasets import Lag
-from service.datasets.report.fit import EIGHTHS, Fit
+from service.datasets.report.fit import FIT, Fit
 from service.datasets.report.signals import Rows
 from service.foundation.text import percent
 
-LARGEST_S = 0.25
-"""Largest lag looked for, s."""
-MOST_SHIFTS = 60
-"""Shifts to either side that are tried."""
-CAUTION = 1.5
-"""How many times larger errors are than leaving out an eighth at a time says: on a simulated Panda with known delays
-0.8 to 2.3 times, as it cannot tell what the fit gets wrong everywhere."""
-DISTINCT = 1.2
-"""How many times worse the fit has to be at either end of the shifts than at its best: else any shift would do."""
-FINEST_S = 1e-3
-"""Added to a joint's standard deviation where joints are taken together, s: none is to outweigh all others."""
-SURE = 3.0
-"""Standard deviations that a lag has to differ from 0 by."""
-UNSURE_S = 0.01
-"""Standard deviation from which on a lag cannot be told, s."""
-LOWERS, OFTEN = 0.05, 3.0
-"""Share of the error on eighths held out that a shift has to take away, and standard deviations of that between
-eighths, before a lag is taken for one."""
-UNEXPLAINED = 0.5
-"""Share of the torque's variance that may be left unexplained at the best shift."""
+
+@dataclass(frozen=True)
+class LagOptions:
+    """When a lag counts as known."""
+
+    max_s: float = 0.25
+    """Max lag that is tried, s."""
+    max_shifts: int = 60
+    """Max shifts to either side that are tried."""
+    caution: float = 1.5
+    """True error over that of leaving out an eighth at a time, which misses what the fit gets wrong everywhere: 0.8 to
+    2.3 on a simulated Panda with known delays."""
+    distinct: float = 1.2
+    """Ratio of errors at either end of the shifts to the lowest; below it any shift would do."""
+    min_std_s: float = 1e-3
+    """Added to a joint's standard deviation where joints are combined, s: no joint outweighs all others."""
+    stds: float = 3.0
+    """Standard deviations by which a lag has to differ from 0."""
+    max_std_s: float = 0.01
+    """Max standard deviation of a known lag, s."""
+    min_gain: float = 0.05
+    """Share of the error on eighths held out that a shift has to remove."""
+    gain_stds: float = 3.0
+    """Standard deviations, between eighths, by which that has to differ from 0."""
+    max_unexplained: float = 0.5
+    """Max share of the torque's variance that is unexplained at the best shift."""
+
+
+LAG = LagOptions()
 
 
 def shifts(rate: float, longest_part: int) -> Rows | None:
     """Steps to shift by, ascending and symmetric about 0; None where the parts are too short for three."""
-    most = min(int(LARGEST_S * rate), longest_part // 8)
+    most = min(int(LAG.max_s * rate), longest_part // 8)
     if most < 2:
         return None
-    every = max(1, round(most / MOST_SHIFTS))
+    every = max(1, round(most / LAG.max_shifts))
     return np.asarray(every * np.arange(-(most // every), most // every + 1), np.int64)
 
 
@@ -54,7 +65,7 @@ class Lags:
 
     def __init__(self, fit: Fit, steps: Rows, rate: float) -> None:
         self.fit, self.steps, self.rate = fit, steps, rate
-        self._blocks = np.linspace(0, len(fit.rows), EIGHTHS + 1).astype(np.int64)
+        self._blocks = np.linspace(0, len(fit.rows), FIT.parts + 1).astype(np.int64)
         self._known: list[tuple[float, float]] = []
 
     def of_joint(self, name: str, tau: Array) -> tuple[Lag, float]:
@@ -81,24 +92,24 @@ class Lags:
         shifted = np.interp(at, np.arange(len(tau)), tau)
         here, there = self.fit.held_out(np.column_stack([tau[self.fit.rows], shifted])).T
         less = here - there
-        often = less.mean() > OFTEN * less.std(ddof=1) / np.sqrt(EIGHTHS)
-        return bool(often and less.sum() > LOWERS * here.sum())
+        often = less.mean() > LAG.gain_stds * less.std(ddof=1) / np.sqrt(FIT.parts)
+        return bool(often and less.sum() > LAG.min_gain * here.sum())
 
     def of_all(self) -> Lag:
         """What the joints that tell a lag say together, as one clock would have it; less sure where they disagree."""
         if not self._known:
             return _unknown(None, "no joint tells")
         seconds, std = np.array(self._known).T
-        weight = 1 / (std**2 + FINEST_S**2)
+        weight = 1 / (std**2 + LAG.min_std_s**2)
         mean = float(weight @ seconds / weight.sum())
         misfit = float(weight @ (seconds - mean) ** 2) / max(1, len(seconds) - 1)
         return Lag(joint=None, seconds=mean, std_s=float(np.sqrt(max(1.0, misfit) / weight.sum())))
 
     def _judge(self, name: str, curves: Array, cost: float, unexplained: float) -> Lag:
         """curves: squared residuals over the shifts, of all rows first, then without an eighth each, (9, S)."""
-        if unexplained > UNEXPLAINED:
+        if unexplained > LAG.max_unexplained:
             return _unknown(name, f"motion explains only {percent(1 - unexplained)} of the torque")
-        if min(curves[0, 0], curves[0, -1]) < DISTINCT * curves[0].min():
+        if min(curves[0, 0], curves[0, -1]) < LAG.distinct * curves[0].min():
             return _unknown(
                 name, "one shift of time explains the torque about as well as another: record faster motion"
             )
@@ -106,8 +117,8 @@ class Lags:
         if np.isnan(lowest).any():
             return _unknown(name, "no shift of time is better than its neighbours: record faster motion")
         left_out = lowest[1:]
-        std = CAUTION * float(np.sqrt((EIGHTHS - 1) / EIGHTHS * np.sum((left_out - left_out.mean()) ** 2)))
-        if std > UNSURE_S:
+        std = LAG.caution * float(np.sqrt((FIT.parts - 1) / FIT.parts * np.sum((left_out - left_out.mean()) ** 2)))
+        if std > LAG.max_std_s:
             return _unknown(name, f"parts of the recording differ by {1e3 * std:.0f} ms: record faster motion")
         return Lag(joint=name, seconds=float(lowest[0]), std_s=std, cost=cost)
 
@@ -125,7 +136,7 @@ class Lags:
 
 def clear(lag: Lag) -> bool:
     """Whether a lag differs from 0."""
-    return lag.seconds is not None and lag.std_s is not None and abs(lag.seconds) > SURE * lag.std_s
+    return lag.seconds is not None and lag.std_s is not None and abs(lag.seconds) > LAG.stds * lag.std_s
 
 
 def _unknown(name: str | None, reason: str) -> Lag:

@@ -18,7 +18,7 @@ from service.datasets.mapping.choice import WARNING
 from service.datasets.report.advice import advice, in_words, warnings
 from service.datasets.report.bodies import Against, Bodies, Signals, compare
 from service.datasets.report.causes import TorqueWork, causes
-from service.datasets.report.excitation import SELDOM, RigidExcitation, joint_excitation, judge_rigid_bodies, weights
+from service.datasets.report.excitation import FRICTION, RigidExcitation, joint_excitation, judge_rigid_bodies, weights
 from service.datasets.report.fit import make_fit
 from service.datasets.report.lag import Lags, clear, no_lags, shifts
 from service.datasets.report.remedies import Upload
@@ -245,7 +245,9 @@ def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> schem
         out = schema.Excitation(friction_beside="any motion", joints=samples.excitation, whole=None, text="")
     else:
         joints = [
-            each.model_copy(update=weights(friction, speed, torque, min(each.forwards, each.backwards) < SELDOM))
+            each.model_copy(
+                update=weights(friction, speed, torque, min(each.forwards, each.backwards) < FRICTION.seldom)
+            )
             for each, friction, speed, torque in zip(
                 samples.excitation, rigid.friction, samples.speeds, samples.torques, strict=True
             )

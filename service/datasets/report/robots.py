@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,13 +15,22 @@ from service.datasets.report.bodies import Against, Bodies, Signals, compare
 from service.datasets.report.remedies import Upload, remedy
 from service.datasets.report.signals import limits_of
 
-LIKE = (0.6, 1.7)
-"""Factors that count as 1: URDFs are wrong by as much, and loads are not in them."""
-ALIKE, UNLIKE = 1.3, 1.5
-"""Factors of gravity up to which a robot is taken for the right one, and from which on for a wrong one."""
-MOST_NAMED = 3
-TRUSTED = 0.6
-"""Share of a joint's torque that has to be explained before a factor is believed."""
+
+@dataclass(frozen=True)
+class MatchOptions:
+    """When a robot's rigid bodies explain a torque."""
+
+    one: tuple[float, float] = (0.6, 1.7)
+    """Factors that count as 1: URDFs are wrong by as much, and payloads are not in them."""
+    right: float = 1.3
+    """Max factor of gravity of the right robot."""
+    wrong: float = 1.5
+    """Min factor of gravity of a wrong robot."""
+    explained: float = 0.6
+    """Share of a joint's torque that has to be explained before a factor is believed."""
+
+
+MATCH = MatchOptions()
 
 
 def bodies_of(robot: Profile, names: tuple[str, ...]) -> Bodies | None:
@@ -36,7 +46,7 @@ def bodies_of(robot: Profile, names: tuple[str, ...]) -> Bodies | None:
 
 def heavy(against: Against) -> list[int]:
     """Joints whose torque gravity is a visible and steady part of."""
-    return [j for j in range(len(against.gravity)) if against.steady(j, 0) and against.explained[j] > TRUSTED]
+    return [j for j in range(len(against.gravity)) if against.steady(j, 0) and against.explained[j] > MATCH.explained]
 
 
 def usual_gravity(against: Against) -> float | None:
@@ -45,7 +55,7 @@ def usual_gravity(against: Against) -> float | None:
     if not len(factors) or (factors <= 0).any():
         return None
     middle = float(np.median(factors))
-    alike = (factors > LIKE[0] * middle) & (factors < LIKE[1] * middle)
+    alike = (factors > MATCH.one[0] * middle) & (factors < MATCH.one[1] * middle)
     return middle if 3 * alike.sum() >= 2 * len(factors) else None
 
 
@@ -58,7 +68,7 @@ def proposed(names: tuple[str, ...], signals: Signals) -> tuple[tuple[str, ...],
     for candidate in candidates:
         bodies = bodies_of(profile(candidate), names)
         usual = None if bodies is None else usual_gravity(compare(bodies, signals))
-        if usual is not None and LIKE[0] < usual < LIKE[1]:
+        if usual is not None and MATCH.one[0] < usual < MATCH.one[1]:
             off[candidate] = abs(np.log(usual))
     return candidates, min(off, key=lambda each: off[each], default=None)
 
@@ -82,7 +92,7 @@ def unnamed(n_joints: int) -> str | None:
         return None
     return (
         "no robot is named, and the names of the joints suggest none: is it one of `lipserve robots list`, such as "
-        f"{listed(known[:MOST_NAMED])}? Then upload it with `--robot`, and friction, limits and torque are judged "
+        f"{listed(known[:3])}? Then upload it with `--robot`, and friction, limits and torque are judged "
         "beside its own"
     )
 
@@ -90,7 +100,7 @@ def unnamed(n_joints: int) -> str | None:
 def other_robot(upload: Upload, bodies: Bodies, against: Against, signals: Signals) -> Remedy | None:
     """A robot whose joints are called alike and whose gravity is that of the torque, where the upload's is not."""
     own = usual_gravity(against)
-    if own is None or 1 / UNLIKE < own < UNLIKE:
+    if own is None or 1 / MATCH.wrong < own < MATCH.wrong:
         return None
     _, best = proposed(upload.names, signals)
     other = None if best is None or best == bodies.name else bodies_of(profile(best), upload.names)
@@ -98,7 +108,7 @@ def other_robot(upload: Upload, bodies: Bodies, against: Against, signals: Signa
         return None
     fit = compare(other, signals)
     theirs = usual_gravity(fit)
-    if theirs is None or not 1 / ALIKE < theirs < ALIKE or fit.error > against.error:
+    if theirs is None or not 1 / MATCH.right < theirs < MATCH.right or fit.error > against.error:
         return None
     return remedy(
         "robot",

@@ -17,8 +17,6 @@ from service.contract.datasets import Gap, JointLimits, JointSaturation, Timing
 from service.datasets.staging import EPISODE, TIME, Staged
 
 Rows = NDArray[np.int64]
-MOST_GAPS = 20
-"""Gaps that a report lists."""
 
 
 def number_parts(rows: int, breaks: list[NDArray[np.bool_]]) -> Rows:
@@ -111,7 +109,7 @@ def look_at_clock(raw: Staged, gap_steps: float, repeated: int) -> RecordedTimes
 
 
 def _longest(t: Array, steps: Array, gaps: NDArray[np.intp]) -> list[Gap]:
-    longest = np.sort(gaps[np.argsort(-steps[gaps], kind="stable")[:MOST_GAPS]])
+    longest = np.sort(gaps[np.argsort(-steps[gaps], kind="stable")[:20]])
     return [Gap(t=float(t[row]), seconds=float(steps[row])) for row in longest]
 
 
@@ -128,18 +126,19 @@ def _without_times(missing: int) -> Timing:
     )
 
 
-AT_LIMIT = 0.99
-"""Share of the torque limit from which on a torque counts as saturated."""
-FLAT_ROWS = 5
-"""Equal extreme torques in a row, while the joint moves, that are no chance."""
-EXTREME = 1e-9
-"""Share of the span that counts as equal to the largest value: rounding of a text file."""
-NORMAL = 1.4826
-"""Standard deviation of normal noise over the median of its size."""
-MOST = 200_000
-"""Differences that are enough for a median."""
-SPREAD_SHARE = 0.1
-"""Of the spread: what stands in where the parts are too short to tell, as in `noise_level`."""
+@dataclass(frozen=True)
+class SaturationOptions:
+    """When a torque counts as cut off."""
+
+    at_limit: float = 0.99
+    """Share of the torque limit from which on a torque counts as saturated."""
+    min_run: int = 5
+    """Equal extreme torques in a row, while the joint moves, that are no chance."""
+    rounding: float = 1e-9
+    """Share of the span that counts as equal to the largest value: rounding of a text file."""
+
+
+SATURATION = SaturationOptions()
 
 
 @dataclass(frozen=True)
@@ -215,11 +214,11 @@ def against_limits(joint: int, name: str, columns: dict[str, Array], limits: Lim
 def saturation(joint: int, name: str, q: Array, tau: Array, limits: Limits | None) -> JointSaturation:
     """Look for flat tops of one joint's torque; q, tau: (N,), values missing ones left out."""
     limit = np.nan if limits is None else float(limits.torque[joint])
-    at_limit = float(np.mean(np.abs(tau) >= AT_LIMIT * limit)) if np.isfinite(limit) and len(tau) else None
+    at_limit = float(np.mean(np.abs(tau) >= SATURATION.at_limit * limit)) if np.isfinite(limit) and len(tau) else None
     span = float(np.ptp(tau)) if len(tau) else 0.0
     if span == 0:
         return JointSaturation(joint=name, at_largest=0.0, flat=0.0, at_limit=at_limit)
-    top, bottom = tau >= tau.max() - EXTREME * span, tau <= tau.min() + EXTREME * span
+    top, bottom = tau >= tau.max() - SATURATION.rounding * span, tau <= tau.min() + SATURATION.rounding * span
     # a robot that stands still holds its torque: only what stays equal while the position changes was cut off
     moved = np.concatenate([[True], np.diff(q) != 0])
     flat = _in_runs(top & moved) + _in_runs(bottom & moved)
@@ -235,10 +234,10 @@ def _against(values: Array, limit: float) -> tuple[float | None, float | None]:
 
 
 def _in_runs(mask: np.ndarray) -> int:
-    """Rows of a mask (N,) that are part of runs of FLAT_ROWS and more."""
+    """Rows of a mask (N,) that are part of runs of SATURATION.min_run and more."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     lengths = edges[1::2] - edges[::2]
-    return int(lengths[lengths >= FLAT_ROWS].sum())
+    return int(lengths[lengths >= SATURATION.min_run].sum())
 
 
 def white_noise(values: Array, part: Rows, robust: bool = False) -> float | None:
@@ -259,15 +258,22 @@ def white_noise(values: Array, part: Rows, robust: bool = False) -> float | None
     return min(levels) if levels else None
 
 
-SEGMENT, SEGMENTS = 128, 200
-"""Rows of a piece of a signal whose spectrum is taken, and most pieces."""
-MIDDLE, TOP = slice(19, 32), slice(45, 61)
-"""Places in that spectrum: 0.15 to 0.25, and 0.35 to 0.48 of the sampling rate."""
-FALLING = 0.02
-"""Power at the top of a spectrum, over that in its middle, below which a filter of two poles or more must be behind it:
-white noise has 1, one pole 0.2, and so have jumps, as of friction."""
-NO_NOISE = 1e-6
-"""Noise over the spread below which it is that of numbers."""
+@dataclass(frozen=True)
+class SmoothingOptions:
+    """When the noise of a torque counts as filtered out, by the spectra of pieces of the signal."""
+
+    rows: int = 128
+    """Rows of a piece."""
+    max_pieces: int = 200
+    """Max pieces."""
+    max_top: float = 0.02
+    """Power at the top of the spectrum over that in its middle, below which there is a filter of two poles or more:
+    white noise has 1, one pole 0.2, and so have jumps, as of friction."""
+    min_noise: float = 1e-6
+    """Noise over the spread below which it is that of numbers."""
+
+
+SMOOTHING = SmoothingOptions()
 
 
 def smoothed(values: Array, part: Rows, level: float | None) -> bool:
@@ -278,24 +284,27 @@ def smoothed(values: Array, part: Rows, level: float | None) -> bool:
     wide = spread(values[np.isfinite(values)])
     if level is None or wide == 0:
         return False
-    if level < NO_NOISE * wide:
+    if level < SMOOTHING.min_noise * wide:
         return True
     starts, ends = bounds(part)
-    firsts = np.concatenate([np.arange(a, b - SEGMENT + 1, SEGMENT // 2) for a, b in zip(starts, ends, strict=True)])
+    firsts = np.concatenate(
+        [np.arange(a, b - SMOOTHING.rows + 1, SMOOTHING.rows // 2) for a, b in zip(starts, ends, strict=True)]
+    )
     if len(firsts) == 0:
         return False
-    firsts = firsts[np.linspace(0, len(firsts) - 1, min(len(firsts), SEGMENTS)).astype(np.int64)]
-    pieces = values[firsts[:, None] + np.arange(SEGMENT)]
-    window = np.hanning(SEGMENT)
+    firsts = firsts[np.linspace(0, len(firsts) - 1, min(len(firsts), SMOOTHING.max_pieces)).astype(np.int64)]
+    pieces = values[firsts[:, None] + np.arange(SMOOTHING.rows)]
+    window = np.hanning(SMOOTHING.rows)
     power = np.median(np.abs(np.fft.rfft((pieces - pieces.mean(1, keepdims=True)) * window, axis=1)) ** 2, axis=0)
-    return bool(power[TOP].mean() < FALLING * power[MIDDLE].mean())
+    middle, top = power[19:32], power[45:61]  # 0.15 to 0.25, and 0.35 to 0.48 of the sampling rate
+    return bool(top.mean() < SMOOTHING.max_top * middle.mean())
 
 
 def _size(differences: Array, robust: bool) -> float:
     """Their root mean square, or what it would be by their median; coarse signals mostly have none that is not 0."""
     if robust:
-        some = differences[:: max(1, len(differences) // MOST)]
-        middle = NORMAL * float(np.median(np.abs(some)))
+        some = differences[:: max(1, len(differences) // 200_000)]  # enough for a median
+        middle = 1.4826 * float(np.median(np.abs(some)))  # the factor of normal noise
         if middle > 0:
             return middle
     return float(np.sqrt(np.dot(differences, differences) / len(differences)))
@@ -304,4 +313,4 @@ def _size(differences: Array, robust: bool) -> float:
 def noise_or_share(values: Array, part: Rows) -> float:
     """The same, a tenth of the spread where the parts are too short: equal to `noise_level`."""
     level = white_noise(values, part)
-    return SPREAD_SHARE * float(values.std()) if level is None else level
+    return 0.1 * float(values.std()) if level is None else level
