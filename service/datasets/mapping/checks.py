@@ -2,31 +2,46 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
-from service.datasets.mapping.vocabulary import TURN
 from service.foundation.errors import InvalidDataError, invalid_data
 
 MIN_SAMPLES = 30
 """Samples of a data set, at least."""
-CONSTANT = 1e-6
-"""A joint whose positions span less than this (rad, m) has not moved."""
-MOVED = 0.01
-"""One that was left out and whose positions span more than this (rad, m) has moved."""
-JUMP = 1.0
-"""Between two rows a position that jumps by a turn, but for so many rad, has been wrapped."""
-LARGEST = 1e12
-"""No time, motion or torque in SI units is larger; beyond it, squares and differences overflow."""
-SLOWEST = 1.0
-"""Steps of time of so many s are no robot's: they are in another unit."""
-WINDOW, STRETCH = 25, 20_000
-"""Rows over which a signal and its derivative are compared, and first rows of a recording that are looked at."""
-AGREEMENT, LIKENESS = 0.97, 0.05
-"""Correlation from which on such a comparison tells, and how near a factor has to be to that of a unit."""
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """Limits of usable columns."""
+
+    constant: float = 1e-6
+    """Span in rad or m below which a joint has not moved."""
+    moved: float = 0.01
+    """Span in rad or m above which a joint that was left out has moved."""
+    jump: float = 1.0
+    """A position that jumps by a turn between two rows, within so many rad, was wrapped."""
+    max_size: float = 1e12
+    """Max size of a time, motion or torque in SI units; beyond it, squares and differences overflow."""
+    max_step_s: float = 1.0
+    """Max step of time of a robot, s; longer ones are in another unit."""
+    window: int = 25
+    """Rows over which a signal and its derivative are compared."""
+    stretch: int = 20_000
+    """Max rows at the start of a recording that are compared so."""
+    correlation: float = 0.97
+    """Min correlation at which such a comparison counts."""
+    tolerance: float = 0.05
+    """Max relative difference between a factor and that of a unit."""
+
+
+CHECKS = CheckOptions()
+
+
 Rows = NDArray[np.int64]
 
 
@@ -53,9 +68,10 @@ class Seen:
             return
         size = np.abs(values)
         place = int(size.argmax())
-        if size[place] > LARGEST:
-            first = int((size > LARGEST).argmax())
-            raise invalid_data(f"{self.name}, row {rows[first]}", str(values[first]), f"SI units, within ±{LARGEST:g}")
+        if size[place] > CHECKS.max_size:
+            first = int((size > CHECKS.max_size).argmax())
+            expected = f"SI units, within ±{CHECKS.max_size:g}"
+            raise invalid_data(f"{self.name}, row {rows[first]}", str(values[first]), expected)
         if size[place] > abs(self.far):
             self.far, self.far_row = float(values[place]), int(rows[place])
         self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
@@ -87,7 +103,7 @@ class Turns:
         numbers = np.zeros(len(known)) if episode is None else episode[known]
         last = self._last or (float(values[0]), float(numbers[0]))
         step, other = np.diff(values, prepend=last[0]), np.diff(numbers, prepend=last[1]) != 0
-        jumps = np.where((np.abs(np.abs(step) - TURN) < JUMP) & ~other, -np.sign(step), 0.0)
+        jumps = np.where((np.abs(np.abs(step) - math.tau) < CHECKS.jump) & ~other, -np.sign(step), 0.0)
         self._last = float(values[-1]), float(numbers[-1])
         if jumps.any():
             self.first = self.first or int(rows[known[np.flatnonzero(jumps)[0]]])
@@ -99,7 +115,7 @@ class Turns:
         turned = np.where(begun < 0, turned + self._turned, turned - turned[np.maximum(begun, 0)])
         self._turned = float(turned[-1])
         out = q.copy()
-        out[known] += TURN * turned
+        out[known] += math.tau * turned
         return out
 
 
@@ -176,7 +192,7 @@ def check_positions(seen: list[tuple[str, Seen]], max_position: float, certain: 
             'units={"q": "rad"} if joints turn on',
         )
     for joint, each in seen:
-        if each.span < CONSTANT:
+        if each.span < CHECKS.constant:
             raise invalid_data(
                 each.name,
                 f"constant at {each.low:g}",
@@ -194,7 +210,7 @@ def check_torques(seen: list[tuple[str, Seen]]) -> None:
 
 def epoch_unit(t: Array, rows: Rows, name: str) -> None:
     """Raise InvalidDataError where times that nobody gave a unit are too large for seconds since whenever."""
-    large = np.abs(t) > LARGEST
+    large = np.abs(t) > CHECKS.max_size
     if large.any():
         value = float(t[large.argmax()])
         unit = "ms" if abs(value) < 1e14 else "us" if abs(value) < 1e17 else "ns"  # since 1970
@@ -210,17 +226,17 @@ def check_time_unit(t: Array, given: bool, name: str) -> None:
     step = np.diff(t[~np.isnan(t)])
     step = step[step > 0]
     usual = float(np.median(step)) if len(step) else 0.0
-    if given or usual < SLOWEST:
+    if given or usual < CHECKS.max_step_s:
         return
     unit = "ms" if usual < 500 else "us" if usual < 500e3 else "ns"  # of rates from 2 to 1000 Hz
     raise invalid_data(name, f"in steps of {usual:g}", _seconds(unit))
 
 
 UNITS_OF_RATIO: tuple[tuple[float, tuple[str, str] | None, tuple[str, str] | None], ...] = (
-    (360 / TURN, ("dq", "deg/s"), ("ddq", "deg/s^2")),
-    (TURN / 360, ("q", "deg"), ("dq", "deg/s")),
-    (60 / TURN, ("dq", "rpm"), None),
-    (1 / TURN, ("dq", "rev/s"), ("ddq", "rev/s^2")),
+    (360 / math.tau, ("dq", "deg/s"), ("ddq", "deg/s^2")),
+    (math.tau / 360, ("q", "deg"), ("dq", "deg/s")),
+    (60 / math.tau, ("dq", "rpm"), None),
+    (1 / math.tau, ("dq", "rev/s"), ("ddq", "rev/s^2")),
     (1000.0, ("dq", "mm/s"), ("ddq", "mm/s^2")),
     (1e-3, ("q", "mm"), ("dq", "mm/s")),
 )
@@ -230,16 +246,17 @@ UNITS_OF_RATIO: tuple[tuple[float, tuple[str, str] | None, tuple[str, str] | Non
 def slope_ratio(t: Array, values: Array, derivative: Array) -> float | None:
     """How many times as large a derivative is as the slope of what it is of; None where the data cannot tell.
 
-    All (M,), of one contiguous recording. Compares what `values` change by over WINDOW rows with the integral of the
+    All (M,), of one contiguous recording. Compares the change of `values` over some rows with the integral of the
     derivative, which noise hardly disturbs.
     """
-    if len(t) < 2 * WINDOW:
+    window = CHECKS.window
+    if len(t) < 2 * window:
         return None
     steps = np.diff(t) * (derivative[1:] + derivative[:-1]) / 2
     integral = np.concatenate([[0.0], np.cumsum(steps)])
-    expected, integrated = values[WINDOW:] - values[:-WINDOW], integral[WINDOW:] - integral[:-WINDOW]
+    expected, integrated = values[window:] - values[:-window], integral[window:] - integral[:-window]
     product, size, other = float(expected @ integrated), float(expected @ expected), float(integrated @ integrated)
-    if not product**2 > AGREEMENT**2 * size * other:
+    if not product**2 > CHECKS.correlation**2 * size * other:
         return None
     return product / size
 
@@ -252,7 +269,7 @@ def wrong_unit(ratios: list[float | None], derivative: str) -> InvalidDataError 
     ratio = float(np.median(known))
     for value, of_dq, of_ddq in UNITS_OF_RATIO:
         hint = of_dq if derivative == "dq" else of_ddq
-        if hint is not None and abs(ratio / value - 1) < LIKENESS:
+        if hint is not None and abs(ratio / value - 1) < CHECKS.tolerance:
             quantity, unit = hint
             return invalid_data(
                 derivative,
@@ -263,12 +280,12 @@ def wrong_unit(ratios: list[float | None], derivative: str) -> InvalidDataError 
 
 
 def first_stretch(t: Array, episode: Array | None, missing: NDArray[np.bool_]) -> slice:
-    """The first contiguous rows of a recording, STRETCH at most, that is long enough to tell of its units."""
+    """The first contiguous rows of a recording, CHECKS.stretch at most, that is long enough to tell of its units."""
     breaks = missing[1:] | missing[:-1]
     if episode is not None:
         breaks |= np.diff(episode) != 0
     ends = np.concatenate([[0], np.flatnonzero(breaks) + 1, [len(t)]])
     lengths = np.diff(ends)
-    long = np.flatnonzero(lengths >= 4 * WINDOW)
+    long = np.flatnonzero(lengths >= 4 * CHECKS.window)
     place = int(long[0]) if len(long) else int(lengths.argmax())
-    return slice(int(ends[place]), int(min(ends[place + 1], ends[place] + STRETCH)))
+    return slice(int(ends[place]), int(min(ends[place + 1], ends[place] + CHECKS.stretch)))

@@ -12,11 +12,10 @@ from lipcore.vocabulary import TorqueConvention
 from service.contract.uploads import Effort
 from service.datasets.mapping.joints import Joint, order_of
 from service.datasets.mapping.recognition import (
-    AIM,
-    CANONICAL,
     JOINT,
     Family,
     Member,
+    Rank,
     columns_hint,
     families,
     keys,
@@ -54,7 +53,7 @@ def named(family: Family) -> Effort:
     first = next(iter(family.members.values()), None)
     if family.kind == "current" or (first is not None and is_current(first.unit)):
         return "current"
-    return "commanded" if family.rank == AIM else "measured"
+    return "commanded" if family.rank == Rank.AIM else "measured"
 
 
 def prefer(families: Sequence[Family], effort: Effort | None) -> list[Family]:
@@ -92,7 +91,7 @@ def torque(
             f"what a model should learn: name it with {columns_hint({'tau': '…{joint}…'})}, or say effort=commanded if "
             "that is meant"
         )
-    if why == BY_DEFAULT and family.rank == CANONICAL:
+    if why == BY_DEFAULT and family.rank == Rank.CANONICAL:
         notes = []  # as documented
     wrong = next((unit for unit in units if unit is not None and is_current(unit) != (effort == "current")), None)
     if wrong is not None and effort != "current":
@@ -222,9 +221,9 @@ class Families:
             self._check_complete(given, joints)
             return given
         rivals = [each for each in self.others if each.quantity == quantity]
-        if quantity in MOTION and self.positions.rank != AIM:
+        if quantity in MOTION and self.positions.rank != Rank.AIM:
             # what was aimed at is not how the robot moved
-            rivals = [each for each in rivals if each.rank != AIM]
+            rivals = [each for each in rivals if each.rank != Rank.AIM]
         covering = [each for each in rivals if covers(each, joints)]
         if not covering:
             return self._none_complete(quantity, rivals, joints)
@@ -234,9 +233,9 @@ class Families:
                 listed = ", ".join(each.pattern for each in torques[:_MOST_LISTED])
                 raise invalid_data("effort", self.options.read.effort, f"what {listed} holds by its name or unit")
         best = best_of(covering)
-        if quantity != "tau" and best[0].rank == CANONICAL:
+        if quantity != "tau" and best[0].rank == Rank.CANONICAL:
             extra = [member for key, member in best[0].members.items() if key not in self.positions.members]
-            if extra and self.positions.rank == CANONICAL:
+            if extra and self.positions.rank == Rank.CANONICAL:
                 n, name = len(self.positions.members), self.names[extra[0].index]
                 raise invalid_data(f"column {name}", "present", f"at most {quantity}{n}, as there are q1..q{n}")
         if len(best) > 1:
@@ -259,7 +258,7 @@ class Families:
             if source_or_none(family, joint) is not None:
                 continue
             n, quantity = len(self.positions.members), family.quantity
-            if family.rank == CANONICAL:
+            if family.rank == Rank.CANONICAL:
                 name, expected = f"{quantity}{joint.key}", f"{quantity}1..{quantity}{n}, as there are q1..q{n}"
             else:
                 name = family.pattern.replace(JOINT, joint.label)
@@ -348,7 +347,7 @@ def _given(quantity: str, columns: str | tuple[str, ...], names: Sequence[str]) 
         if not family.members:
             raise invalid_data(field, columns, f"a pattern of the file's columns: {', '.join(names[:_MOST_LISTED])}…")
         return family
-    out = Family(quantity, quantity, ", ".join(columns), 1, listed=True)
+    out = Family(quantity, quantity, ", ".join(columns), Rank.MEASURED, listed=True)
     labels = [next((s.joint for s in sightings(each) if s.quantity == quantity), "") for each in columns]
     joint_keys = keys(labels)
     distinct = len(set(joint_keys)) == len(joint_keys) and all(labels)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from lipcore.profiles import Profile
 from service.datasets.mapping.choice import Torque, choose, source, source_or_none, torque
 from service.datasets.mapping.joints import Joint, arrange
-from service.datasets.mapping.recognition import CANONICAL, Family, clocks, is_episode
+from service.datasets.mapping.recognition import Family, Rank, clocks, is_episode
 from service.datasets.mapping.vocabulary import KNOWN, factor
 from service.datasets.options import UploadOptions
 from service.foundation.errors import invalid_data, invalid_request
@@ -184,7 +184,7 @@ def _notes(
     """Which columns were taken for what, where their names or units are not those that are documented."""
     out = []
     for quantity, row in quantities.items():
-        if chosen[quantity].rank != CANONICAL:
+        if chosen[quantity].rank != Rank.CANONICAL:
             out.append(f"{quantity} is read from {chosen[quantity].pattern}")
         units = sorted({each.unit for each in row if each.unit is not None})
         if units and any(each.factor != 1.0 for each in row):

@@ -145,7 +145,7 @@ class _Reader:
                     f"{turns.first}: these were taken out"
                 )
         for name, each in self.left_out.items():
-            if each.span > checks.MOVED:
+            if each.span > checks.CHECKS.moved:
                 out.append(
                     f"warning: {name} is left out though it moved by {each.span:.3g}, which acts on the torques of "
                     "the others"

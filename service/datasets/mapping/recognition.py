@@ -7,10 +7,10 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 from service.datasets.mapping.vocabulary import (
     COMMANDED,
-    DESIRED,
     FOREIGN,
     MEASURED,
     NEUTRAL,
@@ -26,14 +26,20 @@ JOINT = "{joint}"
 """In a pattern: where the joint's name or number is."""
 Key = int | str
 """What tells a joint within a file: its number, from 1 on, or its name in small letters."""
-CANONICAL, PLAIN, AIM = 0, 2, 3
-"""Ranks of a family: named as documented, nothing said, commanded; 1 is measured, expressly."""
 _NUMBERED = re.compile(r"(?:joint|jnt|axis|motor|[aj])?[\s_.\-\[(]*0*(\d{1,6})[\])]*")
-_CANONICAL = re.compile(r"(?:q|dq|ddq|tau)\{joint\}")
 _PATHS = re.compile(r"[/.:]")
 _ADJECTIVES = MEASURED | COMMANDED | {"current"}
-_LONGEST = 150
+MAX_NAME = 150
 """Longer names are not looked at."""
+
+
+class Rank(IntEnum):
+    """How a family's columns are named, the best first: as documented, measured, neither, commanded."""
+
+    CANONICAL = 0
+    MEASURED = 1
+    PLAIN = 2
+    AIM = 3
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,7 @@ class Sighting:
     kind: str
     pattern: str
     joint: str
-    rank: int
+    rank: Rank
     unit: str | None
 
 
@@ -64,7 +70,7 @@ class Family:
     quantity: str
     kind: str
     pattern: str
-    rank: int
+    rank: Rank
     members: dict[Key, Member] = field(default_factory=dict)
     doubled: list[int] = field(default_factory=list)
     listed: bool = False
@@ -102,7 +108,7 @@ def keys(labels: Sequence[str]) -> list[Key]:
 
 def sightings(name: str) -> list[Sighting]:
     """The ways in which a column's name can be read, the likeliest first; none where it says nothing of a joint."""
-    if len(name) > _LONGEST:
+    if len(name) > MAX_NAME:
         return []
     for before, unit in in_header(name):
         parsed = _parse(before, unit, name[len(before) :])
@@ -122,13 +128,14 @@ def unfold(pattern: str, names: Sequence[str], quantity: str) -> Family:
     if JOINT not in pattern:
         matches = [(index, "") for index, name in enumerate(names) if name == pattern]
     seen = next((s for index, _ in matches for s in sightings(names[index]) if s.quantity == quantity), None)
-    kind, rank = (quantity, PLAIN) if seen is None else (seen.kind, AIM if seen.rank == AIM else PLAIN)
+    kind = quantity if seen is None else seen.kind
+    rank = Rank.AIM if seen is not None and seen.rank == Rank.AIM else Rank.PLAIN
     units = [_unit_of(names[index]) for index, _ in matches]
     alike = [
         Sighting(quantity, kind, pattern, label, rank, unit) for (_, label), unit in zip(matches, units, strict=True)
     ]
     if not alike:
-        return Family(quantity, kind, pattern, PLAIN)
+        return Family(quantity, kind, pattern, Rank.PLAIN)
     return _family([(index, each) for (index, _), each in zip(matches, alike, strict=True)])
 
 
@@ -159,14 +166,14 @@ def _parse(name: str, unit: str | None, ending: str) -> list[Sighting]:
     behind = parts[subject.last :]
     inner = _inner_unit(subject, behind) if unit is None else ()
     unit = " ".join(inner) or unit
-    # a desired value is marked behind its quantity: q_d, tau_J_d
-    aimed = any(word.text in COMMANDED for word in parts) or any(word.text == DESIRED for word in behind[:2])
+    # Franka marks a desired value behind its quantity: q_d, tau_J_d; elsewhere `d` may be anything
+    aimed = any(word.text in COMMANDED for word in parts) or any(word.text == "d" for word in behind[:2])
     measured = any(word.text in MEASURED for word in parts)
     out = []
     for start, end in _joints(name, parts, subject, inner):
         pattern = (name[:start] + JOINT + name[end:] if end > start else name) + ending
-        canonical = _CANONICAL.fullmatch(pattern.removesuffix(ending).rstrip()) is not None
-        rank = AIM if aimed else CANONICAL if canonical else 1 if measured else PLAIN
+        canonical = re.fullmatch(r"d?d?q\{joint\}|tau\{joint\}", pattern.removesuffix(ending).rstrip()) is not None
+        rank = Rank.AIM if aimed else Rank.CANONICAL if canonical else Rank.MEASURED if measured else Rank.PLAIN
         out.append(Sighting(subject.quantity, subject.kind, pattern, name[start:end], rank, unit))
     return out
 
@@ -183,7 +190,7 @@ def _inner_unit(subject: Mention, behind: list[Word]) -> tuple[str, ...]:
 
 def _joints(name: str, parts: list[Word], subject: Mention, unit: tuple[str, ...]) -> list[tuple[int, int]]:
     """Where a joint may be named: first the likeliest."""
-    besides = MEASURED | COMMANDED | NEUTRAL | {DESIRED, *unit}
+    besides = MEASURED | COMMANDED | NEUTRAL | {"d", *unit}
     behind = [word for word in parts[subject.last :] if word.text not in besides]
     if len(behind) == 1 and behind[0].text.isdecimal():
         return [(behind[0].start, behind[0].end)]
@@ -217,12 +224,11 @@ def _closed(name: str, start: int, end: int) -> int:
 
 _TIMES = re.compile(r"(?:_*|%|elapsed[_ ]?|log[_ ]?|ros[_ ]?|robot[_ ]?)(?:t|time|times|timestamp|timestamps|stamp)")
 _HALVES = re.compile(r"(.*?)(nsecs?|nanosecs?|nanoseconds|secs?|seconds)")
-_EPISODES = frozenset(f"{name}{end}" for name in ("episode", "trajectory", "run") for end in ("", "_index", "_id"))
 
 
 def is_episode(name: str) -> bool:
     """Whether a column numbers contiguous recordings."""
-    return name.strip().lower() in _EPISODES
+    return re.fullmatch(r"(episode|trajectory|run)(_index|_id)?", name.strip().lower()) is not None
 
 
 @dataclass(frozen=True)
@@ -240,7 +246,7 @@ def clocks(names: Sequence[str]) -> list[TimeColumn]:
     for index, name in enumerate(names):
         if name == "t":
             out.append(TimeColumn(name, 0, ((index, None),)))
-        elif index not in halved and len(name) <= _LONGEST:
+        elif index not in halved and len(name) <= MAX_NAME:
             for before, unit in [*in_header(name), (name, None)]:
                 last = _PATHS.split(before.strip().lower())[-1].strip()
                 if _TIMES.fullmatch(last) and (unit is None or factor("t", unit) is not None):
@@ -255,7 +261,7 @@ def _halved(names: Sequence[str]) -> tuple[list[TimeColumn], set[int]]:
     """Stamps in two columns, whole seconds and nanoseconds, as ROS has them; and the indices of these columns."""
     halves: dict[str, dict[str, int]] = defaultdict(dict)
     for index, name in enumerate(names):
-        if len(name) <= _LONGEST and (match := _HALVES.fullmatch(name.strip().lower())):
+        if len(name) <= MAX_NAME and (match := _HALVES.fullmatch(name.strip().lower())):
             last = [part for part in re.split(r"[/.:_ ]", match[1]) if part][-1:]
             if not last or last[0] in ("stamp", "time", "timestamp", "header"):
                 halves[match[1]]["ns" if match[2].startswith("n") else "s"] = index

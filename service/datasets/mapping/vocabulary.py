@@ -8,22 +8,23 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
-TURN = 2 * math.pi
-_LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-_ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": TURN / 360, "rev": TURN, "turn": TURN}
-_POSITIONS = _ANGLES | _LENGTHS
-CURRENTS = {"a": 1.0, "ma": 1e-3}
-_TORQUES = {
-    **{"nm": 1.0, "mnm": 1e-3, "nmm": 1e-3, "ncm": 1e-2, "knm": 1e3, "kgfcm": 0.0980665, "kgfm": 9.80665},
-    **{"n": 1.0, "kn": 1e3},
+_POSITIONS = {
+    **{"rad": 1.0, "mrad": 1e-3, "deg": math.tau / 360, "rev": math.tau, "turn": math.tau},
+    **{"m": 1.0, "cm": 1e-2, "mm": 1e-3},
 }
+CURRENTS = {"a": 1.0, "ma": 1e-3}
 FACTORS: dict[str, dict[str, float]] = {
     "t": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
     "q": _POSITIONS,
     "dq": {f"{unit}s{end}": factor for unit, factor in _POSITIONS.items() for end in ("", "1")}
-    | {"rpm": TURN / 60, "revmin": TURN / 60, "1min": TURN / 60, "min1": TURN / 60},
-    "ddq": {f"{unit}s{end}": factor for unit, factor in _POSITIONS.items() for end in ("2", "s")} | {"rpms": TURN / 60},
-    "tau": _TORQUES | CURRENTS,
+    | {"rpm": math.tau / 60, "revmin": math.tau / 60, "1min": math.tau / 60, "min1": math.tau / 60},
+    "ddq": {f"{unit}s{end}": factor for unit, factor in _POSITIONS.items() for end in ("2", "s")}
+    | {"rpms": math.tau / 60},
+    "tau": {
+        **{"nm": 1.0, "mnm": 1e-3, "nmm": 1e-3, "ncm": 1e-2, "knm": 1e3, "kgfcm": 0.0980665, "kgfm": 9.80665},
+        **{"n": 1.0, "kn": 1e3},
+        **CURRENTS,
+    },
 }
 """SI units in one of each unit by quantity, units as `plain` writes them: rad/s and rad_s are rads."""
 KNOWN = {
@@ -54,10 +55,6 @@ _SPELLINGS = (
     (re.compile(r"per"), ""),
     (re.compile(r"[\s_/*·⋅.^−-]"), ""),
 )
-_OPENING = {"]": "[", ")": "("}
-_NUMBERED = re.compile(r"(\d\]?|time|stamp|elapsed|\bt)$", re.IGNORECASE)
-_LONGEST = 40
-_SUFFIX_WORDS = 4
 QUANTITY_WORDS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(("q", "pos", "position", "positions"), ("q", "position")),
     **dict.fromkeys(("angle", "angles", "theta", "θ"), ("q", "angle")),
@@ -82,8 +79,6 @@ MEASURED = frozenset(("actual", "act", "measured", "meas", "feedback", "fb", "pr
 COMMANDED = frozenset(
     ("target", "desired", "des", "commanded", "command", "cmd", "reference", "ref", "setpoint", "goal", "action")
 )
-DESIRED = "d"
-"""As in Franka's `q_d` and `tau_J_d`: only behind the quantity, as `d` alone may be anything else."""
 NEUTRAL = frozenset(("joint", "joints", "jnt", "j", "axis", "motor", "filtered", "raw", "state", "value", "link"))
 FOREIGN = (
     frozenset(("tcp", "ee", "eef", "cartesian", "pose", "orientation", "quaternion", "wrench", "twist", "imu"))
@@ -92,15 +87,12 @@ FOREIGN = (
 )
 """A column with such a word is no position, velocity, acceleration or whole torque of a joint."""
 _VOCABULARY = frozenset(QUANTITY_WORDS) | MEASURED | COMMANDED | NEUTRAL | FOREIGN
-_PIECES = re.compile(r"[^\W\d_]+|\d+")
-_CAMEL = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+")
-_JOINT = "joint"
 
 
 @lru_cache(maxsize=1024)
 def plain(unit: str) -> str:
     """A unit without what spellings differ in: case, blanks, signs of multiplication and division, full words."""
-    text = unit.lower()[:_LONGEST]
+    text = unit.lower()[:40]
     for spelling, short in _SPELLINGS:
         text = spelling.sub(short, text)
     return text
@@ -122,17 +114,17 @@ def in_header(name: str) -> Iterator[tuple[str, str]]:
     `q1 [deg]`, `q1 (deg)`, `q1_deg`, `dq1_deg_per_s`. What is in brackets may be no unit at all.
     """
     text = name.rstrip()
-    opening = text.rfind(_OPENING.get(text[-1:], "\n"))
+    opening = text.rfind({"]": "[", ")": "("}.get(text[-1:], "\n"))
     if opening > 0:
         before, unit = text[:opening], text[opening + 1 : -1].strip()
         # without a blank it may be a joint's number or name, as in `position[3]`
         if before[-1].isspace() or _is_unit(unit):
             yield before.rstrip(), unit
         return
-    for place in [each.start() for each in re.finditer(r"[_ ]", name)][-_SUFFIX_WORDS:]:
+    for place in [each.start() for each in re.finditer(r"[_ ]", name)][-4:]:
         before, unit = name[:place], name[place + 1 :]
         # one letter is a unit only where nothing else can be meant: of q1_m, but not of q_m
-        single = len(plain(unit)) == 1 and not _NUMBERED.search(before)
+        single = len(plain(unit)) == 1 and not re.search(r"(?i)(\d\]?|time|stamp|elapsed|\bt)$", before)
         if before and not unit.rpartition("_")[2].isdecimal() and not single and _is_unit(unit):
             yield before, unit
 
@@ -163,16 +155,17 @@ class Mention:
 def words(name: str) -> list[Word]:
     """Cut a name into words and numbers."""
     cut_words = []
-    for piece in _PIECES.finditer(name):
+    for piece in re.finditer(r"[^\W\d_]+|\d+", name):
         text, start = piece.group(), piece.start()
         small = text.lower()
         if small in _VOCABULARY or small.isdecimal():
             cut_words.append(Word(small, start, piece.end()))
-        elif small.startswith(_JOINT) and small[len(_JOINT) :] in QUANTITY_WORDS:
-            cut = start + len(_JOINT)
-            cut_words += [Word(_JOINT, start, cut), Word(small[len(_JOINT) :], cut, piece.end())]
+        elif (rest := small.removeprefix("joint")) != small and rest in QUANTITY_WORDS:
+            cut = piece.end() - len(rest)
+            cut_words += [Word("joint", start, cut), Word(rest, cut, piece.end())]
         else:
-            parts = [Word(m.group().lower(), start + m.start(), start + m.end()) for m in _CAMEL.finditer(text)]
+            camel = re.finditer(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", text)
+            parts = [Word(m.group().lower(), start + m.start(), start + m.end()) for m in camel]
             known = text.isascii() and any(part.text in _VOCABULARY for part in parts)
             cut_words += parts if known else [Word(small, start, piece.end())]
     return cut_words
