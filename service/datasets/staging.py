@@ -23,8 +23,6 @@ from service.storage.disk import Disk, Room
 
 TIME, EPISODE = "t", "episode"
 QUANTITIES = ("q", "dq", "ddq", "tau")
-FOLDER = "prepared"
-"""Of prepared columns: those that were read have the same names."""
 
 
 def column(quantity: str, joint: int) -> str:
@@ -162,7 +160,7 @@ def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: D
     if len(made) < min_samples:
         why = "trimming the filter's edges" if made.cutoff is not None else "leaving out what cannot be used"
         raise invalid_data("rows", len(made), f"at least {min_samples} samples after {why}")
-    own = folder / FOLDER
+    own = folder / "prepared"  # columns that were read have the same names
     own.mkdir()
     staged = Staged(own, raw.joint_names, raw.disk if disk is None else disk)
     staged.append({TIME: made.t, EPISODE: made.episode.astype(np.float64)})

@@ -175,7 +175,6 @@ def _show(row: DatasetRow) -> Dataset:
 
 MOST_POINTS = 2000
 """Most points of a column."""
-UNITS = {"q": "rad or m", "dq": "rad/s or m/s", "ddq": "rad/s² or m/s²", "tau": "N·m or N"}
 
 ReadRows = Callable[[str, int, int], Array]
 """(quantity, first row, row after the last) → these rows of all joints, (rows, n)."""
@@ -200,7 +199,7 @@ def make_preview(
                 PreviewColumn(
                     quantity=quantity,
                     joint=name,
-                    unit=UNITS[quantity],
+                    unit={"q": "rad or m", "dq": "rad/s or m/s", "ddq": "rad/s² or m/s²", "tau": "N·m or N"}[quantity],
                     rows=rows.tolist(),
                     t=t[rows].tolist(),
                     values=values.tolist(),

@@ -18,7 +18,6 @@ MISSING = ("", "NA", "N/A", "<NA>", "na", "null", "NULL", "None")
 _PATTERN = rf"(?i)^(?:{NUMBER}|[+-]?(?:nan|inf(?:inity)?))$"
 _COMMA = r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$"
 _INT_MIN = np.iinfo(np.int64).min
-_SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 
 
 class NumberColumn:
@@ -165,7 +164,7 @@ class _Time:
 
     def __init__(self, name: str, kind: pa.DataType) -> None:
         self.names, self.units = [name], {name: "s"}
-        self.unit = _SECONDS[kind.unit]
+        self.unit = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}[kind.unit]
         self.small = pa.types.is_time32(kind)
         self.origin = None if pa.types.is_timestamp(kind) else 0
 

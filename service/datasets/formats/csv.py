@@ -23,13 +23,10 @@ from service.foundation.settings import Settings
 
 SAMPLE_CHARACTERS = 256 * 1024
 MAX_HEADER = 64 * 1024
-SAMPLE_ROWS = 50
 DELIMITERS = (",", ";", "\t", "|")
 BLANK = " "
 """Stands for any run of blanks and tabs."""
 _NUMERIC = re.compile(rf"\s*(?:{NUMBER}|[+-]?(?:nan|inf(?:inity)?)|[+-]?\d+,\d+(?:[eE][+-]?\d+)?)\s*", re.IGNORECASE)
-_WORDS = {"tab": "\t", "\\t": "\t", "blank": BLANK, "space": BLANK, "comma": ",", "semicolon": ";"}
-HINT = "column_names=t,q1..q7,tau1..tau7"
 EXPECTED = "column names in the first line, separated by , ; | tabs or blanks"
 
 
@@ -69,12 +66,13 @@ def read_header(path: Path, delimiter: str | None, naming: Naming | None = None)
         if naming is not None and not _names_stand(lines[comment] if comment is not None else "", lines[index]):
             return _nameless(lines, index, delimiter, naming)
         if comment is None:
-            raise invalid_data("header", _cut(lines[index]), f"{EXPECTED}, not numbers; or {HINT} names them")
+            expected = f"{EXPECTED}, not numbers; or column_names=t,q1..q7,tau1..tau7 names them"
+            raise invalid_data("header", _cut(lines[index]), expected)
         index = comment
     header = lines[index].strip().lstrip("#%") if index == comment else lines[index].strip("\r\n")
     if "\0" in header:
         raise invalid_data("file", "binary", "text in UTF-8")
-    rows = [line for line in lines[index + 1 : index + 1 + SAMPLE_ROWS] if line.strip() and len(line) <= MAX_HEADER]
+    rows = _sample(lines, index)
     chosen = _delimiter(delimiter) if delimiter else _choose(header, rows)
     names = tuple(name.strip() for name in cells(header, chosen))
     if len(names) < 2:
@@ -95,9 +93,14 @@ def _names_stand(comment: str, row: str) -> bool:
 def _nameless(lines: list[str], index: int, delimiter: str | None, naming: Naming) -> Header:
     """The header of a file without one, whose first row of numbers is that line."""
     first = lines[index].strip("\r\n")
-    rows = [line for line in lines[index + 1 : index + 1 + SAMPLE_ROWS] if line.strip() and len(line) <= MAX_HEADER]
+    rows = _sample(lines, index)
     chosen = _delimiter(delimiter) if delimiter else _choose(first, rows)
     return Header(naming(len(cells(first, chosen))), chosen, index, nameless=True)
+
+
+def _sample(lines: list[str], index: int) -> list[str]:
+    """The first rows below a line, without empty and overlong ones."""
+    return [line for line in lines[index + 1 : index + 51] if line.strip() and len(line) <= MAX_HEADER]
 
 
 def _given(names: tuple[str, ...]) -> Naming:
@@ -165,7 +168,8 @@ def _choose(header: str, rows: list[str]) -> str:
 
 
 def _delimiter(delimiter: str) -> str:
-    chosen = _WORDS.get(delimiter, delimiter)
+    known = {"tab": "\t", "\\t": "\t", "blank": BLANK, "space": BLANK, "comma": ",", "semicolon": ";"}
+    chosen = known.get(delimiter, delimiter)
     if len(chosen) != 1 or chosen.isalnum() or chosen in "\"'.+-_\r\n" or ord(chosen) > 126:
         raise invalid_request("delimiter", delimiter, "one of , ; | tab blank")
     return chosen

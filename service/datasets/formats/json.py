@@ -20,8 +20,6 @@ from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, TooLargeError, invalid_data
 from service.foundation.settings import Settings
 
-SAMPLE_ROWS = 1000
-"""Rows that tell which columns there are."""
 MAX_BYTES = 32 * 1024 * 1024
 """Largest JSON document, which is read as a whole; one object a line may be longer."""
 MAX_LINE_BYTES = 1024 * 1024
@@ -130,7 +128,7 @@ class Rows:
 
     def __init__(self, rows: Iterator[Any]) -> None:
         self._rest = rows
-        self._first = list(islice(rows, SAMPLE_ROWS))
+        self._first = list(islice(rows, 1000))  # rows that tell which columns there are
         for number, row in enumerate(self._first, start=1):
             _check(row, number)
         shape = Shape(self._first, 2 * MAX_COLUMNS)

@@ -24,8 +24,6 @@ from service.foundation.settings import Settings
 ARRAYS = {"q": 2, "dq": 2, "ddq": 2, "tau": 2, "t": 1, "episode": 1, "dt": 0, "joint_names": 1}
 """Known arrays and their dimensions: q, dq, ddq, tau (N, n); t, episode (N,); dt (); joint_names (n,)."""
 EXPECTED = "a complete NPZ archive"
-MAX_FORTRAN = 64
-"""Most columns of an array stored column after column: each is unpacked by a reader of its own."""
 
 
 @dataclass
@@ -133,7 +131,7 @@ def _choose(arrays: dict[str, Stored], rows: int) -> tuple[list[Stored], list[st
         if name in ("dt", "joint_names"):
             continue
         if array.dtype.kind in "fiu" and len(array.shape) in (1, 2) and array.shape[0] == rows and array.width:
-            if array.fortran and array.width > MAX_FORTRAN:
+            if array.fortran and array.width > 64:  # each column is unpacked by a reader of its own
                 raise invalid_data(name, f"{array.width} columns in Fortran order", "C order: numpy.ascontiguousarray")
             used.append(array)
         else:

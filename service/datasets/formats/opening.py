@@ -36,12 +36,8 @@ KINDS = {
     "mcap": "MCAP",
 }
 """What is read here, in words."""
-ZIPPED = ("npz", "lerobot", "joined", "rosbag2")
 ALIKE: tuple[set[str | None], ...] = ({"json", "json_lines"}, {"rosbag1", "rosbag2", "mcap"})
 """Kinds that are taken for one another so often that it is not worth telling."""
-_READABLE = (
-    "CSV, Parquet, NPZ, JSON, a bag of ROS 1 or 2, MCAP, or a zip of a LeRobot data set, a bag, or tables of text"
-)
 _MAGIC = (
     (b"PAR1", "parquet"),
     (b"SQLite format 3\0", "rosbag2"),
@@ -196,10 +192,14 @@ def _kind(path: Path, kind: str | None) -> str:
                 return "json_lines" if len(line.strip()) > 1 and line.endswith(b"\n") and file.read(1) else actual
         return actual
     other = foreign(path)
-    if kind in KINDS and (other is None or (kind in ZIPPED and _starts(path, b"PK"))):
+    if kind in KINDS and (other is None or (kind in ("npz", "lerobot", "joined", "rosbag2") and _starts(path, b"PK"))):
         return kind  # whoever reads that kind says best what is wrong with it
     sent = f" (sent as {KINDS[kind]})" if kind in KINDS else ""
-    raise invalid_data("file", f"{other or 'of no known kind'}{sent}", _READABLE)
+    raise invalid_data(
+        "file",
+        f"{other or 'of no known kind'}{sent}",
+        "CSV, Parquet, NPZ, JSON, a bag of ROS 1 or 2, MCAP, or a zip of a LeRobot data set, a bag, or tables of text",
+    )
 
 
 def _starts(path: Path, magic: bytes) -> bool:

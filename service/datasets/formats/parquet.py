@@ -23,9 +23,6 @@ from service.foundation.settings import Settings
 
 EXPECTED = "a complete Parquet file"
 ERRORS = (pa.ArrowException, OSError, ValueError, EOFError, MemoryError)
-SAMPLE_ROWS = 64
-"""Rows that tell how long lists are."""
-BUFFER_BYTES = 64 * 1024
 
 
 @contextmanager
@@ -49,14 +46,15 @@ class ParquetSource:
         self, file: IO[bytes], settings: Settings, rename: Callable[[str, list[str]], list[str]] | None = None
     ) -> None:
         try:
-            self._file = pq.ParquetFile(file, buffer_size=BUFFER_BYTES, pre_buffer=False, memory_map=False)
+            self._file = pq.ParquetFile(file, buffer_size=64 * 1024, pre_buffer=False, memory_map=False)
             groups = map(self._file.metadata.row_group, range(self._file.metadata.num_row_groups))
             if (size := sum(each.total_byte_size for each in groups)) > settings.max_unpacked_bytes:
                 raise TooLargeError(f"the file unpacks to {size} bytes, expected at most {settings.max_unpacked_bytes}")
             schema = self._file.schema_arrow
             checked_names(schema.names)
             nested = [each.name for each in schema if pa.types.is_nested(_storage_type(each.type))]
-            batches = self._file.iter_batches(SAMPLE_ROWS, columns=nested, use_threads=False) if nested else iter(())
+            # a few rows tell how long lists are
+            batches = self._file.iter_batches(64, columns=nested, use_threads=False) if nested else iter(())
             sample = next(batches, None)
         except ERRORS as error:
             text = first_line(error)

@@ -13,8 +13,6 @@ from service.foundation.errors import invalid_data
 
 BLOCK_ROWS = 16_384
 """Most rows of a block: what is held in memory of a file, however long it is."""
-BLOCK_BYTES = 16 * 1024 * 1024
-"""Largest block: a file of many columns is read fewer rows at a time."""
 SAME_LENGTH = 0.9
 """Share of a list's rows that must be of one length: then another is an error, else the list is of no fixed shape."""
 MAX_COLUMNS = 2000
@@ -40,7 +38,7 @@ class Table:
 
 def block_rows(columns: int) -> int:
     """Rows of a block of so many columns, 1 to BLOCK_ROWS."""
-    return max(1, min(BLOCK_ROWS, BLOCK_BYTES // (8 * max(columns, 1))))
+    return max(1, min(BLOCK_ROWS, 2**24 // (8 * max(columns, 1))))  # at most 16 MiB
 
 
 def checked_names(names: Iterable[str]) -> tuple[str, ...]:

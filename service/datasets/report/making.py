@@ -41,11 +41,6 @@ from service.datasets.report.signals import (
 )
 from service.datasets.staging import EPISODE, QUANTITIES, Prepared, Staged, column
 
-MAX_ROWS = 2000
-"""Rows of a data set that figures on several joints together are taken over."""
-UNSEEN = 1e-3
-"""Share of a torque's spread below which a factor of it would be one of rounding."""
-
 
 def make_report(
     raw: Staged,
@@ -184,7 +179,8 @@ def _look_at_samples(prepared: Prepared, limits: Limits | None) -> _Samples:
     part = number_parts(staged.rows, [np.diff(staged.read(EPISODE)) != 0])
     starts, ends = bounds(part)
     steps = None if rate is None else shifts(rate, int((ends - starts).max()))
-    rows = thin(part, MAX_ROWS, 0 if steps is None else int(steps[-1]))
+    # figures on several joints together are taken over a few rows
+    rows = thin(part, 2000, 0 if steps is None else int(steps[-1]))
     motion = (staged.table("q", rows), staged.table("dq", rows), staged.table("ddq", rows))
     tau = staged.table("tau", rows)
     fit = make_fit(rows, *motion, tau=tau, independent=_independent(prepared))
@@ -273,7 +269,8 @@ def _against_robot(
 def _figures(bodies: Bodies, against: Against) -> schema.AgainstRobot:
     joints = []
     for joint, name in enumerate(bodies.names):
-        visible_parts = [bool(visible > UNSEEN) for visible in against.visible[joint]]
+        # else a factor of it is one of rounding
+        visible_parts = [bool(visible > 1e-3) for visible in against.visible[joint]]
         joints.append(
             schema.JointAgainstRobot(
                 joint=name,

@@ -20,8 +20,6 @@ from service.foundation.settings import Settings
 Data = bytes | memoryview
 MAX_PART_BYTES = 64 * 1024 * 1024
 """Largest chunk or message of a bag, once unpacked."""
-ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-"""Begins a message that rosbag2 compressed by itself; no CDR message begins so."""
 
 
 class Channel(NamedTuple):
@@ -150,7 +148,7 @@ class Unpacking:
 
     def message(self, data: bytes) -> bytes:
         """A message, which rosbag2 may have compressed by itself."""
-        if not data.startswith(ZSTD_MAGIC):
+        if not data.startswith(b"\x28\xb5\x2f\xfd"):  # rosbag2 compressed it by zstd; no CDR message begins so
             return data
         try:
             with pa.CompressedInputStream(pa.BufferReader(data), "zstd") as stream:

@@ -26,7 +26,6 @@ from service.datasets.formats.bags.container import (
 
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, CHUNK, CONNECTION = 0x02, 0x03, 0x05, 0x07
-LONGEST_HEADER = 1024 * 1024
 _U32, _TIME = Struct("<I"), Struct("<II")
 
 
@@ -56,7 +55,7 @@ class Rosbag1(ScannedBag):
         while (offset := file.tell()) < end:
             try:
                 (length,) = _U32.unpack(file.read(4))
-                if length > min(LONGEST_HEADER, end - file.tell()):
+                if length > min(1024 * 1024, end - file.tell()):
                     raise EOFError
                 header = _header(memoryview(file.read(length)))
                 (size,) = _U32.unpack(file.read(4))
@@ -131,11 +130,9 @@ def _header(content: memoryview) -> dict[str, bytes]:
 
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
-LATEST = 1 << 63
 FOOTER, SCHEMA, CHANNEL, MCAP_MESSAGE, MCAP_CHUNK, DATA_END = 0x02, 0x03, 0x04, 0x05, 0x06, 0x0F
 _HEAD, _MESSAGE_HEAD, _CHUNK_HEAD = Struct("<BQ"), Struct("<HIQQ"), Struct("<QQQI")
 _U16, _U64 = Struct("<H"), Struct("<Q")
-_TEXT_DEFINITIONS = ("ros2msg", "ros1msg")
 
 
 class Mcap(ScannedBag):
@@ -186,7 +183,7 @@ def _mcap_record(
         number, _, time, _ = _MESSAGE_HEAD.unpack_from(content)
         if number not in channels:
             raise ValueError(f"a message of channel {number}, which is not declared before it")
-        if time >= LATEST:
+        if time >= 1 << 63:
             raise ValueError(f"a message of {time} ns after 1970")
         yield channels[number], time, content[_MESSAGE_HEAD.size :]
     elif kind == SCHEMA:
@@ -194,7 +191,7 @@ def _mcap_record(
         name, at = _mcap_text(content, 2)
         encoding, at = _mcap_text(content, at)
         definition, _ = _mcap_text(content, at)
-        schemas[number] = type_name(name), definition if encoding in _TEXT_DEFINITIONS else None
+        schemas[number] = type_name(name), definition if encoding in ("ros2msg", "ros1msg") else None
     elif kind == CHANNEL:
         (number,), (schema,) = _U16.unpack_from(content), _U16.unpack_from(content, 2)
         topic, at = _mcap_text(content, 4)

@@ -9,11 +9,8 @@ from struct import Struct
 
 from service.datasets.formats.bags.container import type_name
 
-LONGEST = 256 * 1024
-DEEPEST, MOST_FIELDS = 32, 2000
+MAX_CHARACTERS = 256 * 1024
 CDR_HEADER = 4
-_PADDING = 3
-"""Bytes that a CDR message may be longer than its fields: some writers fill it up."""
 SEQUENCE = -1
 SIZES = {
     **dict.fromkeys(("bool", "byte", "char", "int8", "uint8"), 1),
@@ -45,8 +42,8 @@ Types = dict[str, tuple[Field, ...]]
 
 def parse(text: str, root: str) -> Types:
     """Fields of the type `root` and of those that follow it in `text`; raise ValueError."""
-    if len(text) > LONGEST:
-        raise ValueError(f"a definition of {len(text)} characters, expected at most {LONGEST}")
+    if len(text) > MAX_CHARACTERS:
+        raise ValueError(f"a definition of {len(text)} characters, expected at most {MAX_CHARACTERS}")
     types: Types = {}
     name, fields = root, list[Field]()
     for number, line in enumerate([*text.splitlines(), "MSG: end/End"]):
@@ -156,7 +153,7 @@ def lay_out(data: bytes, types: Types, root: str, last: str, encoding: str) -> L
     walk = _Walk(data, types, layout, encoding == "cdr")
     walk.message(root, "", 0, last)
     left = len(data) - walk.at
-    if types[root][-1].name == last and left > (_PADDING if encoding == "cdr" else 0):
+    if types[root][-1].name == last and left > (3 if encoding == "cdr" else 0):  # some writers fill CDR up
         raise ValueError(f"{left} bytes too many")
     layout.fixed = _merged(layout.fixed)
     return layout
@@ -171,7 +168,7 @@ class _Walk:
     def message(self, name: str, path: str, depth: int, last: str | None = None) -> None:
         if name not in self.types:
             raise ValueError(f"type {name} without a definition")
-        if depth > DEEPEST:
+        if depth > 32:
             raise ValueError(f"type {name} nested {depth} deep")
         for each in self.types[name]:
             self.field(each.type, each.count, f"{path}.{each.name}" if path else each.name, depth)
@@ -182,8 +179,8 @@ class _Walk:
 
     def count(self) -> None:
         self.layout.fields += 1
-        if self.layout.fields > MOST_FIELDS:
-            raise ValueError(f"more than {MOST_FIELDS} fields")
+        if self.layout.fields > 2000:
+            raise ValueError("more than 2000 fields")
 
     def field(self, kind: str, count: int | None, path: str, depth: int) -> None:
         self.count()

@@ -39,8 +39,6 @@ QUANTITIES = ("position", "velocity", "acceleration", "effort")
 BATCH_BYTES = 4 * 1024 * 1024
 """Messages that are taken together; their copies and their block take several times that."""
 NS = 1_000_000_000
-SIMULATED = 10**8 * NS
-"""Stamps below it, three years after 1970, are of a simulation's clock, which begins at 0."""
 
 
 @dataclass
@@ -145,7 +143,8 @@ def _survey(bag: Bag, channel: Channel, settings: Settings) -> _Survey:
 def _clock(stamps: NDArray[np.int64], received: NDArray[np.int64]) -> tuple[bool, str]:
     """Whether the headers' stamps serve as times, and what to say about the times."""
     steps, unset = np.diff(stamps), int((stamps == 0).sum())
-    if unset and not 0 < stamps.max() < SIMULATED:
+    # stamps of a simulation's clock, which begins at 0, stay below three years
+    if unset and not 0 < stamps.max() < 10**8 * NS:
         return False, f"those of reception, as {unset} of {len(stamps)} header stamps are not set"
     if back := int((steps < 0).sum()):
         first = int(np.argmax(steps < 0)) + 2

@@ -15,11 +15,8 @@ from service.datasets.formats.bags.layout import Layout, Types, lay_out, parse, 
 from service.foundation.errors import InvalidDataError, invalid_data, readable
 
 ENCODINGS = ("cdr", "ros1")
-MOST_LAYOUTS = 64
-"""Layouts that are remembered of a channel; most have one."""
 MOST_KINDS = 1000
 """Sets of joints that the messages of a channel may tell of."""
-_SECONDS = ((1, "int32"), (1, "uint32"))
 _DTYPES = {
     "float32": "f4",
     "float64": "f8",
@@ -137,7 +134,7 @@ class Decoder:
             if form.layout.fits(data):
                 return form
         form = self._new(data, number)
-        if len(self._forms) >= MOST_LAYOUTS:
+        if len(self._forms) >= 64:  # most channels have one layout
             self._forms.pop()
         self._forms.insert(0, form)
         return form
@@ -168,7 +165,9 @@ class Decoder:
         if "header.stamp" in numbers and numbers["header.stamp"][2] == "time":  # of ROS 1
             return numbers["header.stamp"][0]
         seconds, nanoseconds = numbers.get("header.stamp.sec"), numbers.get("header.stamp.nanosec")
-        if seconds is None or seconds[1:] not in _SECONDS or nanoseconds != (seconds[0] + 4, 1, "uint32"):
+        if seconds is None or seconds[1] != 1 or seconds[2] not in ("int32", "uint32"):
+            raise self._wrong(number, "without a stamp", "a header with a stamp in s and ns")
+        if nanoseconds != (seconds[0] + 4, 1, "uint32"):
             raise self._wrong(number, "without a stamp", "a header with a stamp in s and ns")
         return seconds[0]
 
