@@ -17,6 +17,7 @@ import sysconfig
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import IntEnum, IntFlag
 from errno import ENOSYS, EPERM
 from functools import cache
 from importlib import import_module
@@ -25,7 +26,6 @@ from typing import Any
 
 LINUX = sys.platform == "linux"
 OPEN_FILES = 256
-PACKAGES = ("lipcore", "lipserve", "service")
 
 
 @dataclass(frozen=True)
@@ -53,11 +53,11 @@ def renounce() -> None:
     """Give up for good what no call needs: rights, the network, other processes. This one has one thread, and ends with
     the one that has forked it. Raise OSError where anything that `protections` names cannot be had."""
     if LINUX:
-        _call("prctl", _SET_PDEATHSIG, 9, 0, 0, 0)
+        _call("prctl", Prctl.SET_PDEATHSIG, 9, 0, 0, 0)
         with suppress(OSError):  # a sandbox of its own may have closed it
             Path("/proc/self/oom_score_adj").write_text("1000")
         _drop_capabilities()
-        _call("prctl", _SET_NO_NEW_PRIVS, 1, 0, 0, 0)
+        _call("prctl", Prctl.SET_NO_NEW_PRIVS, 1, 0, 0, 0)
     if protections()["seccomp"]:
         _filter_calls()
 
@@ -91,9 +91,21 @@ def _limit(bounds: Bounds, memory: bool) -> None:
         resource.setrlimit(kind, (soft, soft + spare if hard == resource.RLIM_INFINITY else min(soft + spare, hard)))
 
 
-_SET_PDEATHSIG, _GET_SECCOMP, _SET_SECCOMP, _SET_NO_NEW_PRIVS = 1, 21, 22, 38
-_CREATE_RULESET, _ADD_RULE, _RESTRICT_SELF = 444, 445, 446
-_CAPABILITY_VERSION = 0x20080522
+class Prctl(IntEnum):
+    """Options of the system call `prctl`."""
+
+    SET_PDEATHSIG = 1
+    GET_SECCOMP = 21
+    SET_SECCOMP = 22
+    SET_NO_NEW_PRIVS = 38
+
+
+class Landlock(IntEnum):
+    """System calls of Landlock, numbered alike on all machines."""
+
+    CREATE_RULESET = 444
+    ADD_RULE = 445
+    RESTRICT_SELF = 446
 
 
 def _call(name: str, *given: Any) -> int:
@@ -106,25 +118,32 @@ def _call(name: str, *given: Any) -> int:
 
 
 def _drop_capabilities() -> None:
-    header, none = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION, 0), (ctypes.c_uint32 * 6)()
+    header, none = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()  # version 3
     _call("capset", header, none)
 
 
 def _landlock_version() -> int:
     try:
-        return _call("syscall", _CREATE_RULESET, None, ctypes.c_size_t(0), 1)
+        return _call("syscall", Landlock.CREATE_RULESET, None, ctypes.c_size_t(0), 1)
     except OSError:  # an older kernel, or one that was started without it
         return 0
 
 
-READ = 1 << 2 | 1 << 3
-"""Of Landlock's rights on files: to read a file, to list a folder."""
-FILE = 1 << 1 | 1 << 2 | 1 << 14
-"""To write, read, truncate: what can be done with a file that is none of its folder's business."""
-WRITE = READ | FILE | 1 << 4 | 1 << 5 | 1 << 7 | 1 << 8
-"""And to remove and make folders and plain files: no links, pipes, sockets or devices."""
-_FILE_RIGHTS = {1: 13, 2: 14, 3: 15, 5: 16}
-"""How many rights on files there are from a version on."""
+class Rights(IntFlag):
+    """Landlock's rights on files that are given: none to links, pipes, sockets or devices."""
+
+    WRITE_FILE = 1 << 1
+    READ_FILE = 1 << 2
+    READ_DIR = 1 << 3
+    REMOVE_DIR = 1 << 4
+    REMOVE_FILE = 1 << 5
+    MAKE_DIR = 1 << 7
+    MAKE_FILE = 1 << 8
+    TRUNCATE = 1 << 14
+    READ = READ_FILE | READ_DIR
+    FILE = WRITE_FILE | READ_FILE | TRUNCATE
+    """Rights that a file has, and not its folder."""
+    WRITE = READ | FILE | REMOVE_DIR | REMOVE_FILE | MAKE_DIR | MAKE_FILE
 
 
 class _Rule(ctypes.Structure):
@@ -135,26 +154,27 @@ class _Rule(ctypes.Structure):
 def _keep_files(read: Iterable[Path], write: Iterable[Path]) -> None:
     """Keep some files and folders; all else, TCP and processes outside are out of reach."""
     version = _landlock_version()
-    handled = (1 << max(count for since, count in _FILE_RIGHTS.items() if since <= version)) - 1
+    rights_since = {1: 13, 2: 14, 3: 15, 5: 16}  # how many there are from a version on
+    handled = (1 << max(count for since, count in rights_since.items() if since <= version)) - 1
     # files; TCP, from version 4 on: to bind and connect; abstract sockets and signals, from version 6 on
     attributes = (ctypes.c_uint64 * 3)(handled, 3, 3)
     size = ctypes.c_size_t(8 * (3 if version >= 6 else 2 if version >= 4 else 1))
-    rules = _call("syscall", _CREATE_RULESET, attributes, size, 0)
-    for paths, rights in ((read, READ), (write, WRITE)):
+    rules = _call("syscall", Landlock.CREATE_RULESET, attributes, size, 0)
+    for paths, rights in ((read, Rights.READ), (write, Rights.WRITE)):
         for path in paths:
             with suppress(FileNotFoundError):
                 opened = os.open(path, os.O_PATH | os.O_CLOEXEC)
-                allowed = rights & handled & (-1 if path.is_dir() else FILE)
-                _call("syscall", _ADD_RULE, rules, 1, ctypes.byref(_Rule(allowed, opened)), 0)
+                allowed = rights & handled & (-1 if path.is_dir() else Rights.FILE)
+                _call("syscall", Landlock.ADD_RULE, rules, 1, ctypes.byref(_Rule(allowed, opened)), 0)
                 os.close(opened)
-    _call("syscall", _RESTRICT_SELF, rules, 0)
+    _call("syscall", Landlock.RESTRICT_SELF, rules, 0)
     os.close(rules)
 
 
 @cache
 def own_files() -> list[Path]:
     """Modules, and the libraries and tables that they open. Not what else lies beside a package, as a home may."""
-    modules = [Path(str(import_module(name).__file__)).parent for name in PACKAGES]
+    modules = [Path(str(import_module(name).__file__)).parent for name in ("lipcore", "lipserve", "service")]
     python = [Path(each) for name, each in sysconfig.get_paths().items() if name in ("stdlib", "platstdlib")]
     packages = [Path(each) for name, each in sysconfig.get_paths().items() if name in ("purelib", "platlib")]
     return [*modules, *python, *packages, *map(Path, ("/usr/lib", "/lib", "/lib64", "/usr/share/zoneinfo"))]
@@ -180,14 +200,33 @@ FORBIDDEN = {
 parts of the kernel that have been the way in for many an attack."""
 OF_ITSELF = {"kill": (62, 129), "tgkill": (234, 131), "rt_tgsigqueueinfo": (297, 240), "prlimit64": (302, 261)}
 """Those that a process may do to itself: their first argument is a process."""
-CLONE, CLONE3 = (56, 220), (435, 435)
-_THREAD = 0x10000
-"""Of the flags of `clone`: a thread, not a process."""
-_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
-_ALLOW, _KILL, _ERROR = 0x7FFF0000, 0x80000000, 0x50000
-_NUMBER, _MACHINE, _FIRST = 0, 4, 16
-"""Where the number of a call, the machine and the lower half of the first argument lie."""
 Instruction = tuple[int, int, int, int]
+
+
+class Code(IntEnum):
+    """Instructions of a filter: classic BPF."""
+
+    LOAD = 0x20
+    EQUAL = 0x15
+    AT_LEAST = 0x35
+    ANY_BIT = 0x45
+    RETURN = 0x06
+
+
+class Action(IntEnum):
+    """Answers of a filter."""
+
+    ALLOW = 0x7FFF0000
+    KILL = 0x80000000
+    ERROR = 0x50000
+
+
+class At(IntEnum):
+    """Where the number of a call, the machine and the lower half of the first argument lie."""
+
+    NUMBER = 0
+    MACHINE = 4
+    FIRST = 16
 
 
 class _Instruction(ctypes.Structure):
@@ -203,7 +242,7 @@ def _architecture() -> tuple[int, int] | None:
 
 
 def _has_filters() -> bool:
-    return LINUX and ctypes.CDLL(None).prctl(_GET_SECCOMP, 0, 0, 0, 0) >= 0
+    return LINUX and ctypes.CDLL(None).prctl(Prctl.GET_SECCOMP, 0, 0, 0, 0) >= 0
 
 
 def _filter_calls() -> None:
@@ -211,27 +250,34 @@ def _filter_calls() -> None:
     made = (_Instruction * len(program := calls(machine, place, os.getpid())))(
         *(_Instruction(*each) for each in program)
     )
-    _call("prctl", _SET_SECCOMP, 2, ctypes.byref(_Program(len(made), made)), 0, 0)
+    _call("prctl", Prctl.SET_SECCOMP, 2, ctypes.byref(_Program(len(made), made)), 0, 0)
 
 
 def calls(machine: int, place: int, pid: int) -> Sequence[Instruction]:
     """The filter's program: (code, steps over where true, where false, constant) each."""
-    refuse, allow = (_RETURN, 0, 0, _ERROR | EPERM), (_RETURN, 0, 0, _ALLOW)
+    refuse, allow = (Code.RETURN, 0, 0, Action.ERROR | EPERM), (Code.RETURN, 0, 0, Action.ALLOW)
     program = [
-        (_LOAD, 0, 0, _MACHINE),
-        (_EQUAL, 1, 0, machine),
-        (_RETURN, 0, 0, _KILL),
-        (_LOAD, 0, 0, _NUMBER),
-        (_AT_LEAST, 0, 1, 0x40000000),  # the calls of x32, which are the same once more
+        (Code.LOAD, 0, 0, At.MACHINE),
+        (Code.EQUAL, 1, 0, machine),
+        (Code.RETURN, 0, 0, Action.KILL),
+        (Code.LOAD, 0, 0, At.NUMBER),
+        (Code.AT_LEAST, 0, 1, 0x40000000),  # the calls of x32, which are the same once more
         refuse,
-        (_EQUAL, 0, 1, CLONE3[place]),  # its flags cannot be seen; without it the C library takes `clone`
-        (_RETURN, 0, 0, _ERROR | ENOSYS),
+        (Code.EQUAL, 0, 1, 435),  # clone3: its flags cannot be seen; without it the C library takes `clone`
+        (Code.RETURN, 0, 0, Action.ERROR | ENOSYS),
     ]
     for numbers in FORBIDDEN.values():
         if (number := numbers[place]) is not None:
-            program += [(_EQUAL, 0, 1, number), refuse]
-    program += [(_EQUAL, 0, 4, CLONE[place]), (_LOAD, 0, 0, _FIRST), (_ANY_BIT, 0, 1, _THREAD), allow, refuse]
+            program += [(Code.EQUAL, 0, 1, number), refuse]
+    # clone makes threads, not processes
+    program += [
+        (Code.EQUAL, 0, 4, (56, 220)[place]),
+        (Code.LOAD, 0, 0, At.FIRST),
+        (Code.ANY_BIT, 0, 1, 0x10000),
+        allow,
+        refuse,
+    ]
     for numbers in OF_ITSELF.values():
-        program += [(_EQUAL, 0, 5, numbers[place]), (_LOAD, 0, 0, _FIRST)]
-        program += [(_EQUAL, 1, 0, pid), (_EQUAL, 0, 1, 0), allow, refuse]
+        program += [(Code.EQUAL, 0, 5, numbers[place]), (Code.LOAD, 0, 0, At.FIRST)]
+        program += [(Code.EQUAL, 1, 0, pid), (Code.EQUAL, 0, 1, 0), allow, refuse]
     return [*program, allow]
