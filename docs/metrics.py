@@ -7,14 +7,14 @@ from collections.abc import Iterator
 
 from service.api import metrics
 from service.learning import metrics as learning
-from service.telemetry.meters import MetricKind
+from service.telemetry.meters import MetricKind, kinds
 from service.training import metrics as training
 
 KINDS: tuple[MetricKind, ...] = (
-    *metrics.TRAFFIC_KINDS,
-    *training.KINDS,
+    *kinds(metrics.Traffic),
+    *kinds(training.JobMetrics),
     *learning.KINDS,
-    *metrics.SYSTEM_KINDS,
+    *kinds(metrics.System),
 )
 """All metrics that /metrics shows besides Prometheus's usual ones of a process."""
 

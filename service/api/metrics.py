@@ -22,26 +22,25 @@ from service.storage.storage import Storage
 from service.telemetry.meters import Durations, Kind, Meters, MetricKind, merged
 from service.telemetry.readiness import Readiness
 
-BUILD = MetricKind("gauge", "lipserve_build_info", "1; the version of LIPServe", ("version",))
-PARTS = MetricKind("gauge", "lipserve_ready", "1 where a part is in order, 0 where /health/ready names it", ("part",))
-USED = MetricKind("gauge", "lipserve_disk_used_bytes", "Bytes of the home's files, by what they are of", ("what",))
-FREE = MetricKind("gauge", "lipserve_disk_free_bytes", "Bytes that the disk of the home has free")
-MEMORY = MetricKind(
-    "gauge", "lipserve_process_memory_bytes", "Resident memory of the processes that learn and train", ("process",)
-)
-CPU = MetricKind(
-    "counter",
-    "lipserve_process_cpu_seconds_total",
-    "CPU time of the processes that learn and train which run now, s",
-    ("process",),
-)
-SYSTEM_KINDS = (BUILD, PARTS, USED, FREE, MEMORY, CPU)
-LEARNER = "lipserve-learner"
-_OF_PROCESSES = {"process_resident_memory_bytes": MEMORY, "process_cpu_seconds": CPU}
-
 
 class System(Collector):
     """Of one service. Its own process has Prometheus's usual `process_…` metrics. Not for the event loop."""
+
+    build = MetricKind("gauge", "lipserve_build_info", "1; the version of LIPServe", ("version",))
+    parts = MetricKind(
+        "gauge", "lipserve_ready", "1 where a part is in order, 0 where /health/ready names it", ("part",)
+    )
+    used = MetricKind("gauge", "lipserve_disk_used_bytes", "Bytes of the home's files, by what they are of", ("what",))
+    free = MetricKind("gauge", "lipserve_disk_free_bytes", "Bytes that the disk of the home has free")
+    memory = MetricKind(
+        "gauge", "lipserve_process_memory_bytes", "Resident memory of the processes that learn and train", ("process",)
+    )
+    cpu = MetricKind(
+        "counter",
+        "lipserve_process_cpu_seconds_total",
+        "CPU time of the processes that learn and train which run now, s",
+        ("process",),
+    )
 
     def __init__(self, storage: Storage, readiness: Readiness) -> None:
         self._storage, self._readiness = storage, readiness
@@ -53,67 +52,69 @@ class System(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric."""
-        yield BUILD.of([([__version__], 1)])
+        yield self.build.of([([__version__], 1)])
         parts = self._readiness.report()
-        yield PARTS.of(([part.name], float(part.state != "failed")) for part in parts)
+        yield self.parts.of(([part.name], float(part.state != "failed")) for part in parts)
         files, usage = self._storage.files, self._storage.disk.usage()
         used = {what: measure(folder) for what, folder in files.folders.items()}
         used["other"] = max(usage.used - sum(used.values()), 0)  # the database above all; measured a moment before
-        yield USED.of(([what], size) for what, size in used.items())
-        yield FREE.of([((), usage.free)])
+        yield self.used.of(([what], size) for what, size in used.items())
+        yield self.free.of([((), usage.free)])
         yield from self._own.collect()
         yield from _processes()
 
 
 def _processes() -> Iterator[Metric]:
     """What the processes take that the service has started, where the platform says."""
+    kinds = {"process_resident_memory_bytes": System.memory, "process_cpu_seconds": System.cpu}
     figures: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
     for process in multiprocessing.active_children():
-        name, pid = "learner" if process.name == LEARNER else "training", process.pid
+        name, pid = "learner" if process.name == "lipserve-learner" else "training", process.pid
         for family in ProcessCollector(pid=lambda pid=pid: pid, registry=None).collect():  # type: ignore[misc]
-            if family.name in _OF_PROCESSES:
+            if family.name in kinds:
                 figures[family.name][name] += family.samples[0].value
-    for metric, kind in _OF_PROCESSES.items():
+    for metric, kind in kinds.items():
         yield kind.of(([name], value) for name, value in figures[metric].items())
-
-
-DURATION = MetricKind(
-    "histogram",
-    "lipserve_request_duration_seconds",
-    "Time from a request's arrival until its answer began, s; of a stream, until it was accepted",
-    ("method", "route", "model"),
-)
-REQUESTS = MetricKind(
-    "counter",
-    "lipserve_requests_total",
-    "Requests that were answered; 101: a stream, 499: the client went away before",
-    ("method", "route", "status"),
-)
-ERRORS = MetricKind(
-    "counter", "lipserve_errors_total", "Requests that were answered with an error, by its code", ("route", "code")
-)
-IN_FLIGHT = MetricKind("gauge", "lipserve_requests_in_flight", "Requests that are being answered now")
-STREAMS = MetricKind("gauge", "lipserve_streams_open", "WebSocket connections that are open now")
-FRAMES = MetricKind(
-    "histogram",
-    "lipserve_stream_frame_duration_seconds",
-    "Time from the arrival of a stream's frame until its answer was ready, s; frames that were refused left out",
-    ("model",),
-)
-LATE = MetricKind(
-    "counter",
-    "lipserve_stream_late_total",
-    "Answers of streams after their deadline: the frame's budget, else LIPSERVE_STREAM_DEADLINE_S",
-    ("model",),
-)
-FRAME_ERRORS = MetricKind(
-    "counter", "lipserve_stream_errors_total", "Frames that were answered with an error, by its code", ("model", "code")
-)
-TRAFFIC_KINDS = (DURATION, REQUESTS, ERRORS, IN_FLIGHT, STREAMS, FRAMES, LATE, FRAME_ERRORS)
 
 
 class Traffic(Collector):
     """What the meters have counted since the service started."""
+
+    duration = MetricKind(
+        "histogram",
+        "lipserve_request_duration_seconds",
+        "Time from a request's arrival until its answer began, s; of a stream, until it was accepted",
+        ("method", "route", "model"),
+    )
+    requests = MetricKind(
+        "counter",
+        "lipserve_requests_total",
+        "Requests that were answered; 101: a stream, 499: the client went away before",
+        ("method", "route", "status"),
+    )
+    errors = MetricKind(
+        "counter", "lipserve_errors_total", "Requests that were answered with an error, by its code", ("route", "code")
+    )
+    in_flight = MetricKind("gauge", "lipserve_requests_in_flight", "Requests that are being answered now")
+    streams = MetricKind("gauge", "lipserve_streams_open", "WebSocket connections that are open now")
+    frames = MetricKind(
+        "histogram",
+        "lipserve_stream_frame_duration_seconds",
+        "Time from the arrival of a stream's frame until its answer was ready, s; frames that were refused left out",
+        ("model",),
+    )
+    late = MetricKind(
+        "counter",
+        "lipserve_stream_late_total",
+        "Answers of streams after their deadline: the frame's budget, else LIPSERVE_STREAM_DEADLINE_S",
+        ("model",),
+    )
+    frame_errors = MetricKind(
+        "counter",
+        "lipserve_stream_errors_total",
+        "Frames that were answered with an error, by its code",
+        ("model", "code"),
+    )
 
     def __init__(self, meters: Meters) -> None:
         self._meters = meters
@@ -126,17 +127,17 @@ class Traffic(Collector):
         """Yield every metric."""
         requests, streams = self._meters.requests, self._meters.streams()
         seen = {Kind(*key): durations for key, durations in list(requests.known.items())}
-        yield DURATION.spread(_grouped(seen, lambda kind: (kind.method, kind.route, kind.model)))
+        yield self.duration.spread(_grouped(seen, lambda kind: (kind.method, kind.route, kind.model)))
         answers = _grouped(seen, lambda kind: (kind.method, kind.route, str(kind.status)))
-        yield REQUESTS.of((labels, sum(each.counts)) for labels, each in answers)
+        yield self.requests.of((labels, sum(each.counts)) for labels, each in answers)
         refused = {kind: durations for kind, durations in seen.items() if kind.code}
         errors = _grouped(refused, lambda kind: (kind.route, kind.code))
-        yield ERRORS.of((labels, sum(each.counts)) for labels, each in errors)
-        yield IN_FLIGHT.of([((), requests.in_flight)])
-        yield STREAMS.of([((), requests.streams)])
-        yield FRAMES.spread(([model], meter.durations) for model, meter in streams.items())
-        yield LATE.of(([model], meter.late) for model, meter in streams.items())
-        yield FRAME_ERRORS.of(
+        yield self.errors.of((labels, sum(each.counts)) for labels, each in errors)
+        yield self.in_flight.of([((), requests.in_flight)])
+        yield self.streams.of([((), requests.streams)])
+        yield self.frames.spread(([model], meter.durations) for model, meter in streams.items())
+        yield self.late.of(([model], meter.late) for model, meter in streams.items())
+        yield self.frame_errors.of(
             ([model, code], count) for model, meter in streams.items() for code, count in dict(meter.refused).items()
         )
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
+from prometheus_client.registry import Collector
 
 BOUNDS = (
     *(0.000_05, 0.000_1, 0.000_25, 0.000_5, 0.001, 0.002, 0.005, 0.01, 0.025),
@@ -151,6 +152,11 @@ class MetricKind:
             buckets = list(_buckets(durations))
             family.add_metric(labels, buckets, durations.total)  # type: ignore[attr-defined]
         return family
+
+
+def kinds(collector: type[Collector]) -> list[MetricKind]:
+    """The metrics that a collector declares."""
+    return [each for each in vars(collector).values() if isinstance(each, MetricKind)]
 
 
 def merged(parts: Iterable[Durations]) -> Durations:

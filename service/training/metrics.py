@@ -17,16 +17,6 @@ from service.telemetry.meters import Durations, MetricKind
 from service.telemetry.readiness import Lasting
 from service.training.queue import JobQueue
 
-JOBS = MetricKind("gauge", "lipserve_jobs", "Training jobs that wait or run now", ("state",))
-FINISHED = MetricKind("counter", "lipserve_jobs_finished_total", "Training jobs that have ended, ever", ("outcome",))
-DURATION = MetricKind(
-    "histogram",
-    "lipserve_job_duration_seconds",
-    "Time from the last start of a training job to its end, s; of all jobs ever",
-    ("outcome",),
-)
-KINDS = (JOBS, FINISHED, DURATION)
-BOUNDS = (1.0, 3.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 10_800.0, 36_000.0)
 START_S = 60.0
 """Time in s within which a job should have been started where a training process is free."""
 SILENT_S = 10.0
@@ -36,6 +26,17 @@ OUTCOMES = (SUCCEEDED, FAILED, CANCELLED)
 
 class JobMetrics(Collector):
     """Training jobs of one service. Not for the event loop."""
+
+    jobs = MetricKind("gauge", "lipserve_jobs", "Training jobs that wait or run now", ("state",))
+    finished = MetricKind(
+        "counter", "lipserve_jobs_finished_total", "Training jobs that have ended, ever", ("outcome",)
+    )
+    duration = MetricKind(
+        "histogram",
+        "lipserve_job_duration_seconds",
+        "Time from the last start of a training job to its end, s; of all jobs ever",
+        ("outcome",),
+    )
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -49,14 +50,15 @@ class JobMetrics(Collector):
         with self._database.session() as session:
             states = _counts(session)
             ended = select(JobRow.state, JobRow.started_at, JobRow.finished_at).where(JobRow.state.in_(OUTCOMES))
-            durations = {outcome: Durations(BOUNDS) for outcome in OUTCOMES}
+            bounds = (1.0, 3.0, 10.0, 30.0, 60.0, 180.0, 600.0, 1800.0, 3600.0, 10_800.0, 36_000.0)
+            durations = {outcome: Durations(bounds) for outcome in OUTCOMES}
             for outcome, started, finished in session.execute(ended):
                 if started is not None and finished is not None:
                     lasted = datetime.fromisoformat(finished) - datetime.fromisoformat(started)
                     durations[outcome].add(max(lasted.total_seconds(), 0.0))  # clocks are set back at times
-        yield JOBS.of(([state], states.get(state, 0)) for state in ACTIVE)
-        yield FINISHED.of(([outcome], states.get(outcome, 0)) for outcome in OUTCOMES)
-        yield DURATION.spread(([outcome], durations[outcome]) for outcome in OUTCOMES)
+        yield self.jobs.of(([state], states.get(state, 0)) for state in ACTIVE)
+        yield self.finished.of(([outcome], states.get(outcome, 0)) for outcome in OUTCOMES)
+        yield self.duration.spread(([outcome], durations[outcome]) for outcome in OUTCOMES)
 
 
 def look(queue: JobQueue, lasting: Lasting) -> tuple[PartState, str]:

@@ -9,7 +9,7 @@ from sqlalchemy import delete
 
 from docs import metrics as table
 from service.storage.database import JobRow
-from service.training.metrics import DURATION, FINISHED, JOBS, JobMetrics
+from service.training.metrics import JobMetrics
 from tests.service.data import QUICK, queue, service_of, stream, upload
 from tests.service.observability.test_requests import QUERY
 
@@ -140,8 +140,8 @@ def families(database):
 def test_jobs_are_counted_and_timed_by_outcome(jobs):
     before, after = jobs
     more = {key: now - before[key] for key, now in after.items()}
-    name = DURATION.name
-    finished = {state: more[FINISHED.name, state] for state in ("succeeded", "failed", "cancelled")}
+    name = JobMetrics.duration.name
+    finished = {state: more[JobMetrics.finished.name, state] for state in ("succeeded", "failed", "cancelled")}
     assert finished == {"succeeded": 2, "failed": 2, "cancelled": 1}
     buckets = {"10.0": 0, "30.0": 1, "3600.0": 1, "10800.0": 2, "+Inf": 2}
     assert {le: more[f"{name}_bucket", "succeeded", le] for le in buckets} == buckets
@@ -155,7 +155,7 @@ def test_jobs_that_wait_are_counted(no_worker):
     database = service_of(no_worker).database
 
     def waiting():
-        return families(database)[JOBS.name, "queued"]
+        return families(database)[JobMetrics.jobs.name, "queued"]
 
     before = waiting()
     job = queue(no_worker, "waits-for-metrics", upload(no_worker, stream())["id"], options=FEW)["id"]
