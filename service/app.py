@@ -60,9 +60,6 @@ from service.training.queue import JobQueue, queue_of
 
 logger = logging.getLogger(__name__)
 
-SWITCH_INTERVAL = 3e-5
-"""Seconds after which a thread that computes in Python lets the event loop go on. Python's own 5 ms are more than a
-control loop has; with 0.1 ms it came more than half a millisecond late two to five times as often beside a stream."""
 DESCRIPTION = """Learns the inverse dynamics of a manipulator from joint data and answers torques with uncertainty.
 
 Units are SI: rad, rad/s, rad/s², N·m (prismatic joints: m, m/s, m/s², N).
@@ -179,7 +176,9 @@ def _add_middleware(
 
 def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
     """Open the home, finish what an earlier run left, and load the models that are asked for first."""
-    sys.setswitchinterval(SWITCH_INTERVAL)
+    # s after which a computing thread lets the event loop go on. Python's own 5 ms are more than a control loop has;
+    # with 0.1 ms it came more than half a millisecond late two to five times as often beside a stream
+    sys.setswitchinterval(3e-5)
     storage = Storage.open(settings)
     database, files = storage.database, storage.files
     database.adapter.settle()

@@ -26,13 +26,11 @@ DESCRIPTION = "An API key with scopes, `Authorization: Bearer lip_…`:\n\n" + "
 )
 
 
-PAGES = ("/docs", "/docs/oauth2-redirect", "/static-offline-docs")
 POLICY = (
     "default-src 'self'; script-src 'self'{scripts}; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
 """Nothing comes from other hosts, no other site frames it, and only the scripts run that the page came with."""
-_SCRIPT = re.compile(rb"<script>(.*?)</script>", re.DOTALL)
 
 
 class Guarded:
@@ -65,15 +63,17 @@ class Guarded:
 
 def policy(page: bytes) -> str:
     """The policy of one or more pages: of the scripts that stand in them each runs as it is, by its sha256."""
-    hashes = (b64encode(hashlib.sha256(each).digest()).decode() for each in sorted(set(_SCRIPT.findall(page))))
+    scripts = sorted(set(re.findall(rb"(?s)<script>(.*?)</script>", page)))
+    hashes = (b64encode(hashlib.sha256(each).digest()).decode() for each in scripts)
     return POLICY.format(scripts="".join(f" 'sha256-{each}'" for each in hashes))
 
 
 def install(app: FastAPI, keys_needed: bool) -> None:
     """Complete the document that the application makes of its routes, once it is asked for; see `add_scopes`. Guard the
     pages that show it."""
+    pages = ("/docs", "/docs/oauth2-redirect", "/static-offline-docs")
     for route in app.router.routes:
-        if isinstance(route, Mount | StarletteRoute) and route.path in PAGES:
+        if isinstance(route, Mount | StarletteRoute) and route.path in pages:
             route.app = Guarded(route.app)
     made = app.openapi
 
@@ -106,15 +106,6 @@ def add_scopes(document: dict[str, Any], rules: Rules, keys_needed: bool) -> Non
 
 
 METHODS = ("get", "put", "post", "delete")
-ANY = (errors.InvalidRequestError, errors.ForbiddenError, errors.RateLimitedError, ServiceError, errors.NotReadyError)
-"""What any route may answer, whatever it is asked for: the first to a query parameter that it does not know."""
-GUARDED = (errors.UnauthorizedError, errors.StorageUnavailableError)
-"""What every route may answer but those that need no key, which use no database either."""
-BODY = (errors.RequestTimeoutError, errors.TooLargeError, errors.UnsupportedMediaTypeError)
-"""What a route with a body may answer before it has read it."""
-WRITING = (errors.StorageFullError,)
-PURE = ("/predict", "/evaluate", "/trace", "/compare", "/echo", "/infer")
-"""Ends of the paths of POST routes that store nothing."""
 BEFORE_ROUTES = {
     (405, "method_not_allowed"): "The path is there, the method is not: the header `Allow` lists those that are."
 }
@@ -139,13 +130,18 @@ def _add_errors(document: dict[str, Any], rules: Rules) -> None:
 
 def _add(path: str, method: str, operation: dict[str, Any], rules: Rules) -> None:
     """Add to an operation's answers those that are not its own."""
-    kinds: list[type[ServiceError]] = [*ANY]
+    kinds: list[type[ServiceError]] = [
+        errors.InvalidRequestError,  # of an unknown query parameter
+        *(errors.ForbiddenError, errors.RateLimitedError, ServiceError, errors.NotReadyError),
+    ]
     if rules.table[method.upper(), path].scope is not None:
-        kinds += GUARDED
+        # routes without a key use no database either
+        kinds += (errors.UnauthorizedError, errors.StorageUnavailableError)
     if "requestBody" in operation:
-        kinds += BODY
-    if method != "get" and not path.endswith(PURE):
-        kinds += WRITING
+        kinds += (errors.RequestTimeoutError, errors.TooLargeError, errors.UnsupportedMediaTypeError)
+    # these POST routes store nothing
+    if method != "get" and not path.endswith(("/predict", "/evaluate", "/trace", "/compare", "/echo", "/infer")):
+        kinds += (errors.StorageFullError,)
     protocol = f"{path}/".startswith(f"{OPEN_INFERENCE}/")
     answers = operation["responses"]
     own = set(answers)

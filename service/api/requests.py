@@ -51,8 +51,6 @@ def telemetry(settings: Settings) -> TelemetryConfig:
 request_lines = logging.getLogger("service.requests")
 logger = logging.getLogger(__name__)
 
-SHOWN = 200
-"""Characters of an address that are logged."""
 MAX_REFUSALS_PER_S = 10
 """Refused requests of one route and code that are logged in a second; the others are counted."""
 
@@ -108,7 +106,7 @@ class RequestLog:
 
 def _of(scope: Scope, route: str) -> dict[str, Any]:
     """What a line says of a request: its address without the query, cut, as clients choose both."""
-    fields = {"route": route, "path": scope["path"][:SHOWN]}
+    fields = {"route": route, "path": scope["path"][:200]}
     if "method" in scope:
         fields["method"] = scope["method"][:16]
     if scope.get("client"):
@@ -120,8 +118,6 @@ def _of(scope: Scope, route: str) -> dict[str, Any]:
 
 WEBSOCKET = "WEBSOCKET"
 """Stands for the method of a request for a stream."""
-GONE = 499
-"""Stands for the status of a request whose client went away before it was answered."""
 
 
 class RequestContext:
@@ -171,7 +167,7 @@ class RequestContext:
             self.requests.streams -= status == 101
             now = perf_counter()
             if not status:
-                status, answered = GONE, now
+                status, answered = 499, now  # the client went away
             path, seconds = _template(scope), now - began
             model: str = scope["path_params"].get("model", "") if path else ""
             kind = (method, path, model, status, scope.get(ERROR_CODE, ""))

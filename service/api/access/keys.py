@@ -29,17 +29,12 @@ from service.storage.database import ApiKeyRow, Database, now
 from service.storage.files import new_id
 
 PREFIX = "lip_"
-SECRET_BYTES = 32
 SLOWEST, FASTEST = 1e-3, 1e6
 """Requests per s that a key may be limited to."""
 GIVEN = re.compile(rf"{PREFIX}[A-Za-z0-9_-]{{43,200}}")
 """A key that was made elsewhere: 43 letters of base64 are the 32 bytes of ours."""
 REFRESH_S = 1.0
 """Seconds after which a running service knows of keys that another process made or revoked."""
-
-
-LONGEST_BURST_S = 10.0
-"""Seconds of its own rate that a key may ask for at once, at most."""
 
 
 class KeyRate:
@@ -49,7 +44,7 @@ class KeyRate:
 
     def __init__(self, per_s: float, burst: int) -> None:
         self.per_s = per_s
-        self._rate = Rate(per_s, max(1, min(burst, ceil(LONGEST_BURST_S * per_s))))
+        self._rate = Rate(per_s, max(1, min(burst, ceil(10.0 * per_s))))  # at most 10 s of its own rate at once
 
     def count(self, key: str) -> None:
         """Count a request of the key; raise RateLimitedError where it comes too early."""
@@ -115,7 +110,7 @@ def create(
         raise ValueError(f"the key is not one, expected {PREFIX} and 43 to 200 random letters, digits, - or _")
     if max_requests_per_s is not None and not SLOWEST <= max_requests_per_s <= FASTEST:
         raise ValueError(f"rate is {max_requests_per_s:g}, expected {SLOWEST:g} to {FASTEST:g} requests per s")
-    secret = given or PREFIX + secrets.token_urlsafe(SECRET_BYTES)
+    secret = given or PREFIX + secrets.token_urlsafe(32)
     row = ApiKeyRow(
         id=new_id("key"),
         name=name,
@@ -175,8 +170,6 @@ logger = logging.getLogger(__name__)
 
 INDEXED = 16
 """Bytes of a digest that keys are looked up by; the others are compared in constant time."""
-NOTE_SECONDS = 60.0
-"""How exactly it is stored when a key was seen last."""
 CHALLENGE = 'Bearer realm="lipserve"'
 
 
@@ -248,7 +241,7 @@ class Keyring:
         while True:
             await asyncio.sleep(self._refresh_s)
             await self._refresh(database)
-            await self._note_used(database, NOTE_SECONDS)
+            await self._note_used(database, 60.0)
 
     async def _refresh(self, database: Database) -> None:
         """Read the keys; while the database cannot be read, the known ones stay: controllers are not to stop for it."""

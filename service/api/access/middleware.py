@@ -45,8 +45,6 @@ def subprotocol_of(offered: Iterable[str]) -> str | None:
     return SUBPROTOCOL if SUBPROTOCOL in offered else None
 
 
-SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
-"""Methods that change nothing."""
 FOREIGN = frozenset({b"cross-site", b"same-site"})
 """What a browser says of a request that a page of another origin makes: another port is one, of the same site."""
 MOST_KNOWN = 100
@@ -97,7 +95,7 @@ class LocalAccess:
     @staticmethod
     def _is_link(scope: Scope, mode: bytes | None, target: bytes | None) -> bool:
         """Whether a browser asks for a page to be shown by itself, not within one of another site."""
-        safe = scope["type"] == "http" and scope["method"] in SAFE
+        safe = scope["type"] == "http" and scope["method"] in ("GET", "HEAD", "OPTIONS")  # these change nothing
         return safe and mode == b"navigate" and target == b"document"
 
     def _is_local(self, host: bytes) -> bool:
@@ -123,9 +121,6 @@ def _wrong_origin(origin: bytes) -> ServiceError:
     name = readable(origin.decode("latin-1")[:200])
     message = f"the origin {name!r} is not this service: web pages of other sites may not ask"
     return ForbiddenError(message, [problem("origin", name, "this service, or none")])
-
-
-POLICY_VIOLATION = 1008
 
 
 class KeyAccess:
@@ -173,7 +168,7 @@ class KeyAccess:
         if not isinstance(connection, StreamProtocol):  # the route says that it cannot talk
             await self.app(scope, receive, send)
             return
-        end = partial(connection.end, POLICY_VIOLATION, f"the API key {key.id} is no longer valid")
+        end = partial(connection.end, 1008, f"the API key {key.id} is no longer valid")  # policy violation
         with self.keyring.lasting(key, end):
             await self.app(scope, receive, send)
 

@@ -38,7 +38,6 @@ class Rule(NamedTuple):
     lasting: bool = False
 
 
-OPEN = Rule(None)
 Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 
 
@@ -86,7 +85,7 @@ def _declared(routes: Sequence[BaseRoute]) -> Iterator[tuple[Sequence[str], str,
             continue
         path, pattern = str(route.path), route.path_regex
         if path in PAGES or path.startswith(FOLDERS):
-            yield ("GET",), path, pattern, OPEN
+            yield ("GET",), path, pattern, Rule(None)
             continue
         rule = getattr(route.endpoint, "rule", None)
         if not isinstance(rule, Rule):

@@ -18,7 +18,6 @@ BUNDLES = Path(__file__).with_name("bundles")
 NAMES = ("cartesian", "gl3d")
 """Bundles by what they draw: plots with two axes, and scenes in 3-D."""
 PREFIX = "/dashboard/plotly"
-FOREVER = "public, max-age=31536000, immutable"
 
 
 class Script:
@@ -68,7 +67,7 @@ def install(app: FastAPI, headers: dict[str, str], found: dict[str, Script] | No
         script = next((each for each in known.values() if each.digest == digest), None)
         if script is None:
             raise HTTPException(404)
-        sent = headers | {"cache-control": FOREVER, "vary": "accept-encoding"}
+        sent = headers | {"cache-control": "public, max-age=31536000, immutable", "vary": "accept-encoding"}
         if "gzip" in request.headers.get("accept-encoding", ""):
             return Response(script.packed, headers=sent | {"content-encoding": "gzip"}, media_type="text/javascript")
         return Response(script.path.read_bytes(), headers=sent, media_type="text/javascript")

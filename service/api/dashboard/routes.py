@@ -13,7 +13,6 @@ from starlette.types import Scope
 from service.api.dashboard import plotly
 
 STATIC = Path(__file__).with_name("static")
-FILES = "/dashboard"
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -31,7 +30,7 @@ def install(app: FastAPI) -> None:
     """Add the dashboard to an application. It needs no key: its pages ask for one where the API does."""
     app.add_api_route("/", page, include_in_schema=False)
     plotly.install(app, HEADERS)
-    app.mount(FILES, StaticPages(STATIC, HEADERS))
+    app.mount("/dashboard", StaticPages(STATIC, HEADERS))
 
 
 async def page() -> Response:

@@ -22,10 +22,6 @@ from service.foundation.settings import Settings
 from service.models.archive_reading import MAX_ARCHIVE_BYTES, MAX_URDF_BYTES
 from service.telemetry.logs import KEY_ID
 
-OTHER_BYTES = 256 * 1024
-"""Largest body where neither motions nor files are sent: a list of a thousand names, each as long as may be."""
-LOOK_S = 0.5
-"""Longest time in s between two looks at the bodies that are waited for."""
 MAX_REQUESTS = 256
 """Max requests at a time; a quarter as many may wait for the bodies of one client. More are answered 429."""
 
@@ -57,7 +53,7 @@ def body_limits(settings: Settings) -> dict[str, int]:
         "/v1/robots": MAX_URDF_BYTES,
         "/v1/models/import": MAX_ARCHIVE_BYTES,
         **dict.fromkeys(("predict", "observations", "infer", "echo"), settings.max_request_bytes),
-        "*": min(OTHER_BYTES, settings.max_request_bytes),
+        "*": min(256 * 1024, settings.max_request_bytes),  # a list of a thousand long names
     }
 
 
@@ -137,7 +133,7 @@ class BodyLimit:
 
     def _look_later(self) -> None:
         self._looking = asyncio.get_running_loop()
-        self._looking.call_later(min(LOOK_S, self.seconds / 4), self._look)
+        self._looking.call_later(min(0.5, self.seconds / 4), self._look)
 
     def _look(self) -> None:
         """End the waits that have lasted too long."""
@@ -227,8 +223,6 @@ async def in_turn(turns: CapacityLimiter, make: Callable[..., Made], *args: Any)
 
 COUNTED = "lipserve.counted"
 """In the ASGI scope of a request that was counted already: of a key with a rate of its own."""
-MAX_CLIENTS = 10_000
-"""Clients that are told apart at a time; those beyond share one rate."""
 FORGET_S = 1.0
 """Shortest time in s between two searches for clients that need not be remembered any more."""
 NETWORK_BITS = 64
@@ -239,10 +233,11 @@ OTHERS, LOCAL = "others", "a local socket"
 class Rate:
     """A token bucket for each client: `burst` tokens at most, of which `per_s` are put in every second.
 
-    Kept as one time per client, when its bucket will be full again.
+    Kept as one time per client, when its bucket will be full again. most: clients that have one of their
+    own; the others share one.
     """
 
-    def __init__(self, per_s: float, burst: int, most: int = MAX_CLIENTS) -> None:
+    def __init__(self, per_s: float, burst: int, most: int = 10_000) -> None:
         self.step, self.depth, self.most = 1 / per_s, burst / per_s, most
         self._full: dict[str, float] = {}
         self._forgotten = -FORGET_S

@@ -32,8 +32,6 @@ from service.foundation.errors import (
 )
 from service.storage.rows import identity
 
-KINDS = Kinds(MEDIA_TYPES, SUFFIXES)
-
 router = APIRouter(
     prefix="/v1/datasets", tags=["data sets"], responses=responses(InvalidRequestError), route_class=Route
 )
@@ -66,7 +64,7 @@ async def upload(
     options = upload_options(query)
     path = storage.files.upload()
     try:
-        kind, file_name = await receive_to(request, path, KINDS, storage.disk)
+        kind, file_name = await receive_to(request, path, Kinds(MEDIA_TYPES, SUFFIXES), storage.disk)
         asked = (sorted(request.query_params.multi_items()), kind, file_name)
         named = await to_thread.run_sync(partial(identity, idempotency_key, *asked, file=path))
         called = query.name or file_name or "unnamed"

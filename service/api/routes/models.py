@@ -27,7 +27,6 @@ from service.foundation.errors import (
 from service.foundation.fields import BINARY, upload_body
 from service.models import aliases, archive, archive_import, deletion, registry
 
-ARCHIVES = Kinds({archive.MEDIA_TYPE: "tar"}, {".tar": "tar"})
 _BINARY = {"schema": BINARY}
 _BODY = upload_body("An archive as an export writes it.", {archive.MEDIA_TYPE: _BINARY}, "A .tar file")
 
@@ -65,7 +64,7 @@ async def import_version(
     """Check an archive and make a new version of it."""
     path = loaded.files.upload()
     try:
-        await receive_to(request, path, ARCHIVES, loaded.storage.disk)
+        await receive_to(request, path, Kinds({archive.MEDIA_TYPE: "tar"}, {".tar": "tar"}), loaded.storage.disk)
         version = await to_thread.run_sync(archive_import.add, loaded, path, name, promotion, limiter=turns)
     finally:
         path.unlink(missing_ok=True)

@@ -25,8 +25,6 @@ from service.foundation.errors import (
 from service.foundation.fields import NameForPeople
 from service.robots import store
 
-KINDS = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
-
 router = APIRouter(prefix="/v1/robots", tags=["robots"], responses=responses(InvalidRequestError), route_class=Route)
 
 
@@ -47,7 +45,8 @@ async def upload(
     name: Annotated[NameForPeople | None, Query(description="A name for people; the URDF's by default")] = None,
 ) -> Robot:
     """Check a URDF and store it, or say what is wrong with it. No file that it names is opened."""
-    _, content = await receive(request, KINDS)
+    kinds = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
+    _, content = await receive(request, kinds)
     await to_thread.run_sync(storage.disk.take, len(content))
     robot = await to_thread.run_sync(store.add, storage.database, content, name, storage.settings)
     response.headers["Location"] = f"/v1/robots/{robot.id}"

@@ -219,9 +219,6 @@ CONNECTION = "lipserve.connection"
 """Key of the connection in the `state` of an ASGI scope."""
 MAX_FRAME_BYTES = 64 * 1024
 """Largest frame that a stream reads."""
-FLUSH_SECONDS = 1.0
-CLOSE_SECONDS = 3.0
-"""How long a client may take to answer a close before it is cut off."""
 
 
 class StreamProtocol(WebSocketsSansIOProtocol):
@@ -287,7 +284,7 @@ class StreamProtocol(WebSocketsSansIOProtocol):
         if self.read_paused:
             self.read_paused = False
             self.transport.resume_reading()
-        self.close_timer = self.loop.call_later(CLOSE_SECONDS, self.transport.abort)
+        self.close_timer = self.loop.call_later(3.0, self.transport.abort)  # for the client to answer the close
 
     def shutdown(self) -> None:
         """Close because the server stops: 1001, "going away", where uvicorn says 1012, "service restart"."""
@@ -300,4 +297,4 @@ class StreamProtocol(WebSocketsSansIOProtocol):
         elif not self.handshake_complete or self.close_sent:
             super().shutdown()
         # a client that does not read would keep the server from ending
-        self.loop.call_later(FLUSH_SECONDS, self.transport.abort)
+        self.loop.call_later(1.0, self.transport.abort)

@@ -23,7 +23,6 @@ from service.telemetry.readiness import Stopping
 logger = logging.getLogger(__name__)
 
 BACKLOG = 128
-PROBE_SECONDS = 1.0
 DRAIN_S = 5
 """Longest wait in s for answers in progress when the service stops."""
 
@@ -149,7 +148,7 @@ def _make_room(path: Path) -> None:
     if not stat.S_ISSOCK(kind):
         raise SocketError(f"uds is {str(path)!r}, where something lies that is no socket: expected another path")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(PROBE_SECONDS)
+        probe.settimeout(1.0)
         code = probe.connect_ex(os.fspath(path))
     if code == errno.ECONNREFUSED:
         path.unlink(missing_ok=True)

@@ -25,11 +25,6 @@ from service.storage.errors import translated
 
 logger = logging.getLogger(__name__)
 
-BACKLOG = 10
-"""Blocks that may wait before the stream is read no further."""
-TICK = 1e-6
-"""Least step of time between two frames, s: those that come in one piece have one time of arrival."""
-
 
 class Taught(NamedTuple):
     """A frame to learn from. served: what answered it; loaded: whether with a load; arrived: time of
@@ -67,7 +62,7 @@ class Learning:
                 f"more than {self._sequence}, the last one to learn from: count up, or connect again to repeat frames"
             )
             raise invalid_request("sequence", sequence, expected)
-        while len(self._waiting) >= BACKLOG * self._most:
+        while len(self._waiting) >= 10 * self._most:  # blocks that wait; then the stream is read no further
             self._flushed.clear()
             await self._flushed.wait()
 
@@ -164,7 +159,7 @@ class Learning:
         clock = time.time() - perf_counter()
         if abs(clock - self._clock) > SET_S:
             self._clock, self._time = clock, -np.inf
-        ticks = TICK * np.arange(1, len(block) + 1)
+        ticks = 1e-6 * np.arange(1, len(block) + 1)  # frames that come in one piece have one time of arrival
         arrived = np.array([each.arrived for each in block]) + self._clock
         times: Array = np.maximum.accumulate(np.maximum(arrived - ticks, self._time)) + ticks
         self._time = float(times[-1])
