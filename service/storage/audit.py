@@ -27,8 +27,6 @@ logger = logging.getLogger(__name__)
 
 SERVICE = "service"
 """Stands for a route where nobody asked: a version that comes with LIPServe, or that has proved better."""
-CLEAN_S = 3600.0
-"""Seconds between two searches for lines that are too old."""
 
 
 def note(
@@ -111,7 +109,7 @@ async def cleaned(database: Database, settings: Settings) -> AsyncIterator[None]
 
 async def _clean(database: Database, settings: Settings) -> None:
     while True:
-        await asyncio.sleep(CLEAN_S)  # first: a host that starts with a wrong clock has it set right by then
+        await asyncio.sleep(3600.0)  # first: a host that starts with a wrong clock has it set right by then
         try:
             await to_thread.run_sync(clean, database, settings)
         except Exception as error:

@@ -33,10 +33,7 @@ from service.storage.storage import HomeError, hold_home
 FORMAT, FORMAT_VERSION = "lipserve-backup", 1
 MANIFEST = "backup.json"
 """The last member: what belongs to the moment, with the size and sha256 of each file."""
-FEW = 50
-"""Files that may be left for the moment in which writers wait."""
 MOST_ROUNDS = 20
-CHUNK = 1 << 20
 LOCK = ".lock"
 _NAMES = re.compile(
     rf"{re.escape(FILE)}|{re.escape(MANIFEST)}|(datasets|learning)/[a-z]+_\w{{1,36}}\.safetensors"
@@ -98,7 +95,7 @@ def _write(home: Path, opened: IO[bytes], folder: Path) -> Backup:
             for key in pending:
                 with _files(home, [key], missing_ok=True) as files:
                     _add(tar, files, sums)
-            if len(pending) <= FEW:
+            if len(pending) <= 50:  # the rest, while writers wait
                 break
         with ExitStack() as held:
             with closing(_connected(home / FILE)) as lock:
@@ -242,7 +239,7 @@ def _extract(content: IO[bytes], path: Path) -> str:
     digest = hashlib.sha256()
     path.touch(0o600)
     with path.open("wb") as file:
-        while piece := content.read(CHUNK):
+        while piece := content.read(1 << 20):
             file.write(piece)
             digest.update(piece)
         file.flush()

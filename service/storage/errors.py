@@ -23,9 +23,6 @@ UNAVAILABLE = frozenset(
     if hasattr(errno, name)
 )
 RETRY_AFTER = {"Retry-After": "1"}
-_BUSY = frozenset({sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED})
-_DAMAGED = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
-_FAILING = frozenset({sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM})
 _BUSY_STATES = frozenset({"55P03", "57014", "40001", "40P01"})
 """Lock not available, query cancelled, serialization failure, deadlock."""
 _LOST_STATES = ("08", "57P", "25P03", "53300")
@@ -67,13 +64,13 @@ def _of_database(error: DBAPIError) -> ServiceError | None:
     if error.orig is not None and hasattr(error.orig, "sqlstate"):
         return _of_postgresql(error, error.orig.sqlstate)
     primary = _code(error)
-    if primary in _BUSY:
+    if primary in (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED):
         return StorageUnavailableError(_LOCKED, headers=RETRY_AFTER)
     if primary == sqlite3.SQLITE_FULL:
         return StorageFullError(_NO_SPACE)
-    if primary in _DAMAGED:
+    if primary in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
         return StorageUnavailableError(f"the database is damaged: {error.orig}; the service's log says more")
-    if primary in _FAILING:
+    if primary in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM):
         return StorageUnavailableError(f"the database cannot be used now: {error.orig}", headers=RETRY_AFTER)
     return None
 

@@ -25,13 +25,6 @@ from service.storage.files.local import write_durably
 
 logger = logging.getLogger(__name__)
 
-IDENTITY = "replica"
-BEATS = 10
-"""Signs of life in the time after which a service counts as lost."""
-RECONCILE_S = 30.0
-"""Seconds between two searches for jobs that nobody has, of a service alone: only a fault leaves some."""
-KEPT_S = 3600.0
-"""Seconds for which a service that is gone is remembered."""
 _SECONDS = cast(func.extract("epoch", func.clock_timestamp()), Float)
 
 
@@ -44,9 +37,9 @@ class Replicas:
 
     def __init__(self, settings: Settings, database: Database) -> None:
         self.settings, self.database = settings, database
-        self.beat_s = settings.replica_lost_s / BEATS
+        self.beat_s = settings.replica_lost_s / 10  # so many are missing before it counts as lost
         self.id = identity(settings.home) if database.shared else "alone"
-        self.reconcile_s = self.beat_s if database.shared else RECONCILE_S
+        self.reconcile_s = self.beat_s if database.shared else 30.0  # of a service alone, only a fault leaves some
         self._started = now()
         self._since, self._last = float("inf"), -float("inf")  # monotonic, s: no sign was missed since; the last one
         self._closing = threading.Event()
@@ -119,7 +112,7 @@ class Replicas:
             session.execute(
                 insert(ReplicaRow).values(row).on_conflict_do_update(index_elements=[ReplicaRow.id], set_=row)
             )
-            session.execute(delete(ReplicaRow).where(ReplicaRow.seen_at < _SECONDS - KEPT_S))
+            session.execute(delete(ReplicaRow).where(ReplicaRow.seen_at < _SECONDS - 3600.0))
             session.commit()
         clock = time.monotonic()
         if clock - self._last > self.settings.replica_lost_s / 2:
@@ -134,7 +127,7 @@ def alive(session: Session, lost_s: float) -> set[str]:
 
 def identity(home: Path) -> str:
     """The id of the service on a home, which it keeps. Only the process that holds the home may ask."""
-    path = home / IDENTITY
+    path = home / "replica"
     try:
         known = path.read_text().strip()
     except (FileNotFoundError, UnicodeDecodeError):

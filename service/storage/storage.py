@@ -50,7 +50,6 @@ class Storage:
 
 WRITE_S = 2.0
 """Longest wait in s for another writer of the database: commits take milliseconds."""
-PROBE = bytes(4096)
 
 
 def look_database(storage: Storage, _: Lasting) -> tuple[PartState, str]:
@@ -65,7 +64,7 @@ def look_home(storage: Storage, _: Lasting) -> tuple[PartState, str]:
     """Whether the home can be written, and has room."""
     path = storage.files.upload()
     try:
-        path.write_bytes(PROBE)
+        path.write_bytes(bytes(4096))
     finally:
         path.unlink(missing_ok=True)
     shortage = storage.disk.usage().shortage()

@@ -34,8 +34,6 @@ logger = logging.getLogger(__name__)
 FILE = "lipserve.sqlite3"
 LOG_BYTES = 4 * 1024 * 1024
 """Of SQLite's log, which by itself it brings into the database every 1000 pages."""
-MOST_CONNECTIONS = 64
-"""More than there are threads: who only reads shall not wait for those that wait to write."""
 
 
 class Sqlite:
@@ -50,7 +48,7 @@ class Sqlite:
         self.engine = create_engine(
             f"sqlite:///{self.path}",
             connect_args={"timeout": timeout_s},
-            max_overflow=MOST_CONNECTIONS,
+            max_overflow=64,  # more than there are threads: readers do not wait for waiting writers
             pool_timeout=timeout_s,
         )
         event.listen(self.engine, "connect", _configure)

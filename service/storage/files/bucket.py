@@ -20,8 +20,6 @@ from service.storage.files.objects import Entry, FilesUnreachableError, unreacha
 
 CONNECT_S, READ_S, ATTEMPTS = 5, 30, 2
 """Longest waits in s for a connection and for the next bytes, and how often a request is sent."""
-CHECK_S = 3.0
-"""Longest wait in s for an answer to `check`."""
 PART, PARTS = 16 << 20, 2
 """Bytes of a part of a large object, and how many of them are on their way, and in memory, at a time."""
 NO_BUCKET = "there is no such bucket"
@@ -78,7 +76,7 @@ class Bucket:
         with _of_store(missing=NO_BUCKET):
             prefix = f"{self._prefix}/" if self._prefix else ""
             asked = {"Bucket": self._bucket, "Prefix": prefix, "MaxKeys": 1}
-            sync(self._system.loop, self._system._call_s3, "list_objects_v2", timeout=CHECK_S, **asked)
+            sync(self._system.loop, self._system._call_s3, "list_objects_v2", timeout=3.0, **asked)
 
     def _path(self, key: str) -> str:
         return f"{self._root}/{key}"

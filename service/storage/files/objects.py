@@ -25,7 +25,7 @@ logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 8.0
+FIRST_PAUSE_S = 0.5
 """Pauses before a store is asked again: each time twice as long."""
 
 
@@ -100,7 +100,7 @@ class Patient:
                     raise
                 logger.warning("%s: asked again in %g s", error.strerror, pause)
             time.sleep(pause)
-            pause = min(2 * pause, LONGEST_PAUSE_S)
+            pause = min(2 * pause, 8.0)
 
 
 def store_of(url: str) -> Objects:
@@ -117,9 +117,6 @@ def store_of(url: str) -> Objects:
     return Bucket(parts.netloc, parts.path.strip("/"))
 
 
-DRAFT = ".draft-"
-
-
 class Mounted:
     """Objects are files below a folder, which has to be there: one that is not mounted is not made in its place."""
 
@@ -134,7 +131,7 @@ class Mounted:
             if not target.parent.is_dir():
                 make_folder(target.parent)
             with path.open("rb") as file:
-                draft = target.parent / f"{DRAFT}{secrets.token_hex(8)}"
+                draft = target.parent / f".draft-{secrets.token_hex(8)}"
                 local.write_durably(target, lambda out: shutil.copyfileobj(file, out, 1 << 20), draft)
 
     def get(self, key: str, path: Path) -> None:

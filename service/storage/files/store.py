@@ -39,7 +39,6 @@ logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 
-CACHE_BYTES = 4 << 30
 PATIENCE_S = 60.0
 """How long training asks again for shared files that cannot be reached, before it is given up."""
 
@@ -60,9 +59,7 @@ class Files:
     datasets, versions: folders below the home, of the files themselves or of copies, for tests and tools.
     """
 
-    def __init__(
-        self, home: Path, url: str | None = None, cache_bytes: int = CACHE_BYTES, patience_s: float = 0.0
-    ) -> None:
+    def __init__(self, home: Path, url: str | None = None, cache_bytes: int = 4 << 30, patience_s: float = 0.0) -> None:
         self.uploads, self.learning = home / "uploads", home / "learning"
         for folder in (self.uploads, self.learning):
             make_folder(folder)
