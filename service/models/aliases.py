@@ -13,9 +13,6 @@ from service.models.loaded import LoadedModels
 from service.models.registry import SERVING
 from service.storage.database import AliasMoveRow, AliasRow, ServingRow, VersionRow, now
 
-MAX_MOVES = 20
-"""Last moves of an alias that an answer lists."""
-
 
 def page(loaded: LoadedModels, model: str) -> AliasList:
     """Every alias of a model, `serving` first; raise NotFoundError."""
@@ -162,7 +159,7 @@ def _check_room(loaded: LoadedModels, session: Session, model: str, alias: str) 
 
 
 def _show(loaded: LoadedModels, session: Session, model: str, alias: str) -> Alias:
-    past = _history(session, model, alias, MAX_MOVES)
+    past = _history(session, model, alias, 20)
     if alias == SERVING:
         version = session.get_one(ServingRow, model).version
         changed_at = past[0].at if past else session.get_one(VersionRow, (model, version)).created_at

@@ -25,7 +25,6 @@ from service.models.loaded import LoadedModels
 from service.storage.database import VersionRow, now
 
 MEDIA_TYPE = "application/x-tar"
-CHUNK = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ def _pieces(file: IO[bytes]) -> Iterator[bytes]:
     """What a file holds, which is closed at its end, and where it is given up."""
     with file:
         file.seek(0)
-        while piece := file.read(CHUNK):
+        while piece := file.read(1 << 20):
             yield piece
 
 

@@ -35,8 +35,6 @@ from service.storage.files import new_id
 
 logger = logging.getLogger(__name__)
 
-OTHERS = Acceptance(unknown=("it was imported beside other versions",))
-
 
 def add(loaded: LoadedModels, upload: Path, name: str | None, promotion: PromotionOption | None = None) -> Version:
     """Make a new version of what an archive holds; return it. Not for the event loop.
@@ -80,7 +78,8 @@ def _publish(
     with loaded.database.transaction() as session:
         registry.check_robot(session, model, RobotKind.of_manifest(manifest))
         first = not registry.has_model(session, model)
-        judged = Promotion.of(_accepted(manifest) if first else OTHERS, registry.answering(session, model), option)
+        other = Acceptance(unknown=("it was imported beside other versions",))
+        judged = Promotion.of(_accepted(manifest) if first else other, registry.answering(session, model), option)
         version = registry.publish(
             session, model, folder, manifest, None, candidate=not judged.answers, promotion=judged
         )

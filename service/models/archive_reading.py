@@ -25,8 +25,6 @@ from service.foundation.settings import Settings
 EXPORT, CHECKSUMS = "export.json", "checksums.json"
 SIGNATURE = "signature.json"
 """In archives that earlier builds have signed; it is ignored."""
-MEMBERS = (EXPORT, CHECKSUMS, MANIFEST, TENSORS, ROBOT, SIGNATURE)
-OPTIONAL = frozenset({ROBOT, SIGNATURE})
 FORMAT, FORMAT_VERSION = "lipserve-archive", 1
 BLOCK = 512
 _KINDS = {
@@ -138,8 +136,8 @@ def read(upload: Path, settings: Settings) -> tuple[About, dict[str, bytes]]:
         files = members(upload, limits)
     except ArchiveError as error:
         raise invalid_data(error.member, error.given, error.expected) from None
-    for name in MEMBERS:
-        if name not in files and name not in OPTIONAL:
+    for name in (EXPORT, CHECKSUMS, MANIFEST, TENSORS, ROBOT, SIGNATURE):
+        if name not in files and name not in (ROBOT, SIGNATURE):
             raise invalid_data(name, "missing", "a file of that name in the archive")
     files.pop(SIGNATURE, None)
     sums = _json(CHECKSUMS, files.pop(CHECKSUMS))

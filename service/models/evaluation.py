@@ -14,11 +14,8 @@ from lipcore.data.samples import Array, Samples
 from service.contract.models import Interval, Reliability, Stretches
 from service.foundation.fields import finite
 
-FEWEST_EPISODES, MOST_EPISODES = 5, 200
-"""Episodes stand for stretches where there are so many; fewer make no box plot, more are mostly a few samples long."""
 MAX_EVALUATION_SAMPLES = 5000
 """Samples of one evaluation; more are thinned evenly."""
-EQUAL = 10
 
 
 def stretches(samples: Samples, mean: Array) -> Stretches:
@@ -28,9 +25,9 @@ def stretches(samples: Samples, mean: Array) -> Stretches:
     would look enormous.
     """
     episodes = samples.episodes()
-    by_episode = FEWEST_EPISODES <= len(episodes) <= MOST_EPISODES
+    by_episode = 5 <= len(episodes) <= 200  # fewer make no box plot, more are a few samples long
     if not by_episode:
-        edges = np.linspace(0, len(samples), min(EQUAL, len(samples)) + 1).astype(np.int64).tolist()
+        edges = np.linspace(0, len(samples), min(10, len(samples)) + 1).astype(np.int64).tolist()
         episodes = [slice(first, last) for first, last in pairwise(edges)]
     squared = (samples.tau - mean) ** 2
     varies = np.ptp(samples.tau, axis=0) > 0  # rounding gives a constant column a variance above zero

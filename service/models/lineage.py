@@ -25,11 +25,8 @@ from service.foundation.fields import finite
 from service.models.evaluation import known
 from service.storage.database import DatasetRow
 
-CHECKOUT = Path(__file__).resolve().parents[2]
 MOST_SAMPLES = 500
 """Samples that training metrics are computed on."""
-GIT_SECONDS = 5.0
-"""Longest wait for git, s: a checkout on a slow disk loses its commit, not its training."""
 
 
 def software() -> dict[str, str | int]:
@@ -45,7 +42,7 @@ def software() -> dict[str, str | int]:
         "numpy": np.__version__,
         "scipy": str(scipy.__version__),
     }
-    commit = git_commit(CHECKOUT)
+    commit = git_commit(Path(__file__).resolve().parents[2])
     return versions if commit is None else {**versions, "git_commit": commit}
 
 
@@ -111,9 +108,9 @@ def git_commit(checkout: Path) -> str | None:
     if not (checkout / ".git").exists():  # an installed package may lie within somebody else's checkout
         return None
     command = ["git", "--no-optional-locks", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    try:
+    try:  # a checkout on a slow disk loses its commit, not its training
         answer = subprocess.run(  # noqa: S603 - a fixed command
-            command, cwd=checkout, capture_output=True, text=True, timeout=GIT_SECONDS, check=True
+            command, cwd=checkout, capture_output=True, text=True, timeout=5.0, check=True
         )
     except (OSError, subprocess.SubprocessError):
         return None

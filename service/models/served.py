@@ -109,9 +109,6 @@ class LearntStates(Protocol):
         """All of it, as a model that can be saved: it takes the time to learn what came since the last snapshot."""
 
 
-AGAIN = {"Retry-After": "1"}
-
-
 class Waiter:
     """A coroutine that waits for a model to answer otherwise than before."""
 
@@ -184,4 +181,4 @@ def _not_reached(served: Served, revision: int) -> RevisionNotReachedError:
     name = f"version {served.version} of model {served.name!r}"
     text = f"{name} answers with revision {served.revision} and has not learnt up to revision {revision} yet: ask again"
     expected = f"{served.revision} or less now, of version {served.version}"
-    return RevisionNotReachedError(text, [problem("min_revision", revision, expected)], AGAIN)
+    return RevisionNotReachedError(text, [problem("min_revision", revision, expected)], {"Retry-After": "1"})
