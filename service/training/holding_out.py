@@ -20,9 +20,6 @@ from service.foundation.errors import invalid_request
 from service.foundation.fields import first_repeat
 from service.storage.database import DatasetRow
 
-UNTIMED_GUARD = 25.0
-"""Samples left out on both sides in a data set without times, whose rate is not known."""
-
 
 class CannotHoldOutError(ValueError):
     """A data set cannot be split as asked for."""
@@ -211,7 +208,7 @@ def _divide(rows: Sequence[DatasetRow], clocks: Sequence[RowTimes], splits: dict
 def _first(row: DatasetRow, asked: Holdout, entire: bool, stretches: list[list[int]] | None) -> SetSplit:
     """How a data set is split that was not split before."""
     if not _is_timed(row):
-        return SetSplit(row.id, asked, entire, UNTIMED_GUARD, "rows", stretches)
+        return SetSplit(row.id, asked, entire, 25.0, "rows", stretches)  # samples: the rate is not known
     guard = asked.guard_s
     if guard is None:  # one period of the low-pass that it was prepared with, if it was
         cutoff = row.report["recipe"]["cutoff_hz"]

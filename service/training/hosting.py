@@ -43,8 +43,6 @@ logger = logging.getLogger(__name__)
 
 WATCH_S = 0.2
 """Seconds between two looks at the job's row."""
-SILENCE_S = 3.0
-"""Seconds without a sign of life, one of which comes each half second, after which the worker of a job is gone."""
 AGAIN_S = 1.0
 """Seconds after which the database is tried again."""
 _one = threading.Lock()
@@ -159,7 +157,7 @@ class Host:
 
     def _lives(self, row: JobRow) -> bool:
         """Whether signs of life come from wherever a job runs; one that has ended meanwhile needs none."""
-        end = time.monotonic() + SILENCE_S
+        end = time.monotonic() + 3.0  # a sign of life comes each half second
         while time.monotonic() < end and not _stopping.wait(WATCH_S):
             seen = self._patiently(lambda: self._row(row.id))
             if seen is None or seen.state not in ACTIVE or seen.heartbeat_at != row.heartbeat_at:
@@ -198,12 +196,6 @@ class Host:
                     return None
 
 
-THREADS = 2
-"""Of a worker: one waits for the process of a job, one computes a shard."""
-REJOIN_S = 2.0
-"""Seconds after which a worker that has lost its scheduler tries to join again."""
-STOP_S = 10.0
-"""Longest wait in s for the end of a job when a worker stops: it is handed back."""
 WRITE_S = 10.0
 """Longest wait in s for the database when a worker starts."""
 
@@ -249,7 +241,7 @@ async def _work(settings: Settings, scheduler: str, resources: dict[str, float],
         joined = asyncio.create_task(_be_member(settings, scheduler, resources, name))
         await asyncio.wait({joined, stopping}, return_when=asyncio.FIRST_COMPLETED)
         if stopped.is_set():
-            await asyncio.to_thread(stop, STOP_S)
+            await asyncio.to_thread(stop, 10.0)  # its job is handed back
             joined.cancel()
             with suppress(asyncio.CancelledError):
                 await joined
@@ -258,7 +250,7 @@ async def _work(settings: Settings, scheduler: str, resources: dict[str, float],
             logger.warning("the cluster could not be joined: %s", error)
         logger.warning("the scheduler %s is gone: joined again once it is there", scheduler)
         with suppress(TimeoutError):
-            await asyncio.wait_for(stopped.wait(), REJOIN_S)
+            await asyncio.wait_for(stopped.wait(), 2.0)
 
 
 async def _be_member(settings: Settings, scheduler: str, resources: dict[str, float], name: str | None) -> None:
@@ -268,7 +260,7 @@ async def _be_member(settings: Settings, scheduler: str, resources: dict[str, fl
     with dask.config.set(options):
         member = _Worker(
             scheduler,
-            nthreads=THREADS,
+            nthreads=2,  # one waits for the process of a job, one computes a shard
             resources=resources,
             name=name,
             memory_limit=0,  # results are few; a container's limit is the one that counts

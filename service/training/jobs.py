@@ -45,8 +45,6 @@ MAX_DATASETS = 100
 """Data sets of one training job."""
 MAX_QUEUED = 100
 """Jobs that may wait; more are answered 429."""
-USUAL_WAIT_S, LONGEST_WAIT_S = 30, 3600
-"""Seconds after which who finds the queue full may try again: where nothing is known of the jobs that run, and most."""
 
 
 def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, named: Identity | None = None) -> Job:
@@ -161,7 +159,7 @@ def _seconds_to_wait(session: Session) -> int:
     """When the first of the jobs that run may end and another one leave the queue, s: a guess where none can tell."""
     left = [row.get("remaining_s") for row in session.scalars(select(JobRow.progress).where(JobRow.state == RUNNING))]
     known = [seconds for seconds in left if seconds is not None]
-    return math.ceil(min(max(min(known), 1.0), LONGEST_WAIT_S)) if known else USUAL_WAIT_S
+    return math.ceil(min(max(min(known), 1.0), 3600)) if known else 30
 
 
 def show(queue: JobQueue, loaded: LoadedModels, job: str) -> Job:

@@ -56,8 +56,6 @@ def hand_back(row: JobRow, why: str) -> None:
 Why = Literal["returned", "ended", "cancelled", "silent", "too_long", "not_started", "lingering", "refused"]
 LINGER_S = 10.0
 """Seconds that a process may take to tidy up after the end of its job."""
-AWAY_S = 0.5
-"""Seconds by which the host of a process on another machine, which judges it too, is waited for."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +138,7 @@ class Hand:
         if self.away:
             if self.done is not None:
                 return Ended(self.job, "returned", "it has ended, or is another service's")
-            clock -= AWAY_S
+            clock -= 0.5  # the host of a process elsewhere judges it, too
         if self.done is not None:
             late = clock - self.done >= LINGER_S
             return Ended(self.job, "lingering", "the process did not go on after its end") if late else None
@@ -190,7 +188,7 @@ def _folder_mark(job: str) -> str:
     return job.removeprefix("job_")
 
 
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 1.0, 30.0
+FIRST_PAUSE_S = 1.0
 """Wait before a job is handed out again whose process could not be started: each time twice as long."""
 
 
@@ -252,7 +250,7 @@ class Settler:
             message = f"{ended.message}: no training process could be started for it, {starts + 1} times"
             fail(row, "interrupted", message)
             return Settled()
-        pause = min(FIRST_PAUSE_S * 2**starts, LONGEST_PAUSE_S)
+        pause = min(FIRST_PAUSE_S * 2**starts, 30.0)
         enter(row, QUEUED, f"{ended.message}: it waits for another one")
         return Settled(again=True, pause_s=pause, problem=ended.message)
 

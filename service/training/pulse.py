@@ -19,8 +19,6 @@ from service.storage.database import Database, JobRow, now
 SEARCH = "hyperparameters"
 LEAST_FRACTION = 0.05
 """Share of several fits after which their pace says something."""
-LEAST_ITERATIONS = 3
-"""Iterations after which their pace says something."""
 POSTERIOR_ITERATIONS = 1.5
 """Iterations of the search that conditioning, compressing and saving take as long as, where both stand on equally many
 samples. Both grow with the cube of theirs: measured 0.9 for two joints and 1.9 for seven."""
@@ -48,7 +46,7 @@ class Remaining:
         if at.stage == SEARCH:
             if self._first is None or at.iteration <= self._first[1]:  # or another search: that for the arm comes first
                 self._first = (clock, at.iteration)
-            elif at.iteration >= LEAST_ITERATIONS:
+            elif at.iteration >= 3:  # then their pace says something
                 began, before = self._first
                 self._pace = (clock - began) / (at.iteration - before)
         if self._pace is not None:
