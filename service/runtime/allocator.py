@@ -19,11 +19,8 @@ HEAPS = 1
 Python's threads take turns anyway."""
 BLOCK = 1024 * 1024
 """Bytes from which on a block is the system's own, and goes back to it at once; and of free memory that is kept."""
-PERIOD_S = 60.0
-"""Seconds after which free memory below blocks in use goes back, too. That takes a heap's lock for a millisecond."""
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
 """Parameters of `mallopt`, see malloc.h of glibc."""
-_VARIABLES = ("MALLOC_", "GLIBC_TUNABLES")
 
 
 def keep_little(environment: Mapping[str, str] = os.environ) -> bool:
@@ -32,7 +29,7 @@ def keep_little(environment: Mapping[str, str] = os.environ) -> bool:
     To be called before it starts threads. Nothing is done where the environment has settings of its own, or the C
     library is another one.
     """
-    if any(name.startswith(_VARIABLES) for name in environment):
+    if any(name.startswith(("MALLOC_", "GLIBC_TUNABLES")) for name in environment):
         return False
     library = ctypes.CDLL(None)
     if not hasattr(library, "gnu_get_libc_version"):
@@ -52,5 +49,5 @@ def give_back() -> None:
 
 def _give_back_often() -> None:
     while True:
-        time.sleep(PERIOD_S)
+        time.sleep(60.0)  # it takes a heap's lock for a millisecond
         give_back()

@@ -52,7 +52,6 @@ ENVIRONMENT = {
     "MALLOC_ARENA_MAX": "2",  # each takes address space, used or not
     "ARROW_DEFAULT_MEMORY_POOL": "system",
 }
-KEPT_VARIABLES = ("LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "TZ")
 CPU_SHARE = 0.5
 """Processor time that reading one upload may take, in shares of its time."""
 _making = threading.Lock()
@@ -231,7 +230,8 @@ def start(control: socket.socket) -> Any:
         [sys.executable, "-I", "-c", f"{code}; process.serve({control.fileno()})", path],
         pass_fds=[control.fileno()],
         stdin=subprocess.DEVNULL,
-        env=ENVIRONMENT | {name: os.environ[name] for name in KEPT_VARIABLES if name in os.environ},
+        env=ENVIRONMENT
+        | {name: os.environ[name] for name in ("LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "TZ") if name in os.environ},
         cwd="/",
         start_new_session=True,  # Ctrl-C is not for it
     )

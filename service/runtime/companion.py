@@ -24,8 +24,6 @@ logger = logging.getLogger(__name__)
 
 FIRST_PAUSE, LONGEST_PAUSE = 0.5, 30.0
 """Seconds until a process that died is started again: each time twice as long, unless it lived for LONGEST_PAUSE."""
-END_SECONDS = 5.0
-"""Longest wait for the process to end what it does and end."""
 QUIET_S, STEP_S = 45.0, 900.0
 """Seconds in which the process neither ends a step nor computes, and of one step, after which it is replaced."""
 BEAT, BEAT_S = "beat", 1.0
@@ -103,7 +101,7 @@ class Companion:
         if not self._threads:
             return
         supervisor, sender = self._threads
-        supervisor.join(END_SECONDS)
+        supervisor.join(5.0)
         if supervisor.is_alive() and self._process is not None:
             logger.warning("the %s process does not end: killed", self.name)
             self._process.kill()

@@ -34,8 +34,6 @@ from service.telemetry import logs
 P = ParamSpec("P")
 T = TypeVar("T")
 
-CONNECT_S = 10.0
-"""Longest wait in s for the scheduler of a cluster."""
 SHARD, GPU_SHARD = "SHARD", "GPU_SHARD"
 """Tags of workers that take shards. A job holds its worker's GPU while it lasts, and asks for shards on GPUs
 meanwhile: these have a tag of their own, or they would wait for their job's end."""
@@ -161,7 +159,7 @@ def connect(address: str, name: str = "lipserve") -> Any:
     new: Any = distributed.Client
     logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it has set another one
     try:
-        return new(address, timeout=CONNECT_S, set_as_default=False, direct_to_workers=True, name=name)
+        return new(address, timeout=10.0, set_as_default=False, direct_to_workers=True, name=name)
     except (OSError, TimeoutError, ValueError) as error:
         raise ClusterUnavailableError(f"the scheduler {address} of the cluster cannot be reached: {error}") from None
 

@@ -18,8 +18,6 @@ ANSWER_BYTES = 32 * 1024 * 1024
 """Largest answer: names and facts, as numbers come in files."""
 OUTPUT_BYTES = 4096
 """Most that is kept of what a confined process, or a library in it, writes to stdout and stderr."""
-OF_READERS = ("max_", "min_")
-"""How the settings begin that readers need. No secret does."""
 ERRORS = {each.code: each for each in (InvalidDataError, InvalidRequestError, StorageFullError, TooLargeError)}
 """What a function may raise, by code; and MissingExtraError, OSError."""
 _LENGTH = struct.Struct("<Q")
@@ -71,7 +69,8 @@ def plain(value: Any) -> Any:
     if isinstance(value, Path):
         return os.fspath(value)
     if isinstance(value, Settings):
-        return {name: getattr(value, name) for name in Settings.model_fields if name.startswith(OF_READERS)}
+        # readers need these settings; no secret begins so
+        return {name: getattr(value, name) for name in Settings.model_fields if name.startswith(("max_", "min_"))}
     if isinstance(value, np.ndarray):
         return value.tolist()
     raise NotImplementedError(f"a {type(value).__name__}")

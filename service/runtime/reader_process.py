@@ -41,10 +41,6 @@ from service.runtime.reader_messages import (
 )
 from service.runtime.remote import imported
 
-NICENESS = 5
-"""Of a confined process: a control loop goes before an upload."""
-IDLE_S = 600.0
-"""Seconds without a call after which the process that waits for calls ends; the next call starts another one."""
 _LIMITS = {EFBIG: "size", EMFILE: "files"}
 
 
@@ -55,7 +51,7 @@ def serve(descriptor: int) -> None:
     protections(), own_files()  # to know them takes a while
     known = set[str]()
     with socket.socket(fileno=descriptor) as control, suppress(TimeoutError):
-        control.settimeout(IDLE_S)
+        control.settimeout(600.0)  # then it ends; the next call starts another process
         ready = _ahead(control)
         while descriptors := socket.recv_fds(control, 1, 1)[1]:
             with socket.socket(fileno=descriptors[0]) as connection, suppress(EOFError, ConnectionError):
@@ -174,7 +170,7 @@ def _confined(given: int, answer: int, output: int, parent: int) -> None:
     for low, high in pairwise([2, *sorted((given, answer)), resource.getrlimit(resource.RLIMIT_NOFILE)[0]]):
         os.closerange(low + 1, high)
     faulthandler.enable()
-    os.nice(NICENESS)
+    os.nice(5)  # a control loop goes before an upload
     renounce()
     if os.getppid() != parent:  # it has ended before this one could ask to end with it
         return
