@@ -18,9 +18,7 @@ from service.storage.database.engine import Notice
 
 logger = logging.getLogger(__name__)
 
-PAUSE_S = 0.2
-"""Seconds after which the listener looks whether to end."""
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 2.0
+FIRST_PAUSE_S = 0.1
 """Until the listener connects again: each time twice as long."""
 LOOK_S = 5.0
 """Seconds between two looks at everything in memory: notices come in milliseconds, and should one be lost, this."""
@@ -135,12 +133,12 @@ class Listener:
                 self._listen()
             except Exception as error:  # whatever it is: there is nobody else to listen
                 logger.warning("notices of other services are not heard now: %s", error)
-            pause = min(2 * pause, LONGEST_PAUSE_S) if not self._receiving else FIRST_PAUSE_S
+            pause = min(2 * pause, 2.0) if not self._receiving else FIRST_PAUSE_S
             self._ending.wait(pause)
 
     def _listen(self) -> None:
         self._receiving = False
-        with closing(self._database.changes_of_others(PAUSE_S)) as notices:
+        with closing(self._database.changes_of_others(0.2)) as notices:  # s until it looks whether to end
             for notice in notices:
                 if self._ending.is_set():
                     return

@@ -15,7 +15,6 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 CHECKOUT_MODELS = Path(__file__).resolve().parents[2] / "models"
-PACKAGED_MODELS = Path(__file__).resolve().parents[1] / "shipped"
 CONNECTIONS = 20
 """Max connections of one process to PostgreSQL by default."""
 
@@ -53,7 +52,8 @@ FileMode = Annotated[int, BeforeValidator(_octal), Unit(OCTAL)]
 
 def shipped_models() -> Path:
     """Folder of the models that come with LIPServe, in a checkout or in an installed package."""
-    return CHECKOUT_MODELS if (CHECKOUT_MODELS / "panda-sim").is_dir() else PACKAGED_MODELS
+    packaged = Path(__file__).resolve().parents[1] / "shipped"
+    return CHECKOUT_MODELS if (CHECKOUT_MODELS / "panda-sim").is_dir() else packaged
 
 
 def _default_home() -> Path:

@@ -14,10 +14,6 @@ from service.storage.database import Database, EventRow
 
 SECONDS = 2.0
 FEWEST_ROWS = 200
-MOST_EVENTS = 500
-"""Batches that are looked at, at most."""
-READ_EVENTS = 20
-"""Batches that are read together: few are needed as a rule."""
 
 
 def error_floor_of(database: Database, model: str, version: int, through: int, n_joints: int) -> Array:
@@ -40,8 +36,8 @@ def error_floor_of(database: Database, model: str, version: int, through: int, n
     records, rows = list[dict[str, Any]](), 0
     newest: float | None = None
     with database.session() as session:
-        latest = query.order_by(EventRow.number.desc()).limit(MOST_EVENTS)
-        events = session.execute(latest.execution_options(yield_per=READ_EVENTS))
+        latest = query.order_by(EventRow.number.desc()).limit(500)
+        events = session.execute(latest.execution_options(yield_per=20))  # few are needed as a rule
         for at, record in events:
             if record is None:
                 continue
