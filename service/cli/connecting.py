@@ -161,16 +161,12 @@ def dataset_of(client: Client, data: str, **reading: Any) -> str:
     return dataset.id
 
 
-MOST_READINGS = 50
-"""Data sets of one file that are told apart, at most."""
-
-
 def _made_of(client: Client, path: Path) -> Dataset | None:
     """The data set that a file was made before, however it was read; None where there is none. Raise CommandError where
     it was read in several ways."""
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    made = list(islice(client.datasets(digest), MOST_READINGS))
+    made = list(islice(client.datasets(digest), 50))
     alike = {(each.sha256, *each.joint_names, each.torque_convention, each.report.robot): each for each in made[::-1]}
     if len(alike) > 1:
         listed = ", ".join(f"{each.id} ({_reading_of(each)})" for each in reversed(alike.values()))
@@ -261,8 +257,6 @@ _LISTS = {
 
 PATIENCE, PAUSE = 300.0, 1.0
 """Longest wait for a service that has gone away, and between two looks for it, s."""
-AWAY = (429, 502, 503, 504)
-"""What a service that starts or ends, or a proxy in its place, answers."""
 
 
 def watch(client: Client, job: Job, cancels: bool, patience: float = PATIENCE) -> tuple[Job, bool]:
@@ -301,7 +295,8 @@ def _waited(client: Client, job: str, show: Callable[[Job], None], patience: flo
         try:
             return client.wait(job, look)
         except (ApiError, ServiceUnreachableError) as error:
-            if isinstance(error, ApiError) and error.status not in AWAY:
+            # of a service that starts or ends, or of a proxy in its place
+            if isinstance(error, ApiError) and error.status not in (429, 502, 503, 504):
                 raise
             now = time.monotonic()
             if gone is None:

@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.markup import escape
 
-PIPE_WIDTH = 160
-"""Columns of a table that no terminal shows: room for the inertia matrix of seven joints."""
-out = Console(soft_wrap=True, width=None if sys.stdout.isatty() else PIPE_WIDTH)
+# room for the inertia matrix of seven joints, where no terminal shows the table
+out = Console(soft_wrap=True, width=None if sys.stdout.isatty() else 160)
 err = Console(stderr=True, soft_wrap=True)
 
 
@@ -123,19 +122,17 @@ def _imported(kinds: Mapping[str, str]) -> tuple[type[Exception], ...]:
 
 
 START = "start a service with `lipserve serve`, or name another by --url or LIPSERVE_URL"
-KEY = (
-    "the service asks for an API key: put yours into LIPSERVE_API_KEY; `lipserve keys create --name me --scope admin`, "
-    "run where the service's home is, makes one"
-)
-SCOPE = "this key may not do that: `lipserve keys create --name … --scope …` makes one that may"
 
 
 def hint_of(code: str, status: int | None = None) -> str | None:
     """What to do where the service refuses with this code and status of HTTP."""
     if status == 401 or code == "unauthorized":
-        return KEY
+        return (
+            "the service asks for an API key: put yours into LIPSERVE_API_KEY; `lipserve keys create --name me --scope "
+            "admin`, run where the service's home is, makes one"
+        )
     if status == 403 or code == "forbidden":
-        return SCOPE
+        return "this key may not do that: `lipserve keys create --name … --scope …` makes one that may"
     if status in (429, 503):
         return "try again in a moment: the service says that it is busy"
     if code == "unreachable":

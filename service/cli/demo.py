@@ -31,10 +31,6 @@ from service.foundation.text import counted, percent
 
 MODEL = "panda-demo"
 START_SECONDS = 180.0
-PLOTTED = 150
-"""Samples in the plot: fifteen seconds."""
-REGIMES = {"slow": 1.0, "fast": FAST}
-"""The paper's slow sinusoids, where gravity rules, and the faster variant, where inertia shows."""
 
 
 class DemoError(RuntimeError):
@@ -86,7 +82,8 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
         console.print("[bold]2. simulating a Panda (7 joints, 10 Hz, 50 s a stream) and uploading the streams[/bold]")
         robot = load_robot("panda")
         train, test = {}, {}
-        for name, speed in REGIMES.items():
+        # the paper's slow sinusoids, where gravity rules, and the faster variant, where inertia shows
+        for name, speed in (("slow", 1.0), ("fast", FAST)):
             train[name] = _upload(client, robot, Stream(speed=speed), 1, Path(folder) / f"train-{name}.csv")
             test[name] = _upload(
                 client, robot, Stream(speed=speed, n_sinusoids=100), 2, Path(folder) / f"test-{name}.npz"
@@ -116,7 +113,7 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
         answer = client.predict(MODEL, **query)
         _show_query(query, answer, samples.tau[row], service.url, console)
         if plot is not None:
-            part = samples.rows(slice(0, PLOTTED))
+            part = samples.rows(slice(0, 150))  # fifteen seconds
             draw_torque(plot, part, client.predict(MODEL, part.q, part.dq, part.ddq))
             console.print(f"  drawn to {plot}")
         console.print(f"[bold]done in {time.monotonic() - began:.0f} s[/bold]")

@@ -128,13 +128,11 @@ def _check(profile: Profile, own: Sequence[str], called: Sequence[str]) -> None:
         )
 
 
-MAX_TENSOR_BYTES = 1 << 30
-SMALL = 64 * 1024
 MEMBER_LIMITS: Mapping[str, int] = {
-    archive.EXPORT: SMALL,
-    archive.CHECKSUMS: SMALL,
+    archive.EXPORT: 64 * 1024,
+    archive.CHECKSUMS: 64 * 1024,
     MANIFEST: DEFAULT_LIMITS.manifest_bytes,
-    TENSORS: MAX_TENSOR_BYTES,
+    TENSORS: 1 << 30,
     ROBOT: DEFAULT_LIMITS.robot_bytes,
 }
 
@@ -170,7 +168,6 @@ ERRORS = (ApiError, NotPositiveDefiniteError)
 """What a user is told without a traceback, beside ValueError and OSError."""
 COMPARED = 5
 """Random motions whose expected value the planned one is compared with."""
-COMPARED_SAMPLES = 500
 WARNING = (
     "The plan knows joint limits only, neither obstacles nor the robot's own links: watch it in a simulator or slowly "
     "before you drive a robot along it."
@@ -263,7 +260,7 @@ def random_motion(made: Plan) -> Random:
     limits, options = made.limits, made.options
     kinds: list[JointType] = ["revolute"] * limits.n_joints  # of no consequence here
     bare = Robot("", None, limits.joint_names, tuple(kinds), limits.lower, limits.upper, limits.speed)
-    samples = min(options.samples, COMPARED_SAMPLES)
+    samples = min(options.samples, 500)
     t = np.arange(samples) * options.seconds / samples
     repeats = options.samples / samples
 

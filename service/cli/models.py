@@ -324,17 +324,14 @@ def _print_guarantee(conformal: dict[str, Any]) -> None:
     echo(f"  intervals {wider}: {blocks} left out in turn guarantee {100 * least:.0f} % of such motion{few}")
 
 
-OF_JOINTS = {
-    "right_angle_": "axes at right angles, how probably",
-    "local_": "corrected where the motion repeats, error that is left",
-    "widened_": "intervals widened by what was held out",
-}
-"""Entries of a fit's report that end with a joint's number, and what they are called."""
-
-
 def print_of_joints(version: VersionRecord) -> None:
     """What the fit reports joint by joint."""
-    for prefix, text in OF_JOINTS.items():
+    joints = {
+        "right_angle_": "axes at right angles, how probably",
+        "local_": "corrected where the motion repeats, error that is left",
+        "widened_": "intervals widened by what was held out",
+    }
+    for prefix, text in joints.items():
         found = {int(key.removeprefix(prefix)): value for key, value in version.fit.items() if key.startswith(prefix)}
         if found:
             echo(f"  {text}: {', '.join(f'{version.joint_names[j - 1]} {found[j]:.2g}' for j in sorted(found))}")

@@ -26,7 +26,6 @@ STATES = {
     "contact": "contact",
     "friction": "friction has changed",
 }
-CHECK = "check the estimate: an arm learnt from torque alone knows kilograms only as well as its lengths"
 
 
 @app.command()
@@ -95,7 +94,7 @@ def _print(known: Payloads, streams: Sequence[StreamPayload]) -> None:
         frame = "as it was learnt" if known.frame == "learnt" else "as the URDF has it"
         echo(f"centres of mass: in the frame of the link behind {known.link}, {frame}")
         if known.frame == "learnt":
-            echo(CHECK)
+            echo("check the estimate: an arm learnt from torque alone knows kilograms only as well as its lengths")
 
 
 def _print_stream(stream: StreamPayload) -> None:

@@ -217,10 +217,6 @@ def _staged(path: Path, folder: Path) -> tuple[Staged, TorqueConvention]:
     return prepare(recording.staged, folder, options.recipe, FEWEST, disk).staged, recording.torque_convention
 
 
-NAP = 0.05
-"""Longest sleep, s: so soon a Ctrl-C is heard."""
-
-
 class Stop:
     """Whether Ctrl-C was pressed. The first lets the row that is under way be answered; the second ends it at once."""
 
@@ -265,7 +261,7 @@ def play(
     begin, second = time.perf_counter(), 1
     for row in range(len(motion)):
         while (wait := begin + due[row] - time.perf_counter()) > 0 and not stop.asked:
-            time.sleep(min(wait, NAP))
+            time.sleep(min(wait, 0.05))  # so soon a Ctrl-C is heard
         if stop.asked:
             break
         sent = time.perf_counter()

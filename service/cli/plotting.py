@@ -13,8 +13,6 @@ from lipcore.extras import need
 from lipserve import Prediction
 from service.foundation.text import percent
 
-HEADINGS = ("position, rad (m)", "speed, per s", "acceleration, per s²")
-
 
 def pyplot() -> Any:
     """Matplotlib's plotting module; raise MissingExtraError."""
@@ -37,7 +35,7 @@ def draw_motion(path: Path, made: Plan) -> None:
                 axis.axhline(bound, color="tab:red", lw=0.7, ls="--")
             axis.tick_params(labelsize=7)
         row[0].set_ylabel(f"{limits.joint_names[j]}\n{percent(made.left[j], 1)} left", fontsize=7)
-    for axis, heading in zip(axes[0], HEADINGS, strict=True):
+    for axis, heading in zip(axes[0], ("position, rad (m)", "speed, per s", "acceleration, per s²"), strict=True):
         axis.set_title(heading, fontsize=8)
     for axis in axes[-1]:
         axis.set_xlabel("s", fontsize=8)

@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from service.cli.playing import Motion, Tally
 
 app = alone()
-SECONDS, ANSWER_S = 60.0, 10.0
-"""Of motion; and longest wait for an answer, which is counted as late long before."""
 
 
 @app.command()
@@ -113,7 +111,7 @@ def stream(
             raise CommandError(f"file is {str(file)!r}, expected a recording")
         played = recorded(file, seconds)
     else:
-        samples = max(2, round((seconds or SECONDS) * rate))
+        samples = max(2, round((seconds or 60.0) * rate))
         asked = described(
             samples, rate, sinusoids, motion, course, fast, noise, viscous, coulomb, payload, payload_at, dirt
         )
@@ -122,7 +120,7 @@ def stream(
     with (
         Stop().listening() as stop,
         connected(url) as client,
-        client.stream(model, version=version, alias=alias, stream_id=source, scale=True, timeout=ANSWER_S) as opened,
+        client.stream(model, version=version, alias=alias, stream_id=source, scale=True, timeout=10.0) as opened,
     ):
         played = _fitting(played, opened)
         step = played.step if deadline is None else deadline / 1e3
@@ -177,7 +175,7 @@ class Doubt:
         self._told = True
         evidence = held.evidence
         if evidence.get("stream_id") != self._source or evidence.get("kind") != "opening":
-            self.held, self._looks = True, LOOKS
+            self.held, self._looks = True, 3  # seconds in which the stream's own alarm is looked for
             hint = f"`lipserve alarms {self._model}` tells why; `lipserve learning decide {self._model} …` ends it"
             print_error(Explained(f"learning of {self._model} is held: rows are kept, and not learnt", hint))
             return
@@ -199,7 +197,7 @@ class Doubt:
 
     def _own(self) -> bool:
         """Whether the service says that this stream does not fit either, while learning is held; then say so."""
-        alarms = islice(self._client.alarms(self._model), NEWEST)
+        alarms = islice(self._client.alarms(self._model), 20)
         own = (each.evidence for each in alarms if each.evidence.get("stream_id") == self._source)
         evidence = next((each for each in own if each.get("kind") == "opening"), None)
         if evidence is None:
@@ -211,8 +209,6 @@ class Doubt:
         return True
 
 
-LOOKS, NEWEST = 3, 20
-"""Seconds in which an alarm of the stream itself is looked for while learning is held, and alarms looked at."""
 CHECK = "check that it is this robot, with the friction, the payload and the units that were learnt"
 
 

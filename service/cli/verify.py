@@ -30,11 +30,6 @@ from service.storage.database.engine import FILE
 from service.storage.files import Files, FilesUnreachableError
 from service.storage.storage import WAIT_S, HomeError, usable
 
-FAULTS = 20
-"""Faults of the database that are told, at most."""
-EVENTS = 200
-"""Batches that are read together."""
-
 
 class Damage(NamedTuple):
     """Something stored that cannot be used. kind, name: of what; reason: why."""
@@ -80,7 +75,7 @@ def verify_home(settings: Settings) -> Verified:
 
 def _verify(database: Database, files: Files) -> Verified:
     findings = Verified()
-    findings.damages += [Damage("database", FILE, each) for each in database.adapter.inconsistencies(FAULTS)]
+    findings.damages += [Damage("database", FILE, each) for each in database.adapter.inconsistencies(20)]
     for kind, check in _CHECKS.items():
         findings.read[kind] = 0
         for name, gone, reason in check(database, files):
@@ -164,7 +159,7 @@ def _observations(database: Database, files: Files) -> Iterator[_Finding]:
     while True:
         query = select(EventRow).where(EventRow.seq > last, EventRow.payload.is_not(None)).order_by(EventRow.seq)
         with database.session() as session:
-            rows = list(session.scalars(query.limit(EVENTS).options(undefer(EventRow.payload))))
+            rows = list(session.scalars(query.limit(200).options(undefer(EventRow.payload))))
         if not rows:
             return
         for row in rows:
