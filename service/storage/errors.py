@@ -23,12 +23,6 @@ UNAVAILABLE = frozenset(
     if hasattr(errno, name)
 )
 RETRY_AFTER = {"Retry-After": "1"}
-_BUSY_STATES = frozenset({"55P03", "57014", "40001", "40P01"})
-"""Lock not available, query cancelled, serialization failure, deadlock."""
-_LOST_STATES = ("08", "57P", "25P03", "53300")
-"""Connections broken or refused, the server stopping or starting, one idle for too long, too many of them."""
-_FAILING_STATES = ("25006", "28", "3D", "42501", "53", "58", "XX")
-"""Read-only, no access, no such database, out of memory and the like, its disk, its own faults."""
 _LOCKED = "the database is locked by another writer: try again"
 _LOST = "the database server cannot be reached now: try again"
 _NO_SPACE = "nothing was stored: the disk of the database is full. Delete data sets or versions"
@@ -86,13 +80,16 @@ def _of_postgresql(error: DBAPIError, state: str | None) -> ServiceError | None:
     if state is None:
         lost = error.connection_invalidated or isinstance(error, OperationalError)
         return StorageUnavailableError(_LOST, headers=RETRY_AFTER) if lost else None
-    if state in _BUSY_STATES:
+    # lock not available, query cancelled, serialization failure, deadlock
+    if state in ("55P03", "57014", "40001", "40P01"):
         return StorageUnavailableError(_LOCKED, headers=RETRY_AFTER)
     if state == "53100":
         return StorageFullError(_NO_SPACE)
-    if state.startswith(_LOST_STATES):
+    # connection broken or refused, the server stops or starts, idle for too long, too many
+    if state.startswith(("08", "57P", "25P03", "53300")):
         return StorageUnavailableError(_LOST, headers=RETRY_AFTER)
-    if state.startswith(_FAILING_STATES):
+    # read-only, no access, no such database, out of memory and the like, its disk, its own faults
+    if state.startswith(("25006", "28", "3D", "42501", "53", "58", "XX")):
         message = f"the database cannot be used now: SQLSTATE {state}; the service's log says more"
         return StorageUnavailableError(message, headers=RETRY_AFTER)
     return None

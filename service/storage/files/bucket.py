@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,27 @@ from fsspec.exceptions import FSTimeoutError
 
 from service.storage.files.objects import Entry, FilesUnreachableError, unreachable
 
-CONNECT_S, READ_S, ATTEMPTS = 5, 30, 2
-"""Longest waits in s for a connection and for the next bytes, and how often a request is sent."""
-PART, PARTS = 16 << 20, 2
-"""Bytes of a part of a large object, and how many of them are on their way, and in memory, at a time."""
+
+@dataclass(frozen=True)
+class BucketOptions:
+    """How objects are sent and fetched."""
+
+    connect_s: int = 5
+    """Max wait in s for a connection."""
+    read_s: int = 30
+    """Max wait in s for the next bytes."""
+    attempts: int = 2
+    """Max times that a request is sent."""
+    part_bytes: int = 16 << 20
+    """Bytes of a part of a large object."""
+    max_parts: int = 2
+    """Max parts that are on their way, and in memory, at a time."""
+
+
+BUCKET = BucketOptions()
+
+
 NO_BUCKET = "there is no such bucket"
-_OF_DISK = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class Bucket:
@@ -36,9 +52,9 @@ class Bucket:
             skip_instance_cache=True,  # one of a forked parent would speak through the parent's connections
             use_listings_cache=False,
             config_kwargs={
-                "connect_timeout": CONNECT_S,
-                "read_timeout": READ_S,
-                "retries": {"total_max_attempts": ATTEMPTS, "mode": "standard"},
+                "connect_timeout": BUCKET.connect_s,
+                "read_timeout": BUCKET.read_s,
+                "retries": {"total_max_attempts": BUCKET.attempts, "mode": "standard"},
             },
         )
         self._system.retries = 1  # of its own, on top of the library's
@@ -46,13 +62,17 @@ class Bucket:
     def put(self, path: Path, key: str) -> None:
         """Store a file; a large one goes in parts, and is there once all of them are."""
         with _of_store(missing=NO_BUCKET):
-            self._system.put_file(str(path), self._path(key), chunksize=PART, max_concurrency=PARTS)
+            self._system.put_file(
+                str(path), self._path(key), chunksize=BUCKET.part_bytes, max_concurrency=BUCKET.max_parts
+            )
 
     def get(self, key: str, path: Path) -> None:
         """Copy an object into a new file; raise FileNotFoundError where there is none."""
         with _of_store():
             try:
-                self._system.get_file(self._path(key), str(path), chunksize=PART, max_concurrency=PARTS)
+                self._system.get_file(
+                    self._path(key), str(path), chunksize=BUCKET.part_bytes, max_concurrency=BUCKET.max_parts
+                )
             except FileNotFoundError:
                 self.check()  # a bucket that is gone is no reason to take what lay there for lost
                 raise
@@ -102,6 +122,7 @@ def _of_store(missing: str | None = None) -> Iterator[None]:
     except BotoCoreError as error:
         raise unreachable(f"the store does not answer ({type(error).__name__})") from None
     except OSError as error:
-        if error.errno in _OF_DISK:  # of this host, while an object was fetched
+        # of this host, while an object was fetched
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
         raise unreachable(f"the store refuses ({type(error).__name__}: {error.strerror or error})") from None

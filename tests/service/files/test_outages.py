@@ -48,7 +48,9 @@ def refused(files):
 def quick(monkeypatch):
     """Requests that are sent once: the library's pauses are its own affair."""
     pytest.importorskip("s3fs")
-    monkeypatch.setattr("service.storage.files.bucket.ATTEMPTS", 1)
+    from service.storage.files import bucket
+
+    monkeypatch.setattr(bucket, "BUCKET", bucket.BucketOptions(attempts=1))
 
 
 def test_an_endpoint_that_is_down_is_found_and_found_again(s3, bucket, tmp_path, quick):
