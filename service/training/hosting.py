@@ -43,8 +43,6 @@ logger = logging.getLogger(__name__)
 
 WATCH_S = 0.2
 """Seconds between two looks at the job's row."""
-AGAIN_S = 1.0
-"""Seconds after which the database is tried again."""
 _one = threading.Lock()
 _stopping = threading.Event()
 
@@ -192,7 +190,7 @@ class Host:
                 return ask()
             except Exception:
                 logger.warning("the database could not be used: tried again", exc_info=True)
-                if _stopping.wait(AGAIN_S):
+                if _stopping.wait(1.0):
                     return None
 
 

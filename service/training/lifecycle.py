@@ -54,8 +54,6 @@ def hand_back(row: JobRow, why: str) -> None:
 
 
 Why = Literal["returned", "ended", "cancelled", "silent", "too_long", "not_started", "lingering", "refused"]
-LINGER_S = 10.0
-"""Seconds that a process may take to tidy up after the end of its job."""
 
 
 @dataclass(frozen=True)
@@ -63,13 +61,16 @@ class JobLimits:
     """How often a job is started, and how long its process may take.
 
     attempts: starts before an interruption fails the job. start_s: until the process is ready. heartbeat_s: without
-    progress. cancel_s: until it obeys a cancel.
+    progress. cancel_s: until it obeys a cancel. linger_s: to tidy up after the end of its job. pause_s: before a job is
+    handed out again whose process could not be started; each time twice as long.
     """
 
     attempts: int = 3
     start_s: float = 120.0
     heartbeat_s: float = HEARTBEAT_S
     cancel_s: float = 1.0
+    linger_s: float = 10.0
+    pause_s: float = 1.0
 
 
 LIMITS = JobLimits()
@@ -140,7 +141,7 @@ class Hand:
                 return Ended(self.job, "returned", "it has ended, or is another service's")
             clock -= 0.5  # the host of a process elsewhere judges it, too
         if self.done is not None:
-            late = clock - self.done >= LINGER_S
+            late = clock - self.done >= LIMITS.linger_s
             return Ended(self.job, "lingering", "the process did not go on after its end") if late else None
         if self.stopped is not None:
             if clock - self.stopped < LIMITS.cancel_s:
@@ -186,10 +187,6 @@ def remove_leftovers(database: Database, files: Files, job: str) -> int:
 
 def _folder_mark(job: str) -> str:
     return job.removeprefix("job_")
-
-
-FIRST_PAUSE_S = 1.0
-"""Wait before a job is handed out again whose process could not be started: each time twice as long."""
 
 
 @dataclass(frozen=True)
@@ -250,7 +247,7 @@ class Settler:
             message = f"{ended.message}: no training process could be started for it, {starts + 1} times"
             fail(row, "interrupted", message)
             return Settled()
-        pause = min(FIRST_PAUSE_S * 2**starts, 30.0)
+        pause = min(LIMITS.pause_s * 2**starts, 30.0)
         enter(row, QUEUED, f"{ended.message}: it waits for another one")
         return Settled(again=True, pause_s=pause, problem=ended.message)
 

@@ -7,7 +7,7 @@ from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.storage.files import Files
 from service.training import lifecycle
-from service.training.lifecycle import LINGER_S, Ended, Facts, Hand, Settled, Settler
+from service.training.lifecycle import LIMITS, Ended, Facts, Hand, Settled, Settler
 from tests.service.jobs.conftest import new_row
 
 SETTINGS = Settings(max_job_s=1000.0)
@@ -74,8 +74,8 @@ def test_a_process_that_does_not_go_on_after_its_job_is_ended(state):
     given = hand()
     given.see(facts(), 101.0)
     given.see(facts(state, cancel=True), 110.0)
-    assert verdict(given, 110.0 + LINGER_S - 0.1) is None
-    assert verdict(given, 110.0 + LINGER_S) == "lingering"
+    assert verdict(given, 110.0 + LIMITS.linger_s - 0.1) is None
+    assert verdict(given, 110.0 + LIMITS.linger_s) == "lingering"
 
 
 @pytest.fixture

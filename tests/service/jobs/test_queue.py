@@ -53,9 +53,8 @@ def test_the_service_knows_of_a_process_that_is_silent(bench, monkeypatch):
     assert seen[1].startswith("0 jobs waiting, 1 running; a training process has given no sign of life for ")
 
 
-def test_a_job_whose_process_cannot_start_fails_in_the_end_and_the_service_knows(bench, monkeypatch):
-    monkeypatch.setattr("service.training.lifecycle.FIRST_PAUSE_S", 0.05)
-    jobs = bench(workers.stillborn, JobLimits(attempts=2))
+def test_a_job_whose_process_cannot_start_fails_in_the_end_and_the_service_knows(bench):
+    jobs = bench(workers.stillborn, JobLimits(attempts=2, pause_s=0.05))
     seen = jobs.ended(jobs.submit("stillborn"))
     assert (seen.state, seen.attempts, seen.error["code"]) == ("failed", 0, "interrupted")
     assert "exit code 3" in seen.error["message"]
@@ -64,8 +63,7 @@ def test_a_job_whose_process_cannot_start_fails_in_the_end_and_the_service_knows
 
 
 def test_where_the_system_starts_no_process_the_job_waits_for_one(bench, monkeypatch):
-    monkeypatch.setattr("service.training.lifecycle.FIRST_PAUSE_S", 0.05)
-    jobs = bench(workers.well)
+    jobs = bench(workers.well, JobLimits(pause_s=0.05))
     (slot,) = jobs.queue._slots
     start, refusals = slot.start, iter([OSError(11, "Resource temporarily unavailable")])
 
