@@ -13,14 +13,21 @@ import os
 import threading
 import time
 from collections.abc import Mapping
+from enum import IntEnum
 
 HEAPS = 1
 """What one thread frees serves all others. With two, more is left free in between, and no query is answered sooner:
 Python's threads take turns anyway."""
 BLOCK = 1024 * 1024
 """Bytes from which on a block is the system's own, and goes back to it at once; and of free memory that is kept."""
-_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8
-"""Parameters of `mallopt`, see malloc.h of glibc."""
+
+
+class Mallopt(IntEnum):
+    """Parameters of `mallopt`, see malloc.h of glibc."""
+
+    TRIM_THRESHOLD = -1
+    MMAP_THRESHOLD = -3
+    ARENA_MAX = -8
 
 
 def keep_little(environment: Mapping[str, str] = os.environ) -> bool:
@@ -34,7 +41,7 @@ def keep_little(environment: Mapping[str, str] = os.environ) -> bool:
     library = ctypes.CDLL(None)
     if not hasattr(library, "gnu_get_libc_version"):
         return False
-    settings = ((_ARENA_MAX, HEAPS), (_MMAP_THRESHOLD, BLOCK), (_TRIM_THRESHOLD, BLOCK))
+    settings = ((Mallopt.ARENA_MAX, HEAPS), (Mallopt.MMAP_THRESHOLD, BLOCK), (Mallopt.TRIM_THRESHOLD, BLOCK))
     taken = [library.mallopt(parameter, value) for parameter, value in settings]
     threading.Thread(target=_give_back_often, name="give-back", daemon=True).start()
     return all(taken)

@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Hashable, Iterable
 from contextlib import suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -22,10 +23,24 @@ from service.runtime.progress import LOOK_S, Progress
 
 logger = logging.getLogger(__name__)
 
-FIRST_PAUSE, LONGEST_PAUSE = 0.5, 30.0
-"""Seconds until a process that died is started again: each time twice as long, unless it lived for LONGEST_PAUSE."""
-QUIET_S, STEP_S = 45.0, 900.0
-"""Seconds in which the process neither ends a step nor computes, and of one step, after which it is replaced."""
+
+@dataclass(frozen=True)
+class CompanionOptions:
+    """When the process is started again, and when it is replaced."""
+
+    pause_s: float = 0.5
+    """Seconds until a process that died is started again: each time twice as long."""
+    max_pause_s: float = 30.0
+    """Max of these seconds; a process that lived for so long begins again at `pause_s`."""
+    quiet_s: float = 45.0
+    """Seconds in which the process neither ends a step nor computes, after which it is replaced."""
+    step_s: float = 900.0
+    """Seconds of one step after which the process is replaced."""
+
+
+COMPANION = CompanionOptions()
+
+
 BEAT, BEAT_S = "beat", 1.0
 """What the process says after a step, and how often it says so at most, s."""
 Work = dict[Hashable, list[Any]]
@@ -109,7 +124,7 @@ class Companion:
         sender.join()
 
     def _supervise(self) -> None:
-        pause = FIRST_PAUSE
+        pause = COMPANION.pause_s
         while not self._closing:
             began = time.monotonic()
             try:
@@ -131,7 +146,7 @@ class Companion:
                 self._connection = self._progress = None
                 if self._closing:
                     return
-                pause = FIRST_PAUSE if time.monotonic() - began >= LONGEST_PAUSE else pause
+                pause = COMPANION.pause_s if time.monotonic() - began >= COMPANION.max_pause_s else pause
                 code = self._process.exitcode
                 logger.error("the %s process ended with exit code %s; it is started again", self.name, code)
             pause = self._rest(pause)
@@ -140,7 +155,7 @@ class Companion:
         """Wait before the next start; return how long to wait before the one after that."""
         with self._changed:
             self._changed.wait_for(lambda: self._closing, pause)
-        return min(2 * pause, LONGEST_PAUSE)
+        return min(2 * pause, COMPANION.max_pause_s)
 
     def _start(self) -> tuple[Connection, BaseProcess]:
         context = multiprocessing.get_context("spawn")
@@ -154,10 +169,10 @@ class Companion:
     def _listen(self, connection: Connection, process: BaseProcess) -> None:
         """Pass on the messages of the process until it ends; kill it if it hangs."""
         pids = () if process.pid is None else (process.pid,)
-        progress = self._progress = Progress(lambda: pids, QUIET_S, STEP_S)
+        progress = self._progress = Progress(lambda: pids, COMPANION.quiet_s, COMPANION.step_s)
         while True:
             try:
-                message = connection.recv() if connection.poll(min(LOOK_S, QUIET_S / 4)) else None
+                message = connection.recv() if connection.poll(min(LOOK_S, COMPANION.quiet_s / 4)) else None
             except (EOFError, OSError):
                 return
             if message is None:

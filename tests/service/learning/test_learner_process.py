@@ -16,6 +16,7 @@ from service.learning.learner.learnt import LearntVersions
 from service.learning.learner.process import LearnerProcess, learner_place
 from service.learning.learner.publication import Published
 from service.models.loaded import LoadedModels
+from service.runtime import companion
 from service.storage.database import SnapshotRow
 from tests.service.data import DEADLINE, eventually
 from tests.service.learning.pendulums import ARM, Arm, adopt, at_once, same
@@ -113,7 +114,7 @@ def test_a_killed_learner_comes_back_and_catches_up(serving, caplog):
 
 
 def test_a_learner_that_hangs_is_replaced_and_nothing_is_lost(home, caplog, monkeypatch):
-    monkeypatch.setattr("service.runtime.companion.QUIET_S", 2.0)
+    monkeypatch.setattr(companion, "COMPANION", companion.CompanionOptions(quiet_s=2.0))
     hasty = Serving(home)
     try:
         hasty.teach(0, 1)
