@@ -60,7 +60,7 @@ class Payload(BaseModel):
         return self.mass, self.com, self.inertia
 
 
-MOST_MASS, MOST_DISTANCE = 1000.0, 10.0
+MOST_DISTANCE = 10.0
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Metres = Annotated[float, Field(ge=-MOST_DISTANCE, le=MOST_DISTANCE, allow_inf_nan=False)]
 Row = Annotated[list[Finite], Field(min_length=3, max_length=3)]
@@ -72,7 +72,7 @@ class PayloadRequest(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [PAYLOAD_EXAMPLE]})
 
-    mass: float = Field(gt=0, le=MOST_MASS, allow_inf_nan=False, description="kg")
+    mass: float = Field(gt=0, le=1000.0, allow_inf_nan=False, description="kg")
     com: Annotated[list[Metres], Field(min_length=3, max_length=3)] = Field(description="Centre of mass, m")
     inertia: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = Field(
         None, description="3 × 3 about the centre of mass, along the axes of the link, kg·m²; null: that of a point"

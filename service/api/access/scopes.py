@@ -23,9 +23,6 @@ SCOPES = {
 
 WEBSOCKET = "WEBSOCKET"
 """Stands for the method of a WebSocket, which has none."""
-PAGES = ("/", "/docs", "/openapi.json")
-FOLDERS = ("/docs", "/static-offline-docs", "/dashboard", "/guide")
-"""Pages and their files, which are no part of the API: shown without a key."""
 LONGEST_PATH = 1000
 """Far beyond that of any route: what is longer is not kept for the next request."""
 
@@ -84,7 +81,8 @@ def _declared(routes: Sequence[BaseRoute]) -> Iterator[tuple[Sequence[str], str,
                 yield ("POST",), call, re.compile(re.escape(call) + r"\Z"), needed
             continue
         path, pattern = str(route.path), route.path_regex
-        if path in PAGES or path.startswith(FOLDERS):
+        # pages and their files, which are no part of the API, are shown without a key
+        if path in ("/", "/openapi.json") or path.startswith(("/docs", "/static-offline-docs", "/dashboard", "/guide")):
             yield ("GET",), path, pattern, Rule(None)
             continue
         rule = getattr(route.endpoint, "rule", None)

@@ -13,13 +13,10 @@ from starlette.types import Scope
 from service.api.dashboard import plotly
 
 STATIC = Path(__file__).with_name("static")
-POLICY = (
-    "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-"""Nothing comes from other hosts and no script stands in a page; Plotly writes styles of its own."""
 HEADERS = {
-    "content-security-policy": POLICY,
+    # nothing comes from other hosts and no script stands in a page; Plotly writes styles of its own
+    "content-security-policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
     "x-content-type-options": "nosniff",
     "referrer-policy": "no-referrer",
     "cache-control": "no-cache",  # asked for again and answered 304: after an update nobody sees old pages
