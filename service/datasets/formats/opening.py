@@ -67,15 +67,6 @@ _FOREIGN = (
     (b"\xd0\xcf\x11\xe0", "an Office document"),
 )
 Opener = Callable[[Path, ReadOptions, Settings], AbstractContextManager[Table]]
-OPENERS: dict[str, Opener] = {"npz": open_npz, "json_lines": open_json_lines, "json": open_json}
-"""Of the formats that NumPy and msgspec read; all others need the extra `ingest`."""
-FURTHER = {
-    "csv": ("service.datasets.formats.csv", "open_csv"),
-    "parquet": ("service.datasets.formats.parquet", "open_parquet"),
-    "lerobot": ("service.datasets.formats.lerobot", "open_lerobot"),
-    "joined": ("service.datasets.formats.joined", "open_joined"),
-}
-"""Modules and names of openers that stand on Arrow; bags have one for all their kinds."""
 
 
 def sniff(path: Path) -> str | None:
@@ -208,12 +199,12 @@ def _starts(path: Path, magic: bytes) -> bool:
 
 
 def _open(path: Path, kind: str, options: ReadOptions, settings: Settings) -> AbstractContextManager[Table]:
-    if kind in OPENERS:
-        return OPENERS[kind](path, options, settings)
+    own: dict[str, Opener] = {"npz": open_npz, "json_lines": open_json_lines, "json": open_json}
+    if kind in own:
+        return own[kind](path, options, settings)
     need("pyarrow", "ingest")  # what is imported from here on stands on it
-    if kind in FURTHER:
-        module, name = FURTHER[kind]
-        opener: Opener = getattr(import_module(module), name)
+    if kind in ("csv", "parquet", "lerobot", "joined"):
+        opener: Opener = getattr(import_module(f"service.datasets.formats.{kind}"), f"open_{kind}")
         return opener(path, options, settings)
     from service.datasets.formats.bags.reading import BagKind, open_bag  # noqa: PLC0415
 

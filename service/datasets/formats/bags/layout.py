@@ -78,26 +78,8 @@ def _field(line: str, owner: str) -> Field | None:
     return Field(match["name"], kind, count)
 
 
-_JOINT_STATE = """std_msgs/Header header
-string[] name
-float64[] position
-float64[] velocity
-float64[] effort
-"""
-_STAMP = """MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-MSG: builtin_interfaces/Duration
-int32 sec
-uint32 nanosec
-"""
-_VECTOR = """MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-"""
 # the beginning of what franka_ros2 publishes: the fields that follow differ between its releases
-_FRANKA_ROBOT_STATE = """std_msgs/Header header
+_DEFINITIONS = """std_msgs/Header header
 CollisionIndicators collision_indicators
 sensor_msgs/JointState measured_joint_state
 uint8 what_follows
@@ -108,17 +90,35 @@ geometry_msgs/Vector3 is_cartesian_linear_contact
 geometry_msgs/Vector3 is_cartesian_angular_contact
 float64[7] is_joint_collision
 float64[7] is_joint_contact
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+MSG: sensor_msgs/JointState
+std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+MSG: builtin_interfaces/Duration
+int32 sec
+uint32 nanosec
 """
 
 
 def well_known(encoding: str) -> Types:
     """Types whose definition need not be in the bag: rosbag2 stores none before ROS 2 Iron."""
-    types = parse(_JOINT_STATE, "sensor_msgs/JointState")
-    if encoding == "ros1":
-        header = "uint32 seq\ntime stamp\nstring frame_id"
-        return types | parse(header, "std_msgs/Header")
-    types |= parse("builtin_interfaces/Time stamp\nstring frame_id", "std_msgs/Header") | parse(_STAMP, "")
-    return types | parse(_FRANKA_ROBOT_STATE + _VECTOR, "franka_msgs/FrankaRobotState")
+    types = parse(_DEFINITIONS, "franka_msgs/FrankaRobotState")
+    if encoding != "ros1":
+        return types
+    joint_state = "sensor_msgs/JointState"
+    return {joint_state: types[joint_state]} | parse("uint32 seq\ntime stamp\nstring frame_id", "std_msgs/Header")
 
 
 @dataclass
