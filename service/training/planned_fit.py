@@ -19,7 +19,7 @@ from lipcore.training.train import fit_model
 from lipcore.vocabulary import JointType
 from service.foundation.settings import Settings
 from service.training.material import CANDIDATES, Material
-from service.training.pulse import FIT_ROWS, LAST_FIT, LAST_FIT_ROWS, Pulse, Remaining
+from service.training.pulse import LAST_FIT, PACE, Pulse, Remaining
 from service.training.summing import all_rows
 from service.training.table import Table
 
@@ -47,14 +47,14 @@ class PlannedFit:
         # the version that serves has learnt all rows of a refresh, not only the few that a fit chooses
         every = request.get("refresh") is not None or should_condition(options, material.rows, table.independent_rows())
         if material.every is not None:  # the last fit sums all rows: judging takes no second pass as long as that
-            table = table.sparse(FIT_ROWS)
+            table = table.sparse(PACE.fit_rows)
         pass_rows = len(table) + (0 if material.logged is None else len(material.logged[0])) if every else 0
         return cls(material, tuple(request["joint_types"]), options, table, pass_rows)
 
     def first(self, settings: Settings, estimator: str, last: PlannedFit | None, pulse: Pulse) -> TorqueModel:
         """Fit a model. last: the fit that is to follow, if any; raise what `fit_model` does."""
         material, count = self.material, len(self.material.samples)
-        pulse.plan(FIT_ROWS, self.pass_rows, 0 if last is None else LAST_FIT_ROWS + last.pass_rows)
+        pulse.plan(PACE.fit_rows, self.pass_rows, 0 if last is None else PACE.last_fit_rows + last.pass_rows)
         if not self.pass_rows or material.rows <= CANDIDATES:  # else it is the pass that takes long
             searched, conditioned = self.options.hyperparameter_samples, self.options.posterior_samples
             pulse.remaining = Remaining(min(searched, count), min(conditioned, count))
@@ -67,7 +67,7 @@ class PlannedFit:
 
         held_out: what it was judged on, of which its intervals are to hold 95 %.
         """
-        pulse.plan(LAST_FIT_ROWS, self.pass_rows)
+        pulse.plan(PACE.last_fit_rows, self.pass_rows)
         pulse.stage(LAST_FIT)
         try:
             again = refit(widened(judged, held_out), self._task(pulse.last_fit, pulse))

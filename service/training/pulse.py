@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextvars import copy_context
+from dataclasses import dataclass
 from math import inf
 from types import TracebackType
 from typing import Any, Self
@@ -17,11 +18,26 @@ from service.runtime.progress import Progress
 from service.storage.database import Database, JobRow, now
 
 SEARCH = "hyperparameters"
-LEAST_FRACTION = 0.05
-"""Share of several fits after which their pace says something."""
-POSTERIOR_ITERATIONS = 1.5
-"""Iterations of the search that conditioning, compressing and saving take as long as, where both stand on equally many
-samples. Both grow with the cube of theirs: measured 0.9 for two joints and 1.9 for seven."""
+
+
+@dataclass(frozen=True)
+class PaceOptions:
+    """How long the parts of a job take."""
+
+    min_fraction: float = 0.05
+    """Share of several fits after which their pace is known."""
+    min_iterations: int = 3
+    """Iterations of a search after which their pace is known."""
+    posterior_iterations: float = 1.5
+    """Iterations of the search that conditioning, compressing and saving take as long as, on equally many samples. Both
+    grow with the cube of theirs: measured 0.9 for two joints and 1.9 for seven."""
+    fit_rows: int = 200_000
+    """Rows whose pass takes about as long as a fit; for the fraction shown."""
+    last_fit_rows: int = 20_000
+    """Rows whose pass takes about as long as the last fit, which does not search."""
+
+
+PACE = PaceOptions()
 
 
 class Remaining:
@@ -32,7 +48,7 @@ class Remaining:
     """
 
     def __init__(self, searched: int, conditioned: int) -> None:
-        self._after_search = max(1.0, POSTERIOR_ITERATIONS * (conditioned / searched) ** 3)
+        self._after_search = max(1.0, PACE.posterior_iterations * (conditioned / searched) ** 3)
         self._first: tuple[float, int] | None = None
         self._pace: float | None = None
         self._ends: float | None = None
@@ -40,13 +56,13 @@ class Remaining:
     def step(self, at: FitProgress, clock: float) -> None:
         """Take a step of the fit. clock: monotonic time, s."""
         if at.estimator is not None:  # one of several: how long each takes shows in the share of all that is done
-            if at.fraction >= LEAST_FRACTION:
+            if at.fraction >= PACE.min_fraction:
                 self._ends = clock + at.elapsed * (1 - at.fraction) / at.fraction
             return
         if at.stage == SEARCH:
             if self._first is None or at.iteration <= self._first[1]:  # or another search: that for the arm comes first
                 self._first = (clock, at.iteration)
-            elif at.iteration >= 3:  # then their pace says something
+            elif at.iteration >= PACE.min_iterations:
                 began, before = self._first
                 self._pace = (clock - began) / (at.iteration - before)
         if self._pace is not None:
@@ -68,8 +84,6 @@ STATISTICS = "statistics"
 """Stage of the pass over all rows."""
 LAST_FIT = "all_rows"
 """Stage of the fit that learns what was held out, too."""
-FIT_ROWS, LAST_FIT_ROWS = 200_000, 20_000
-"""Rows whose pass takes about as long as a fit, and as the last fit, which does not search; for the fraction shown."""
 
 
 class SupersededError(RuntimeError):

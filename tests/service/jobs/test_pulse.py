@@ -10,7 +10,7 @@ from lipcore.estimators.hyperparameters import FitProgress
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.training import pulse
-from service.training.pulse import LEAST_FRACTION, POSTERIOR_ITERATIONS, Pulse, Remaining, SupersededError
+from service.training.pulse import PACE, Pulse, Remaining, SupersededError
 from tests.service.data import eventually
 from tests.service.jobs.conftest import new_row
 
@@ -139,7 +139,7 @@ def test_it_is_not_told_before_the_pace_is_known():
 @pytest.mark.parametrize("ratio", [1, 2, 4])
 def test_a_steady_search_counts_down_to_the_end(ratio):
     """The steps that follow the search cost as the cube of their samples."""
-    left, after = Remaining(100, 100 * ratio), POSTERIOR_ITERATIONS * ratio**3
+    left, after = Remaining(100, 100 * ratio), PACE.posterior_iterations * ratio**3
     for iteration in range(1, 51):
         left.step(at(iteration), 10.0 + 2.0 * iteration)
         if iteration >= 3:
@@ -155,12 +155,12 @@ def test_a_second_search_begins_anew():
         left.step(at(iteration), 10.0 * iteration)
     for iteration in (1, 2, 3, 4):
         left.step(at(iteration), 60.0 + 2.0 * iteration)
-    assert left.seconds(68.0) == pytest.approx(2.0 * (46 + POSTERIOR_ITERATIONS))
+    assert left.seconds(68.0) == pytest.approx(2.0 * (46 + PACE.posterior_iterations))
 
 
 def test_the_time_that_is_left_of_several_fits_is_that_of_their_share():
     left = Remaining(100, 500)
-    left.step(FitProgress("geometry", 1, 150, 0.0, LEAST_FRACTION / 2, 1.0, "rigid-body"), 11.0)
+    left.step(FitProgress("geometry", 1, 150, 0.0, PACE.min_fraction / 2, 1.0, "rigid-body"), 11.0)
     assert left.seconds(11.0) is None
     left.step(FitProgress("hyperparameters", 3, 150, 0.0, 0.25, 20.0, "lip-chain"), 30.0)
     assert left.seconds(30.0) == pytest.approx(60.0)
@@ -171,5 +171,5 @@ def test_what_was_told_too_low_is_no_longer_told():
     for iteration in range(1, 5):
         left.step(at(iteration), float(iteration))
     left.step(at(4, "posterior"), 4.0)
-    assert left.seconds(4.0) == pytest.approx(POSTERIOR_ITERATIONS)
-    assert left.seconds(4.0 + POSTERIOR_ITERATIONS) is None
+    assert left.seconds(4.0) == pytest.approx(PACE.posterior_iterations)
+    assert left.seconds(4.0 + PACE.posterior_iterations) is None
