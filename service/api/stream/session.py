@@ -132,12 +132,6 @@ class Echo(Conversation):
         return data
 
 
-_FLAGS = (
-    f"a sum of {frames.ASK_STD} to be answered tau_std, {frames.ASK_LEARN} to be learnt from, and "
-    f"{frames.ASK_EXTERNAL} to be answered the external torque"
-)
-
-
 class FrameReader:
     """Reads frames of one robot into a single buffer, which the next frame overwrites."""
 
@@ -153,7 +147,11 @@ class FrameReader:
         if n != self.n_joints:
             raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
         if flags >= 2 * frames.ASK_EXTERNAL:
-            raise invalid_request("flags", flags, _FLAGS)
+            expected = (
+                f"a sum of {frames.ASK_STD} to be answered tau_std, {frames.ASK_LEARN} to be learnt from, and "
+                f"{frames.ASK_EXTERNAL} to be answered the external torque"
+            )
+            raise invalid_request("flags", flags, expected)
         length = self._lengths[torque := flags > frames.ASK_STD]
         if len(data) != length:
             expected = f"{length} bytes for {n} joints{' with tau' if torque else ''}"
