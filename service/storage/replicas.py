@@ -25,6 +25,8 @@ from service.storage.files.local import write_durably
 
 logger = logging.getLogger(__name__)
 
+RECONCILE_S = 30.0
+"""Seconds between two searches for jobs that nobody has, of a service alone: only a fault leaves some."""
 _SECONDS = cast(func.extract("epoch", func.clock_timestamp()), Float)
 
 
@@ -39,7 +41,7 @@ class Replicas:
         self.settings, self.database = settings, database
         self.beat_s = settings.replica_lost_s / 10  # so many are missing before it counts as lost
         self.id = identity(settings.home) if database.shared else "alone"
-        self.reconcile_s = self.beat_s if database.shared else 30.0  # of a service alone, only a fault leaves some
+        self.reconcile_s = self.beat_s if database.shared else RECONCILE_S
         self._started = now()
         self._since, self._last = float("inf"), -float("inf")  # monotonic, s: no sign was missed since; the last one
         self._closing = threading.Event()
