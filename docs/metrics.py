@@ -13,7 +13,7 @@ from service.training import metrics as training
 KINDS: tuple[MetricKind, ...] = (
     *kinds(metrics.Traffic),
     *kinds(training.JobMetrics),
-    *learning.KINDS,
+    *kinds(learning.Learning),
     *kinds(metrics.System),
 )
 """All metrics that /metrics shows besides Prometheus's usual ones of a process."""
