@@ -149,10 +149,10 @@ def test_a_state_without_room_is_not_stored_and_learning_goes_on(monkeypatch, ca
     follower = Follower.__new__(Follower)
     follower.model, follower.version, follower._stored = "limits", 1, 0
     follower.known = SimpleNamespace(number=5, settled=True, online=None)
-    follower.database = SimpleNamespace(shared=False)
     follower.settings = Settings(home=tmp_path, max_home_bytes=1)
     follower.disk, follower.snapshot_every_s = Disk(follower.settings), 60.0
-    follower.store()
+    with closing(Database(tmp_path)) as follower.database:
+        follower.store()
     assert "has learnt is not stored" in caplog.text
     assert follower._stored == 0
     assert time.monotonic() < follower.snapshot_due <= time.monotonic() + 60
