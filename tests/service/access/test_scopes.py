@@ -77,7 +77,7 @@ def test_health_and_documentation_are_open(guarded):
         assert guarded.api.get(path).status_code == 200, path
 
 
-PLAIN = ["/nothing", "/dashboard", "/v1/models/", "/V1/models", "/health", "/docs/", "/v1/" + "m" * LONGEST_PATH]
+PLAIN = ["/nothing", "/dashboard", "/v1/models/", "/V1/models", "/health/", "/docs/", "/v1/" + "m" * LONGEST_PATH]
 ODD = ["//v1/models", "/v1%2fmodels", "/v1/models%00", "/v1/models;x", "/v1/models%0a", "/openapi.json/v1/models"]
 UPWARDS = ["/health/../v1/models", "/health/%2e%2e/v1/models", "/docs/../v1/models", "/dashboard/../v1/models"]
 UPWARDS += ["/static-offline-docs/../v1/models", "/static-offline-docs/%2e%2e/%2e%2e/v1/models"]

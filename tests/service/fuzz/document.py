@@ -7,20 +7,23 @@ METHODS = ("get", "put", "post", "delete")
 NUMBERS = ("q", "dq", "ddq", "tau")
 
 
-def narrowed(document: dict[str, Any], known: dict[str, list[Any]]) -> dict[str, Any]:
-    """Let parameters of these names be among the values that are known."""
+def narrowed(
+    document: dict[str, Any], known: dict[str, list[Any]], places: tuple[str, ...] = ("path",)
+) -> dict[str, Any]:
+    """Let parameters of these names be among the values that are known. A query may filter by any value."""
     document = deepcopy(document)
     for path, operations in document["paths"].items():
         for method in METHODS:
             for parameter in operations.get(method, {}).get("parameters", []):
-                if parameter["name"] in known and (method, path) != ("delete", "/v1/models/{model}"):
+                narrow = parameter["name"] in known and parameter["in"] in places
+                if narrow and (method, path) != ("delete", "/v1/models/{model}"):
                     parameter["schema"] = {"enum": known[parameter["name"]]}
     return document
 
 
 def fitting(document: dict[str, Any], known: dict[str, list[Any]], joints: int) -> dict[str, Any]:
     """Let also fields of bodies be among the values that are known, and motions fit a robot."""
-    document = narrowed(document, known)
+    document = narrowed(document, known, ("path", "query"))
     row = {"type": "array", "items": {"type": "number", "minimum": -3, "maximum": 3}}
     row |= {"minItems": joints, "maxItems": joints}
     fields = {name: {"enum": values} for name, values in known.items()} | dict.fromkeys(NUMBERS, row)
