@@ -70,6 +70,7 @@ def test_the_fraction_done_never_falls_while_a_version_is_judged_and_learns_all_
     dataset = upload(api, stream(samples=150, seed=4))["id"]
     options = {**QUICK, "statistics": statistics}
     name = queue(api, f"learns-{statistics}", dataset, options=options, holdout={"share": 0.3})["id"]
+    service.jobs.replicas.take(name, None)
     worker.run(service.settings, name)
     assert job(api, name)["state"] == "succeeded"
     fractions = [each["fraction"] for each in seen]
