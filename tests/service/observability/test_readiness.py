@@ -72,11 +72,10 @@ def test_all_parts_are_named_and_what_does_not_work(api, fresh_looks, monkeypatc
     assert api.get("/health/live").json() == {"status": "alive"}
 
 
+@pytest.mark.own_files("locks the file of the database")
 def test_a_locked_database_is_found(api, look, monkeypatch):
     monkeypatch.setattr(storage, "WRITE_S", 0.05)
     service = service_of(api)
-    if service.database.shared:
-        pytest.skip("PostgreSQL has no lock of the whole database")
     with closing(sqlite3.connect(service.database.engine.url.database, isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")
         assert look(service)["database"] == ("failed", "OperationalError: database is locked")
