@@ -14,7 +14,7 @@ from tests.browser.robot import playing
 from tests.browser.visitor import PHONE, Visitor
 from tests.choosing import slow
 from tests.service.data import stream
-from tests.service.learning.payloads import lift
+from tests.service.learning.payloads import lift, lifting
 from tests.service.models.versions import publish_arm_at
 
 if TYPE_CHECKING:
@@ -171,6 +171,9 @@ def test_a_change_is_decided_and_old_rows_are_said_to_be_old(
 def test_what_arms_carry_is_told_in_kilograms_and_a_contact_is_said(visitor: Visitor, dashboard: Dashboard) -> None:
     publish_arm_at(dashboard.server.home, "carrier")
     lift(dashboard.client, "carrier", "cell-1")
+    last = lifting("cell-1")[-1]  # once more, now that the payload is known
+    later = last | {"sequence": last["sequence"] + 1, "t": [each + 0.25 for each in last["t"]]}
+    dashboard.client.post("/v1/models/carrier/observations", json=later).raise_for_status()
     lift(dashboard.client, "carrier", "cell-2", mass=0.0, push=30.0)
     page = visitor.open("#/live/carrier")
     carried = page.get_by_role("region", name="Payload", exact=True)

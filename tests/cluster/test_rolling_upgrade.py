@@ -40,8 +40,9 @@ def earlier(tmp_path_factory):
     """The code of the release before."""
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("the release before is in git, which is not here")
-    if find_spec("torch") is None:
-        pytest.skip("the release before needs torch, which is not installed")
+    for name in ("torch", "plotly"):
+        if find_spec(name) is None:
+            pytest.skip(f"the release before needs {name}, which is not installed")
     folder = tmp_path_factory.mktemp("earlier")
     for name in EARLIER:
         made = subprocess.run(["git", "archive", name, *FOLDERS], cwd=ROOT, capture_output=True, check=False)
