@@ -18,7 +18,7 @@ from benchmarks.clients import Address
 from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
 from lipcore.robots.library import ROBOTS, Robot, load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipserve import Client
 from lipserve.progress import follow
 from lipserve.states import SUCCEEDED
@@ -48,7 +48,7 @@ class Source:
     """
 
     robot: str = "panda"
-    stream: Stream = field(default_factory=Stream)
+    stream: Simulation = field(default_factory=Simulation)
     fit: Mapping[str, Any] = field(default_factory=dict)
     load: Mapping[str, Any] = field(
         default_factory=lambda: {"hyperparameter_samples": 300, "max_iterations": 10_000, "starts": 1}
@@ -71,7 +71,7 @@ class Workload:
     robot: Robot | None
 
     @classmethod
-    def load(cls, folder: Path, robot: Robot | None, samples: Samples | None, stream: Stream) -> Workload:
+    def load(cls, folder: Path, robot: Robot | None, samples: Samples | None, stream: Simulation) -> Workload:
         """Load the model in this process; queries are an unseen trajectory where its stream is known."""
         manifest = json.loads((folder / "manifest.json").read_bytes())
         model = lipcore.load(folder)
@@ -163,7 +163,7 @@ def _train(client: Client, home: Path, dataset: str, robot: Robot, source: Sourc
     raise BenchError(f"no model in {home} comes from job {job.id}")
 
 
-def _unseen(stream: Stream) -> Stream:
+def _unseen(stream: Simulation) -> Simulation:
     return replace(stream, n_sinusoids=QUERY_SINUSOIDS)
 
 

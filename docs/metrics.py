@@ -7,14 +7,14 @@ from collections.abc import Iterator
 
 from service.api import metrics
 from service.learning import metrics as learning
-from service.telemetry.meters import MetricKind, kinds
+from service.telemetry.meters import MetricKind, list_metrics
 from service.training import metrics as training
 
 KINDS: tuple[MetricKind, ...] = (
-    *kinds(metrics.Traffic),
-    *kinds(training.JobMetrics),
-    *kinds(learning.Learning),
-    *kinds(metrics.System),
+    *list_metrics(metrics.Traffic),
+    *list_metrics(training.JobMetrics),
+    *list_metrics(learning.LearningCollector),
+    *list_metrics(metrics.System),
 )
 """All metrics that /metrics shows besides Prometheus's usual ones of a process."""
 

@@ -1,26 +1,25 @@
 """Inverse dynamics of manipulators as physics-informed Gaussian processes: the method of docs/method.md.
 
-The floors, from the top; what stands higher imports what stands lower, never the other way (import-linter, in
-pyproject.toml, checks it):
+The layers, from the top. A module imports lower layers only; import-linter checks this (pyproject.toml):
 
-    warm_up                                 above all: trains one of each, so that all is compiled
-    training, export, online, excitation    on one floor; none of them knows another:
-        training     samples in, a model out; `auto` chooses the estimator
-        export       a model that leaves: URDF, C
-        online       learning from a live stream: gates, records, changes, payloads, what is learnt and taken back
-        excitation   the motion that tells a model most
-    files        a model on disk: manifest, tensors, checked when read
+    warm_up                                 the top: trains one model of each kind to compile all code
+    training, export, online, excitation    one layer; none of them imports another:
+        training     from samples to a model; `auto` chooses the estimator
+        export       a model as URDF and as C
+        online       learning from a live stream: gates, records, changes, payloads, undo
+        excitation   the motion with the most information for a model
+    files        a model on disk: manifest, tensors, checks on reading
     arm          the rigid arm learnt from torque alone: geometry, masses, friction (sections 6 and 7)
     model        a trained model: torque, dynamics, energies, parameters, warnings (section 9)
-    estimators   what an estimator is made of: prior, hyperparameters, noise, options, what a training is given
-    posterior    exact and compact posteriors, what answers queries, sums over samples, linear algebra (section 8)
+    estimators   parts of an estimator: prior, hyperparameters, noise, options, the task of a training
+    posterior    exact and compact posteriors, prediction, sums over samples, linear algebra (section 8)
     kernels      the torque priors as formulas, and their compiled loops in `fast` (sections 2 to 5)
-    profiles     robots by name: limits, and what their effort field means
+    profiles     robots by name: limits, and the meaning of their effort field
     preparation  from recordings to samples: filters, rates, derivatives
     robots       URDFs, Pinocchio models, simulated recordings
     data         samples of motion and torque, splits, metrics
-    extras       what may be missing is imported there; on the floor of vocabulary
-    vocabulary   the names that things go by
+    extras       imports of optional dependencies; in the layer of vocabulary
+    vocabulary   the names of estimators, joint types and conventions
 """
 
 from __future__ import annotations
@@ -69,7 +68,7 @@ _PLACES = {
 
 
 def __getattr__(name: str) -> Any:
-    """Import what is asked for: numerics take seconds to load, which who only names things (clients) does without."""
+    """Import a name when it is used: numerics take seconds to load, and clients that only need names do without."""
     if name not in _PLACES:
         raise AttributeError(f"module 'lipcore' has no attribute {name!r}")
     value = globals()[name] = getattr(import_module(f"lipcore.{_PLACES[name]}"), name)

@@ -1,5 +1,8 @@
-"""What can be installed besides the base, and the one place that imports it: whoever needs a module of an extra asks
-here, when it is needed, and gets the module or an error that says what to install."""
+"""The optional dependencies, and the one place that imports them.
+
+Code that needs a module of an extra calls `import_extra` when it needs it. It gets the module, or an error with the
+command that installs it.
+"""
 
 from __future__ import annotations
 
@@ -13,20 +16,19 @@ from pathlib import Path
 from typing import Any
 
 ROBOTS_DATA = "cmeel.prefix/share/example-robot-data/robots"
-"""Where the package example-robot-data puts URDFs, in a folder of packages: it has no module to be imported."""
+"""Folder of URDFs in an installation of example-robot-data, which has no module to import."""
 
 
 @dataclass(frozen=True)
 class Extra:
-    """An extra, as pip takes it behind the name of the distribution.
-
-    gives: what it is for, to be read after "to"; modules: those that it brings and that are imported here; folder: of
-    data that it brings, below a folder of packages.
-    """
+    """An optional dependency of the distribution, by its name in pip."""
 
     gives: str
+    """Its purpose, as words after "to"."""
     modules: tuple[str, ...]
+    """Modules that it installs and that are imported here."""
     folder: str | None = None
+    """Folder of data that it installs, below a folder of packages."""
 
 
 EXTRAS = {
@@ -39,14 +41,13 @@ EXTRAS = {
     "opentelemetry": Extra("send traces", ("opentelemetry.exporter.otlp.proto.http",)),
     "plot": Extra("draw pictures", ("matplotlib",)),
 }
-"""All extras by name, as pyproject.toml has them."""
+"""All extras by name, as in pyproject.toml."""
 
 
 class MissingExtraError(RuntimeError):
-    """Something is needed that is not installed; the message says how to install it.
+    """A module or folder is not installed; the message has the command that installs it.
 
-    extra: its name, of EXTRAS; lacking: what is not there; reason: why it is needed, where that is not what the extra
-    is for.
+    extra: a name of EXTRAS; lacking: what is missing; reason: why it is needed, if not for the purpose of the extra.
     """
 
     def __init__(self, extra: str, lacking: str, reason: str | None = None) -> None:
@@ -55,27 +56,27 @@ class MissingExtraError(RuntimeError):
         self.extra, self.lacking, self.reason = extra, lacking, reason
 
     def __reduce__(self) -> tuple[type[MissingExtraError], tuple[str, str, str | None]]:
-        """Its own arguments, where it comes from another process."""
+        """Return its own arguments, to unpickle it in another process."""
         return type(self), (self.extra, self.lacking, self.reason)
 
 
 def install_line(extra: str) -> str:
-    """The line that installs an extra."""
+    """Return the command that installs an extra."""
     return "pip install " + shlex.quote(f"lipserve[{extra}]")
 
 
-def need(module: str, extra: str, reason: str | None = None) -> Any:
-    """Import a module of an extra; raise MissingExtraError where it cannot be."""
+def import_extra(module: str, extra: str, reason: str | None = None) -> Any:
+    """Import and return a module of an extra; raise MissingExtraError if that fails."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:
         raise MissingExtraError(extra, _not_installed(error.name or module), reason) from error
-    except ImportError as error:  # it is there, but a library of the system is not: libgomp1, for one
+    except ImportError as error:  # the module is installed, but not a system library, such as libgomp1
         raise MissingExtraError(extra, f"the module {module}, which cannot be imported ({error})", reason) from error
 
 
-def need_folder(extra: str) -> Path:
-    """The folder of data that an extra brings; raise MissingExtraError."""
+def find_data_folder(extra: str) -> Path:
+    """Return the folder of data that an extra installs; raise MissingExtraError if it is missing."""
     folder = EXTRAS[extra].folder
     assert folder is not None
     if (found := _folder(folder)) is None:
@@ -83,19 +84,19 @@ def need_folder(extra: str) -> Path:
     return found
 
 
-def check(extra: str, reason: str | None = None) -> None:
-    """Raise MissingExtraError unless all that an extra brings is installed; imports none of it."""
+def check_extra(extra: str, reason: str | None = None) -> None:
+    """Raise MissingExtraError unless all modules and data of an extra are installed; imports none of them."""
     for module in EXTRAS[extra].modules:
         if not _is_there(module):
             raise MissingExtraError(extra, _not_installed(module), reason)
     if EXTRAS[extra].folder is not None:
-        need_folder(extra)
+        find_data_folder(extra)
 
 
-def installed(extra: str) -> bool:
-    """Whether all that an extra brings is installed; imports none of it."""
+def is_installed(extra: str) -> bool:
+    """Return whether all modules and data of an extra are installed; imports none of them."""
     try:
-        check(extra)
+        check_extra(extra)
     except MissingExtraError:
         return False
     return True
@@ -108,7 +109,7 @@ def _not_installed(module: str) -> str:
 def _is_there(module: str) -> bool:
     try:
         return find_spec(module) is not None
-    except ModuleNotFoundError:  # of the package that it is in
+    except ModuleNotFoundError:  # its package is missing
         return False
 
 

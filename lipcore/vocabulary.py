@@ -1,4 +1,4 @@
-"""The names that things go by in models, data and answers. It loads no numerics: clients name things too."""
+"""Define the names that models, data and responses share. This module loads no numerics: clients import it, too."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ JointType = Literal["revolute", "prismatic"]
 JOINT_TYPES: tuple[JointType, ...] = get_args(JointType)
 
 TorqueConvention = Literal["gravity_included", "gravity_compensated"]
-"""What a torque means: all of it (Franka's `tau_J`), or what is added to gravity compensation (its commands)."""
+"""What a torque contains: all torque (Franka's `tau_J`), or only what is added to gravity compensation (its
+commands)."""
 TORQUE_CONVENTIONS: tuple[TorqueConvention, ...] = get_args(TorqueConvention)
 
 EffortMeaning = Literal["measured", "commanded", "current", "unknown"]
-"""Measured torque, gravity included; commanded torque, what is added to gravity compensation; motor current, A."""
+"""Measured torque with gravity; commanded torque, which is added to gravity compensation; motor current, A."""
 
-Place = Literal["cpu", "cuda"]
-"""What computes."""
+Device = Literal["cpu", "cuda"]
+"""The device that computes."""
 
 ComponentName = Literal[
     "inertia_matrix",
@@ -31,32 +32,32 @@ ComponentName = Literal[
 COMPONENTS: tuple[ComponentName, ...] = get_args(ComponentName)
 
 AUTO = "auto"
-"""Of several estimators, the simplest unless another one is surely better (`lipcore.training.auto`)."""
+"""The simplest estimator, unless another one is significantly better (`lipcore.training.auto`)."""
 RIGID, LOCAL, CHAINED_ARM = "rigid-body", "rigid-body+local", "rigid-body+lip-chain"
 ROBOT_ESTIMATORS = (RIGID, LOCAL, CHAINED_ARM)
-"""Estimators with the term `rigid_body`, which take a robot."""
-CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", *ROBOT_ESTIMATORS)
-"""What may be asked for: `auto`, and the estimators of `lipcore.estimators.catalogue`."""
+"""Estimators with the term `rigid_body`, which need a robot."""
+ESTIMATOR_CHOICES = (AUTO, "lip", "lip-chain", "se", "gip", "lse", *ROBOT_ESTIMATORS)
+"""Values of `estimator` in a request: `auto`, and the estimators of `lipcore.estimators.catalogue`."""
 
-DIFFERENTIATED = ("se", "gip", "lse")
-"""Estimators that torch differentiates as they are trained, on a GPU if there is one: the extra `train`. What they
-answer needs none."""
+TORCH_ESTIMATORS = ("se", "gip", "lse")
+"""Estimators that torch differentiates in training, on a GPU if there is one. They need the extra `train`; their
+predictions do not."""
 
 GeometryMode = Literal["learn", "calibrate", "fixed"]
 GEOMETRY_MODES: tuple[GeometryMode, ...] = get_args(GeometryMode)
-"""Where the joint axes of rigid bodies lie: learnt from torque alone, learnt around a URDF or another unit's arm, or as
-that has them."""
+"""How the joint axes of rigid bodies are found: learnt from torque alone, learnt around a URDF or the arm of another
+unit, or fixed as given there."""
 
 Prior = Literal["urdf", "zero"]
 PRIORS: tuple[Prior, ...] = get_args(Prior)
-"""What inertial parameters are expected to be before the data speak: those of the URDF, or none."""
+"""Prior mean of the inertial parameters: those of the URDF, or zero."""
 
 PayloadState = Literal["none", "payload", "contact", "friction"]
-"""What the last rows of a stream show: something carried, a contact, other friction, or none of these."""
+"""What the last rows of a stream show: a payload, a contact, changed friction, or none of these."""
 
 
 class Code(IntEnum):
-    """What becomes of a row. All but `LEARNT` keep it out of learning; the log stores the numbers."""
+    """Why a row was learnt or rejected. Only `LEARNT` rows are learnt; the log stores the numbers."""
 
     LEARNT = 0
     NON_FINITE = 1
@@ -64,25 +65,25 @@ class Code(IntEnum):
     LIMIT = 2
     """A position, velocity, acceleration or torque is beyond its limit."""
     TIME_JUMP = 3
-    """Time goes backwards or leaps."""
+    """Time goes backwards or jumps ahead."""
     SATURATION = 4
-    """Torque is at its actuator's limit."""
+    """The torque is at its actuator's limit."""
     STATIONARY = 5
     """The robot is at rest: stiction hides its torque."""
     CONTACT = 6
     CHANGE = 7
-    """The robot has changed, and its owner has not decided yet."""
+    """The robot has changed, and learning is paused until its owner decides."""
     EDGE = 8
-    """The acceleration cannot be derived, at the edge of what has come."""
+    """The acceleration cannot be derived yet, because neighbouring rows are missing."""
     PAYLOAD = 9
-    """The arm carries something, of which the row teaches instead."""
+    """The arm carries a payload. The row is used to estimate the payload instead."""
     LATE = 10
-    """The row came so late that by forgetting it no longer counts."""
+    """The row arrived so late that forgetting leaves it no weight."""
     PAUSED = 11
     """Learning was paused."""
     IMPLAUSIBLE = 12
-    """Nobody has measured this torque."""
+    """The torque cannot be a measurement."""
 
 
 CODES = tuple(code.name.lower() for code in Code)
-"""The names of codes, in the order of their numbers."""
+"""Names of the codes, in the order of their numbers."""

@@ -1,7 +1,7 @@
 """Compile ahead of the first use, for images and installations: `python -m lipcore.warm_up [ESTIMATOR …]`.
 
-Numba keeps the machine code on disk (`NUMBA_CACHE_DIR`, else beside the source, else below the home); without this the
-first training on a machine waits for it, up to a minute.
+Numba keeps the machine code on disk (`NUMBA_CACHE_DIR`, else beside the source, else below the home). Without it the
+first training on a machine waits up to a minute for the compiler.
 """
 
 from __future__ import annotations
@@ -21,30 +21,33 @@ from lipcore.robots.urdf import PARAMETERS
 from lipcore.training.train import train
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
-COMPILED = ("lip", "lip-chain", *ROBOT_ESTIMATORS)
-"""Estimators with compiled terms. What all have in common comes with each."""
-LEAST = FitOptions(
+COMPILED_ESTIMATORS = ("lip", "lip-chain", *ROBOT_ESTIMATORS)
+"""Estimators with compiled terms. Code that they share is compiled with each."""
+FASTEST_OPTIONS = FitOptions(
     hyperparameter_samples=20, posterior_samples=40, max_iterations=3, starts=1, device="cpu", search_seconds=0.01
 )
+"""The fastest training that compiles everything."""
 
 
 def warm_up(*names: str) -> None:
-    """Train these estimators on a made-up robot of two joints and ask them; all of COMPILED where none is named.
+    """Train the named estimators, or all of COMPILED_ESTIMATORS, on an artificial robot of two joints, and predict.
 
-    What the machine code does not depend on, as the number of joints or samples, may as well be small. Raise ValueError
-    for a name that is none of COMPILED.
+    The machine code does not depend on the number of joints or samples, so these are small. Raise ValueError for a name
+    that is not one of COMPILED_ESTIMATORS.
     """
-    if unknown := [name for name in names if name not in COMPILED]:
-        raise ValueError(f"{unknown[0]!r} is no compiled estimator, expected names out of {', '.join(COMPILED)}")
-    for name in names or COMPILED:
-        model = train(_swinging(), ("revolute", "revolute"), name, LEAST)
+    if unknown := [name for name in names if name not in COMPILED_ESTIMATORS]:
+        raise ValueError(
+            f"{unknown[0]!r} is no compiled estimator, expected names out of {', '.join(COMPILED_ESTIMATORS)}"
+        )
+    for name in names or COMPILED_ESTIMATORS:
+        model = train(_swinging(), ("revolute", "revolute"), name, FASTEST_OPTIONS)
         model.warm_up()
         if model.arm is not None:
             _of_arm(model.arm)
 
 
 def _swinging() -> Samples:
-    """Two joints that swing at frequencies of their own, under gravity."""
+    """Return samples of two joints that swing under gravity, each at its own frequency."""
     time, frequency = np.linspace(0.0, 10.0, 60), np.array([1.0, 1.7])
     phase = time[:, None] * frequency
     q, dq, ddq = np.sin(phase), np.cos(phase) * frequency, -np.sin(phase) * frequency**2
@@ -53,7 +56,7 @@ def _swinging() -> Samples:
 
 
 def _of_arm(arm: Arm) -> None:
-    """What a training on another recording might take besides: other arms or none, and the energies."""
+    """Compile the kernels that only a training on another recording needs: other arms or none, and the energies."""
     friction = np.zeros((arm.n_joints, 4 if arm.stribeck else 3))
     one = Alternative(arm.geometry, arm.parameters, np.zeros(arm.n_joints), friction, 0.5)
     zeros = np.zeros((1, arm.n_joints))

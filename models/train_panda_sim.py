@@ -11,13 +11,13 @@ from threadpoolctl import threadpool_limits
 import lipcore
 from lipcore.data.metrics import evaluate
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 
 FOLDER = Path(__file__).parent / "panda-sim"
 SPEEDS = (1.0, 2.0, 5.0, 10.0)
 NOISE = 0.05
 """N·m, about what an arm's torque sensors have."""
-STREAMS = [(Stream(speed=SPEEDS[k % 4], noise=NOISE, motion="full"), 100 + k) for k in range(16)]
+STREAMS = [(Simulation(speed=SPEEDS[k % 4], noise=NOISE, motion="full"), 100 + k) for k in range(16)]
 """The whole range of every joint. Its URDF is not looked at: the arm is learnt from torque alone."""
 
 
@@ -33,7 +33,7 @@ def main() -> None:
     model = lipcore.train(samples, robot.joint_types, "rigid-body", on_progress=show)
     print(f"\nspeed  joint  {'nMSE':>9}  {'RMSE N·m':>9}  coverage of 95 %")
     for speed in SPEEDS:
-        streams = [Stream(speed=speed, n_sinusoids=100, noise=NOISE, motion="full")] * 3
+        streams = [Simulation(speed=speed, n_sinusoids=100, noise=NOISE, motion="full")] * 3
         tests = [simulate(robot, stream, seed) for stream, seed in zip(streams, (900, 901, 902), strict=True)]
         test = lipcore.Samples.concatenate(tests)
         answer = model.predict(test.q, test.dq, test.ddq)

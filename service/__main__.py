@@ -1,7 +1,7 @@
 """The command `lipserve`, also `python -m service`.
 
-It imports nothing of ours before it runs: spawned processes import their parent's main module again, and training
-processes shall take their place on the machine before anything else is loaded (see `compute.process`).
+It imports nothing of ours before it runs, because spawned processes import their parent's main module again. Training
+processes must set their options before they import anything else (see `service.runtime.process`).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import gc
 
 def main() -> None:
     """Run the command line."""
-    # what is imported stays: searching it for garbage would take a fifth of a start, and 40 ms of the loop's time later
+    # imports are permanent: their garbage collection would take a fifth of a start, and later 40 ms of the loop
     gc.disable()
     from service.cli import main as command  # noqa: PLC0415
 

@@ -1,4 +1,4 @@
-"""The application: settings in, ASGI app out."""
+"""The ASGI application, built from settings."""
 
 from __future__ import annotations
 
@@ -42,18 +42,18 @@ from service.foundation.settings import Settings
 from service.foundation.text import counted
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learners import Learners
-from service.learning.metrics import Learning
+from service.learning.metrics import LearningCollector
 from service.learning.refresh import attach
 from service.models import deletion, registry
 from service.models.loaded import LoadedModels
 from service.replication import Replication
 from service.runtime.confinement import protections
 from service.runtime.process import SERVING_THREADS
-from service.storage.audit import cleaned
+from service.storage.audit import clean_hourly
 from service.storage.files.store import start_sweeping
-from service.storage.storage import Storage, hold_home
+from service.storage.storage import Storage, lock_home
 from service.telemetry.meters import Meters
-from service.telemetry.readiness import Look, Readiness, Stopping
+from service.telemetry.readiness import Probe, Readiness, StopState
 from service.training.metrics import JobMetrics
 from service.training.metrics import look as look_jobs
 from service.training.queue import JobQueue, queue_of
@@ -68,24 +68,24 @@ Errors are `{"error": {code, message, detail}}`, below /v2 `{"error": message}` 
 
 
 def create_app(settings: Settings | None = None) -> FastAPI:
-    """Build the application. Nothing is opened before it starts."""
+    """Return the application. It opens files and the database only when it starts."""
     settings = settings or Settings()
-    stopping, meters = Stopping(), Meters()
+    stopping, meters = StopState(), Meters()
     calls = rpc.check_installed(settings)
     keyring = Keyring(REFRESH_S, settings.max_request_burst) if settings.keys_needed else None
 
     @asynccontextmanager
     async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        lock = hold_home(settings.home)
+        lock = lock_home(settings.home)
         storage, jobs, learners = await to_thread.run_sync(_open, settings)
-        threadpool_limits(SERVING_THREADS)  # of BLAS, whose libraries the models have brought in
+        threadpool_limits(SERVING_THREADS)  # of BLAS; the models imported its libraries
         _share(app, storage, jobs, learners)
         stop_following = storage.database.follow_others(lambda: Replication(learners).close)
         try:
             async with AsyncExitStack() as serving:
                 if keyring is not None:
                     await serving.enter_async_context(keyring.watching(storage.database))
-                await serving.enter_async_context(cleaned(storage.database, settings))
+                await serving.enter_async_context(clean_hourly(storage.database, settings))
                 if calls:
                     await serving.enter_async_context(_calls(app, settings, stopping))
                 yield
@@ -95,12 +95,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
                 rest.callback(storage.database.close)
                 rest.push_async_callback(to_thread.run_sync, learners.close)
                 rest.push_async_callback(to_thread.run_sync, stop_following)
-                await to_thread.run_sync(jobs.close)  # first: what learns needs the CPU to store its state
+                await to_thread.run_sync(jobs.close)  # first: the learner needs the CPU to store its state
 
     hot = [*predictions.hot.routes, *predictions.echo_hot.routes, *oip.hot.routes, *observations.hot.routes]
     if calls:
         hot.append(_calls_route())
-    # the documentation page loads nothing from other hosts: robots' networks often have no way out
+    # the documentation page loads nothing from other hosts: robots' networks are often isolated
     app = FastAPIOffline(
         title="LIPServe",
         summary="A model server for robot dynamics",
@@ -108,8 +108,8 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         version=__version__,
         lifespan=lifespan,
         redoc_url=None,
-        redirect_slashes=False,  # to an address that the client's Host header would choose
-        # tried first, and not through an included router: 50 µs less a request
+        redirect_slashes=False,  # the redirect would go to an address from the client's Host header
+        # matched first and without an included router: 50 µs less a request
         routes=hot,
         telemetry=requests.telemetry(settings),
     )
@@ -145,7 +145,7 @@ def _calls_route() -> BaseRoute:
     return Methods()
 
 
-def _calls(app: FastAPI, settings: Settings, stopping: Stopping) -> AbstractAsyncContextManager[int]:
+def _calls(app: FastAPI, settings: Settings, stopping: StopState) -> AbstractAsyncContextManager[int]:
     from service.api.oip.rpc.listening import listening  # noqa: PLC0415 - of an extra
 
     return listening(app, settings, stopping)
@@ -154,7 +154,7 @@ def _calls(app: FastAPI, settings: Settings, stopping: Stopping) -> AbstractAsyn
 def _add_middleware(
     app: FastAPI, settings: Settings, keyring: Keyring | None, meters: Meters, hot: list[BaseRoute]
 ) -> None:
-    """Add what every request passes, from the inside out."""
+    """Add the middleware of all requests, from the inside out."""
     app.add_middleware(
         BodyLimit,
         limits=body_limits(settings),
@@ -175,9 +175,9 @@ def _add_middleware(
 
 
 def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
-    """Open the home, finish what an earlier run left, and load the models that are asked for first."""
-    # s after which a computing thread lets the event loop go on. Python's own 5 ms are more than a control loop has;
-    # with 0.1 ms it came more than half a millisecond late two to five times as often beside a stream
+    """Open the home, clean up after an earlier run, and preload models."""
+    # s after which a computing thread yields to the event loop. Python's 5 ms exceed a control loop's period.
+    # With 0.1 ms the loop was over half a millisecond late two to five times as often beside a stream
     sys.setswitchinterval(3e-5)
     storage = Storage.open(settings)
     database, files = storage.database, storage.files
@@ -201,20 +201,20 @@ def _open(settings: Settings) -> tuple[Storage, JobQueue, Learners]:
 
 
 def _share(app: FastAPI, storage: Storage, jobs: JobQueue, learners: Learners) -> None:
-    """Put the parts where routes ask for them, each for those that it uses."""
+    """Store the parts in the application's state, where routes read them."""
     state, loaded, settings = app.state, learners.loaded, storage.settings
-    looks: dict[str, Look] = {
-        **storage.looks(),
+    probes: dict[str, Probe] = {
+        **storage.probes(),
         "models": loaded.look,
-        "learner": learners.look,
+        "learner": learners.check_process,
         "training": lambda lasting: look_jobs(jobs, lasting),
     }
     state.storage, state.loaded, state.jobs, state.learners = storage, loaded, jobs, learners
     state.turns = Turns(CapacityLimiter(settings.max_concurrent_predictions))
-    state.readiness = Readiness(looks, state.stopping)
+    state.readiness = Readiness(probes, state.stopping)
     state.collectors = (
         Traffic(state.meters),
         JobMetrics(storage.database),
-        Learning(learners),
+        LearningCollector(learners),
         System(storage, state.readiness),
     )

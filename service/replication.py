@@ -1,4 +1,7 @@
-"""A service beside others: it takes in what they change when they announce it, and looks for itself now and then."""
+"""A service beside others: it applies their changes when notified.
+
+It also compares its memory with the database regularly.
+"""
 
 from __future__ import annotations
 
@@ -19,16 +22,16 @@ from service.storage.database.engine import Notice
 logger = logging.getLogger(__name__)
 
 FIRST_PAUSE_S = 0.1
-"""Until the listener connects again: each time twice as long."""
-LOOK_S = 5.0
-"""Seconds between two looks at everything in memory: notices come in milliseconds, and should one be lost, this."""
+"""First pause before the listener reconnects, s; doubled each time."""
+FULL_LOOK_S = 5.0
+"""Seconds between two comparisons of everything in memory with the database, in case a notice was lost."""
 
 
 class Replication:
-    """Made once the service is, where it shares its database; close it before the service's parts.
+    """Follows the changes of other services, if they share the database. Close it before the service's parts.
 
-    A log that has grown wakes the learner at once, from the listener's thread. All else is looked up in another
-    thread, one look at a time, because versions are loaded for it.
+    A new event in a log wakes the learner at once, from the listener's thread. All other changes are read in a second
+    thread, one after the other, because it loads versions.
     """
 
     def __init__(self, learners: Learners) -> None:
@@ -43,7 +46,7 @@ class Replication:
         self._listener = Listener(learners.database, self._note, self._note_everything)
 
     def close(self) -> None:
-        """End both threads."""
+        """Stop both threads."""
         self._listener.close()
         with self._changed:
             self._ending = True
@@ -64,7 +67,7 @@ class Replication:
             self._changed.notify_all()
 
     def _run(self) -> None:
-        due = time.monotonic() + LOOK_S
+        due = time.monotonic() + FULL_LOOK_S
         while True:
             with self._changed:
                 self._changed.wait_for(
@@ -77,15 +80,15 @@ class Replication:
                 self._everything, self._models, self._grown = False, set(), set()
             try:
                 if everything:
-                    look(self._learners, None)
+                    update_models(self._learners, None)
                 elif models:
-                    look(self._learners, models)
+                    update_models(self._learners, models)
                     self._wake(models)  # roles may have changed
                 self._learners.follow(grown & self._known())
                 if everything or time.monotonic() >= due:
                     self._look_around()
-                    due = time.monotonic() + LOOK_S
-            except Exception as error:  # the database may be away: it is looked for again, and nothing is lost
+                    due = time.monotonic() + FULL_LOOK_S
+            except Exception as error:  # the database may be unreachable: retry, nothing is lost
                 logger.warning("what other services have changed is not known now: %s", error)
                 with self._changed:
                     self._models |= models
@@ -93,11 +96,11 @@ class Replication:
                     self._changed.wait_for(lambda: self._ending, 1.0)
 
     def _look_around(self) -> None:
-        """Look at all that is in memory, whatever was announced."""
-        look(self._learners, self._known())
-        behind = lagging(self._learners)
+        """Compare all models in memory with the database, without a notice."""
+        update_models(self._learners, self._known())
+        behind = find_lagging_models(self._learners)
         self._wake(model for model, number in behind.items() if self._woken.get(model) != number)
-        self._woken = behind  # once for an event: who cannot learn it tries again by itself
+        self._woken = behind  # once per event: a learner that cannot learn it retries by itself
         self._learners.follow()
 
     def _wake(self, models: Iterable[str]) -> None:
@@ -109,9 +112,9 @@ class Replication:
 
 
 class Listener:
-    """Receives the notices of other services in a thread of its own, whatever the database does.
+    """Receives the notices of other services in a thread of its own, and reconnects after each error.
 
-    noticed: called with each notice; connected: called whenever it begins to receive: earlier notices may be lost. Both
+    noticed: called with each notice. connected: called at each start of receiving, as earlier notices may be lost. Both
     are called in its thread and must not wait.
     """
 
@@ -122,7 +125,7 @@ class Listener:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         self._ending.set()
         self._thread.join()
 
@@ -131,14 +134,14 @@ class Listener:
         while not self._ending.is_set():
             try:
                 self._listen()
-            except Exception as error:  # whatever it is: there is nobody else to listen
+            except Exception as error:  # any error: no other thread listens
                 logger.warning("notices of other services are not heard now: %s", error)
             pause = min(2 * pause, 2.0) if not self._receiving else FIRST_PAUSE_S
             self._ending.wait(pause)
 
     def _listen(self) -> None:
         self._receiving = False
-        with closing(self._database.changes_of_others(0.2)) as notices:  # s until it looks whether to end
+        with closing(self._database.changes_of_others(0.2)) as notices:  # s between two checks for the end
             for notice in notices:
                 if self._ending.is_set():
                     return
@@ -149,9 +152,11 @@ class Listener:
                     self._noticed(notice)
 
 
-def look(learners: Learners, models: Collection[str] | None) -> None:
-    """Take in which versions of these models serve, have aliases or are gone; of all that are known here where None.
-    Not for the event loop: versions are loaded before they answer."""
+def update_models(learners: Learners, models: Collection[str] | None) -> None:
+    """Update serving versions, aliases and deletions of these models; of all models in memory if None.
+
+    Not for the event loop: versions are loaded before they answer.
+    """
     known = {model for model, _ in learners.loaded.held()} | learners.monitors().keys()
     here = known if models is None else known & set(models)
     learners.loaded.announce(here)
@@ -159,8 +164,8 @@ def look(learners: Learners, models: Collection[str] | None) -> None:
     _forget(learners, here)
 
 
-def lagging(learners: Learners) -> dict[str, int]:
-    """Models that answer here with less than their log holds, and the number of its newest event."""
+def find_lagging_models(learners: Learners) -> dict[str, int]:
+    """Return the models whose revision here is behind their log, with the number of the log's newest event."""
     held = learners.loaded.held()
     newest = select(func.max(EventRow.number)).where(EventRow.model == LearnerRow.model).scalar_subquery()
     query = select(LearnerRow.model, LearnerRow.version, LearnerRow.start, newest).where(
@@ -176,7 +181,7 @@ def lagging(learners: Learners) -> dict[str, int]:
 
 
 def _point(learners: Learners, models: Collection[str] | None) -> None:
-    """Let aliases point where the database says, to versions in memory where the model is in use here."""
+    """Update aliases from the database, and load their versions if the model is in use here."""
     loaded = learners.loaded
     used = {model for model, _ in loaded.versions()}
     moved = registry.pointers(learners.database, models).items() - loaded.aliases().items()
@@ -186,12 +191,12 @@ def _point(learners: Learners, models: Collection[str] | None) -> None:
                 loaded.get(model, version)
             except ServiceError as error:  # the next query for it is answered with the error
                 logger.warning("version %d of model %s, which an alias points to now: %s", version, model, error)
-    with loaded.moving:  # read again: aliases moved here meanwhile are in the database by now
+    with loaded.moving:  # read again: aliases that were moved here meanwhile are now in the database
         loaded.repoint(registry.pointers(learners.database, models), models)
 
 
 def _forget(learners: Learners, models: Collection[str]) -> None:
-    """Answer no more with versions that are gone."""
+    """Remove deleted versions from memory."""
     loaded = learners.loaded
     with loaded.moving:
         held = {key for key in loaded.held() if key[0] in models}
@@ -202,7 +207,7 @@ def _forget(learners: Learners, models: Collection[str]) -> None:
         for model in models:
             gone = {version for name, version in held - kept if name == model}
             serving = loaded.newest(model)
-            # of a model that was deleted and made anew nothing that is known here holds any more
+            # a model that was deleted and created again shares nothing with the one in memory
             everything = model not in left or (serving is not None and serving in gone)
             if gone or everything:
                 loaded.forget(model, gone, everything)

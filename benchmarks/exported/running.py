@@ -20,7 +20,7 @@ from benchmarks.latency.targets import Target
 from benchmarks.timing import Timing, measure
 from benchmarks.workload import BenchError, simulator
 from lipcore.data.samples import Array
-from lipcore.export.c_writer import SOURCE, Origin, c_files
+from lipcore.export.c_writer import SOURCE, ModelOrigin, c_files
 from lipcore.files.persistence import load
 from lipcore.robots.library import Robot, pinocchio
 
@@ -68,7 +68,7 @@ def run(options: Options, console: Console) -> Results:
     motion = np.stack([draw(limits[name]["min"], limits[name]["max"], size) for name in ("q", "dq", "ddq")], axis=1)
     with tempfile.TemporaryDirectory(prefix="lipserve-bench-") as home:
         folder = Path(home)
-        for name, text in c_files(model, Origin(options.folder.name, 1, 0, "")).items():
+        for name, text in c_files(model, ModelOrigin(options.folder.name, 1, 0, "")).items():
             (folder / name).write_text(text)
         motion.tofile(folder / "queries")
         command = ["cc", "-std=c99", *options.flags, f"-I{folder}", str(HERE / "timing.c"), str(folder / SOURCE)]

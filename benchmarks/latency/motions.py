@@ -19,14 +19,14 @@ from benchmarks.latency.targets import p50, single
 from benchmarks.workload import TRAIN_SEED, Workload
 from lipcore.data.samples import Samples
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import FAST, Stream, simulate
+from lipcore.robots.simulation import FAST_SPEED, Simulation, simulate
 
-SLOW, QUICK = Stream(), Stream(speed=FAST)
-MOTIONS: dict[str, tuple[Stream, ...]] = {
+SLOW, QUICK = Simulation(), Simulation(speed=FAST_SPEED)
+MOTIONS: dict[str, tuple[Simulation, ...]] = {
     "slow": (SLOW,),
     "fast": (QUICK,),
     "slow and fast": (SLOW, QUICK),
-    "full range, slow and fast": (Stream(motion="full"), Stream(motion="full", speed=FAST)),
+    "full range, slow and fast": (Simulation(motion="full"), Simulation(motion="full", speed=FAST_SPEED)),
 }
 QUERIES = 1000
 
@@ -49,7 +49,7 @@ def compare(
 
 
 def _train(
-    name: str, robot: Robot, streams: tuple[Stream, ...], fit: Mapping[str, Any], home: Path, console: Console
+    name: str, robot: Robot, streams: tuple[Simulation, ...], fit: Mapping[str, Any], home: Path, console: Console
 ) -> Workload:
     samples = Samples.concatenate([simulate(robot, stream, TRAIN_SEED) for stream in streams])
     model = lipcore.train(samples, robot.joint_types, "lip-chain", lipcore.FitOptions(**fit))

@@ -14,7 +14,7 @@ from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import FAST, Payload, Stream, simulate
+from lipcore.robots.simulation import FAST_SPEED, Payload, Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 
 Kind = Literal["clean", "dirty", "dirty+urdf"]
@@ -78,7 +78,7 @@ class Arm:
         """A model of rigid bodies, learnt from torque alone or, for `dirty+urdf`, calibrated around the URDF."""
         robot, seed = self.robot, _SEEDS * self.seed
         if (dirt := self.dirt) is None:
-            samples = simulate(robot, Stream(speed=FAST, noise=NOISE, motion="full"), seed)
+            samples = simulate(robot, Simulation(speed=FAST_SPEED, noise=NOISE, motion="full"), seed)
         else:
             samples = prepared(simulate(robot, recording(TRAINED_S, dirt), seed))
         if self.kind != "dirty+urdf":
@@ -92,7 +92,7 @@ class Arm:
         end = round(max(SIMULATED, seconds) * RATE)
         dirt = self.dirt
         count, noise = end + round(EDGE_S * RATE), noise if dirt is None else 0.0
-        stream = Stream(count, RATE, speed=speed, noise=noise, payload=payload, dirt=dirt)
+        stream = Simulation(count, RATE, speed=speed, noise=noise, payload=payload, dirt=dirt)
         samples = simulate(self.robot, stream, _SEEDS * self.seed + part)
         last = samples.rows(slice(end - round(seconds * RATE), end))
         return replace(last, t=last.t - last.t[0])

@@ -13,7 +13,7 @@ from benchmarks.latency.targets import Target
 from benchmarks.online.bed import install, train
 from benchmarks.online.trials import BATCHES, LATE, MODEL, ROWS, TWICE, Tally, Trials, Victim
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 from service.contract.observations import LearningOptions
 
 ROBOT, RATE, SPEED = "double-pendulum", 100.0, 5.0
@@ -32,12 +32,12 @@ SAID = (
 def open_trials(home: Path, trials: int, seed: int, batches: int = BATCHES) -> Trials:
     """Train a model of a double pendulum and prepare a home that serves it; samples are enough for so many trials."""
     robot = load_robot(ROBOT)
-    history = simulate(robot, Stream(100, 10.0, speed=SPEED), 10 * seed + 1)
+    history = simulate(robot, Simulation(100, 10.0, speed=SPEED), 10 * seed + 1)
     model, _ = train(history, robot.joint_types, FIT)
     lipcore.save(model, home / "model")
     install(home / "home", home / "model", {MODEL: LEARNING}, robot.n_joints)
     # a payload and friction, so that there is something to learn
-    more = Stream(trials * batches * ROWS, RATE, speed=SPEED, viscous=0.05, payload=Payload(0.2))
+    more = Simulation(trials * batches * ROWS, RATE, speed=SPEED, viscous=0.05, payload=Payload(0.2))
     samples = simulate(robot, more, 10 * seed + 2)
     queries = simulate(robot, replace(more, n_samples=50, rate=1.0), 10 * seed + 3)
     return Trials(home / "home", lipcore.load(home / "model"), samples, queries, seed)

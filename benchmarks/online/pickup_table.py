@@ -30,8 +30,8 @@ NOTES = (
     "rivals are judged on the Panda with 1 kg, centred, fast, clean; the refit and least squares are told when the "
     "payload was taken up and stand ready at once, least squares knows the URDF, which is the truth here; the service "
     "that adapts is asked when it has learnt all rows",
-    "nothing carried: `Watch` in process, by the model as trained, which learns nothing meanwhile; contacts: forces of "
-    "10 to 40 N on random links, for 0.2 s every 2 s",
+    "nothing carried: `PayloadTracker` in process, by the model as trained, which learns nothing meanwhile; contacts: "
+    "forces of 10 to 40 N on random links, for 0.2 s every 2 s",
 )
 
 

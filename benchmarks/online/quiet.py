@@ -1,6 +1,7 @@
 """Streams of arms that carry nothing: how often a payload is noticed all the same, by itself and in contacts.
 
-The library's `Watch` is driven in this process, by the model as trained: what a service learns on the way is not in it.
+The library's `PayloadTracker` is driven in this process, by the model as trained: what a service learns on the way is
+not in it.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from benchmarks.online.scene import rows_of
 from lipcore.data.samples import Array, Samples
 from lipcore.model.payload import Carrier
 from lipcore.model.torque_model import TorqueModel
-from lipcore.online.payload.holding import Watch
+from lipcore.online.payload.holding import PayloadTracker
 from lipcore.robots.library import Robot, pinocchio
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 
 BLOCK_S = 300.0
 """The longest motion that is simulated at once: every block is of another motion, begins cold and is watched anew."""
@@ -74,14 +75,19 @@ def watched(arm: Arm, model: TorqueModel, minutes: float, console: Console) -> l
 def payloads(carrier: Carrier, samples: Samples) -> tuple[list[tuple[float, float]], int]:
     """When a payload was noticed on a stream, s, and for how long it was believed, s; how often the watch failed."""
     failed = 0
-    watch, rows, found, since = Watch(carrier.model.n_joints), rows_of(samples), list[tuple[float, float]](), None
+    watch, rows, found, since = (
+        PayloadTracker(carrier.model.n_joints),
+        rows_of(samples),
+        list[tuple[float, float]](),
+        None,
+    )
     for start in range(0, len(rows), BATCH):
         batch = rows.take(slice(start, start + BATCH))
         now = float(batch.time[-1])
         try:
             watch = watch.step(carrier, batch)
         except np.linalg.LinAlgError:  # as the service does, which then begins anew
-            watch, failed = Watch(carrier.model.n_joints), failed + 1
+            watch, failed = PayloadTracker(carrier.model.n_joints), failed + 1
         if watch.held is not None and since is None:
             since = now
         elif watch.held is None and since is not None:
@@ -118,6 +124,6 @@ def _block(arm: Arm, seconds: float, speed: float, block: int) -> Samples:
     """Motion without payload, whose friction is that of a cold arm at first."""
     dirt, edge = arm.dirt, round(EDGE_S * RATE)
     count = round(seconds * RATE) + 2 * edge
-    stream = Stream(count, RATE, speed=speed, noise=NOISE if dirt is None else 0.0, dirt=dirt)
+    stream = Simulation(count, RATE, speed=speed, noise=NOISE if dirt is None else 0.0, dirt=dirt)
     samples = simulate(arm.robot, stream, 1000 * arm.seed + _PART + block).rows(slice(edge, count - edge))
     return replace(samples, t=samples.t - samples.t[0])

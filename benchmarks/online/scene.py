@@ -12,7 +12,7 @@ from lipcore.data import independence
 from lipcore.data.samples import Array, Samples
 from lipcore.online.batch import Rows
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 from lipcore.vocabulary import Code
 
 SINUSOIDS, UNSEEN_SINUSOIDS = 50, 100
@@ -97,7 +97,7 @@ class Scene:
     ) -> Samples:
         """Rigid bodies alone: no friction, no noise. loaded: time from which on they carry the payload."""
         payload = None if loaded is None else Payload(self.payload, loaded)
-        stream = Stream(count, rate, sinusoids, speed=self.speed, noise=0.0, payload=payload)
+        stream = Simulation(count, rate, sinusoids, speed=self.speed, noise=0.0, payload=payload)
         return simulate(self.arm, stream, self._seed(part))
 
     def _measured(self, samples: Samples, factor: Array | float, part: int) -> Samples:

@@ -21,7 +21,7 @@ from lipcore.data.samples import Array, Samples
 from lipcore.estimators.catalogue import check_estimator
 from lipcore.estimators.options import FitOptions
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 
@@ -138,14 +138,14 @@ class Experiment:
 
     def training_set(self, cell: Cell) -> Samples:
         """Samples spread evenly over the whole stream of a cell, so that fewer samples see the same region."""
-        stream = Stream(self.samples, self.rate, self.training_sinusoids, speed=cell.speed, noise=self.noise)
+        stream = Simulation(self.samples, self.rate, self.training_sinusoids, speed=cell.speed, noise=self.noise)
         rows = np.linspace(0, self.samples - 1, cell.samples).round().astype(np.int64)
         return simulate(load_robot(self.robot), stream, cell.seed).rows(rows)
 
     def test_set(self, speed: float, seed: int) -> tuple[Samples, Array]:
         """Every `test_stride`-th sample of a test stream and its torque without noise, (N, n) N·m."""
         robot = load_robot(self.robot)
-        stream = Stream(self.samples, self.rate, self.test_sinusoids, speed=speed, noise=self.noise)
+        stream = Simulation(self.samples, self.rate, self.test_sinusoids, speed=speed, noise=self.noise)
         samples = simulate(robot, stream, seed).rows(slice(None, None, self.test_stride))
         return samples, inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)
 

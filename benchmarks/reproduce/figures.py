@@ -12,7 +12,7 @@ from benchmarks.reproduce import table
 from benchmarks.reproduce.report import Run
 from lipcore.data.metrics import RELIABILITY_LEVELS
 from lipcore.data.samples import Array
-from lipcore.extras import need
+from lipcore.extras import import_extra
 
 COLOURS = {
     "se": "#999999",
@@ -45,8 +45,8 @@ STYLE = {
 
 def pyplot() -> Any:
     """Matplotlib's pyplot, without a window; raise MissingExtraError."""
-    need("matplotlib", "plot").use("agg")
-    return need("matplotlib.pyplot", "plot")
+    import_extra("matplotlib", "plot").use("agg")
+    return import_extra("matplotlib.pyplot", "plot")
 
 
 def draw(run: Run, folder: Path) -> None:
@@ -95,8 +95,8 @@ def _boxes(plt: Any, run: Run) -> Any:
         axis.grid(False, axis="x")
         for edge in np.arange(len(run.joint_names) - 1) + 0.5:
             axis.axvline(edge, color="#e6e6e6", lw=0.7)
-    patches = need("matplotlib.patches", "plot")
-    lines = need("matplotlib.lines", "plot")
+    patches = import_extra("matplotlib.patches", "plot")
+    lines = import_extra("matplotlib.lines", "plot")
     handles = [patches.Patch(color=COLOURS.get(name, OTHER), label=name) for name in run.estimators]
     handles.append(lines.Line2D([], [], color="black", lw=1, ls=(0, (3, 2)), label="noise / torque variance"))
     _legend(figure, handles)

@@ -15,7 +15,7 @@ from benchmarks.reproduce import table
 from benchmarks.reproduce.experiment import YARDSTICK, CellResult, Experiment
 from benchmarks.reproduce.table import Row, Summary
 from lipcore.data.samples import Array
-from lipcore.robots.simulation import FUNDAMENTAL, MIDDLE_AMPLITUDE
+from lipcore.robots.simulation import FUNDAMENTAL_RAD_S, MIDDLE_AMPLITUDE
 
 _PACKAGES = ("lipserve", "numpy", "scipy", "torch", "numba", "pin", "example-robot-data", "matplotlib")
 
@@ -77,9 +77,9 @@ def _introduction(run: Run) -> str:
         f"```sh\n{run.command}\n```",
         f"{run.training_sets} training sets × {e.test_sets} test sets of {e.samples} samples at {e.rate:g} Hz. Joints "
         f"move ±{MIDDLE_AMPLITUDE:g} rad in random sums of sinusoids: {e.training_sinusoids} multiples of "
-        f"{FUNDAMENTAL:g} rad/s times the speed for training, {e.test_sinusoids} for testing. Torques are measured "
-        f"with noise of {e.noise:g} N·m and have no friction. One model is trained on each training set; every "
-        f"{_th(e.test_stride)}sample of each test set is compared.",
+        f"{FUNDAMENTAL_RAD_S:g} rad/s times the speed for training, {e.test_sinusoids} for testing. Torques are "
+        f"measured with noise of {e.noise:g} N·m and have no friction. One model is trained on each training set; "
+        f"every {_th(e.test_stride)}sample of each test set is compared.",
         "nMSE is the mean squared error against the simulator's torque without noise, divided by that torque's "
         "variance (`nmse_noisy` in the CSV is against the measured one). Coverage is the share of *measured* torques "
         "inside the interval, noise included. Medians, means and lowest values are over training sets × test sets.",

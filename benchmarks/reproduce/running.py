@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from benchmarks.reproduce.experiment import Cell, CellResult, Experiment, run_cell
 from benchmarks.reproduce.results import Results
-from service.runtime.process import Place, start_process
+from service.runtime.process import ProcessOptions, start_process
 
 
 class ReproductionError(RuntimeError):
@@ -32,7 +32,10 @@ def run(experiment: Experiment, cells: Sequence[Cell], results: Results, workers
     with (
         Progress(*columns, TextColumn("{task.fields[left]}"), console=console, disable=not console.is_terminal) as bar,
         ProcessPoolExecutor(
-            min(workers, max(len(todo), 1)), multiprocessing.get_context("spawn"), start_process, (Place(threads=1),)
+            min(workers, max(len(todo), 1)),
+            multiprocessing.get_context("spawn"),
+            start_process,
+            (ProcessOptions(threads=1),),
         ) as pool,
     ):
         task = bar.add_task("training", total=len(cells), completed=len(cells) - len(todo), left="")

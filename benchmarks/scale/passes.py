@@ -26,7 +26,7 @@ from lipcore.posterior.summing import Summing
 from lipcore.training.conditioning import SHARD, ShardStatistics, sum_samples
 from service.foundation.settings import Settings, shipped_models
 from service.runtime import executors
-from service.runtime.executors import Processes, summed
+from service.runtime.executors import Processes, sum_shards
 
 NAME = "pass"
 MODEL = "panda-sim"
@@ -71,18 +71,18 @@ def run(engines: Engines, rows: int, pairs: int, seed: int, console: Console) ->
         with opened as by_count:
             found = seconds[kind] = {count: [] for count in by_count}
             for executor in by_count.values():
-                summed(executor, work, shards[:2], _never)  # imports, loads the model
+                sum_shards(executor, work, shards[:2], _never)  # imports, loads the model
             for pair in range(pairs):
                 for count in sorted(by_count, reverse=bool(pair % 2)):
                     began = time.monotonic()
-                    total = summed(by_count[count], work, shards, _never)
+                    total = sum_shards(by_count[count], work, shards, _never)
                     found[count].append(time.monotonic() - began)
                     sums.add(hashlib.sha256(total.a.tobytes() + total.b.tobytes()).hexdigest())
                 one, two = found[1][-1], found[2][-1]
                 console.print(f"{kind}: {one:.1f} s with one, {two:.1f} s with two", highlight=False)
             if kind == POOL:
                 began = time.monotonic()
-                summed(by_count[2], work, LONGER * shards, _never)
+                sum_shards(by_count[2], work, LONGER * shards, _never)
                 longer = time.monotonic() - began
     return _part(rows, seconds, longer, len(sums))
 

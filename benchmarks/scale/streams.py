@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 
 from lipcore.data.samples import Samples
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 
 ROBOT = "panda"
 SPEED, NOISE, VISCOUS, COULOMB = 5.0, 0.05, 0.5, 0.3
@@ -27,7 +27,7 @@ def robot() -> Robot:
 
 def stream(rows: int, seed: int, rate: float = RATE) -> Samples:
     """One trajectory with friction and noise."""
-    motion = Stream(rows, rate, speed=SPEED, noise=NOISE, viscous=VISCOUS, coulomb=COULOMB)
+    motion = Simulation(rows, rate, speed=SPEED, noise=NOISE, viscous=VISCOUS, coulomb=COULOMB)
     return simulate(robot(), motion, seed)
 
 

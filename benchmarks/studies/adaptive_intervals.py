@@ -25,19 +25,19 @@ import lipcore
 from benchmarks.studies.dirty_arms import prepared
 from lipcore.data.independence import stream_weights
 from lipcore.data.samples import Array, Samples
-from lipcore.online.adaptive import Adaptive, scores
+from lipcore.online.adaptive import AdaptiveScale, scores
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.record import LEVEL
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 from lipcore.vocabulary import Code
 
 STREAMS = {"tune": ("panda:0", "ur10:1"), "report": ("kinova:10", "xarm7:10", "panda:11", "ur5:12")}
 RATE, BATCH, NOISE = 100.0, 10, 0.05
 MINUTE = round(60 * RATE)
-TRAINED = Stream(MINUTE, RATE, speed=5.0, noise=0.0)
+TRAINED = Simulation(MINUTE, RATE, speed=5.0, noise=0.0)
 UNSEEN = replace(TRAINED, n_sinusoids=100)
 PARTS = {
     "warming up": UNSEEN,
@@ -52,7 +52,7 @@ EVERY = round(0.5 * RATE)
 MISS = 1 - LEVEL
 
 
-def measured(robot: Robot, stream: Stream, seed: int, dirt: Dirt | None) -> Samples:
+def measured(robot: Robot, stream: Simulation, seed: int, dirt: Dirt | None) -> Samples:
     """A stream of a clean arm, or of a dirty one whose noise is in its dirt."""
     return simulate(robot, replace(stream, dirt=dirt, noise=0.0 if dirt else NOISE), seed)
 
@@ -106,7 +106,7 @@ class Ours:
     """What the service does."""
 
     def __init__(self, n: int) -> None:
-        self._state, self._rows = Adaptive.start(np.ones(n)), 0
+        self._state, self._rows = AdaptiveScale.start(np.ones(n)), 0
 
     @property
     def scale(self) -> Array:

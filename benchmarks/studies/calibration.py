@@ -15,11 +15,11 @@ from threadpoolctl import threadpool_limits
 
 import lipcore
 from lipcore.robots.library import Robot, load_robot, pinocchio
-from lipcore.robots.simulation import FAST, Stream, simulate
+from lipcore.robots.simulation import FAST_SPEED, Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
-SEEDS, TESTS, SPEEDS, SIZES = (301, 302), 2, (1.0, FAST), (60, 200, 500)
+SEEDS, TESTS, SPEEDS, SIZES = (301, 302), 2, (1.0, FAST_SPEED), (60, 200, 500)
 STRIDE = 5
 FACTORS = (1.0, 1.1, 1.2, 1.3, 1.4, 1.5, 1.75, 2.0, 2.5, 3.0)
 Z95 = 1.959964
@@ -50,9 +50,11 @@ def collect(path: str, estimator: str, names: list[str]) -> None:
         for seed in SEEDS:
             robot = randomised(load_robot(name), seed)
             for speed in SPEEDS:
-                stream = simulate(robot, Stream(speed=speed), seed)
+                stream = simulate(robot, Simulation(speed=speed), seed)
                 tests = [
-                    simulate(robot, Stream(speed=speed, n_sinusoids=100), 10 * seed + k).rows(slice(0, None, STRIDE))
+                    simulate(robot, Simulation(speed=speed, n_sinusoids=100), 10 * seed + k).rows(
+                        slice(0, None, STRIDE)
+                    )
                     for k in range(TESTS)
                 ]
                 for size in SIZES:

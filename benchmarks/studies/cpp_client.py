@@ -23,7 +23,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import undefer
 
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipserve import StreamClient
 from service.foundation.settings import Settings
 from service.journal import log
@@ -185,7 +185,7 @@ def logged(home: Path) -> np.ndarray:
 def main() -> None:
     """Compile, measure, print."""
     compiler = sys.argv[1] if len(sys.argv) > 1 else "g++"
-    arm = simulate(load_robot("panda"), Stream(n_samples=CYCLES, rate=1 / PERIOD_S), seed=4)
+    arm = simulate(load_robot("panda"), Simulation(n_samples=CYCLES, rate=1 / PERIOD_S), seed=4)
     rows = np.stack([arm.q, arm.dq, arm.ddq, arm.tau], 1)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -23,13 +23,13 @@ from benchmarks.online.bed import Bed, install, serving
 from benchmarks.online.sending import Ack, batch_requests, stream
 from lipcore.data.samples import Samples
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 from service.contract.observations import LearningOptions
 
 CROWDED, OTHER = "crowded", "other"
 ROWS, PERIOD_S, ALONE_S, BESIDE_S, LEAD_S = 10, 0.1, 10, 12, 2.0
 CYCLE_S = 4.0
-MOTION = Stream(int(100 * (ALONE_S + BESIDE_S)), 100.0, speed=5.0, noise=0.05)
+MOTION = Simulation(int(100 * (ALONE_S + BESIDE_S)), 100.0, speed=5.0, noise=0.05)
 
 
 def carrying(seed: int) -> Samples:

@@ -21,7 +21,7 @@ from lipcore.data.samples import Samples
 from lipcore.data.signals import differentiate, low_pass
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 
 ARMS = ("panda", "ur5", "ur10", "kinova", "xarm7", "z1", "tiago", "baxter-left")
 RATE, SPEED, SECONDS, KEEP = 100.0, 5.0, (10, 60), 5
@@ -29,12 +29,12 @@ LEAST_S, RESTS_S = 20.0, 40.0
 CASES = ("same", "three times faster", "rests")
 
 
-def recording(seconds: float, dirt: Dirt) -> Stream:
+def recording(seconds: float, dirt: Dirt) -> Simulation:
     """What an arm is trained on."""
-    return Stream(round(seconds * RATE), RATE, speed=SPEED, noise=0.0, dirt=dirt)
+    return Simulation(round(seconds * RATE), RATE, speed=SPEED, noise=0.0, dirt=dirt)
 
 
-def unseen(robot: Robot, stream: Stream, case: str, seed: int) -> Samples:
+def unseen(robot: Robot, stream: Simulation, case: str, seed: int) -> Samples:
     """Recordings of an arm, trained on such a stream, in motion of another kind: one of CASES."""
     least = LEAST_S
     if case == "three times faster":
@@ -45,7 +45,7 @@ def unseen(robot: Robot, stream: Stream, case: str, seed: int) -> Samples:
     return Samples.concatenate([recorded(robot, stream, 200 + 1000 * k + seed) for k in range(count)])
 
 
-def recorded(robot: Robot, stream: Stream, seed: int) -> Samples:
+def recorded(robot: Robot, stream: Simulation, seed: int) -> Samples:
     """A recording: prepared, or where there is no dirt, as simulated, of the same rate."""
     samples = simulate(robot, stream, seed)
     return samples.rows(slice(None, None, KEEP)) if stream.dirt is None else prepared(samples)

@@ -31,13 +31,13 @@ from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.vocabulary import Code
 
 RATE, KEEP, EVERY_S, MINUTES, JUDGED = 100.0, 5, 2.0, 30, 5
 NOISE = 0.05
 """Of a clean arm, N·m; a dirty one's is in its dirt."""
-STREAM = Stream(round(60 * RATE), RATE, speed=5.0, noise=0.0)
+STREAM = Simulation(round(60 * RATE), RATE, speed=5.0, noise=0.0)
 MOVING = 0.1
 """rad/s."""
 VISCOUS, COULOMB = 0.5, 0.3

@@ -21,7 +21,7 @@ import lipcore
 from lipcore.excitation import Belief, Limits, PlanOptions, plan
 from lipcore.profiles import profile
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import FAST, Stream, inverse_dynamics, sinusoids
+from lipcore.robots.simulation import FAST_SPEED, Simulation, inverse_dynamics, sinusoids
 
 SEEDS = range(101, 106)
 TESTS = range(9001, 9005)
@@ -36,7 +36,7 @@ ARMS = ("random", "random, fast", "planned")
 
 def random(robot: Robot, speed: float, count: int, seed: int) -> Motion:
     """The paper's sinusoids over the whole range, which knows no acceleration limits."""
-    stream = Stream(len(T), RATE, count, "full", speed)
+    stream = Simulation(len(T), RATE, count, "full", speed)
     return sinusoids(robot, stream, T, np.random.default_rng(seed))
 
 
@@ -85,7 +85,7 @@ def main(seeds: list[int]) -> None:
     robot, limits = load_robot("panda"), Limits.of_profile(profile("panda")).within(RANGE, SCALE)
     tests = {
         "sinusoids": [random(robot, 1.0, 100, seed) for seed in TESTS],
-        "fast sinusoids": [random(robot, FAST, 100, seed) for seed in TESTS],
+        "fast sinusoids": [random(robot, FAST_SPEED, 100, seed) for seed in TESTS],
         "moves": [moves(limits, seed) for seed in TESTS],
     }
     tests = {name: [tuple(part[::STRIDE] for part in test) for test in some] for name, some in tests.items()}
@@ -96,7 +96,7 @@ def main(seeds: list[int]) -> None:
         made = plan(belief, limits, PlanOptions(SECONDS, RATE, budget_s=3600, seed=seed), robot)
         planned = tuple(part[: len(T)] for part in made.table()[1:])
         print(f"seed {seed}: planned in {time.monotonic() - began:.0f} s, {made.iterations} iterations")
-        motions = (random(robot, 1.0, 50, seed), random(robot, FAST, 50, seed), planned)
+        motions = (random(robot, 1.0, 50, seed), random(robot, FAST_SPEED, 50, seed), planned)
         for arm, motion in zip(ARMS, motions, strict=True):
             began, model = time.monotonic(), train(robot, motion, seed)
             took = time.monotonic() - began

@@ -32,9 +32,9 @@ from lipcore.data.motion import motion_arrays
 from lipcore.data.samples import Samples
 from lipcore.kernels.geometry import Geometry
 from lipcore.posterior.selection import spread_out
-from lipcore.robots.dirt import SPREAD, Dirt
+from lipcore.robots.dirt import JOINT_SPREAD, Dirt
 from lipcore.robots.library import Robot, load_robot, pinocchio
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate, usual_torque
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate, usual_torque
 from lipcore.training import auto, fit
 
 ROWS = (
@@ -82,11 +82,11 @@ def rows(seeds: int) -> None:
     for name, speed, motion, count in ROWS:
         robot, errors, covers, seconds = load_robot(name), [], [], []
         for seed in range(5001, 5001 + seeds):
-            training = simulate(robot, Stream(count, n_sinusoids=50, speed=speed, motion=motion), seed)
+            training = simulate(robot, Simulation(count, n_sinusoids=50, speed=speed, motion=motion), seed)
             began = time.perf_counter()
             found = lipcore.train(training, robot.joint_types, "rigid-body", FitOptions(device="cpu"))
             seconds.append(time.perf_counter() - began)
-            unseen = simulate(robot, Stream(500, n_sinusoids=100, speed=speed, motion=motion), seed + 100)
+            unseen = simulate(robot, Simulation(500, n_sinusoids=100, speed=speed, motion=motion), seed + 100)
             true = inverse_dynamics(robot, unseen.q, unseen.dq, unseen.ddq)
             answer = found.predict(unseen.q, unseen.dq, unseen.ddq)
             figures = evaluate(unseen.tau, *answer.interval)
@@ -104,7 +104,7 @@ def search(first: int, last: int, seeds: int) -> None:
     for number in range(first, last + 1):
         robot = random_arm(number, prismatic=1 if number % 5 == 0 else None)
         for seed in range(5001, 5001 + seeds):
-            stream = Stream(
+            stream = Simulation(
                 500, n_sinusoids=50, speed=10.0, motion="full", noise=NOISE, viscous=FRICTION, coulomb=FRICTION
             )
             training = simulate(robot, stream, seed)
@@ -127,7 +127,7 @@ def search(first: int, last: int, seeds: int) -> None:
     print(f"best geometry found in {wins} of {total}; lowest coverage of a joint {100 * np.min(covers):.0f} %")
 
 
-def units(robot: Robot, seed: int, dirty: bool) -> list[tuple[Robot, Stream]]:
+def units(robot: Robot, seed: int, dirty: bool) -> list[tuple[Robot, Simulation]]:
     """Two units of a robot and how long streams of them are recorded: their friction differs, all masses by up to
     MASSES. What is not dirty has viscous friction and white noise."""
     out = []
@@ -135,7 +135,7 @@ def units(robot: Robot, seed: int, dirty: bool) -> list[tuple[Robot, Stream]]:
         dirt = Dirt(seed=2 * seed + number)
         stream, spread = (
             recording(LONG_S, dirt),
-            np.random.default_rng(dirt.seed).uniform(-SPREAD, SPREAD, unit.n_joints),
+            np.random.default_rng(dirt.seed).uniform(-JOINT_SPREAD, JOINT_SPREAD, unit.n_joints),
         )
         if not dirty:
             viscous = usual_torque(robot) * dirt.viscous * (1 + spread)
@@ -144,7 +144,7 @@ def units(robot: Robot, seed: int, dirty: bool) -> list[tuple[Robot, Stream]]:
     return out
 
 
-def silent(stream: Stream) -> Stream:
+def silent(stream: Simulation) -> Simulation:
     """The same without noise."""
     return replace(stream, noise=0.0, dirt=None if stream.dirt is None else replace(stream.dirt, noise=0.0))
 

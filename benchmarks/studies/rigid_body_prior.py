@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 import lipcore
 from lipcore.data.metrics import evaluate
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import FAST, Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import FAST_SPEED, Simulation, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody
 
 SEEDS, TESTS, STRIDE = range(1, 6), range(1001, 1005), 5
@@ -23,15 +23,17 @@ def main() -> None:
     threadpool_limits(1)
     nominal = load_robot("panda")
     bodies = RigidBody.from_profile("panda", nominal.joint_names, nominal.joint_types)
-    for speed in (1.0, FAST):
+    for speed in (1.0, FAST_SPEED):
         for prior in ("urdf", "zero"):
             nmse, coverage = [], []
             for seed in SEEDS:
                 robot, options = randomised(nominal, seed, 0.7, 1.4), lipcore.FitOptions(prior=prior)
-                samples = simulate(robot, Stream(speed=speed), seed)
+                samples = simulate(robot, Simulation(speed=speed), seed)
                 model = lipcore.train(samples, robot.joint_types, "rigid-body", options, robot=bodies)
                 for test_seed in TESTS:
-                    test = simulate(robot, Stream(speed=speed, n_sinusoids=100), test_seed).rows(slice(0, None, STRIDE))
+                    test = simulate(robot, Simulation(speed=speed, n_sinusoids=100), test_seed).rows(
+                        slice(0, None, STRIDE)
+                    )
                     answer = model.predict(test.q, test.dq, test.ddq)
                     truth = inverse_dynamics(robot, test.q, test.dq, test.ddq)
                     nmse.append(evaluate(truth, *answer.interval).nmse)

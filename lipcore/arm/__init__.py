@@ -1,1 +1,1 @@
-"""The arm itself: where its joint axes lie, its masses, and how both are learnt from torque alone."""
+"""The rigid arm: its geometry, masses and friction, learnt from torque alone."""

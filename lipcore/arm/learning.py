@@ -1,4 +1,4 @@
-"""Learning an arm from samples: its geometry found, calibrated or taken as it is, then masses, friction and noise."""
+"""Learning of an arm from samples: its geometry (searched, calibrated or fixed), then masses, friction and noise."""
 
 from __future__ import annotations
 
@@ -25,26 +25,26 @@ from lipcore.kernels.arm_prior import Alternative, Arm, chain
 from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.friction import FRICTION_TERMS
 from lipcore.kernels.geometry import Geometry
-from lipcore.posterior.misfit import Misfit, estimate, shared_rows
+from lipcore.posterior.misfit import Misfit, estimate_misfit, shared_rows
 from lipcore.posterior.selection import spread_out
 from lipcore.vocabulary import GeometryMode
 
 
 @dataclass(frozen=True)
 class ArmOptions:
-    """Effort of learning an arm, and what its friction and its alternatives must gain."""
+    """Effort of learning an arm, and min gains of its friction term and its alternatives."""
 
     min_search_rows: int = 80
     search_rows_per_joint: int = 10
-    """Rows of the search: this many a joint, at least the min."""
+    """Rows of the search: this many per joint, at least the min."""
     polished: int = 4
-    """Optima of the search that are followed on all rows."""
+    """Optima of the search that are improved on all rows."""
     polish_steps: int = 40
     rounds: int = 3
     round_steps: int = 15
-    """Times that scales and geometry are fitted in turn, and steps of each."""
+    """Alternations between the fits of scales and geometry, and steps of each."""
     min_difference: float = 0.3
-    """An alternative arm is kept if its torque differs by this share of the stated spread."""
+    """Min difference in torque of an alternative arm, as a share of the stated spread."""
     check_motions: int = 200
     """Motions at which arms are compared."""
     min_stribeck_nats: float = 3.0
@@ -53,24 +53,28 @@ class ArmOptions:
     stribeck_rounds: int = 2
     rest_rounds: int = 2
     max_contiguous_rows: int = 20_000
-    """Max contiguous rows from which the lasting part of the errors is estimated."""
+    """Max contiguous rows for the estimate of the lasting part of the errors."""
 
 
 OPTIONS = ArmOptions()
 
 
 @dataclass(frozen=True)
-class Learnt:
-    """What was learnt. arm: its linearisation; params: hyperparameters of arm, friction and noise; rows: samples that
-    it was learnt from; counts: (rows, n), independent measurements that each torque of them stands for; misfit: what is
-    not expressed; report: for the manifest."""
+class ArmFit:
+    """A learnt arm."""
 
     arm: Arm
+    """The arm, linearised."""
     params: dict[str, Array]
+    """Hyperparameters of arm, friction and noise."""
     rows: NDArray[np.int64]
+    """Indices of the samples that it was learnt from."""
     counts: Array
+    """Independent measurements that each torque of these rows represents, (rows, n)."""
     misfit: Misfit
+    """Variance that the arm does not model."""
     report: dict[str, float | int | bool | str]
+    """Report for the manifest."""
 
 
 def learn(
@@ -78,17 +82,17 @@ def learn(
     known: Sequence[Geometry] = (),
     begin: Sequence[Geometry] = (),
     seed: int = 0,
-) -> Learnt:
-    """Learn the arm that moved as the samples of a task say.
+) -> ArmFit:
+    """Learn the arm from the samples of a task.
 
-    task.robot, task.sibling: a URDF's bodies, or the arm of another unit, which geometry and masses are expected
-    around, as `options.geometry` and `options.prior` say; known: geometries that a search looks at, too, where neither
-    is given; begin: geometries from base to tip that other samples of the same arm have led to, which are followed from
-    there, without a search; seed: of the search.
+    task.robot, task.sibling: bodies of a URDF, or the arm of another unit, as the prior of geometry and masses
+    according to `options.geometry` and `options.prior`; known: additional start geometries of a search, without robot
+    and sibling; begin: geometries from other samples of the same arm, base to tip, which are improved without a search;
+    seed: of the search.
 
-    Raise FitCancelledError when `task.cancelled` answers true, ValueError for samples that no arm can be learnt from.
+    Raise FitCancelledError when `task.cancelled` returns true, ValueError for samples that no arm can be learnt from.
     """
-    with threadpool_limits(1):  # matrices are small: more threads would take longer
+    with threadpool_limits(1):  # matrices are small: more threads would be slower
         samples, options = task.samples, task.options
         watch = _Watch(task, time.monotonic())
         mode, around = mode_of(task), surroundings(task)
@@ -116,7 +120,7 @@ def learn(
         )
         problem = counting.applied(problem, ends[0], at_rest=False)
         ends = sorted((problem.at(each.geometry, each.sigma) for each in ends), key=lambda each: each.value)
-        found, stribeck_nats = _refined(problem, ends, counting, watch, known if mode == "learn" else None)
+        found, stribeck_nats = _refine(problem, ends, counting, watch, known if mode == "learn" else None)
         best, problem = found[0].point, found[0].problem
         misfit, _ = counting.misfit(problem, best, best.sigma**2)
         watch.step("posterior", best.value, 0.95)
@@ -137,36 +141,41 @@ def learn(
             "device": "cpu",
         }
         if mode == "learn":
-            sure = right_angles.certainty(found)[np.argsort(order)]
+            sure = right_angles.right_angle_probabilities(found)[np.argsort(order)]
             report |= {f"right_angle_{joint + 1}": round(float(each), 3) for joint, each in enumerate(sure)}
         arm, params = _arm(found, order, mode)
         place, n = np.argsort(order), problem.n_joints
         friction = problem.weights(best)[problem.bodies :].reshape(n, -1)
         misfit = misfit.with_friction(friction[:, FRICTION_TERMS.index("coulomb")]).of_joints(place)
-        return Learnt(arm, params, rows, problem.counts[:, place], misfit, report)
+        return ArmFit(arm, params, rows, problem.counts[:, place], misfit, report)
 
 
 @dataclass(frozen=True)
 class _Counting:
-    """What each torque counts. contiguous: samples; order: (n,), the data's joint at each place of the chain; shared:
-    rows of a problem that have an error in common where it lasts."""
+    """Weights of torques from the lasting part of their errors."""
 
     contiguous: Samples
+    """Contiguous samples."""
     order: NDArray[np.int64]
+    """The data's joint at each place of the chain, (n,)."""
     shared: float
+    """Rows of a problem that share one lasting error."""
 
     def applied(self, problem: Problem, point: Point, at_rest: bool) -> Problem:
-        """The problem whose torques count as a point's residuals say. at_rest: less where friction is unknown, too."""
+        """Return the problem with torques weighted by a point's residuals.
+
+        at_rest: include unknown friction at rest.
+        """
         misfit, noise = self.misfit(problem, point)
         misfit = misfit if at_rest else replace(misfit, rest=np.zeros_like(misfit.rest))
         variance = misfit.of_row(noise, problem.motions[:, 1], self.shared)
         return replace(problem, counts=noise / variance)
 
     def misfit(self, problem: Problem, point: Point, least: Array | float = 0.0) -> tuple[Misfit, Array]:
-        """What `estimate` says of what a point leaves of contiguous samples, base to tip."""
+        """Return `estimate_misfit` of a point's residuals on contiguous samples, base to tip."""
         recorded = with_samples(problem, self.contiguous, self.order)
         residual, moved = recorded.tau - recorded.mean(point), recorded.motions[:, 1:].swapaxes(0, 1)
-        return estimate(residual, recorded.tau, moved, self.contiguous.episodes(), least)
+        return estimate_misfit(residual, recorded.tau, moved, self.contiguous.episodes(), least)
 
 
 def _search(
@@ -186,19 +195,19 @@ def _search(
     return search(problem.rows(few), types, task.gravity, sensor, seconds, seed, known, watch.searching)
 
 
-def _refined(
+def _refine(
     problem: Problem,
     ends: Sequence[Point],
     counting: _Counting,
     watch: _Watch,
     known: Sequence[Geometry] | None,
 ) -> tuple[list[Candidate], float]:
-    """Return the most likely arm and the others that are nearly as likely, with the scales and the noise of the first,
-    and how many nats friction's fourth term gains, which is there if the evidence wants it.
+    """Return the most likely arm with those nearly as likely, and the gain in nats of friction's fourth term.
 
-    known: geometries for the search for right angles, if the geometry is learnt from nothing; else None.
+    All have the scales and the noise of the first. The fourth term is included if the evidence supports it. known:
+    geometries for the search for right angles, if the geometry is learnt without a prior; else None.
     """
-    best, problem = _in_turn(problem, ends[0], OPTIONS.rounds, 0.85, watch)
+    best, problem = _alternate(problem, ends[0], OPTIONS.rounds, 0.85, watch)
     free: Layout = (None,) * problem.n_joints
     others = [end for end in ends[1:] if end.value < ends[0].value + 2 * right_angles.OPTIONS.near_nats]
     starts = [(free, problem.expected, end) for end in (best, *others)]
@@ -206,15 +215,15 @@ def _refined(
         chosen = right_angles.likely_layouts(problem, [best, *ends[1:]], known, watch.stop)
         starts = [*((each.layout, each.problem.expected, each.point) for each in chosen), *starts]
         problem = replace(problem, expected=starts[0][1])
-        best, problem = _in_turn(problem, starts[0][2], OPTIONS.stribeck_rounds, 0.87, watch)
+        best, problem = _alternate(problem, starts[0][2], OPTIONS.stribeck_rounds, 0.87, watch)
     wider = with_stribeck(problem)
     start = wider.at(best.geometry, best.sigma)
     gain = rescale(problem, best).value - rescale(wider, start).value
     if gain > OPTIONS.min_stribeck_nats:
-        best, problem = _in_turn(wider, start, OPTIONS.stribeck_rounds, 0.88, watch)
+        best, problem = _alternate(wider, start, OPTIONS.stribeck_rounds, 0.88, watch)
     for number in range(OPTIONS.rest_rounds):
         problem = counting.applied(problem, best, at_rest=True)
-        best, problem = _in_turn(
+        best, problem = _alternate(
             problem, problem.at(best.geometry, best.sigma), OPTIONS.stribeck_rounds, 0.9 + 0.02 * number, watch
         )
     found = [right_angles.weigh(problem, best, starts[0][0])]
@@ -226,8 +235,8 @@ def _refined(
     return [each for each in found if each.evidence < found[0].evidence + right_angles.OPTIONS.near_nats], gain
 
 
-def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch: _Watch) -> tuple[Point, Problem]:
-    """Scales and noise, then geometry, in turn; fraction: of the work done before."""
+def _alternate(problem: Problem, point: Point, rounds: int, fraction: float, watch: _Watch) -> tuple[Point, Problem]:
+    """Fit scales and noise, then geometry, in turn. fraction: of the work done before."""
     for number in range(rounds):
         scaled = rescale(problem, point)
         problem = scaled.problem
@@ -237,7 +246,7 @@ def _in_turn(problem: Problem, point: Point, rounds: int, fraction: float, watch
 
 
 def _arm(found: Sequence[Candidate], order: NDArray[np.int64], mode: GeometryMode) -> tuple[Arm, dict[str, Array]]:
-    """The arm of the most likely candidate, with the others that answer otherwise."""
+    """Return the arm of the most likely candidate, with the others that predict different torques."""
     problem, best = found[0].problem, found[0].point
     n, place = problem.n_joints, np.argsort(order)
     first = problem.bodies
@@ -266,7 +275,7 @@ def _arm(found: Sequence[Candidate], order: NDArray[np.int64], mode: GeometryMod
     if not differing:
         return arm, params
     chosen = [found[0], *differing[:3]]
-    shares = right_angles.shares(chosen)
+    shares = right_angles.candidate_probabilities(chosen)
     alternatives = tuple(
         _alternative(each.problem, each.point, place, float(share)) for each, share in zip(chosen, shares, strict=True)
     )
@@ -281,7 +290,7 @@ def _alternative(problem: Problem, point: Point, place: NDArray[np.int64], share
 
 
 def _differs(problem: Problem, best: Point, other: Point) -> bool:
-    """Whether two arms differ in torque beyond what is stated, where motions recombine those of the samples."""
+    """Return whether two arms differ in torque beyond the stated uncertainty, at recombined motions of the samples."""
     asked = problem.recombined(OPTIONS.check_motions)
     means = [asked.mean(point) for point in (best, other)]
     hessian, _, _ = problem.normal(best)
@@ -317,7 +326,7 @@ class _Watch:
         self.task, self.began, self.iteration = task, began, 0
 
     def step(self, stage: str, objective: float, fraction: float) -> None:
-        """Report a step; raise FitCancelledError where the caller asks to stop."""
+        """Report a step. Raise FitCancelledError if the caller has cancelled."""
         self.iteration += 1
         if self.stop():
             raise FitCancelledError("the fit was cancelled")
@@ -326,9 +335,9 @@ class _Watch:
             self.task.on_progress(FitProgress(stage, self.iteration, most, objective, fraction, elapsed))
 
     def searching(self, objective: float, fraction: float) -> None:
-        """Report a step of the search, which takes most of the time."""
+        """Report a step of the search, the longest part of the work."""
         self.step("geometry", objective, 0.8 * min(fraction, 1.0))
 
     def stop(self) -> bool:
-        """Whether the caller asks to stop."""
+        """Return whether the caller has cancelled."""
         return self.task.cancelled is not None and self.task.cancelled()

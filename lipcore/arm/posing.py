@@ -1,4 +1,4 @@
-"""What samples ask of an arm: the problem of `arm.problem`, with what is expected beforehand."""
+"""Construction of the problem of `arm.problem` from samples and a prior."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.arm.problem import Expected, Problem
+from lipcore.arm.problem import GeometryPrior, Problem
 from lipcore.data.samples import Array, Samples
 from lipcore.estimators import noise
 from lipcore.estimators.task import Task
-from lipcore.kernels.arm_prior import Arm, arm_of_robot, in_chain, unit_anywhere
+from lipcore.kernels.arm_prior import Arm, arm_of_robot, in_chain, unit_from_torque
 from lipcore.kernels.fast.arm import PARAMETERS
 from lipcore.kernels.friction import FRICTION_TERMS, friction_features
 from lipcore.kernels.geometry import Geometry
@@ -20,9 +20,9 @@ from lipcore.vocabulary import GeometryMode, JointType
 
 
 def mode_of(task: Task) -> GeometryMode:
-    """How a task's geometry is obtained: learnt, calibrated around that of a URDF or of a sibling, or fixed to it.
+    """Return how a task obtains the geometry: learnt, calibrated around a URDF or a sibling, or fixed to it.
 
-    Raise ValueError where `options.geometry` needs one of them and there is none.
+    Raise ValueError if `options.geometry` needs one of them and there is none.
     """
     asked, around = task.options.geometry, task.robot is not None or task.sibling is not None
     if asked == "auto":
@@ -33,14 +33,16 @@ def mode_of(task: Task) -> GeometryMode:
 
 
 def surroundings(task: Task) -> Arm | None:
-    """The arm that a task's geometry and masses are expected around, as `options.geometry` and `options.prior` say:
-    that of the sibling, or of the URDF; None where it is learnt from nothing. Raise ValueError as `mode_of` does, or
-    for a URDF without masses whose prior is "urdf"."""
+    """Return the prior arm of a task, that of the sibling or of the URDF; None if the arm is learnt without a prior.
+
+    `options.geometry` and `options.prior` select it. Raise ValueError like `mode_of`, or if the prior is "urdf" and the
+    URDF has no masses.
+    """
     mode = mode_of(task)
     if mode == "learn":
         return None
     if task.sibling is None:
-        assert task.robot is not None  # `mode_of` has seen to it
+        assert task.robot is not None  # `mode_of` has checked it
         return arm_of_robot(task.robot, task.gravity, task.options.prior, mode)
     if mode == "calibrate":
         return task.sibling
@@ -55,20 +57,20 @@ def make_problem(
     around: Arm | None = None,
     every: Samples | None = None,
 ) -> Problem:
-    """What N samples ask of an arm, base to tip.
+    """Return the problem of learning an arm from N samples, base to tip.
 
     joint_types: (n,), in the order of the data; order: (n,), the data's joint at each place of the chain; gravity:
-    whether torques contain it; around: the arm that geometry and masses are expected around; every: all samples, which
-    tell how large torques and noise are; `samples` where None.
+    whether torques contain it; around: prior arm of geometry and masses; every: all samples, for the size of torques
+    and noise, `samples` if None.
     """
     n, every = samples.n_joints, samples if every is None else every
     motions, tau = _in_chain(samples, order)
     usual = np.sqrt(np.mean(every.tau**2, axis=0))[order]
     floor, start = noise.floor(every)[order], noise.start(every)[order]
     speed = np.maximum(np.sqrt(np.mean(every.dq**2, axis=0))[order], 1e-3)
-    # friction's weights of a joint, as large as its torque
+    # the prior std of a joint's friction weights is its torque
     friction = np.stack([usual / speed, usual, usual], axis=1).reshape(-1) + floor.repeat(len(FRICTION_TERMS))
-    anywhere = unit_anywhere(float(usual.max()), n)
+    anywhere = unit_from_torque(float(usual.max()), n)
     body, centre = anywhere, np.zeros((PARAMETERS + 1) * n)
     if around is not None:
         masses, rotors = around.unit[: PARAMETERS * n].reshape(n, -1), around.unit[PARAMETERS * n :]
@@ -91,21 +93,21 @@ def make_problem(
 
 
 def with_samples(problem: Problem, samples: Samples, order: NDArray[np.int64]) -> Problem:
-    """The same expectations with N other samples, each counted in full. order: (n,), as of `make_problem`."""
+    """Return the same problem with N other samples of weight one. order: (n,), as in `make_problem`."""
     motions, tau = _in_chain(samples, order)
     friction = joint_friction(motions[:, 1], problem.friction_terms > len(FRICTION_TERMS))
     return replace(problem, motions=motions, tau=tau, counts=np.ones(tau.shape), friction=friction)
 
 
 def _in_chain(samples: Samples, order: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Motions (N, 3, n) and torques (N, n) from base to tip."""
+    """Return motions (N, 3, n) and torques (N, n) from base to tip."""
     parts = [in_chain(part, order) for part in (samples.q, samples.dq, samples.ddq)]
     return np.ascontiguousarray(np.stack(parts, axis=1)), in_chain(samples.tau, order)
 
 
-def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -> Expected | None:
+def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -> GeometryPrior | None:
     if around is not None:
-        return Expected(around.widths, around.geometry.moved(around.expected)) if around.steps else None
+        return GeometryPrior(around.widths, around.geometry.moved(around.expected)) if around.steps else None
     n = len(types)
     any_arm = Geometry(
         types,
@@ -114,11 +116,11 @@ def _expected(types: tuple[JointType, ...], gravity: bool, around: Arm | None) -
         np.tile([0.0, 0.0, 1.0], (n, 1)),
         np.array([0.0, 0.0, -1.0 if gravity else 0.0]),
     )
-    return Expected.anything(any_arm)
+    return GeometryPrior.anything(any_arm)
 
 
 def with_stribeck(problem: Problem) -> Problem:
-    """The same with friction's fourth term, whose weights may be as large as a joint's torque, as the Coulomb ones."""
+    """Return the same problem with friction's fourth term. Its prior is that of the Coulomb term."""
     n, first = problem.n_joints, problem.bodies
     known, scaled = (each[first:].reshape(n, -1) for each in (problem.unit, problem.scale))
     coulomb = known[:, FRICTION_TERMS.index("coulomb"), None]
@@ -133,7 +135,7 @@ def with_stribeck(problem: Problem) -> Problem:
 
 
 def joint_friction(dq: Array, stribeck: bool = False) -> Array:
-    """Friction's features P of N velocities, joint by joint (section 5 of docs/method.md): (N, n, f n).
+    """Return the friction features P of N velocities, joint by joint, (N, n, f n) (section 5 of docs/method.md).
 
     dq: (N, n) rad/s or m/s; stribeck: whether friction has its fourth term.
     """

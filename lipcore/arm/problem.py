@@ -1,9 +1,9 @@
-"""The evidence of a geometry, with masses, rotor inertia and friction integrated out, and its descent.
+"""The evidence of a geometry, with masses, rotor inertia and friction integrated out, and its minimisation.
 
     τ = Y(θ) π + r ∘ ddq + P f + ε,    ε_j ~ N(0, σ_j²),    w = (π, r, f) ~ N(μ, diag s²)
 
-The torque is linear in w, so w is integrated out in closed form; what is minimised is −log p(τ | θ, σ) − log p(θ). The
-step is that of Gauss and Newton on (w, θ) together, damped in θ (Levenberg–Marquardt): J = ∂(Y π)/∂θ is exact.
+The torque is linear in w, so w is integrated out in closed form. The objective is −log p(τ | θ, σ) − log p(θ). The step
+is that of Gauss–Newton on (w, θ) together, damped in θ (Levenberg–Marquardt). J = ∂(Y π)/∂θ is exact.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from lipcore.kernels.geometry import Geometry
 
 @dataclass(frozen=True)
 class PriorWidths:
-    """Prior widths of an arm of which only the joints are known."""
+    """Prior standard deviations of an arm without a robot."""
 
     angle: float = 1.0
     """Directions of axes, rad."""
@@ -32,74 +32,81 @@ class PriorWidths:
     noise: float = 3.0
     """Logarithm of σ."""
     scale: float = 2.0
-    """Parts that a logarithm of s is the sum of (`arm.scales`): a factor of seven either way within one deviation."""
+    """Parts of the logarithms of s (`arm.scales`): a factor of seven either way within one standard deviation."""
     unit: float = 0.3
-    """The same of masses and rotor inertias around another unit's, which differ about as much as expected."""
+    """The same for masses and rotor inertias around those of another unit, which differ about as much as expected."""
 
 
 WIDTHS = PriorWidths()
 
 
 @dataclass(frozen=True)
-class Expected:
-    """What a geometry is expected to be. widths: (g,) rad and m.
-
-    around: the geometry of a URDF, where there is one. Without it axes may point anywhere, and lie about where the
-    frame before them is.
-    """
+class GeometryPrior:
+    """Prior of a geometry."""
 
     widths: Array
+    """Standard deviations, (g,) rad and m."""
     around: Geometry | None = None
+    """Geometry of a URDF, if there is one. Without it axes may have any direction, and lie near the frame before
+    them."""
 
     @classmethod
-    def anything(cls, geometry: Geometry) -> Expected:
-        """Nothing is known but the joints: axes point anywhere, and lie within some 0.5 m of the frame before."""
+    def anything(cls, geometry: Geometry) -> GeometryPrior:
+        """Return the prior of an unknown arm: axes in any direction, within some 0.5 m of the frame before."""
         return cls(np.where(geometry.turns, WIDTHS.angle, WIDTHS.length))
 
     def step(self, geometry: Geometry) -> Array:
-        """From a geometry to what is expected, (g,) rad and m."""
+        """Return the step from a geometry to the prior mean, (g,) rad and m."""
         return -geometry.shifts() if self.around is None else geometry.towards(self.around)
 
     def value(self, geometry: Geometry) -> float:
-        """−log of the prior's density at a geometry, nats, without its constant."""
+        """Return −log of the prior density at a geometry, nats, without its constant."""
         return 0.5 * float(np.sum((self.step(geometry) / self.widths) ** 2))
 
 
 @dataclass(frozen=True)
 class Point:
-    """A geometry with what follows from it. value: −log posterior, nats; sigma: (n,) noise std, N·m; weights: (k,) the
-    most likely w, in units of s around μ; features: (N, n, k), of them; factor: Cholesky of I + their precision."""
+    """A geometry with its evidence and its most likely weights."""
 
     geometry: Geometry
     sigma: Array
+    """Noise std, (n,) N·m."""
     value: float
+    """−log posterior, nats."""
     weights: Array
+    """Most likely w, in units of s around μ, (k,)."""
     features: Array
+    """Features of w, (N, n, k)."""
     factor: Array
+    """Cholesky factor of I plus the precision of w."""
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Samples that a geometry is to explain.
-
-    motions: (N, 3, n), q, dq and ddq from base to tip; tau: (N, n); counts: (N, n), independent measurements that a
-    torque stands for; friction: (N, n, f n), its features; centre, scale: (k,), μ and s of w; unit: (k,), s before any
-    samples, of friction the joint's torque; noise: (n,), where its prior lies; floor: (n,), the smallest admitted;
-    expected: prior of the geometry, None where it is fixed; scale_width: prior width of what the logarithms of s are
-    made of, but for friction's.
-    """
+    """Samples, with the prior of the arm that is learnt from them."""
 
     motions: Array
+    """q, dq and ddq from base to tip, (N, 3, n)."""
     tau: Array
+    """Torques, (N, n) N·m."""
     counts: Array
+    """Independent measurements that each torque represents, (N, n)."""
     friction: Array
+    """Features of friction, (N, n, f n)."""
     centre: Array
+    """μ, prior mean of w, (k,)."""
     scale: Array
+    """s, prior standard deviations of w, (k,)."""
     unit: Array
+    """s before any samples, (k,); that of friction is the joint's torque."""
     noise: Array
+    """Prior median of the noise, (n,) N·m."""
     floor: Array
-    expected: Expected | None
+    """Min noise, (n,) N·m."""
+    expected: GeometryPrior | None
+    """Prior of the geometry, None if it is fixed."""
     scale_width: float = WIDTHS.scale
+    """Prior standard deviation of the parts of the logarithms of s, except those of friction."""
 
     @property
     def n_joints(self) -> int:
@@ -108,22 +115,25 @@ class Problem:
 
     @property
     def bodies(self) -> int:
-        """Number of the weights of masses and rotors, which come before those of friction."""
+        """Number of weights of masses and rotors, which come before those of friction."""
         return (PARAMETERS + 1) * self.n_joints
 
     @property
     def friction_terms(self) -> int:
-        """Terms of a joint's friction: f = 3, or 4 with more friction at low speed."""
+        """Terms of a joint's friction: f = 3, or 4 with additional friction at low speed."""
         return int(self.friction.shape[2]) // self.n_joints
 
     def rows(self, rows: Indices) -> Problem:
-        """The same with some of the samples. rows: their indices, or (N,) whether each is kept."""
+        """Return the same problem with some of the samples. rows: indices, or a mask (N,)."""
         kept = {name: getattr(self, name)[rows] for name in ("motions", "tau", "counts", "friction")}
         return replace(self, **kept)
 
     def recombined(self, count: int) -> Problem:
-        """At most `count` motions whose position, velocity and acceleration are those of three samples, without torque:
-        they lie where the robot has been, but were never seen."""
+        """Return a problem of at most `count` recombined motions, without torque.
+
+        Position, velocity and acceleration of a motion are those of three samples. It is in the range of the samples,
+        but new.
+        """
         rng, size = np.random.default_rng(0), min(count, len(self.tau))
         rows = rng.integers(len(self.tau), size=(3, size))
         motions = np.stack([self.motions[rows[part], part] for part in range(3)], axis=1)
@@ -133,20 +143,20 @@ class Problem:
         )
 
     def mean(self, point: Point) -> Array:
-        """The most likely torque of a point at these samples, (N, n) N·m."""
+        """Return the most likely torque of a point at these samples, (N, n) N·m."""
         return np.asarray(self.features(point.geometry) @ (self.weights(point) / self.scale))
 
     def weights(self, point: Point) -> Array:
-        """The most likely w of a point, in SI units: (k,)."""
+        """Return the most likely w of a point, (k,), in SI units."""
         return self.centre + point.weights * self.scale
 
     def parameters(self, point: Point) -> Array:
-        """Inertial parameters π of a point: (n, 10)."""
+        """Return the inertial parameters π of a point, (n, 10)."""
         n = self.n_joints
         return np.ascontiguousarray(self.weights(point)[: PARAMETERS * n].reshape(n, PARAMETERS))
 
     def features(self, geometry: Geometry) -> Array:
-        """Features Φ of w at a geometry, in units of s: (N, n, k) (eq. 12 of docs/method.md)."""
+        """Return the features Φ of w at a geometry, in units of s, (N, n, k) (eq. 12 of docs/method.md)."""
         size, n = self.tau.shape
         out = np.empty((size, n, len(self.scale)))
         masses = np.empty((size, PARAMETERS * n, n))
@@ -159,7 +169,7 @@ class Problem:
         return out
 
     def shapes(self, point: Point) -> Array:
-        """J = ∂(Y π)/∂θ at a point: (N, n, g), g = 0 where the geometry is fixed."""
+        """Return J = ∂(Y π)/∂θ at a point, (N, n, g); g = 0 if the geometry is fixed."""
         n = self.n_joints
         geometry = point.geometry
         out = np.empty((len(self.tau), geometry.size if self.expected is not None else 0, n))
@@ -170,10 +180,9 @@ class Problem:
         return out.transpose(0, 2, 1)
 
     def at(self, geometry: Geometry, sigma: Array, features: Array | None = None) -> Point:
-        """The evidence of a geometry and of a noise (eq. 18 of docs/method.md), with its priors.
+        """Return the point of a geometry and a noise, with its evidence and priors (eq. 18 of docs/method.md).
 
-        sigma: (n,) N·m; features: those of `features`, where they are known. Raise LinAlgError where it cannot be
-        computed.
+        sigma: (n,) N·m; features: result of `features`, if known. Raise LinAlgError if the evidence cannot be computed.
         """
         features = self.features(geometry) if features is None else features
         scaled, target = self._scaled(features, sigma)
@@ -181,7 +190,7 @@ class Problem:
         precision.flat[:: len(precision) + 1] += 1.0
         lower = root_of(precision)
         weights = cho_solve((lower, True), scaled.T @ target, check_finite=False)
-        left = target - scaled @ weights  # (not target² − …: where the noise is small, that leaves no digit)
+        left = target - scaled @ weights  # target² − … would lose all digits if the noise is small
         value = 0.5 * (left @ left + weights @ weights) + np.log(lower.diagonal()).sum()
         value += self.counts.sum(0) @ np.log(sigma)
         value += 0.0 if self.expected is None else self.expected.value(geometry)
@@ -189,20 +198,23 @@ class Problem:
         return Point(geometry, sigma, float(value), weights, features, lower)
 
     def laplace(self, point: Point) -> float:
-        """−log p(τ | σ), nats, of all geometries near a point: its value and half the log determinant of what is left
-        of the precision of θ once w is integrated out, without the prior's own constant."""
+        """Return −log p(τ | σ), nats, of all geometries near a point.
+
+        It is the point's value plus half the log determinant of the precision of θ after w is integrated out. The
+        constant of the prior is not included.
+        """
         hessian, _, k = self.normal(point)
-        roots = root_of(hessian).diagonal()  # those of w come first
+        roots = root_of(hessian).diagonal()  # w comes first
         return point.value + float(np.log(roots[k:]).sum())
 
     def residual(self, point: Point) -> Array:
-        """What a point leaves of the torque: (N, n) N·m."""
+        """Return the residual torque of a point, (N, n) N·m."""
         return self.tau - point.features @ (self.weights(point) / self.scale)
 
     def with_noise(self, point: Point) -> Point:
-        """Return the point with the noise of its residuals: their squares over the degrees of freedom that are left.
+        """Return the point with the noise of its residuals: their squares divided by the remaining degrees of freedom.
 
-        Every row tells of the noise, however few of them are independent: errors that last are as large as others.
+        Every row counts, even if few of them are independent: lasting errors are as large as others.
         """
         size, n = self.tau.shape
         scaled, _ = self._scaled(point.features, point.sigma)
@@ -221,12 +233,12 @@ class Problem:
         stop: Callable[[], bool] | None = None,
         noise: bool = True,
     ) -> Point:
-        """The optimum that a geometry leads to; `noise`: the noise is estimated on the way.
+        """Return the local optimum from a geometry. `noise`: whether to estimate the noise too.
 
-        stop: asked at every step. Raise LinAlgError where the evidence cannot be computed.
+        stop: called at every step. Raise LinAlgError if the evidence cannot be computed.
         """
         point, damping = self.at(start, sigma), 1e-2
-        largest = np.where(start.turns, 0.5, 0.3)  # rad and m: beyond, the linearisation says nothing
+        largest = np.where(start.turns, 0.5, 0.3)  # rad and m; the linearisation is not valid beyond
         for iteration in range(iterations):
             before = point.value
             hessian, gradient, k = self.normal(point)
@@ -251,13 +263,13 @@ class Problem:
         return point
 
     def all_features(self, point: Point) -> Array:
-        """Features of (w, θ) around a point at these samples, those of w in units of s: (N, n, k + g)."""
+        """Return the features of (w, θ) around a point at these samples, those of w in units of s, (N, n, k + g)."""
         return np.concatenate([self.features(point.geometry), self.shapes(point)], axis=2)
 
     def normal(self, point: Point) -> tuple[Array, Array, int]:
-        """Normal equations of (w, θ), undamped (eq. 19 of docs/method.md).
+        """Return the undamped normal equations of (w, θ) (eq. 19 of docs/method.md).
 
-        Return the precision (k + g, k + g), the right-hand side (k + g,), and k, where θ begins.
+        They are the precision (k + g, k + g), the right-hand side (k + g,), and k, where θ begins.
         """
         k = len(self.scale)
         both = np.concatenate([point.features, self.shapes(point)], axis=2)
@@ -274,7 +286,7 @@ class Problem:
         return hessian, gradient, k
 
     def _scaled(self, features: Array, sigma: Array) -> tuple[Array, Array]:
-        """Features (N n, …) and the torque that μ leaves, (N n,), in units of the noise."""
+        """Return the features (N n, …) and the torque minus that of μ, (N n,), in units of the noise."""
         weight = np.sqrt(self.counts) / sigma
         target = self.tau
         if np.any(self.centre):
@@ -285,9 +297,9 @@ class Problem:
 
 
 def root_of(precision: Array) -> Array:
-    """Lower L, L Lᵀ = precision, of a matrix whose eigenvalues are one at least: a Gram matrix plus the prior's part.
+    """Return lower L with L Lᵀ = precision, for eigenvalues of at least one: a Gram matrix plus the prior's part.
 
-    Rounding may make some of them negative, where noise is small and features are alike: those are taken for one.
+    Rounding may make some of them negative, if noise is small and features are similar. These are replaced by one.
     Raise LinAlgError for numbers that are not finite.
     """
     lower, failed = lapack.dpotrf(precision, lower=1)

@@ -1,8 +1,9 @@
-"""Arms as they are built: axes at right angles to each other, at the zero pose and up to a turn about the vertical.
+"""Arms as they are built: axes at right angles to each other, in the zero pose and up to a turn about the vertical.
 
-Of an axis that a recording leaves open, one of six directions is far more likely than any other. A *layout* names for
-each joint the direction of its axis, or none. Given a layout the axes are expected near it, the free
-ones anywhere; layouts are weighed by their evidence, with the geometry integrated out.
+If a recording does not identify the direction of an axis, one of six directions is far more likely than any other. A
+*layout* contains for each joint the direction of its axis, or None. Given a layout, the prior of these axes is near
+their directions, and that of free axes is anywhere. Layouts are weighed by their evidence, with the geometry integrated
+out.
 """
 
 from __future__ import annotations
@@ -13,48 +14,51 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from lipcore.arm.problem import WIDTHS, Expected, Point, Problem
+from lipcore.arm.problem import WIDTHS, GeometryPrior, Point, Problem
 from lipcore.data.samples import Array
-from lipcore.kernels.geometry import Geometry, aligned, rotation_of
+from lipcore.kernels.geometry import Geometry, rotation_of, rotation_to_axis
 
 DIRECTIONS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]], np.float64)
 TYPICAL_LAYOUTS = {7: ("zyzyzyz", "zyzYzyz"), 6: ("zyyxyx", "zyyyzy")}
-"""Axes of common arms at their zero pose, base to tip; capitals point backwards."""
+"""Axes of common arms in their zero pose, base to tip; capitals are negative directions."""
 
 
 @dataclass(frozen=True)
 class LayoutOptions:
-    """How near axes are to right angles, and how layouts are searched for."""
+    """Tolerance of right angles, and effort of the search for layouts."""
 
     turn_width_rad: float = 0.01
     """Standard deviation of an axis from its right angle."""
     near_rad: float = float(np.radians(12.0))
-    """An axis within this angle of a direction is put there at once."""
+    """Max angle between an axis and a direction, at which the axis is set to it at once."""
     right_share: float = 0.9
     """Share of all axes that are built at right angles."""
     rows: int = 80
-    """Rows of a problem that layouts are compared on."""
+    """Rows of a problem on which layouts are compared."""
     steps: int = 5
     """Steps of each descent."""
     max_kept: int = 3
     max_improved: int = 2
     max_sweeps: int = 3
-    """Max number of layouts that are kept, of those that are improved, and of times that all joints are tried."""
+    """Max number of layouts that are kept, of layouts that are improved, and of passes over all joints."""
     near_nats: float = 7.0
-    """A candidate that is this much less likely than the best counts for a thousandth."""
+    """Difference from the best candidate at which a candidate has a thousandth of its probability."""
     min_gain_nats: float = 1.0
-    """Min gain of a sweep after which another one follows."""
+    """Min gain of a pass over all joints that is followed by another one."""
 
 
 OPTIONS = LayoutOptions()
 
 Layout = tuple[int | None, ...]
-"""For each joint, base to tip, the row of DIRECTIONS that its axis points to, or None for a free axis."""
+"""For each joint, base to tip, the row of DIRECTIONS of its axis, or None for a free axis."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A geometry under a layout. evidence: −log, nats, with the geometry integrated out and the layout's own share."""
+    """A geometry under a layout.
+
+    evidence: −log, nats, with the geometry integrated out and the probability of the layout included.
+    """
 
     layout: Layout
     problem: Problem
@@ -63,9 +67,9 @@ class Candidate:
 
 
 def weigh(problem: Problem, point: Point, layout: Layout) -> Candidate:
-    """Weigh a point of a problem under a layout.
+    """Return a candidate for a point of a problem under a layout.
 
-    A geometry that is fixed has nothing to integrate out. Raise LinAlgError if the evidence cannot be computed.
+    A fixed geometry is not integrated out. Raise LinAlgError if the evidence cannot be computed.
     """
     if problem.expected is None:
         return Candidate(layout, problem, point, point.value)
@@ -83,11 +87,11 @@ def likely_layouts(
     known: Sequence[Geometry] = (),
     stop: Callable[[], bool] | None = None,
 ) -> list[Candidate]:
-    """Return the layouts that are more likely than the first of some optima is without one: `max_kept` at most.
+    """Return at most `max_kept` layouts that are more likely than the first of some optima without a layout.
 
-    They are compared on few rows of the problem, which count for all. A search starts at the optima, with the axes that
-    lie near a direction put there, at known geometries, and at TYPICAL_LAYOUTS. The best of these are improved: each
-    joint in turn is tried in all directions, `max_sweeps` times at most, until that gains nothing.
+    They are compared on few rows of the problem, weighted for all rows. A search starts at the optima, with axes near a
+    direction set to it, at known geometries, and at TYPICAL_LAYOUTS. The best of these are improved: each joint in turn
+    is tried in all directions, until a pass gains nothing or after `max_sweeps` passes.
     """
     rows = np.unique(np.linspace(0, len(problem.tau) - 1, OPTIONS.rows).round().astype(np.int64))
     few = problem.rows(rows)
@@ -112,7 +116,7 @@ def likely_layouts(
 
 @dataclass
 class _Search:
-    """The layouts that were tried on some rows, with a noise of sigma, (n,) N·m."""
+    """The layouts tried on some rows, with a noise of sigma, (n,) N·m."""
 
     problem: Problem
     sigma: Array
@@ -120,9 +124,9 @@ class _Search:
     found: dict[Layout, Candidate] = field(default_factory=dict)
 
     def settle(self, geometry: Geometry, layout: Layout) -> Candidate:
-        """Return the optimum of a layout, to which a geometry leads the first time."""
+        """Return the optimum of a layout. The first call determines it, from a geometry."""
         if layout not in self.found:
-            start = laid_out(geometry, layout)
+            start = apply_layout(geometry, layout)
             posed = replace(self.problem, expected=expected_layout(start, layout))
             try:
                 end = weigh(posed, posed.descend(start, self.sigma, OPTIONS.steps, noise=False), layout)
@@ -132,15 +136,15 @@ class _Search:
         return self.found[layout]
 
     def nearest(self, geometry: Geometry, within: float) -> Candidate:
-        """Put the axes of a geometry that lie within an angle of a direction there, rad."""
-        turned, off = _turned(geometry)
+        """Return the optimum after axes within an angle of a direction are set to it. within: rad."""
+        turned, off = _turn_upright(geometry)
         nearest = (DIRECTIONS @ _axes(turned).T).argmax(axis=0)
         return self.settle(
             turned, tuple(int(at) if angle < within else None for at, angle in zip(nearest, off, strict=True))
         )
 
     def improve(self, best: Candidate) -> None:
-        """Try each joint in all directions until that gains nothing."""
+        """Try each joint in all directions until a pass gains nothing."""
         for _ in range(OPTIONS.max_sweeps):
             before = best.evidence
             for joint in range(len(best.layout)):
@@ -157,36 +161,36 @@ def _evidence(candidate: Candidate) -> float:
     return candidate.evidence
 
 
-def shares(found: Sequence[Candidate]) -> Array:
+def candidate_probabilities(found: Sequence[Candidate]) -> Array:
     """Return the probabilities of candidates, (K,)."""
     evidence = np.array([each.evidence for each in found])
     odds = np.exp(
         np.maximum(evidence.min() - evidence, -2 * OPTIONS.near_nats)
-    )  # none of zero: a covariance is made of them
+    )  # never zero, because a covariance is computed from them
     return np.asarray(odds / odds.sum())
 
 
-def certainty(found: Sequence[Candidate]) -> Array:
-    """Return how probable it is that each axis lies at right angles, (n,)."""
+def right_angle_probabilities(found: Sequence[Candidate]) -> Array:
+    """Return the probability that each axis is at a right angle, (n,)."""
     snapped = np.array([[direction is not None for direction in each.layout] for each in found])
-    return np.asarray(shares(found) @ snapped)
+    return np.asarray(candidate_probabilities(found) @ snapped)
 
 
-def expected_layout(geometry: Geometry, layout: Layout) -> Expected:
-    """Return what a layout expects around a geometry that has it: axes there, shifts near none."""
+def expected_layout(geometry: Geometry, layout: Layout) -> GeometryPrior:
+    """Return the prior of a layout around a geometry that has it: axes in its directions, shifts near zero."""
     turn = np.array([WIDTHS.angle if each is None else OPTIONS.turn_width_rad for each in layout]).repeat(
         geometry.screws
     )
     around = replace(geometry, translation=np.zeros_like(geometry.translation))
-    return Expected(np.where(geometry.turns, turn, WIDTHS.length), around)
+    return GeometryPrior(np.where(geometry.turns, turn, WIDTHS.length), around)
 
 
-def laid_out(geometry: Geometry, layout: Layout) -> Geometry:
-    """Return the geometry with its axes turned into a layout. The places of all axes and the free ones stay."""
+def apply_layout(geometry: Geometry, layout: Layout) -> Geometry:
+    """Return the geometry with its axes turned into a layout. The places of all axes, and free axes, stay."""
     turns, places = geometry.placements(np.zeros(geometry.n_joints))
     for joint, direction in enumerate(layout):
         if direction is not None:
-            turns[joint] = aligned(DIRECTIONS[direction]) @ aligned(geometry.axis[joint]).T
+            turns[joint] = rotation_to_axis(DIRECTIONS[direction]) @ rotation_to_axis(geometry.axis[joint]).T
     before = np.concatenate([np.eye(3)[None], turns[:-1]])
     rotation = before.mT @ turns
     steps = np.diff(places, axis=0, prepend=np.zeros((1, 3)))
@@ -194,13 +198,13 @@ def laid_out(geometry: Geometry, layout: Layout) -> Geometry:
 
 
 def _axes(geometry: Geometry) -> Array:
-    """Directions of the axes in the base's frame at the zero pose, (n, 3)."""
+    """Return the directions of the axes in the base's frame in the zero pose, (n, 3)."""
     turns, _ = geometry.placements(np.zeros(geometry.n_joints))
     return np.asarray((turns @ geometry.axis[..., None])[..., 0])
 
 
-def _turned(geometry: Geometry) -> tuple[Geometry, Array]:
-    """The arm turned about the vertical so that most axes lie at right angles, and how far off each is, (n,) rad."""
+def _turn_upright(geometry: Geometry) -> tuple[Geometry, Array]:
+    """Return the arm turned about the vertical to put most axes at right angles, and the remaining angles, (n,) rad."""
     axes = _axes(geometry)
     turns = [rotation_of(np.array([0.0, 0.0, yaw])) for yaw in np.radians(np.arange(0.0, 90.0, 0.5))]
     angles = [np.arccos(np.clip((axes @ turn.T @ DIRECTIONS.T).max(axis=1), -1, 1)) for turn in turns]

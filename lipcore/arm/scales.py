@@ -1,14 +1,14 @@
-"""How large masses, rotor inertias and friction are expected to be: what the evidence says.
+"""Prior standard deviations of masses, rotor inertias and friction, by the evidence.
 
-Around an optimum the torque is linear in all unknowns u = (w, θ), so the evidence of prior deviations s,
+Around an optimum the torque is linear in all unknowns u = (w, θ). So the evidence of prior deviations s,
 
     −log p(τ | s) = Σ_j N_j log σ_j + ½ log |I + S A S| + ½ (y − Φ û)ᵀ R⁻¹ (y − Φ û) + ½ |d|²,    û = μ + S d,
 
-costs no more than a factorisation of A = Φᵀ R⁻¹ Φ. The noise σ is held at what residuals say. The logarithm of a body's
-deviation is a sum of one number for the kind of parameter (mass, first moment, inertia) and one for the body, since a
-wrist is lighter than a shoulder; rotors share one number. Each term of each joint's friction has its own, near the mean
-of all joints. Every deviation keeps within limits: where few samples tell nothing, the largest evidence lies at zero or
-at infinity.
+costs no more than a factorisation of A = Φᵀ R⁻¹ Φ. The noise σ is fixed to that of the residuals. The logarithm of a
+body's deviation is a sum of one number for the kind of parameter (mass, first moment, inertia) and one for the body,
+since a wrist is lighter than a shoulder. All rotors share one number. Each friction term of each joint has its own
+number, near the mean of all joints. Every deviation has limits: if few samples do not determine it, the max of the
+evidence is at zero or at infinity.
 """
 
 from __future__ import annotations
@@ -26,20 +26,21 @@ from lipcore.kernels.fast.arm import PARAMETERS
 
 @dataclass(frozen=True)
 class ScaleOptions:
-    """Limits of prior deviations."""
+    """Limits of prior standard deviations."""
 
     max_log_share: float = 2.5
-    """Max size of the logarithm of the shares of masses and rotors: a factor of 12 either way."""
+    """Max absolute logarithm of the shares of masses and rotors: a factor of 12 either way."""
     min_friction_share: float = 0.1
-    """Min deviation of a friction torque, as a share of its joint's root mean square torque, which is the max."""
+    """Min standard deviation of a friction torque, as a share of its joint's root mean square torque, which is the
+    max."""
     pooling_width: float = 0.7
-    """Prior width of the logarithm of a joint's friction deviation around the mean of all joints."""
+    """Prior standard deviation of the logarithm of a joint's friction deviation around the mean of all joints."""
     min_count: float = 40.0
-    """Min measurements of a joint in the evidence of deviations, however few rows of a recording are independent.
+    """Min measurements of a joint in the evidence of deviations, even if fewer rows of a recording are independent.
 
-    With few measurements friction and masses seem to be zero and count as noise; with all rows masses follow lasting
-    errors. Tuned on recordings of seven arms, each left out in turn: with a URDF 30 and 60 differ by 2 %, and no such
-    limit is 25 % worse (geometric mean of nMSE); without a URDF all three are within 8 %.
+    With few measurements, friction and masses appear to be zero and count as noise. With all rows, masses follow
+    lasting errors. Tuned on recordings of seven arms, each held out in turn: with a URDF, 30 and 60 differ by 2 %, and
+    no such limit is 25 % worse (geometric mean of nMSE). Without a URDF all three are within 8 %.
     """
 
 
@@ -48,19 +49,21 @@ BODY_KINDS = 3
 
 
 @dataclass(frozen=True)
-class Scaled:
-    """problem: with the deviations of largest evidence; point: the same geometry with them and with the noise of its
-    residuals; value: −log evidence of the deviations, nats."""
+class ScaleFit:
+    """Result of `rescale`."""
 
     problem: Problem
+    """The problem with the deviations of max evidence."""
     point: Point
+    """The same geometry with these deviations, and with the noise of its residuals."""
     value: float
+    """−log evidence of the deviations, nats."""
 
 
-def rescale(problem: Problem, point: Point) -> Scaled:
+def rescale(problem: Problem, point: Point) -> ScaleFit:
     """Maximise the evidence over prior deviations around a point (eq. 20 of docs/method.md).
 
-    Raise LinAlgError where there is no evidence.
+    Raise LinAlgError if the evidence cannot be computed.
     """
     from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
 
@@ -84,34 +87,39 @@ def rescale(problem: Problem, point: Point) -> Scaled:
     start = np.clip(start, *np.transpose(bounds))
     best = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 60})
     problem = replace(problem, scale=problem.unit * np.exp(parts @ best.x))
-    return Scaled(problem, problem.with_noise(problem.at(point.geometry, point.sigma)), float(best.fun))
+    return ScaleFit(problem, problem.with_noise(problem.at(point.geometry, point.sigma)), float(best.fun))
 
 
-def tempered(counts: Array) -> Array:
-    """Counts with which torques enter the evidence of deviations: at least `min_count` of a joint on average."""
+def raise_counts(counts: Array) -> Array:
+    """Return the weights of torques in the evidence of deviations: at least `min_count` per joint on average."""
     return np.asarray(counts * max(1.0, OPTIONS.min_count / float(counts.sum(0).mean())))
 
 
 @dataclass(frozen=True)
 class _Evidence:
-    """Sums over samples in units of the noise: the Gram matrix (k + g, k + g) and right-hand side of all features, and
-    Σ τ²; log_noise: Σ N_j log σ_j; mean and deviations of the prior, (k + g,), the first `scaled` of which are units.
-    """
+    """Evidence of prior deviations, from sums over samples in units of the noise."""
 
     gram: Array
+    """Gram matrix of all features, (k + g, k + g)."""
     right: Array
+    """Right-hand side, (k + g,)."""
     squares: float
+    """Σ τ²."""
     log_noise: float
+    """Σ N_j log σ_j."""
     mean: Array
+    """Prior mean, (k + g,)."""
     std: Array
+    """Prior standard deviations, (k + g,)."""
     scaled: int
+    """Number of the first standard deviations, which `log_factor` scales."""
 
     @classmethod
     def around(cls, problem: Problem, point: Point) -> _Evidence:
         both = np.concatenate([point.features / problem.scale, problem.shapes(point)], axis=2)
         steps = np.zeros(0) if problem.expected is None else problem.expected.step(point.geometry)
         widths = np.zeros(0) if problem.expected is None else problem.expected.widths
-        counts = tempered(problem.counts)
+        counts = raise_counts(problem.counts)
         weight = np.sqrt(counts) / point.sigma
         flat, target = (both * weight[:, :, None]).reshape(-1, both.shape[2]), (problem.tau * weight).reshape(-1)
         return cls(
@@ -125,9 +133,9 @@ class _Evidence:
         )
 
     def __call__(self, log_factor: Array) -> tuple[float, Array]:
-        """−log evidence and its derivatives by the logarithms of the scaled deviations, (k,).
+        """Return −log evidence and its derivatives by the logarithms of the scaled deviations, (k,).
 
-        log_factor: (k,), of the deviations over those of unit weights.
+        log_factor: (k,), logarithm of the deviations relative to those of unit weights.
         """
         std = self.std.copy()
         std[: self.scaled] *= np.exp(log_factor)
@@ -144,7 +152,7 @@ class _Evidence:
 
 
 def _parts(n: int, k: int) -> Array:
-    """Which numbers each deviation's logarithm is the sum of: (k, 3 + n + 1 + friction's weights)."""
+    """Return the matrix of the numbers that sum to each deviation's logarithm, (k, 3 + n + 1 + friction's weights)."""
     first = (PARAMETERS + 1) * n
     out = np.zeros((k, BODY_KINDS + n + 1 + k - first))
     for body in range(n):

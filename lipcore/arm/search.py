@@ -14,59 +14,61 @@ from numpy.linalg import LinAlgError
 from lipcore.arm.problem import Point, Problem
 from lipcore.data.samples import Array
 from lipcore.extras import MissingExtraError
-from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of
-from lipcore.robots.library import ROBOTS, installed_profiles
+from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, rotation_of, rotation_to_axis
+from lipcore.robots.library import ROBOTS, list_installed_robots
 from lipcore.robots.urdf import JointMismatchError, RigidBody
 from lipcore.robots.urdf_text import UrdfError
 from lipcore.vocabulary import JointType
 
-RIGHT_ANGLED = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], np.float64)
+RIGHT_ANGLE_DIRECTIONS = np.array([[0, 0, 1], [0, 0, -1], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]], np.float64)
 
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How arms are drawn, and how long and from where the search goes on."""
+    """Distribution of random arms, and effort of the search."""
 
     direction_shares: tuple[float, ...] = (0.25, 0.05, 0.175, 0.175, 0.175, 0.175)
-    """Shares of axes that point as the one before, point back, or lie across it, in the order of `RIGHT_ANGLED`."""
+    """Shares of axes parallel to the one before, antiparallel or across it, ordered as `RIGHT_ANGLE_DIRECTIONS`."""
     upright_share: float = 0.5
     """Share of arms whose first axis is upright."""
     right_base_share: float = 0.7
-    """Share of arms whose first axis is upright, upside down or level."""
+    """Share of arms with the first axis upright, upside down or horizontal."""
     across_m: float = 0.2
     along_m: float = 0.3
-    """Widths of the next axis' place, across and along the one before."""
+    """Standard deviations of the next axis' place, across and along the one before."""
     screened: int = 400
-    """Random arms whose evidence is computed."""
+    """Random arms with a computed evidence."""
     starts: int = 20
-    """Best of the random arms, which the search starts from."""
+    """Number of the best random arms that the search starts from."""
     max_idle: int = 60
     max_idle_at_noise: int = 15
-    """Max successive hops without a gain: while residuals exceed the sensor's noise, and once they do not."""
+    """Max successive hops without a gain: while residuals exceed the sensor's noise, and when they no longer do."""
     explained_ratio: float = 1.3
-    """Residuals up to this many times the sensor's noise are explained."""
+    """Max ratio of explained residuals to the sensor's noise."""
     min_gain_nats: float = 1.0
     """Min improvement that counts as a gain."""
     same_nats: float = 0.5
     same_noise: float = 3.0
     check_motions: int = 40
-    """Two optima are the same within this many nats, and within this many noise levels of torque at these motions."""
+    """Two optima are the same if they differ by at most this many nats, and by this many noise levels of torque at
+    these motions."""
     max_kept: int = 6
     """Max number of optima that are kept."""
     steps: int = 25
     """Max steps of a descent."""
     hop_noise: float = 3.0
     min_hop_noise_share: float = 0.02
-    """Noise that a hop starts with: this many times the optimum's, at least this share of the torque's spread."""
+    """Noise at the start of a hop: this many times that of the optimum, and at least this share of the torque's
+    spread."""
     rank_scale: float = 1.5
-    """A hop starts at an optimum whose rank is drawn from an exponential distribution of this scale."""
+    """Scale of the exponential distribution of the rank of the optimum that a hop starts from."""
 
 
 OPTIONS = SearchOptions()
 
 
 def draw(rng: np.random.Generator, joint_types: tuple[JointType, ...], gravity: bool) -> Geometry:
-    """A random arm with right angles, its first axis mostly upright, sometimes any way.
+    """Return a random arm with right angles, its first axis mostly upright, sometimes in any direction.
 
     joint_types: (n,), base to tip; gravity: whether torques contain it.
     """
@@ -75,13 +77,13 @@ def draw(rng: np.random.Generator, joint_types: tuple[JointType, ...], gravity: 
     for j in range(n):
         kind = rng.uniform()
         if j or kind >= OPTIONS.upright_share:
-            direction = RIGHT_ANGLED[rng.choice(6, p=OPTIONS.direction_shares)]
+            direction = RIGHT_ANGLE_DIRECTIONS[rng.choice(6, p=OPTIONS.direction_shares)]
             if not j:
-                direction = RIGHT_ANGLED[rng.integers(6)] if kind < OPTIONS.right_base_share else _unit(rng)
+                direction = RIGHT_ANGLE_DIRECTIONS[rng.integers(6)] if kind < OPTIONS.right_base_share else _unit(rng)
         else:
-            direction = RIGHT_ANGLED[0]
-        rotation[j] = aligned(direction) @ rotation_of(np.array([0.0, 0.0, rng.integers(4) * np.pi / 2]))
-        if not j:  # where the first joint's zero lies relative to a tilt, nobody knows
+            direction = RIGHT_ANGLE_DIRECTIONS[0]
+        rotation[j] = rotation_to_axis(direction) @ rotation_of(np.array([0.0, 0.0, rng.integers(4) * np.pi / 2]))
+        if not j:  # the zero of the first joint relative to a tilt is unknown
             rotation[j] = rotation[j] @ rotation_of(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
         elif joint_types[j] == "revolute":
             translation[j] = rng.normal(0, [OPTIONS.across_m, OPTIONS.across_m, OPTIONS.along_m])
@@ -90,32 +92,32 @@ def draw(rng: np.random.Generator, joint_types: tuple[JointType, ...], gravity: 
 
 
 def hop(rng: np.random.Generator, geometry: Geometry) -> Geometry:
-    """Another arm near an optimum: one or two joints turned, mirrored, reversed, moved, shaken or drawn anew."""
+    """Return another arm near an optimum: one or two joints turned, mirrored, reversed, moved, perturbed or redrawn."""
     rotation, translation, n = geometry.rotation.copy(), geometry.translation.copy(), geometry.n_joints
     for j in rng.choice(n, min(int(rng.integers(1, 3)), n), replace=False):
         axis, kind = geometry.axis[j], rng.integers(7)
-        if kind == 0:  # all that follows, by a quarter or half about this axis
+        if kind == 0:  # turns the rest of the arm by a quarter or half about this axis
             rotation[j] = rotation[j] @ rotation_of(axis * rng.choice([0.5, 1.0, -0.5]) * np.pi)
-        elif kind == 1:  # a right angle
-            rotation[j] = aligned(RIGHT_ANGLED[rng.integers(6)]) @ aligned(axis).T
-        elif kind == 2:  # mirrored about the axis before
+        elif kind == 1:  # sets the axis to a right angle
+            rotation[j] = rotation_to_axis(RIGHT_ANGLE_DIRECTIONS[rng.integers(6)]) @ rotation_to_axis(axis).T
+        elif kind == 2:  # mirrors the joint about the axis before
             half = rotation_of(np.pi * (geometry.axis[j - 1] if j else np.array([0.0, 0.0, 1.0])))
             rotation[j] = half @ rotation[j] @ half
-        elif kind == 3:  # anew
-            rotation[j] = aligned(_unit(rng)) @ rotation_of(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
+        elif kind == 3:  # draws the joint again
+            rotation[j] = rotation_to_axis(_unit(rng)) @ rotation_of(np.array([0.0, 0.0, rng.uniform(-np.pi, np.pi)]))
             translation[j] = rng.normal(0, OPTIONS.along_m, 3)
-        elif kind == 4:  # to the other side
+        elif kind == 4:  # moves the joint to the other side
             translation[j] = -translation[j]
-        elif kind == 5:  # the other sense of turning
+        elif kind == 5:  # reverses the direction of rotation
             rotation[j] = rotation[j] @ rotation_of(np.pi * geometry.across[j, rng.integers(2)])
-        else:  # a little
+        else:  # perturbs the joint
             rotation[j] = rotation[j] @ rotation_of(rng.normal(0, 0.5, 3))
             translation[j] = translation[j] + rng.normal(0, OPTIONS.across_m, 3)
     return replace(geometry, rotation=rotation, translation=translation).canonical()
 
 
 def weight(gravity: bool) -> Array:
-    """Gravity in the base's frame, or none."""
+    """Return gravity in the base's frame, or zero, (3,) m/s²."""
     return np.array([0.0, 0.0, -STANDARD_GRAVITY if gravity else 0.0])
 
 
@@ -126,13 +128,13 @@ def _unit(rng: np.random.Generator) -> Array:
 
 @lru_cache(maxsize=16)
 def known_geometries(joint_types: tuple[JointType, ...], gravity: bool) -> tuple[Geometry, ...]:
-    """Geometries of the robots of ROBOTS with these joints from base to tip; none where no URDFs are installed.
+    """Return the geometries of the robots of ROBOTS with these joints; empty if no URDFs are installed.
 
-    joint_types: (n,), from base to tip; gravity: whether torques contain it. A robot that is no serial arm of such
-    joints is left out.
+    joint_types: (n,), from base to tip; gravity: whether torques contain it. Robots that are no serial arm of such
+    joints are skipped.
     """
     geometries = []
-    for name in installed_profiles():
+    for name in list_installed_robots():
         joints = ROBOTS[name].free
         if len(joints) == len(joint_types):
             with suppress(JointMismatchError, UrdfError, MissingExtraError):
@@ -142,21 +144,24 @@ def known_geometries(joint_types: tuple[JointType, ...], gravity: bool) -> tuple
 
 @dataclass(frozen=True)
 class SearchResult:
-    """Where a search ended: optima, best first, and how.
-
-    points: distinct optima; starts, hops: descents; distinct: optima seen that differ;
-    times_best: descents that ended in the best; explained: whether its residuals look like the sensor's noise;
-    ended: `idle`, or `time` where the time limit came first; seconds.
-    """
+    """Optima and effort of a search."""
 
     points: tuple[Point, ...]
+    """Distinct optima, the best first."""
     starts: int
+    """Descents from starts."""
     hops: int
+    """Descents from hops."""
     distinct: int
+    """Number of distinct optima found."""
     times_best: int
+    """Descents that ended in the best optimum."""
     explained: bool
+    """Whether the residuals of the best optimum are at the level of the sensor's noise."""
     ended: str
+    """`idle`, or `time` if the time limit was reached first."""
     seconds: float
+    """Duration, s."""
 
 
 def search(
@@ -169,11 +174,11 @@ def search(
     known: Sequence[Geometry] = (),
     step: Callable[[float, float], None] | None = None,
 ) -> SearchResult:
-    """Find the geometry of the best evidence; `problem` holds few rows, some eighty.
+    """Return the geometries of the best evidence. `problem` contains few rows, some eighty.
 
-    sensor_noise: (n,) N·m, what the signals say of their white noise; seconds: time limit; known: geometries to begin
-    from, too; step: called with the best value and the fraction of the work after each descent, may raise to end it.
-    Raise LinAlgError where no start has an evidence.
+    sensor_noise: (n,) N·m, white noise of the signals; seconds: time limit; known: additional start geometries; step:
+    called with the best value and the fraction of the work after each descent, may raise to end the search. Raise
+    LinAlgError if the evidence of no start can be computed.
     """
     rng = np.random.default_rng(seed)
     pool = Pool(problem.recombined(OPTIONS.check_motions))
@@ -181,7 +186,7 @@ def search(
     wide = 0.3 * spread + problem.floor
     drawn = [draw(rng, joint_types, gravity) for _ in range(OPTIONS.screened)]
     with suppress(LinAlgError):
-        problem.descend(drawn[0], wide, 1)  # compiles what is not compiled yet: that is none of the search's time
+        problem.descend(drawn[0], wide, 1)  # compiles missing code, which must not count as search time
     began = time.monotonic()
     ranked = sorted(drawn, key=lambda each: _value(problem, each, wide))
     begin = [*known, *ranked[: OPTIONS.starts]]
@@ -231,7 +236,10 @@ def search(
 
 
 class Pool:
-    """Distinct optima, best first: they differ in evidence or, at `checks`, in torque. Mirror images are one."""
+    """Distinct optima, the best first.
+
+    They differ in evidence or, at `checks`, in torque. Mirror images are one optimum.
+    """
 
     def __init__(self, checks: Problem) -> None:
         self.checks = checks
@@ -248,11 +256,11 @@ class Pool:
 
     @property
     def descents(self) -> int:
-        """How many were made."""
+        """Number of descents."""
         return len(self.ends) + self.failed
 
     def add(self, point: Point) -> None:
-        """Take in the end of a descent, unless a better one of the same arm is there."""
+        """Add the end of a descent, unless a better optimum of the same arm exists."""
         self.ends.append(point.value)
         torque = self.checks.mean(point)
         for place, (other, its) in enumerate(zip(self.points, self.torques, strict=True)):
@@ -268,7 +276,7 @@ class Pool:
         self._keep(None, point, torque)
 
     def _keep(self, place: int | None, point: Point, torque: Array) -> None:
-        """Take a point in, in the place of another one or beside all."""
+        """Insert a point, replacing another one if `place` is given."""
         pairs = [*zip(self.points, self.torques, strict=True)]
         if place is not None:
             del pairs[place]

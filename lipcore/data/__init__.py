@@ -1,1 +1,1 @@
-"""Samples of motion and torque: how many count, how they are split, and how a model is judged by them."""
+"""Samples of motion and torque, their splits, and the metrics of a model on them."""

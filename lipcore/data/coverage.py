@@ -1,4 +1,4 @@
-"""How far a coverage is known: neighbouring errors tell the same, and 85 % of ten is not 85 % of a thousand."""
+"""The confidence interval of a coverage. Neighbouring errors are correlated, so N rows are fewer effective samples."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import betaincinv
 
-from lipcore.data.metrics import LEVEL, Answer
+from lipcore.data.metrics import LEVEL, TorqueDistribution
 from lipcore.data.samples import Array, Samples
 
 
 @dataclass(frozen=True)
 class CoverageInterval:
-    """Each (n,), one number a joint. independent: errors that the coverage of the 95 % interval of torque stands on;
-    low, high: the confidence interval of that coverage, of probability LEVEL."""
+    """Confidence interval of the coverage of the 95 % interval of torque, of probability LEVEL. Each array is (n,)."""
 
     independent: Array
+    """Number of effective samples."""
     low: Array
     high: Array
 
-    def below(self, coverage: float) -> Array:
-        """Whether the true coverage is lower than this one, as far as so few errors can tell: (n,)."""
+    def is_below(self, coverage: float) -> Array:
+        """Return whether the true coverage is below `coverage`, with confidence: (n,)."""
         return np.asarray(self.high < coverage)
 
 
-def coverage_interval(samples: Samples, answer: Answer) -> CoverageInterval:
-    """How far the coverage of the 95 % interval is known from samples (N, n) in order of time, N >= 1.
+def coverage_interval(samples: Samples, answer: TorqueDistribution) -> CoverageInterval:
+    """Return the confidence interval of the coverage on samples (N, n) in order of time, N >= 1.
 
-    N rows count for N / τ errors, τ the larger of the correlation times of the errors, in their standard deviations,
-    and of whether the interval holds them.
+    N rows are N / τ effective samples. τ is the larger of two correlation times, in rows: of the errors divided by
+    their standard deviations, and of whether the interval contains them.
     """
-    error, inside = (samples.tau - answer.mean) / answer.spread, answer.holds(samples.tau)
+    error, inside = (samples.tau - answer.mean) / answer.spread, answer.contains(samples.tau)
     runs = _runs(samples)
     independent = np.array(
         [
@@ -46,24 +46,24 @@ def coverage_interval(samples: Samples, answer: Answer) -> CoverageInterval:
 
 
 def clopper_pearson(share: Array, count: Array) -> tuple[Array, Array]:
-    """Confidence interval of a probability of which a `share` of `count` independent trials came true, (n,) each.
+    """Return the confidence interval of a probability with a `share` of hits in `count` trials, (n,) each.
 
     With k = share · count and α = 1 - LEVEL: the quantiles α/2 of Beta(k, count - k + 1) and 1 - α/2 of
-    Beta(k + 1, count - k) (Clopper and Pearson 1934), also where counts are not integers.
+    Beta(k + 1, count - k) (Clopper and Pearson 1934). Counts need not be integers.
     """
     hits = share * count
     misses, tail = np.maximum(count - hits, 0.0), (1 - LEVEL) / 2
-    some, others = np.maximum(hits, 1e-9), np.maximum(misses, 1e-9)  # where there are none, the bound is known
+    some, others = np.maximum(hits, 1e-9), np.maximum(misses, 1e-9)  # without hits or misses the bound is 0 or 1
     low = np.where(hits > 1e-9, betaincinv(some, misses + 1, tail), 0.0)
     high = np.where(misses > 1e-9, betaincinv(hits + 1, others, 1 - tail), 1.0)
     return low, high
 
 
 def _correlation(values: Array, runs: Sequence[slice]) -> float:
-    """Rows that one independent row of these values (N,) counts for, at least 1: 1 + 2 Σ c_k / c_0.
+    """Return the correlation time of values (N,), in rows, at least 1: 1 + 2 Σ c_k / c_0.
 
-    c_k is the sum of products of values less their mean that are k rows apart in one run, up to the lag at which their
-    mean correlation falls to chance level: for white values below 2/√(pairs).
+    c_k is the sum of products of centred values that are k rows apart in one run. The sum over k ends at the lag at
+    which their mean correlation falls to chance level, which is 2/√(pairs) for white values.
     """
     centred = values - values.mean()
     longest = max(run.stop - run.start for run in runs)
@@ -81,7 +81,10 @@ def _correlation(values: Array, runs: Sequence[slice]) -> float:
 
 
 def _runs(samples: Samples) -> list[slice]:
-    """Rows that follow each other in time, without a step of more than two usual ones; even thinning is no gap."""
+    """Return the runs of rows that follow each other in time, split at steps of more than two usual steps.
+
+    The usual step is the median, so evenly thinned rows form one run.
+    """
     steps = np.diff(samples.t)
     usual = np.median(steps[steps > 0]) if (steps > 0).any() else np.inf
     begins = np.flatnonzero((steps <= 0) | (steps > 2 * usual)) + 1

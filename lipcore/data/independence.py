@@ -1,4 +1,4 @@
-"""How many independent samples and motions there are: rows of a fast stream tell nearly the same."""
+"""Effective samples and independent motions: neighbouring rows of a fast stream are nearly equal."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 
 INDEPENDENT_HZ = 10.0
-"""Rows a second that count as independent.
+"""Effective samples per second.
 
-Measured (`independent_rows.py 2 5` of benchmarks/studies) on a simulated Panda with friction that no estimator
-expresses exactly, after 30 s at 1 kHz: where every row counted in full, 95 % intervals on an unseen trajectory covered
-53 % (slow motion) and 82 % (faster), with nMSE 1.4e-1 and 1.5e-2; at ten rows a second 92 % and 95 %, with 2.7e-2 and
-1.1e-2; at five no more. The best nMSE of the faster motion was 9.3e-3, at fifty.
+Measured with `independent_rows.py 2 5` of benchmarks/studies on a simulated Panda with friction that no estimator
+expresses exactly, after 30 s at 1 kHz. With full weight for every row, 95 % intervals on an unseen trajectory covered
+53 % (slow motion) and 82 % (faster), with nMSE 1.4e-1 and 1.5e-2. At ten rows a second they covered 92 % and 95 %, with
+2.7e-2 and 1.1e-2. Five rows a second covered no more. The best nMSE of the faster motion was 9.3e-3, at fifty.
 """
 
 
 def even_weights(time: Array) -> Array:
-    """Weights of rows that a clock has spaced evenly, whatever a few of their times say: the same for all, (N,).
+    """Return the weights of rows that a clock has spaced evenly: the same for all, (N,), whatever single times are.
 
-    time: (N,) s; not finite where not known. Rows without a spacing count in full.
+    time: (N,) s, not finite if unknown. Rows without a spacing have weight 1.
     """
     steps = np.diff(time[np.isfinite(time)])
     rising = steps[steps > 0]
@@ -28,11 +28,13 @@ def even_weights(time: Array) -> Array:
 
 
 def recording_weights(time: Array, episode: NDArray[np.int64], rate: float = INDEPENDENT_HZ) -> Array:
-    """Weight of each row of a recording, (N,), from 0 to 1: `rate` times the seconds since the row before in its
-    episode, 1 at most; the first of an episode counts as the second does, and a row without a neighbour in full.
+    """Return the weight of each row of a recording, (N,), from 0 to 1.
 
-    time, episode: (N,). A row's weight depends on its neighbours alone: those of a piece are those of the whole, where
-    the piece has one more row at both ends.
+    The weight is `rate` times the seconds since the previous row of its episode, at most 1. The first row of an episode
+    has the weight of the second, and a row without a neighbour has weight 1.
+
+    time, episode: (N,). A weight depends on neighbouring rows only: a piece of a recording has the weights of the whole
+    if the piece has one more row at both ends.
     """
     if not len(time):
         return np.empty(0)
@@ -45,15 +47,15 @@ def recording_weights(time: Array, episode: NDArray[np.int64], rate: float = IND
 
 
 def stream_weights(time: Array, before: float | None = None, rate: float = INDEPENDENT_HZ) -> Array:
-    """Weight of each row, (N,), from 0 to 1: `rate` times the seconds since the row before, 1 at most.
+    """Return the weight of each row of a stream, (N,), from 0 to 1.
 
-    The noise of a sensor may be new every millisecond, but what a model cannot express, such as friction that is not as
-    it should be, is the same for as long as the motion is: a thousand rows of one second are not a thousand witnesses.
-    Counted as such they make a model certain of its own misfit. The sum over a stream is `rate` times its duration,
-    whatever its own rate and however its rows were bunched on their way.
+    The weight is `rate` times the seconds since the previous row, at most 1. A sensor's noise may be new every
+    millisecond, but a model's misfit, such as other friction, lasts as long as the motion. With full weight, a thousand
+    rows of one second would make a model certain of its own misfit. The weights of a stream sum to `rate` times its
+    duration, for any sampling rate and any bunching of its rows.
 
-    time: (N,) event time, s, in the order of the stream; before: that of the row before the first, where known. Rows of
-    one time, as of a batch without times of its own, share the time since then evenly.
+    time: (N,) event time, s, in the order of the stream; before: time of the row before the first, if known. Rows of
+    equal time, as of a batch without times, share the time since then evenly.
     """
     if not len(time):
         return np.empty(0)
@@ -70,10 +72,9 @@ def stream_weights(time: Array, before: float | None = None, rate: float = INDEP
 
 
 def motion_dimensions(dq: Array) -> float:
-    """How many joints' worth of independent motion velocities (N, n) hold: 1 where all move together, n where each
-    moves by itself.
+    """Return the number of independently moving joints in velocities (N, n), from 1, if all move together, to n.
 
-    The participation ratio (Σ λ)² / Σ λ² of their correlation matrix's eigenvalues.
+    This is the participation ratio (Σ λ)² / Σ λ² of the eigenvalues of their correlation matrix.
     """
     spread = dq.std(axis=0)
     moving = spread > 1e-9

@@ -1,4 +1,4 @@
-"""Joint motion: what a torque is a function of."""
+"""Joint motion, the input of a torque model."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def check_finite(name: str, array: NDArray[np.float64]) -> None:
 
 
 def motion_arrays(q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> tuple[Array, Array, Array]:
-    """q, dq and ddq as arrays (N, n); raise ValueError where shapes differ or a value is not finite."""
+    """Return q, dq and ddq as arrays (N, n); raise ValueError if shapes differ or a value is not finite."""
     arrays = []
     for name, values in (("q", q), ("dq", dq), ("ddq", ddq)):
         array = np.atleast_2d(np.asarray(values, dtype=np.float64))
@@ -60,10 +60,7 @@ class Motion:
 
     @classmethod
     def from_arrays(cls, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> Motion:
-        """Build from copies of arrays of shape (N, n) or (n,).
-
-        Raise ValueError where shapes differ or a value is not finite.
-        """
+        """Build from copies of arrays, (N, n) or (n,); raise ValueError if shapes differ or a value is not finite."""
         return cls(*(array.copy() for array in motion_arrays(q, dq, ddq)))
 
     def __len__(self) -> int:
@@ -74,9 +71,9 @@ class Motion:
 
     @property
     def n_joints(self) -> int:
-        """Number of joints n."""
+        """Return the number of joints n."""
         return int(self.q.shape[1])
 
     def arrays(self) -> Array:
-        """q, dq and ddq as one C-contiguous array (N, 3, n), which compiled code reads."""
+        """Return q, dq and ddq as one C-contiguous array (N, 3, n) for compiled code."""
         return np.stack([self.q, self.dq, self.ddq], axis=1)

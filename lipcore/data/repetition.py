@@ -1,6 +1,6 @@
-"""Where a motion repeats itself: instants whose state has its like at another time.
+"""Repetition of motion: instants with a like state at another time.
 
-A held-out part that repeats motion of the training flatters: it is predicted well by what has only been remembered.
+Metrics of a held-out part that repeats the training are too good: a model that only remembers predicts it well.
 """
 
 from __future__ import annotations
@@ -18,29 +18,29 @@ from lipcore.data.splits import Mask, Numbers
 
 @dataclass(frozen=True)
 class RepetitionOptions:
-    """When two instants are alike, and when a stretch repeats another."""
+    """Limits for two instants to be alike, and for a stretch to repeat another."""
 
     max_near: float = 0.25
     min_near: float = 0.1
     """Two instants are alike if they are nearer than half the step to the next instant. This distance is limited to
     these shares of the usual distance of two instants."""
     repeated_share: float = 0.5
-    """Min share of instants with their like elsewhere in time in a stretch that repeats."""
+    """Min share of instants with a like instant elsewhere in time, for a stretch that repeats."""
     block_instants: int = 60
     """Max instants of a block that are compared."""
     part_instants: int = 600
     """Max instants of a part that are compared."""
     min_spread: tuple[float, float, float] = (0.01, 0.02, 0.1)
-    """Min spreads of position, velocity and acceleration that count as motion: rad, rad/s and rad/s² (m)."""
+    """Min spreads of position, velocity and acceleration that count as motion: rad, rad/s and rad/s² (m, m/s, m/s²)."""
 
 
 OPTIONS = RepetitionOptions()
 
 
 def features(samples: Samples, joint_types: Sequence[str]) -> Array:
-    """The state of a robot at N instants, (N, k): cos q and sin q, of sliding joints q, dq and ddq, by their spread.
+    """Return the states of a robot at N instants, (N, k), each divided by its spread.
 
-    joint_types: (n,).
+    A state is cos q and sin q (of prismatic joints q), dq and ddq. joint_types: (n,).
     """
     turns = np.array([each == "revolute" for each in joint_types])
     parts = []
@@ -53,11 +53,11 @@ def features(samples: Samples, joint_types: Sequence[str]) -> Array:
     return np.concatenate(parts, axis=1)
 
 
-def repeated(states: Array, edges: Numbers) -> Array:
-    """Share of the instants of each of B blocks that have their like elsewhere in time: (B,).
+def measure_repeated_shares(states: Array, edges: Numbers) -> Array:
+    """Return the share of the instants of each of B blocks with a like instant elsewhere in time: (B,).
 
-    states: (N, k), in order of time; edges: (B + 1,), where blocks begin and end. Elsewhere is neither in the block nor
-    in those beside it, which a motion leaves and enters slowly.
+    states: (N, k), in order of time; edges: (B + 1,), where blocks begin and end. Elsewhere is neither the block nor
+    those beside it, because a motion leaves and enters a block slowly.
     """
     shares = np.zeros(len(edges) - 1)
     for block, like in enumerate(_likes(states, edges)):
@@ -66,10 +66,13 @@ def repeated(states: Array, edges: Numbers) -> Array:
     return shares
 
 
-def groups(states: Array, edges: Numbers) -> Numbers:
-    """Number of the group that each of B blocks belongs to, (B,): blocks repeat, directly or through others, those of
-    their group and no other. Arguments as of `repeated`."""
-    # imported late: this takes as long as the rest of the module
+def group_blocks(states: Array, edges: Numbers) -> Numbers:
+    """Return the number of the group of each of B blocks, (B,).
+
+    Blocks repeat, directly or through others, blocks of their group and no other.
+    Arguments as of `measure_repeated_shares`.
+    """
+    # these imports take as long as the rest of the module
     from scipy.sparse import csr_array  # noqa: PLC0415
     from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
 
@@ -80,7 +83,7 @@ def groups(states: Array, edges: Numbers) -> Numbers:
 def nearest(states: Array, edges: Numbers) -> Iterator[tuple[Numbers, Array]]:
     """Yield, block by block, some of its instants and their distances from the nearest instant of each block.
 
-    states: (N, k), in order of time; edges: (B + 1,), where blocks begin and end. Rows (asked,), distances (asked, B).
+    states: (N, k), in order of time; edges: (B + 1,), where blocks begin and end. Yields rows (R,), distances (R, B).
     """
     for first, last in pairwise(edges.tolist()):
         rows = _evenly(first, last, OPTIONS.block_instants)
@@ -88,30 +91,31 @@ def nearest(states: Array, edges: Numbers) -> Iterator[tuple[Numbers, Array]]:
 
 
 class Repetition(NamedTuple):
-    """share: of a part's instants that have their like in the training; period: after which the training repeats
-    itself, s, None where it has none."""
+    """How much of a part repeats motion of the training."""
 
     share: float
+    """Share of the part's instants with a like instant in the training."""
     period: float | None
+    """Period of the training's motion, s, None if it has none."""
 
     @property
-    def flatters(self) -> bool:
-        """Whether the part repeats what was learnt from."""
+    def is_repeated(self) -> bool:
+        """Return whether the part repeats the training."""
         return self.share >= OPTIONS.repeated_share
 
 
 def repetition(training: Samples, part: Samples, joint_types: Sequence[str]) -> Repetition:
-    """How much of a part repeats motion of the training.
+    """Return how much of a part repeats motion of the training.
 
     training, part: at least one row each, the training in order of time within its episodes; joint_types: (n,).
     """
     states = features(Samples.concatenate([training, part]), joint_types)
-    share = share_repeated(states[: len(training)], states[len(training) :])
-    return Repetition(share, period(training, joint_types))
+    share = measure_repeated_share(states[: len(training)], states[len(training) :])
+    return Repetition(share, find_period(training, joint_types))
 
 
-def share_repeated(known: Array, states: Array) -> float:
-    """Share of some states (R, k) that have their like among those that are known, (N, k), in order of time."""
+def measure_repeated_share(known: Array, states: Array) -> float:
+    """Return the share of states (R, k) with a like state among known ones, (N, k), in order of time."""
     limits, shares = _limits(known, np.concatenate([known, states])), []
     rows = _evenly(0, len(states), OPTIONS.part_instants)
     for few in np.array_split(rows, max(1, len(rows) // 100)):
@@ -121,11 +125,11 @@ def share_repeated(known: Array, states: Array) -> float:
     return float(np.concatenate(shares).mean())
 
 
-def distinct(samples: Samples, joint_types: Sequence[str]) -> float:
-    """Share of a recording that is left where motion that comes again counts once, from 0 to 1.
+def measure_distinct_share(samples: Samples, joint_types: Sequence[str]) -> float:
+    """Return the share of a recording that remains if repeated motion counts once, from 0 to 1.
 
     samples: at least one row, in order of time within its episodes; joint_types: (n,). An instant that the recording
-    passes k times counts 1 / k; between two passes it is left by twice the limit of likeness.
+    passes k times counts 1 / k. Between two passes the motion leaves it by twice the limit of likeness.
     """
     states = features(samples, joint_types)
     limits, passes = _limits(states, states), []
@@ -137,12 +141,12 @@ def distinct(samples: Samples, joint_types: Sequence[str]) -> float:
     return float(np.mean(1 / np.array(passes)))
 
 
-def period(samples: Samples, joint_types: Sequence[str]) -> float | None:
-    """Time after which a motion repeats itself, s; None where it has no one such time.
+def find_period(samples: Samples, joint_types: Sequence[str]) -> float | None:
+    """Return the time after which a motion repeats itself, s; None if there is no one such time.
 
-    The median, over instants, of the time until a state that was left by twice the limit of likeness comes again: if at
-    least a quarter of the instants return, and 60 % of these within 5 % of that time. Tuned on simulated arms
-    (`tests/lipcore/test_repetition.py`).
+    The median, over instants, of the time until the motion returns to a state that it left by twice the limit of
+    likeness. At least a quarter of the instants must return, and 60 % of these within 5 % of that time. Tuned on
+    simulated arms (`tests/lipcore/test_repetition.py`).
     """
     states = features(samples, joint_types)
     limits, lags, asked = _limits(states, states), [], 0
@@ -161,7 +165,7 @@ def period(samples: Samples, joint_types: Sequence[str]) -> float | None:
 
 
 def _return(distances: Array, limit: float) -> int | None:
-    """Place at which a motion is nearest to where it began, when it first comes back; None where it does not."""
+    """Return the index at which a motion is nearest to its start when it first returns; None if it does not."""
     left = np.flatnonzero(distances > 2 * limit)
     back = np.flatnonzero(distances[left[0] :] <= limit) + left[0] if len(left) else left
     if not len(back):
@@ -172,26 +176,26 @@ def _return(distances: Array, limit: float) -> int | None:
 
 
 def _likes(states: Array, edges: Numbers) -> Iterator[Mask]:
-    """For each of B blocks, which of the instants that are looked at have their like in which block: (asked, B)."""
+    """Yield, for each of B blocks, which of its compared instants have a like instant in which block: (R, B)."""
     limits = _limits(states, states)
     for rows, distances in nearest(states, edges):
         yield distances <= limits[rows, None]
 
 
 def _limits(states: Array, all_states: Array) -> Array:
-    """How near another instant has to be to be like each of these, (N,)."""
+    """Return the distance below which another instant is like each of these, (N,)."""
     usual = np.sqrt(2 * all_states.var(axis=0).sum())
     steps = np.linalg.norm(np.diff(states, axis=0, append=states[-2:-1]), axis=1) if len(states) > 1 else np.zeros(1)
     return np.asarray(np.clip(0.5 * steps, OPTIONS.min_near * usual, OPTIONS.max_near * usual))
 
 
 def _squares(states: Array, others: Array) -> Array:
-    """Squared distances, (R, N)."""
+    """Return squared distances, (R, N)."""
     products = states @ others.T
     squares = np.square(states).sum(axis=1)[:, None] - 2 * products + np.square(others).sum(axis=1)
     return np.asarray(np.maximum(squares, 0.0))
 
 
 def _evenly(first: int, last: int, most: int) -> Numbers:
-    """Rows from `first` to `last`, exclusive, at most so many."""
+    """Return at most `most` rows from `first` to `last`, exclusive."""
     return np.unique(np.linspace(first, last - 1, most).round().astype(np.int64))

@@ -1,4 +1,4 @@
-"""A table of samples: what is recorded, simulated, uploaded and learnt from."""
+"""A table of samples: recorded, simulated, uploaded, and the input of a training."""
 
 from __future__ import annotations
 
@@ -18,6 +18,13 @@ class Samples:
     """N samples of n joints, SI units, joint order as in `joint_names`.
 
     q, dq, ddq, tau: (N, n); t: (N,) seconds; episode: (N,) integers, constant over one contiguous recording.
+
+    Example:
+        >>> t, rest = np.linspace(0.0, 1.0, 5), np.zeros((5, 1))
+        >>> samples = Samples(("joint1",), t, np.zeros(5, np.int64), rest, rest, rest, tau=rest + 2.0)
+        >>> len(samples), samples.n_joints
+        (5, 1)
+
     """
 
     joint_names: tuple[str, ...]
@@ -41,26 +48,26 @@ class Samples:
 
     @property
     def n_joints(self) -> int:
-        """Number of joints n."""
+        """Return the number of joints n."""
         return len(self.joint_names)
 
     def rows(self, index: slice | NDArray[np.int64] | NDArray[np.bool_]) -> Samples:
-        """Return the chosen rows. index: a slice, indices, or (N,) whether each is chosen."""
+        """Return the chosen rows. index: a slice, indices, or a mask (N,)."""
         return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "joint_names"})
 
     def episodes(self) -> list[slice]:
-        """Contiguous runs of equal `episode`, in order of rows."""
+        """Return the contiguous runs of equal `episode`, in order of rows."""
         edges = np.flatnonzero(np.diff(self.episode)) + 1
         bounds = [0, *edges.tolist(), len(self)]
         return [slice(a, b) for a, b in pairwise(bounds) if b > a]
 
     def motion(self) -> Motion:
-        """Position, velocity and acceleration, (N, n) each, copied; raise ValueError where one is not finite."""
+        """Return position, velocity and acceleration, (N, n) each, copied; raise ValueError if one is not finite."""
         return Motion.from_arrays(self.q, self.dq, self.ddq)
 
     @staticmethod
     def concatenate(parts: list[Samples]) -> Samples:
-        """Rows of all parts in order; episodes are renumbered so that parts never share one."""
+        """Return the rows of all parts in order; episodes are renumbered so that parts never share one."""
         if not parts:
             raise ValueError("no samples to concatenate")
         if empty := [index for index, part in enumerate(parts) if len(part) == 0]:

@@ -1,6 +1,6 @@
-"""From raw recordings to samples: zero-phase low-pass, acausal differentiation, and the noise level of a signal.
+"""Zero-phase low-pass, acausal differentiation, and the noise level of a signal.
 
-The paper's choices: 4 Hz cut-off, both without delay, so they suit recordings and not live streams.
+The paper's choices: a 4 Hz cut-off, and no delay. They suit recordings, not live streams.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
     from lipcore.data.samples import Array
 
 CUTOFF = 4.0
-"""Default cut-off in Hz."""
+"""Default cut-off, Hz."""
 ORDER = 4
 DIFFERENCE_ORDERS = range(2, 9)
 
 
 def low_pass(signal: Array, rate: float, cutoff: float = CUTOFF) -> Array:
-    """Butterworth low-pass run forwards and backwards: no phase shift.
+    """Return the signal after a Butterworth low-pass run forwards and backwards, without phase shift.
 
-    signal: (N, k), evenly sampled at `rate` Hz. Raise ValueError where the cut-off is not below half the rate or the
+    signal: (N, k), evenly sampled at `rate` Hz. Raise ValueError if the cut-off is not below half the rate or the
     signal is too short for the filter.
     """
     from scipy.signal import butter, sosfiltfilt  # noqa: PLC0415 - half a second, for recordings to be filtered only
@@ -37,16 +37,16 @@ def low_pass(signal: Array, rate: float, cutoff: float = CUTOFF) -> Array:
 
 
 def differentiate(signal: Array, rate: float) -> Array:
-    """Central differences, one-sided at both ends. signal: (N, k), N ≥ 3, evenly sampled at `rate` Hz."""
+    """Return central differences, one-sided at both ends. signal: (N, k), N ≥ 3, evenly sampled at `rate` Hz."""
     if len(signal) < 3:
         raise ValueError(f"signal has {len(signal)} samples, expected at least 3 to be differentiated")
     return np.asarray(np.gradient(signal, 1.0 / rate, axis=0, edge_order=2), dtype=np.float64)
 
 
 def noise_level(episodes: list[Array]) -> Array:
-    """Standard deviation of the white noise on smooth signals, per column.
+    """Return the standard deviation of the white noise on smooth signals, per column.
 
-    A k-th difference cancels what is smooth and keeps noise with the known gain comb(2k, k); the smallest estimate over
+    A k-th difference cancels what is smooth and keeps noise with the known gain comb(2k, k). The smallest estimate over
     several orders k is the least contaminated by motion. episodes: contiguous signals (N_e, m); returns (m,).
     """
     levels = []

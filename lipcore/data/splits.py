@@ -1,8 +1,8 @@
-"""Splitting a recording into what is learnt from and what is held out to evaluate with: whole stretches, never rows.
+"""Splits of a recording into training rows and held-out rows: whole stretches, never single rows.
 
-Neighbouring samples tell nearly the same, and a low-pass spreads each over those around it: of rows held out one by one
-a model has as good as seen every one. Therefore whole episodes or contiguous stretches are held out, and where the two
-sides meet in time the rows next to the other side belong to neither.
+Neighbouring samples are nearly equal, and a low-pass spreads each over its neighbours. A model would have as good as
+seen every single row that is held out. Therefore whole episodes or contiguous stretches are held out. Rows next to the
+other side belong to neither.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 from lipcore.data.signals import CUTOFF
 
 Kind = Literal["episodes", "last", "blocks"]
-"""episodes: whole ones, chosen by the seed; last: the end of the recording; blocks: some of equal stretches, chosen by
-the seed."""
+"""episodes: whole ones, chosen by the seed; last: the end of the recording; blocks: some of equal stretches, chosen
+by the seed."""
 GUARD_S = 1.0 / CUTOFF
 """One period of the usual low-pass, which spreads a sample over about that long on both sides, s."""
 
@@ -30,7 +30,7 @@ Numbers = NDArray[np.int64]
 
 
 class SplitError(ValueError):
-    """What is asked for cannot be held out of these samples. field, value, expected: what is wrong."""
+    """These samples cannot be split as requested. field, value, expected: what is wrong."""
 
     def __init__(self, field: str, value: object, expected: str) -> None:
         super().__init__(f"{field} is {value!r}, expected {expected}")
@@ -39,17 +39,15 @@ class SplitError(ValueError):
 
 @dataclass(frozen=True)
 class Split:
-    """What to hold out.
-
-    share: of the rows, as nearly as whole episodes or blocks allow; blocks: how many equal stretches `blocks` chooses
-    from; guard_s: rows as near as that in time to a row of the other side are left out, on both sides, s; seed: of the
-    choice. Raise SplitError where a value is impossible.
-    """
+    """A choice of rows to hold out. Raise SplitError if a value is impossible."""
 
     kind: Kind = "last"
     share: float = 0.3
+    """Share of the rows to hold out, as nearly as whole episodes or blocks allow."""
     blocks: int = 10
+    """Number of equal stretches that kind `blocks` chooses from."""
     guard_s: float = GUARD_S
+    """Rows within this time of a row of the other side are left out, on both sides, s."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -64,28 +62,31 @@ class Split:
 
 
 @dataclass(frozen=True)
-class Parts:
-    """Which rows are learnt from (`train`) and which are held out, (N,) each."""
+class SplitRows:
+    """Masks of the training rows and the held-out rows, (N,) each."""
 
     train: Mask
     held_out: Mask
 
     @property
     def guarded(self) -> int:
-        """Rows left out between the two."""
+        """Return the number of rows left out between the two."""
         return len(self.train) - int(np.count_nonzero(self.train)) - int(np.count_nonzero(self.held_out))
 
 
-def split(episode: Numbers, t: Array, how: Split, stretches: Sequence[Sequence[int]] | None = None) -> Parts:
-    """Hold part of a recording out.
+def split(episode: Numbers, t: Array, how: Split, stretches: Sequence[Sequence[int]] | None = None) -> SplitRows:
+    """Return the training rows and the held-out rows of a recording.
 
-    episode: (N,), equal over one contiguous recording; t: (N,) s; stretches: rows to hold out in place of what `how`
-    chooses, first and last exclusive, in order of episode and time.
-    Episodes count as one course of time, in the order of their numbers, for as long as time goes on from one to the
-    next: pieces of a recording with gaps are as near as their times, episodes whose clocks start anew are far from each
-    other. Equal arguments give equal parts, on every machine and in every release, and rows in another order the same
+    episode: (N,), equal over one contiguous recording; t: (N,) s; stretches: rows to hold out instead of those that
+    `how` chooses, first and last exclusive, in order of episode and time.
+
+    Episodes form one course of time, in the order of their numbers, while time rises from one to the next. Pieces of a
+    recording with gaps are therefore as near as their times. Episodes whose clocks restart are far from each other.
+
+    Equal arguments return equal parts on every machine and in every release. Rows in another order return the same
     parts in that order.
-    Raise SplitError where nothing is left of a side, ValueError for wrong shapes or times that are not finite.
+
+    Raise SplitError if a side has no rows left, ValueError for wrong shapes or times that are not finite.
     """
     if episode.ndim != 1 or episode.shape != t.shape:
         raise ValueError(f"t has shape {t.shape}, expected that of episode, {episode.shape}, one number a row")
@@ -94,8 +95,8 @@ def split(episode: Numbers, t: Array, how: Split, stretches: Sequence[Sequence[i
     if len(t) < 2:
         raise SplitError("rows", len(t), "at least 2, one for each side")
     order = np.lexsort((t, episode))
-    held = _HELD[how.kind](episode[order], how) if stretches is None else _within(stretches, len(t))
-    parts = guarded(episode, t, order, held, how.guard_s)
+    held = _CHOOSERS[how.kind](episode[order], how) if stretches is None else _within(stretches, len(t))
+    parts = apply_guard(episode, t, order, held, how.guard_s)
     for side, rows in (("held out", parts.held_out), ("to train on", parts.train)):
         if not rows.any():
             expected = f"fewer: no row {side} is further than {how.guard_s:g} s from the other side"
@@ -103,27 +104,27 @@ def split(episode: Numbers, t: Array, how: Split, stretches: Sequence[Sequence[i
     return parts
 
 
-def guarded(episode: Numbers, t: Array, order: Numbers, held: Mask, guard_s: float) -> Parts:
-    """Both sides without the rows next to the other one.
+def apply_guard(episode: Numbers, t: Array, order: Numbers, held: Mask, guard_s: float) -> SplitRows:
+    """Return both sides without the rows next to the other one.
 
-    episode, t: (N,), of rows in any order; order: (N,), their indices by episode and time; held: (N,), in that order;
-    guard_s: how near a row of the other side may be, s.
+    episode, t: (N,), of rows in any order; order: (N,), their indices by episode and time; held: (N,) mask in that
+    order; guard_s: min time to a row of the other side, s.
     """
     near = _near_other_side(episode[order], t[order], held, guard_s)
-    parts = Parts(np.empty(len(t), dtype=bool), np.empty(len(t), dtype=bool))
+    parts = SplitRows(np.empty(len(t), dtype=bool), np.empty(len(t), dtype=bool))
     parts.train[order], parts.held_out[order] = ~held & ~near, held & ~near
     return parts
 
 
-def choose(lengths: Numbers, share: float, seed: int) -> Mask:
-    """Choose some of several stretches of rows, by their lengths (K,), to hold about `share` of all rows: (K,).
+def choose_stretches(lengths: Numbers, share: float, seed: int) -> Mask:
+    """Return which of several stretches with lengths (K,) contain about `share` of all rows: (K,).
 
-    At least one is chosen and one is not, K ≥ 2. The seed decides which are tried first; one is taken where that brings
-    the rows nearer to the share.
+    At least one is chosen and one is not, K ≥ 2. The seed decides the order in which stretches are tried. A stretch is
+    chosen if that brings the number of rows nearer to the share.
     """
     if len(lengths) < 2:
         raise SplitError("episodes", len(lengths), "at least 2 to hold out whole ones of: hold out `last` or `blocks`")
-    # no generator of random numbers: theirs may change from release to release, and the same rows must be held
+    # a hash, because random number generators may change from release to release, and the same rows must be held
     # out again
     order = sorted(range(len(lengths)), key=lambda each: sha256(f"{seed}/{each}".encode()).digest())
     rows, goal = lengths.tolist(), share * int(lengths.sum())
@@ -138,11 +139,8 @@ def choose(lengths: Numbers, share: float, seed: int) -> Mask:
     return mask
 
 
-def taken(samples: Samples, rows: Mask) -> Samples:
-    """The samples of one side; where an episode is interrupted a new one begins, as what follows is later.
-
-    rows: (N,), whether each is of that side.
-    """
+def select_rows(samples: Samples, rows: Mask) -> Samples:
+    """Return the samples of one side. rows: (N,) mask. An interrupted episode becomes several."""
     index = np.flatnonzero(rows)
     begins = (np.diff(index) > 1) | (np.diff(samples.episode[index]) != 0)
     numbered = np.concatenate([np.zeros(1, dtype=np.int64), np.cumsum(begins, dtype=np.int64)])
@@ -158,7 +156,7 @@ def _within(stretches: Sequence[Sequence[int]], rows: int) -> Mask:
 
 def _episodes(episode: Numbers, how: Split) -> Mask:
     lengths = np.unique(episode, return_counts=True)[1]
-    return np.asarray(np.repeat(choose(lengths, how.share, how.seed), lengths))
+    return np.asarray(np.repeat(choose_stretches(lengths, how.share, how.seed), lengths))
 
 
 def _last(episode: Numbers, how: Split) -> Mask:
@@ -172,19 +170,19 @@ def _blocks(episode: Numbers, how: Split) -> Mask:
         raise SplitError("blocks", how.blocks, f"at most as many as there are rows, {len(episode)}")
     edges = np.linspace(0, len(episode), how.blocks + 1).round().astype(np.int64)
     lengths = edges[1:] - edges[:-1]
-    return np.asarray(np.repeat(choose(lengths, how.share, how.seed), lengths))
+    return np.asarray(np.repeat(choose_stretches(lengths, how.share, how.seed), lengths))
 
 
-_HELD: dict[Kind, Callable[[Numbers, Split], Mask]] = {"episodes": _episodes, "last": _last, "blocks": _blocks}
-"""Which rows, ordered by episode and time, are held out before any are guarded."""
+_CHOOSERS: dict[Kind, Callable[[Numbers, Split], Mask]] = {"episodes": _episodes, "last": _last, "blocks": _blocks}
+"""Returns the held-out rows of each kind, ordered by episode and time, before the guard."""
 
 
 def _near_other_side(episode: Numbers, t: Array, held: Mask, guard_s: float) -> Mask:
-    """Whether a row of the other side is at most `guard_s` away in one course of time, for rows in order: (N,)."""
+    """Return whether a row of the other side is within `guard_s` in one course of time, for rows in order: (N,)."""
     back = (np.diff(episode) != 0) & (np.diff(t) <= 0)
     edges = np.flatnonzero(back | (held[1:] != held[:-1])) + 1
     lengths = np.diff(np.concatenate([[0], edges, [len(t)]]))
-    # within a stretch between edges all rows are of one side; the next one is of the other, or of another time
+    # between edges all rows are of one side; the next stretch is of the other side, or of another course of time
     before = np.concatenate([[-np.inf], np.where(back[edges - 1], -np.inf, t[edges - 1])])
     after = np.concatenate([np.where(back[edges - 1], np.inf, t[edges]), [np.inf]])
     return np.asarray((t - np.repeat(before, lengths) <= guard_s) | (np.repeat(after, lengths) - t <= guard_s))

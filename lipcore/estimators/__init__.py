@@ -1,1 +1,1 @@
-"""The estimators: which there are, their hyperparameters, noise, options, and what a training is given."""
+"""The estimators: their names, hyperparameters, noise, options, and the input of a training."""

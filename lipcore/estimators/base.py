@@ -1,4 +1,4 @@
-"""What a training may start from: the version of another unit of the same robot, its base."""
+"""Checks of the base of a training: the version of another unit of the same robot that it starts from."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from lipcore.vocabulary import AUTO, CHAINED_ARM, ROBOT_ESTIMATORS
 
 
 class BaseMismatchError(ValueError):
-    """A training cannot start from the base that is named.
+    """The training cannot start from the given base.
 
-    field: of the training that does not go with it, as the API names it; value: what it is; expected: what it may be.
+    field: of the training, as in the API, that does not match; value: its value; expected: its valid values.
     """
 
     def __init__(self, field: str, value: object, expected: str) -> None:
@@ -23,7 +23,7 @@ class BaseMismatchError(ValueError):
 
 @dataclass(frozen=True)
 class RobotKind:
-    """What two units of one robot have in common: the names and types of their joints, and what their torque means."""
+    """Properties that all units of a robot share: joint names, joint types and torque convention."""
 
     joint_names: tuple[str, ...]
     joint_types: tuple[str, ...]
@@ -31,12 +31,12 @@ class RobotKind:
 
     @classmethod
     def of_manifest(cls, manifest: Mapping[str, Any]) -> RobotKind:
-        """The robot of a saved model."""
+        """Return the robot of a saved model."""
         names, types = tuple(manifest["joint_names"]), tuple(manifest["joint_types"])
         return cls(names, types, manifest["torque_convention"])
 
     def difference(self, other: RobotKind) -> tuple[str, str, str] | None:
-        """Return a field in which another robot differs, its text here and there; None where there is none."""
+        """Return the first field that differs from another robot, with its text in both; None if there is none."""
         for name in (each.name for each in fields(RobotKind)):
             own, others = getattr(self, name), getattr(other, name)
             if own != others:
@@ -56,8 +56,8 @@ def check_base(
 ) -> None:
     """Raise BaseMismatchError unless a training can start from a base.
 
-    name: of the base; order: the data's joint at each place of its arm's chain, (n,), None where it has no arm; data:
-    of what is trained on; estimator, options, robot: of the training.
+    name: of the base; order: the data's joint at each place of its arm's chain, (n,), None if it has no arm; data:
+    robot of the training data; estimator, options, robot: of the training.
     """
     robots = (AUTO, *ROBOT_ESTIMATORS)
     if order is None:

@@ -1,10 +1,10 @@
-"""The estimators a user chooses from: a torque prior each, by name, and the factor that makes its intervals true.
+"""The estimators by name: a torque prior each, and a factor that calibrates its intervals.
 
-A posterior with fitted hyperparameters knows what the samples leave open, but takes the hyperparameters themselves for
-certain: it is too sure of itself. The standard deviation of the function is therefore multiplied by a factor, one for
-each estimator, measured on simulated arms with random masses: `lip-chain` on four arms, `lip` on two, the baselines on
-one; slow and fast motion, 60 to 500 samples, judged on trajectories of twice the bandwidth
-(`benchmarks/studies/calibration.py`). It is stored with the model and touches neither mean nor noise.
+A posterior with fitted hyperparameters does not include the uncertainty of the hyperparameters. It is overconfident.
+The standard deviation of the function is therefore multiplied by a factor, one for each estimator. The factors were
+measured on simulated arms with random masses: `lip-chain` on four arms, `lip` on two, the baselines on one. Motion was
+slow and fast, with 60 to 500 samples, and test trajectories had twice the bandwidth
+(`benchmarks/studies/calibration.py`). The factor is stored with the model. It changes neither mean nor noise.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from lipcore.kernels.lip import LipKernel
 from lipcore.kernels.local import LocalKernel
 from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.robots.urdf import JointMismatchError, RigidBody
-from lipcore.vocabulary import AUTO, CHOICES, ROBOT_ESTIMATORS, JointType
+from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, ROBOT_ESTIMATORS, JointType
 
 
 class UnknownEstimatorError(ValueError):
-    """No estimator of that name."""
+    """There is no estimator of this name."""
 
 
 class MissingRobotError(ValueError):
-    """The estimator needs a robot, or it has no use for the one given."""
+    """The estimator needs a robot, or it cannot use the given one."""
 
 
 @dataclass(frozen=True)
 class Estimator:
-    """A torque prior: a sum of independent terms by name, friction always among them."""
+    """A torque prior: a sum of independent terms by name, always with friction."""
 
     name: str
     terms: Mapping[str, TorqueKernel]
@@ -49,10 +49,10 @@ class Estimator:
 
 
 class _ResidualChainKernel(ChainKernel):
-    """Energies for what rigid bodies leave over: the fit starts from a share of the torque, not from all of it."""
+    """Chain kernel for the residual of rigid bodies: the fit starts from a share of the torque."""
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """Those of the chain kernel for a tenth of the torque."""
+        """Start like the chain kernel for a tenth of the torque."""
         return super().initial(motion, 0.1 * tau)
 
 
@@ -76,10 +76,10 @@ def make_estimator(
     tied: bool = True,
     arm: Arm | None = None,
 ) -> Estimator:
-    """Build an estimator for a robot; raise UnknownEstimatorError listing the known names.
+    """Return an estimator for a robot. Raise UnknownEstimatorError with the valid names.
 
-    arm: for ROBOT_ESTIMATORS, what was learnt of the rigid bodies (`lipcore.arm.learning`); raise ValueError where it
-    is absent or of no use, JointMismatchError where its joints are not those of the data.
+    arm: for ROBOT_ESTIMATORS, the learnt rigid bodies (`lipcore.arm.learning`). Raise ValueError if it is absent or
+    cannot be used, JointMismatchError if its joints are not those of the data.
     """
     if name not in ESTIMATORS:
         raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATORS)}")
@@ -99,13 +99,14 @@ def make_estimator(
 def check_estimator(
     name: str, joint_types: Sequence[str], robot: RigidBody | None = None, options: FitOptions | None = None
 ) -> None:
-    """Check that an estimator can be trained so, before anything is spent on it.
+    """Check that an estimator can be trained with this robot and these options, before any work is done.
 
-    Raise UnknownEstimatorError, MissingRobotError where a robot is given in vain, ValueError where `options.geometry`
-    needs one and there is none, JointMismatchError where its joints are not those of the data or in another order.
+    Raise UnknownEstimatorError. Raise MissingRobotError if the estimator cannot use a robot. Raise ValueError if
+    `options.geometry` needs a robot and there is none. Raise JointMismatchError if the robot's joints are not those of
+    the data, or are in another order.
     """
-    if name not in CHOICES:
-        raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(CHOICES)}")
+    if name not in ESTIMATOR_CHOICES:
+        raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATOR_CHOICES)}")
     types = check_joint_types(joint_types)
     if robot is None:
         if name in (AUTO, *ROBOT_ESTIMATORS) and options is not None and options.geometry in ("calibrate", "fixed"):
@@ -135,12 +136,16 @@ FUNCTION_STD_FACTOR = {
     "gip": 1.2,
     "lse": 1.8,
 }
-"""Where 95 % intervals covered 95 % on average; `rigid-body+lip-chain` takes that of its terms."""
+"""Factors with which 95 % intervals had a coverage of 95 % on average. `rigid-body+lip-chain` uses that of its
+terms."""
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """function_std_factor: what the standard deviation of the function is multiplied by, at least 1."""
+    """Calibration of an estimator.
+
+    function_std_factor: factor on the standard deviation of the function, at least 1.
+    """
 
     function_std_factor: float
 
@@ -153,5 +158,5 @@ NO_CALIBRATION = Calibration(1.0)
 
 
 def calibrate(estimator: str) -> Calibration:
-    """Return the correction measured for an estimator."""
+    """Return the calibration of an estimator."""
     return Calibration(FUNCTION_STD_FACTOR.get(estimator, 1.0))

@@ -1,4 +1,4 @@
-"""Fitting: hyperparameters by penalised marginal likelihood on a subset, then the exact posterior."""
+"""Fit of hyperparameters by penalised marginal likelihood on a subset of the samples."""
 
 from __future__ import annotations
 
@@ -18,58 +18,65 @@ from lipcore.kernels.base import Params, TorqueKernel
 from lipcore.posterior.exact import negative_log_evidence
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.posterior.selection import spread_out
-from lipcore.vocabulary import Place
+from lipcore.vocabulary import Device
 
 PRIOR_STD = {"noise.log_std": noise.OPTIONS.prior_std, "logits": 4.0, "log": 3.0}
-"""Widths of the Gaussian priors on hyperparameters around their starting values: weak, but for the noise, which a
-small data set cannot tell from misfit. 3 on a logarithm admits a factor of 20 either way within one deviation."""
+"""Standard deviations of the Gaussian priors on hyperparameters around their starting values. They are weak, except for
+the noise, which few data cannot distinguish from misfit. 3 on a logarithm admits a factor of 20 either way within one
+standard deviation."""
 START_SPREAD = 0.3
-"""How far other starts lie from the kernel's own, in widths of the prior."""
+"""Distance of other starts from the kernel's own, in standard deviations of the prior."""
 
 
 class FitCancelledError(RuntimeError):
-    """The caller asked to stop."""
+    """The caller cancelled the fit."""
 
 
 @dataclass(frozen=True)
 class FitProgress:
-    """How far a fit is.
-
-    stage: `geometry`, `hyperparameters` or `posterior`; iteration, of max_iterations; objective: penalised −log
-    evidence, nats; fraction: 0..1 of the work; elapsed: s; estimator: the one at work, where `auto` trains several.
-    """
+    """Progress of a fit."""
 
     stage: str
+    """`geometry`, `hyperparameters` or `posterior`."""
     iteration: int
+    """Number of the iteration, at most `max_iterations`."""
     max_iterations: int
     objective: float
+    """Penalised −log evidence, nats."""
     fraction: float
+    """Completed share of the work, 0 to 1."""
     elapsed: float
+    """Time since the start, s."""
     estimator: str | None = None
+    """Estimator in training, if `auto` trains several."""
 
 
 @dataclass(frozen=True)
 class FitReport:
-    """What a fit did.
-
-    objective: penalised −log evidence at the end, nats; iterations: of the search that was followed; evaluations: of it
-    and of the screening; rejected_steps: line-search points whose covariance could not be factored; converged: whether
-    the search ended by itself; start: number of the start that was followed, 0 for the kernel's own; samples_given,
-    samples_hyperparameters, samples_posterior: how many there were, and how many each stage used; seconds: wall time of
-    the hyperparameters' fit; device: that it ran on.
-    """
+    """Result and effort of a fit."""
 
     objective: float
+    """Penalised −log evidence at the end, nats."""
     iterations: int
+    """Iterations of the search from the chosen start."""
     evaluations: int
+    """Evaluations of that search and of the screening of starts."""
     rejected_steps: int
+    """Line-search points at which the covariance could not be factored."""
     converged: bool
+    """Whether the search converged."""
     start: int
+    """Number of the chosen start; 0 is the kernel's own."""
     samples_given: int
+    """Number of samples."""
     samples_hyperparameters: int
+    """Samples used by the fit of hyperparameters."""
     samples_posterior: int
+    """Samples used by the posterior."""
     seconds: float
+    """Wall time of the fit of hyperparameters."""
     device: str
+    """Device of the fit."""
 
 
 Progress = Callable[[FitProgress], None]
@@ -78,7 +85,7 @@ Cancelled = Callable[[], bool]
 
 @dataclass(frozen=True)
 class Fit:
-    """Fitted hyperparameters and the rows of the data that the posterior stands on."""
+    """Fitted hyperparameters, and the rows of the data that the posterior is conditioned on."""
 
     params: dict[str, Array]
     rows: NDArray[np.int64]
@@ -93,14 +100,14 @@ def fit(
     cancelled: Cancelled | None = None,
     stretches: Samples | None = None,
     begin: Params | None = None,
-    device: Place = "cpu",
+    device: Device = "cpu",
 ) -> Fit:
-    """Fit hyperparameters to samples; on_progress after every iteration, `cancelled` asked at every evaluation.
+    """Fit hyperparameters to samples.
 
-    stretches: contiguous samples that tell the white noise, where `samples` are thinned; begin: hyperparameters that
-    are known better than the kernel's own start; device: to compute on, see `FitOptions.place`.
-    Raise FitCancelledError when `cancelled` answers true, NotPositiveDefiniteError where no hyperparameters give a
-    covariance that can be factored.
+    on_progress: called after every iteration; cancelled: called at every evaluation; stretches: contiguous samples to
+    estimate the white noise, if `samples` are thinned; begin: hyperparameters that replace the kernel's own start;
+    device: to compute on, see `FitOptions.place`. Raise FitCancelledError when `cancelled` returns true. Raise
+    NotPositiveDefiniteError if no hyperparameters give a covariance that can be factored.
     """
     motion, tau = samples.motion(), samples.tau
     floor = np.log(noise.floor(samples))
@@ -132,7 +139,7 @@ def fit(
     report_progress("posterior", float(result.fun))
 
     used = spread_out(motion, options.posterior_samples)
-    # evenly among those of the posterior: spread-out samples are the odd ones
+    # evenly chosen among those of the posterior: spread-out samples are not representative
     even = used[np.linspace(0, len(used) - 1, min(len(used), noise.OPTIONS.samples)).round().astype(np.int64)]
     params = search.unpack(result.x)
     params = noise.refine(kernel, params, motion[even], tau[even], start["noise.log_std"], floor)
@@ -153,10 +160,10 @@ def fit(
 
 
 def _best_start(screening: _Search, starts: int) -> tuple[int, Array]:
-    """Return which of several starts leads to the best evidence of few samples in few steps, and where it led.
+    """Return the number of the start with the best evidence of few samples after few steps, and where it ended.
 
-    The first is the kernel's own, the others are drawn from the prior. A poor optimum mostly shows early, and few
-    samples cost little: this finds it before the long search.
+    The first start is the kernel's own, the others are drawn from the prior. A poor optimum mostly shows early, and few
+    samples cost little. This finds it before the long search.
     """
     rng = np.random.default_rng(0)
     centre, width = screening.pack(screening.start), screening.pack(screening.width_tensors())
@@ -186,7 +193,7 @@ class _Search:
         motion: Motion,
         tau: Array,
         cancelled: Cancelled,
-        device: Place,
+        device: Device,
     ) -> None:
         self.kernel, self.start, self.floor, self.motion, self.tau = kernel, start, floor, motion, tau
         self.widths = {name: prior_std(name) for name in start} | kernel.prior_std()
@@ -200,12 +207,12 @@ class _Search:
         self.evaluations += 1
         params = self.unpack(flat)
         try:
-            # a line search may step to where exponentials overflow: that covariance is not finite, and is refused
+            # a line search may step so far that exponentials overflow: that covariance is not finite, and is rejected
             with np.errstate(over="ignore", invalid="ignore"):
                 evidence = negative_log_evidence(self.kernel, params, self.motion, self.tau, self.device)
         except NotPositiveDefiniteError:
             if not np.isfinite(self.best):
-                raise  # not even the starting point is well posed
+                raise  # not even the starting point has a valid covariance
             self.rejected += 1
             return self.best + 1e4, np.zeros_like(flat)
         value, gradient = evidence.value, evidence.gradient
@@ -218,7 +225,7 @@ class _Search:
         return value, self.pack(gradient)
 
     def run(self, begin: Array, iterations: int, callback: Callable[..., None] | None = None) -> Any:
-        """Minimise by L-BFGS-B from `begin`; scipy's result. The noise stays above its floor."""
+        """Minimise by L-BFGS-B from `begin` and return scipy's result. The noise stays above its floor."""
         from scipy.optimize import minimize  # noqa: PLC0415 - serving does without it
 
         free = {name: np.full_like(value, -np.inf) for name, value in self.start.items()}
@@ -234,7 +241,7 @@ class _Search:
         )
 
     def width_tensors(self) -> dict[str, Array]:
-        """Width of the prior of every hyperparameter."""
+        """Return the prior standard deviation of every hyperparameter."""
         return {name: np.full_like(value, self.widths[name]) for name, value in self.start.items()}
 
     def pack(self, params: Params) -> Array:
@@ -250,7 +257,7 @@ class _Search:
 
 
 def prior_std(name: str) -> float:
-    """Width of the prior on hyperparameter `name` around its starting value."""
+    """Return the standard deviation of the prior on hyperparameter `name` around its starting value."""
     if name in PRIOR_STD:
         return PRIOR_STD[name]
     return PRIOR_STD["logits" if name.endswith("logits") else "log"]

@@ -1,4 +1,4 @@
-"""The measurement noise of each joint: where a fit starts, how far it may fall, and what all samples say of it."""
+"""The measurement noise of each joint: starting value of a fit, min value, and estimate from all samples."""
 
 from __future__ import annotations
 
@@ -18,40 +18,40 @@ class NoiseOptions:
     """Limits of a joint's noise, and the effort of its estimate."""
 
     start_share: float = 0.01
-    """Min noise std that a fit starts from, relative to the joint's torque spread: what no model explains is noise too,
-    and filtered torques look free of noise though they are not. A fit to cleaner data ends with less."""
+    """Min noise std that a fit starts from, relative to the joint's torque spread. Torque that no model explains is
+    noise too, and filtered torques only look free of noise. A fit to cleaner data ends with less."""
     min_joint_share: float = 1e-4
     min_robot_share: float = 1e-5
-    """Min noise std, relative to the joint's torque spread and to the max root mean square of all joints: below the
-    second, a Gram matrix in float64 can no longer be factored faithfully."""
+    """Min noise std, relative to the joint's torque spread and to the max root mean square of all joints. Below the
+    second, a Gram matrix in float64 can no longer be factored accurately."""
     prior_std: float = 1.0
-    """Width of the prior on the logarithm: a small data set cannot tell noise from misfit."""
+    """Standard deviation of the prior on the logarithm: few data cannot distinguish noise from misfit."""
     max_step: float = 0.7
     max_newton_steps: int = 8
     converged_step: float = 0.01
     max_widenings: int = 3
     stretches: int = 25
-    """Contiguous parts of the samples that are left out one after another."""
+    """Contiguous parts of the samples that are held out one after another."""
     chance_ratio: float = 1.15
-    """Squared error over expected variance that chance explains."""
+    """Ratio of squared error to expected variance that chance explains."""
     samples: int = 250
-    """Max samples of the estimate, which is then good to about five per cent."""
+    """Max samples of the estimate, which is then accurate to about five per cent."""
 
 
 OPTIONS = NoiseOptions()
 
 
 def white(samples: Samples, stretches: Samples | None = None) -> Array:
-    """White noise of the torque signals, standard deviation (n,) N·m.
+    """Return the white noise of the torque signals, standard deviation (n,) N·m.
 
-    stretches: contiguous samples, where `samples` are thinned: their differences would tell of motion.
+    stretches: contiguous samples, if `samples` are thinned: their differences would contain motion.
     """
     signals = samples if stretches is None else stretches
     return noise_level([signals.tau[part] for part in signals.episodes()])
 
 
 def start(samples: Samples, stretches: Samples | None = None) -> Array:
-    """Noise std that a fit starts from, (n,) N·m: the white noise of the signals, or a share of their spread.
+    """Return the noise std that a fit starts from, (n,) N·m: the white noise of signals, or a share of their spread.
 
     stretches: see `white`.
     """
@@ -60,7 +60,7 @@ def start(samples: Samples, stretches: Samples | None = None) -> Array:
 
 
 def floor(samples: Samples) -> Array:
-    """Smallest noise std admitted for these samples, (n,) N·m."""
+    """Return the min noise std for these samples, (n,) N·m."""
     largest = float(np.sqrt(np.mean(samples.tau**2, axis=0)).max())
     return np.asarray(
         np.maximum(OPTIONS.min_joint_share * samples.tau.std(axis=0), OPTIONS.min_robot_share * max(largest, 1e-6))
@@ -70,16 +70,17 @@ def floor(samples: Samples) -> Array:
 def refine(
     kernel: TorqueKernel, params: Params, motion: Motion, tau: Array, centre: Array, lowest: Array
 ) -> dict[str, Array]:
-    """What some samples say of the noise, all else held: two steps, returned as new hyperparameters.
+    """Return the hyperparameters with the noise estimated again from some samples, in two steps.
 
     First the penalised evidence is maximised over the noise by Newton steps on log σ_j. With K = k(X, X) + R and
-    α = K⁻¹y, its slope is σ_j²(Σα² − tr K⁻¹) over joint j; σ_j² tr K⁻¹ is the number of samples left to tell the noise,
-    after those that the function uses up.
+    α = K⁻¹y, its slope is σ_j²(Σα² − tr K⁻¹) over joint j. σ_j² tr K⁻¹ is the number of samples that determine the
+    noise, without those that the function uses up.
 
-    Then contiguous stretches are left out one after another and predicted by the rest. Errors larger than the model
-    expects, as where filtered noise lasts over several samples and was taken for the function, raise the noise.
+    Then contiguous stretches are held out one after another and predicted from the rest. If the errors are larger than
+    the model expects, the noise is raised. This happens if filtered noise lasts over several samples and was attributed
+    to the function.
 
-    centre, lowest: (n,) log std of the prior's centre and of the floor. Raise NotPositiveDefiniteError as a fit does.
+    centre, lowest: (n,), log std of the prior's centre and of the floor. Raise NotPositiveDefiniteError as a fit does.
     """
     n, gram = kernel.n_joints, kernel.symmetric_gram(params, motion)
     y = (tau - kernel.mean(motion)).reshape(-1)
@@ -95,7 +96,7 @@ def refine(
         if (np.abs(log_std - before) < OPTIONS.converged_step).all():
             break
     for _ in range(OPTIONS.max_widenings):
-        excess = _left_out(*_inverse(gram, log_std, y), n)
+        excess = _cross_validate(*_inverse(gram, log_std, y), n)
         if (excess <= OPTIONS.chance_ratio).all():
             break
         log_std = log_std + np.where(
@@ -105,17 +106,17 @@ def refine(
 
 
 def _inverse(gram: Array, log_std: Array, y: Array) -> tuple[Array, Array]:
-    """K⁻¹ and α = K⁻¹y."""
+    """Return K⁻¹ and α = K⁻¹y."""
     noisy = gram.copy()
     add_diagonal(noisy, np.tile(np.exp(2 * log_std), len(y) // len(log_std)))
     factor = cholesky(noisy)
     return factor.inverse(), factor.solve(y)
 
 
-def _left_out(inverse: Array, alpha: Array, n: int) -> Array:
-    """Mean squared error over predicted variance of each joint, stretch by stretch predicted from all others: (n,).
+def _cross_validate(inverse: Array, alpha: Array, n: int) -> Array:
+    """Return the mean squared error over predicted variance, (n,), each stretch predicted from all others.
 
-    Leaving out block B, the error is [K⁻¹]_BB⁻¹ α_B and its covariance [K⁻¹]_BB⁻¹ (Rasmussen & Williams, eq. 5.12).
+    If block B is held out, the error is [K⁻¹]_BB⁻¹ α_B and its covariance [K⁻¹]_BB⁻¹ (Rasmussen & Williams, eq. 5.12).
     """
     ratios = []
     for block in np.array_split(np.arange(len(alpha)).reshape(-1, n), OPTIONS.stretches):

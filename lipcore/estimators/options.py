@@ -7,46 +7,48 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Literal, get_args
 
-from lipcore.vocabulary import DIFFERENTIATED, GEOMETRY_MODES, PRIORS, Place, Prior
+from lipcore.vocabulary import GEOMETRY_MODES, PRIORS, TORCH_ESTIMATORS, Device, Prior
 
 Standing = Literal["auto", "all", "chosen"]
 GeometryOption = Literal["auto", "learn", "calibrate", "fixed"]
 
 
-MOST_SECONDS = 3600.0
-"""s; longer no search for a geometry may take."""
+MAX_SEARCH_SECONDS = 3600.0
+"""Max time limit of the search for a geometry, s."""
 
 
 @dataclass(frozen=True)
 class FitOptions:
-    """How to fit.
-
-    hyperparameter_samples: samples that hyperparameters are fitted on; posterior_samples: samples the posterior is
-    conditioned on, where there are more the most spread-out ones; starts: points that the search for hyperparameters is
-    tried from, the best of which is followed; tied: links share kernel shapes (see LipKernel);
-    device: "cpu", "cuda" (`se`, `gip` and `lse` alone), or "auto": a GPU for these, if there is one;
-    prior: of the masses of rigid bodies, those of the "urdf" or "zero";
-    geometry: of rigid bodies, "learn", "calibrate" (around the URDF), "fixed" (as the URDF has it), or "auto":
-    calibrated where there is a robot, else learnt; search_seconds: time limit of the search for a geometry;
-    compact_tolerance: largest deviation of the compact posterior from the exact one, in standard deviations;
-    max_inducing_outputs: where that would take more, the compact posterior deviates more, and answers stay fast;
-    statistics: what the posterior of the chosen basis stands on in the end: the samples `chosen` before, or `all`, each
-    counted for the time that it stands for (`data.independence`); `auto`: all where together they count as more
-    than posterior_samples independent ones, which was measured to answer better (benchmarks/studies/all_rows.py).
-    """
+    """Options of a fit."""
 
     hyperparameter_samples: int = 150
+    """Samples that hyperparameters are fitted on."""
     posterior_samples: int = 500
+    """Samples that the posterior is conditioned on. If there are more, the most spread-out ones are used."""
     max_iterations: int = 150
+    """Max iterations of the search for hyperparameters."""
     starts: int = 3
+    """Starting points of the search for hyperparameters. The best one is continued."""
     tied: bool = True
+    """Whether links share kernel shapes (see LipKernel)."""
     device: str = "auto"
+    """Device: "cpu", "cuda" (`se`, `gip` and `lse` alone), or "auto": a GPU for these, if there is one."""
     prior: Prior = "urdf"
+    """Prior masses of rigid bodies: those of the "urdf", or "zero"."""
     compact_tolerance: float = 0.01
+    """Max deviation of the compact posterior from the exact one, in standard deviations."""
     max_inducing_outputs: int = 1500
+    """Max size of the compact posterior. If the tolerance needs more, the deviation is larger and predictions stay
+    fast."""
     statistics: Standing = "auto"
+    """Samples of the final posterior: those `chosen` before, or `all`, each weighted by the time that it represents
+    (`data.independence`). `auto` uses all if their effective samples exceed posterior_samples, which was measured to
+    predict better (benchmarks/studies/all_rows.py)."""
     geometry: GeometryOption = "auto"
+    """Geometry of rigid bodies: "learn", "calibrate" (around the URDF), "fixed" (that of the URDF), or "auto":
+    calibrated if there is a robot, else learnt."""
     search_seconds: float = 30.0
+    """Time limit of the search for a geometry, s."""
 
     def __post_init__(self) -> None:
         for name, low, high in (
@@ -65,7 +67,7 @@ class FitOptions:
             raise ValueError(f"statistics is {self.statistics!r}, expected one of {', '.join(get_args(Standing))}")
         if self.device not in ("auto", "cpu", "cuda"):
             raise ValueError(f"device is {self.device!r}, expected auto, cpu or cuda")
-        for name, most in (("compact_tolerance", 1.0), ("search_seconds", MOST_SECONDS)):
+        for name, most in (("compact_tolerance", 1.0), ("search_seconds", MAX_SEARCH_SECONDS)):
             number = getattr(self, name)
             if type(number) not in (int, float) or not 0 < number <= most:
                 raise ValueError(f"{name} is {number!r}, expected a number above 0, at most {most:g}")
@@ -75,17 +77,20 @@ class FitOptions:
             raise ValueError(f"prior is {self.prior!r}, expected one of {', '.join(PRIORS)}")
 
     def check_device(self, estimator: str) -> None:
-        """Raise ValueError if `device` is "cuda" and the estimator gains nothing from a GPU."""
-        if self.device == "cuda" and estimator not in DIFFERENTIATED:
+        """Raise ValueError if `device` is "cuda" and the estimator does not benefit from a GPU."""
+        if self.device == "cuda" and estimator not in TORCH_ESTIMATORS:
             raise ValueError(
                 f"device is 'cuda', but the compiled code of {estimator!r} is faster on the CPU: leave `device` out. "
-                f"Only {', '.join(DIFFERENTIATED)} use a GPU."
+                f"Only {', '.join(TORCH_ESTIMATORS)} use a GPU."
             )
 
-    def place(self, estimator: str) -> Place:
-        """Return the device to fit an estimator on; raise ValueError as `check_device`, or if "cuda" finds no GPU."""
+    def place(self, estimator: str) -> Device:
+        """Return the device for the fit of an estimator.
+
+        Raise ValueError like `check_device`, or if "cuda" finds no GPU.
+        """
         self.check_device(estimator)
-        if self.device == "cpu" or estimator not in DIFFERENTIATED:
+        if self.device == "cpu" or estimator not in TORCH_ESTIMATORS:
             return "cpu"
         if _cuda():
             return "cuda"
@@ -95,7 +100,10 @@ class FitOptions:
 
 
 def _cuda() -> bool:
-    """Whether torch can compute on a GPU. It is imported only where there is a driver: it takes seconds."""
+    """Return whether torch can compute on a GPU.
+
+    torch is imported only if there is a driver, because its import takes seconds.
+    """
     try:
         ctypes.CDLL("libcuda.so.1")
     except OSError:

@@ -1,4 +1,4 @@
-"""What a training is given, checked before anything is spent on it."""
+"""The input of a training, checked before any work is done."""
 
 from __future__ import annotations
 
@@ -15,32 +15,36 @@ from lipcore.robots.urdf import JointMismatchError, RigidBody
 from lipcore.vocabulary import TORQUE_CONVENTIONS, JointType, TorqueConvention
 
 MIN_SAMPLES = 10
-"""Fewer samples say too little to fit anything to."""
+"""Min samples of a fit."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What a training is given, whichever estimator it is of.
-
-    samples: of n joints, thinned where all are too many for memory; joint_types: (n,); torque_convention: what
-    `samples.tau` holds; robot: rigid bodies, built for the joints of the samples; stretches: contiguous samples of the
-    same recordings, which tell the white noise of signals, the samples themselves where None; on_progress: called after
-    every step; cancelled: asked at every evaluation, and ends the training with FitCancelledError; sibling: the
-    arm of another unit of the same robot, which is expected beforehand in the place of `robot`.
+    """Input of a training, the same for all estimators.
 
     Raise ValueError for samples that are too few, not finite or of other joints, JointMismatchError for a robot of
     other joints.
     """
 
     samples: Samples
+    """Samples of n joints, thinned if all are too many for memory."""
     joint_types: tuple[JointType, ...]
+    """Types of the joints, (n,)."""
     options: FitOptions = field(default_factory=FitOptions)
+    """Options of the fit."""
     torque_convention: TorqueConvention = "gravity_included"
+    """Meaning of `samples.tau`."""
     robot: RigidBody | None = None
+    """Rigid bodies, built for the joints of the samples."""
     stretches: Samples | None = None
+    """Contiguous samples of the same recordings, to estimate the white noise of signals. None: the samples
+    themselves."""
     on_progress: Progress | None = None
+    """Called after every step."""
     cancelled: Cancelled | None = None
+    """Called at every evaluation. If it returns true, the training ends with FitCancelledError."""
     sibling: Arm | None = None
+    """Arm of another unit of the same robot: the prior instead of `robot`."""
 
     def __post_init__(self) -> None:
         samples, convention = self.samples, self.torque_convention
@@ -66,11 +70,14 @@ class Task:
 
     @property
     def signals(self) -> Samples:
-        """The contiguous samples that tell the white noise."""
+        """Contiguous samples to estimate the white noise."""
         return self.samples if self.stretches is None else self.stretches
 
     def contiguous(self, most: int) -> Samples:
-        """`signals`, or of more than `most` so many, in 20 stretches from all over them, each an episode of its own."""
+        """Return `signals`. If there are more than `most`, return that many in 20 stretches, each a separate episode.
+
+        The stretches are distributed over all signals.
+        """
         signals, length = self.signals, most // 20
         if len(signals) <= most:
             return signals
@@ -81,5 +88,5 @@ class Task:
         return replace(signals.rows(rows), episode=episode.reshape(-1))
 
     def on(self, samples: Samples) -> Task:
-        """The same task on other samples of the same recordings."""
+        """Return the same task with other samples of the same recordings."""
         return replace(self, samples=samples)

@@ -1,4 +1,4 @@
-"""Planning motions that tell a model what it does not know yet."""
+"""Plan motions that reduce the uncertainty of a model most."""
 
 from lipcore.excitation.information import Belief
 from lipcore.excitation.limits import Limits

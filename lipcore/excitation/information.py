@@ -1,9 +1,9 @@
-"""What is known of a robot's torques before a motion, and how much of the variance that motion would take away.
+"""Compute how much of a model's torque variance a motion would remove.
 
-The variance of a Gaussian process after more samples depends on where they are, not on the torques that come: it is
-known before the robot moves. With k the covariance that a model's posterior (or a prior) gives to torques at two
-motions, measuring the motion X with noise R leaves k(r, r) − k(r, X) (k(X, X) + R)⁻¹ k(X, r) at a reference motion r.
-Nothing is approximated: X is a few hundred samples at most, of which each stands for several.
+The variance of a Gaussian process after more samples depends on where they are, not on the torques measured: it is
+known before the robot moves. Let k be the covariance that a model's posterior (or a prior) gives to torques at two
+motions. Measuring the motion X with noise R leaves k(r, r) − k(r, X) (k(X, X) + R)⁻¹ k(X, r) at a reference motion r.
+Nothing is approximated: X has at most a few hundred samples, each of which represents several.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
 
 PRIOR_FIT = FitOptions(hyperparameter_samples=80, posterior_samples=80, max_iterations=60, starts=1, device="cpu")
-"""Short: where hyperparameters start, all motions would seem hopeless, and nothing be gained by choosing one."""
+"""Short, but necessary: at the initial hyperparameters every motion seems useless, and the choice would not matter."""
 
 
 @dataclass(frozen=True)
 class Belief:
-    """Gaussian belief of an n-joint robot's torques: a kernel with its hyperparameters, and what a model has learnt.
+    """Gaussian belief about an n-joint robot's torques: a kernel with its hyperparameters, and what a model has learnt.
 
-    noise_variance: (n,) (N·m)² of a measurement. posterior: None before anything was learnt.
+    noise_variance: (n,) (N·m)² of a measurement. posterior: None before training.
     """
 
     kernel: TorqueKernel
@@ -46,7 +46,7 @@ class Belief:
 
     @classmethod
     def of_model(cls, model: TorqueModel) -> Belief:
-        """What a trained model believes. Its calibration factor is left out: it widens all deviations alike."""
+        """Return the belief of a trained model, without its calibration factor, which scales all deviations alike."""
         posterior = replace(model.posterior, std_factor=1.0)
         return cls(posterior.kernel, posterior.params, posterior.noise_variance, posterior)
 
@@ -60,12 +60,12 @@ class Belief:
         bodies: RigidBody | None = None,
         seed: int = 0,
     ) -> Belief:
-        """What is believed before any data: an estimator with hyperparameters fitted to what the URDF says.
+        """Return the belief before any data: an estimator with hyperparameters fitted to the URDF's torques.
 
-        The URDF need not be right: it tells how large and how smooth torques are, not what they are.
+        The URDF need not be right: it only shows how large and how smooth torques are.
 
-        noise_std: N·m, of all joints or (n,); 1 % of the torque's spread by default. bodies: for estimators
-        of rigid bodies. estimator: `rigid-body` with bodies and `lip-chain` without by default.
+        noise_std: N·m, of all joints or (n,); 1 % of the torque's spread by default. bodies: for estimators of rigid
+        bodies. estimator: `rigid-body` with bodies and `lip-chain` without by default.
         """
         estimator = estimator or ("lip-chain" if bodies is None else "rigid-body")
         motion = draw(limits, PRIOR_FIT.hyperparameter_samples, seed)
@@ -83,47 +83,49 @@ class Belief:
 
     @property
     def floor(self) -> Array:
-        """Variance that the model's answers never fall below, (n,) (N·m)²."""
+        """Return the min variance of the model's predictions, (n,) (N·m)²."""
         return np.zeros_like(self.noise_variance) if self.posterior is None else self.posterior.floor
 
     def cross(self, motion: Motion) -> Array:
-        """Prior covariance of what the model is made of with all torques of N motions, (M, N n); M = 0 for a prior."""
+        """Return the prior covariance of the model's variables with all torques of N motions, (M, N n); M = 0 for a
+        prior."""
         if self.posterior is None:
             return np.zeros((0, len(motion) * self.kernel.n_joints))
         return self.posterior.cross(self.kernel, motion)
 
     @property
     def root(self) -> Array:
-        """Q, (M, M): Q c, of a cross covariance c, has as its square what the model has learnt of those torques."""
+        """Return Q, (M, M): for a cross covariance c, the square of Q c is the variance of these torques removed by
+        training."""
         return np.zeros((0, 0)) if self.posterior is None else self.posterior.learnt
 
 
 @dataclass(frozen=True)
 class Information:
-    """What a motion would tell of the torques at R reference motions of an n-joint robot.
-
-    belief: what is known before; learnt: (M, R n), its square is what the model has learnt of the references; now: (R,
-    n) variance there, (N·m)²; floor: (n,) that a variance never falls below.
-    """
+    """How much a motion would reduce the variance at R reference motions of an n-joint robot."""
 
     belief: Belief
+    """The belief before the motion."""
     reference: Motion
     learnt: Array
+    """Its square is the variance at the references that training has removed, (M, R n)."""
     now: Array
+    """Variance at the references, (R, n) (N·m)²."""
     floor: Array
+    """Min variance, (n,)."""
 
     @classmethod
     def about(cls, belief: Belief, reference: Motion) -> Information:
-        """Of a belief about `reference`."""
+        """Return the information of a belief about `reference`."""
         learnt = belief.root @ belief.cross(reference)
         prior = belief.kernel.variance(belief.params, reference).diagonal(axis1=1, axis2=2)
         now = np.maximum(prior - np.square(learnt).sum(0).reshape(prior.shape), belief.floor)
         return cls(belief, reference, learnt, now, belief.floor)
 
     def left(self, motion: Motion, repeats: float = 1.0) -> Array:
-        """Share of the variance at a reference that is left after measuring a motion of N samples, (n,).
+        """Return the share of the variance at the references that remains after measuring a motion of N samples, (n,).
 
-        Geometric mean over the references. repeats: how many samples each of the N stands for.
+        It is the geometric mean over the references. repeats: how many samples each of the N represents.
         """
         belief = self.belief
         own = belief.kernel.symmetric_gram(belief.params, motion)
@@ -131,9 +133,10 @@ class Information:
         return self._share(self._after(explained))
 
     def slope(self, motion: Motion, repeats: float = 1.0) -> tuple[float, Motion]:
-        """Mean over joints of log `left`, and its derivatives by position, velocity and acceleration, each (N, n).
+        """Return the mean over joints of log `left`, and its derivatives by position, velocity and acceleration, each
+        (N, n).
 
-        With S = k(X, X) + R, D = k(X, r) and α = S⁻¹ D, what X explains of r changes by 2 αᵀ dD − αᵀ dS α.
+        With S = k(X, X) + R, D = k(X, r) and α = S⁻¹ D, the variance that X explains at r changes by 2 αᵀ dD − αᵀ dS α.
         """
         belief, kernel, params = self.belief, self.belief.kernel, self.belief.params
         own, other, cross = kernel.gram(params, motion, motion), self._with_reference(motion), belief.cross(motion)
@@ -162,11 +165,11 @@ class Information:
         return float(np.log(self._share(after)).mean()), Motion(**slopes)
 
     def _with_reference(self, motion: Motion) -> Array:
-        """Prior covariance of the motion's torques with those at the references, (N n, R n)."""
+        """Return the prior covariance of the motion's torques with those at the references, (N n, R n)."""
         return self.belief.kernel.gram(self.belief.params, motion, self.reference)
 
     def _explained(self, own: Array, other: Array, learnt: Array, repeats: float) -> tuple[Array, Array]:
-        """S⁻¹ D, (N n, R n), and the variance that the motion would take away, (R, n), from prior covariances."""
+        """Return S⁻¹ D, (N n, R n), and the variance that the motion would remove, (R, n), from prior covariances."""
         noise = np.tile(self.belief.noise_variance / repeats, len(own) // len(self.floor))
         factor = cholesky(own - learnt.T @ learnt + np.diag(noise))
         whitened = factor.whiten(other - learnt.T @ self.learnt)
@@ -177,5 +180,6 @@ class Information:
         return np.maximum(np.maximum(self.now - explained, self.floor), 1e-9 * self.now)
 
     def _share(self, after: Array) -> Array:
-        """Geometric mean over the references: what is left of the largest variances alone would tell of extremes."""
+        """Return the geometric mean over the references. An arithmetic mean would depend on the largest variances
+        alone."""
         return np.asarray(np.exp(np.log(after / self.now).mean(0)))

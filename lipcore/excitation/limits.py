@@ -1,4 +1,4 @@
-"""How far, how fast and how hard a robot may be moved."""
+"""Define the limits of a robot's motion."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lipcore.vocabulary import JointType
 @dataclass(frozen=True)
 class Limits:
     """Limits of n joints, SI units, each (n,): position `lower` to `upper`, and the magnitudes of speed, acceleration
-    and torque. torque: infinite where none is known.
+    and torque. torque: infinite if unknown.
 
-    Raise ValueError where shapes differ or a range is empty.
+    Raise ValueError if shapes differ or a range is empty.
     """
 
     joint_names: tuple[str, ...]
@@ -42,7 +42,7 @@ class Limits:
                 raise ValueError(f"joint {joint!r} may move from {low} to {high}, expected a range that is not empty")
 
     @classmethod
-    def known(
+    def with_defaults(
         cls,
         joint_names: Sequence[str],
         joint_types: Sequence[JointType],
@@ -52,10 +52,10 @@ class Limits:
         acceleration: Array,
         torque: Array,
     ) -> Limits:
-        """Limits of which some are unknown, NaN, infinite or not above zero, and replaced by usual ones.
+        """Return limits of which some are unknown (NaN, infinite or not positive) and replaced by usual ones.
 
-        These are 1 rad/s (0.2 m/s), reached within 0.25 s from rest (the Panda's data sheet allows 0.13 to 0.29 s),
-        and half a turn (0.5 m) to either side.
+        These are 1 rad/s (0.2 m/s), reached within 0.25 s from rest (the Panda's data sheet allows 0.13 to 0.29 s), and
+        half a turn (0.5 m) to either side.
         """
         slides = np.array(joint_types) == "prismatic"
         speed = np.where(_given(speed), speed, np.where(slides, 0.2, 1.0))
@@ -66,8 +66,8 @@ class Limits:
 
     @classmethod
     def of_profile(cls, profile: Profile) -> Limits:
-        """Those of a robot's profile, usual ones where it knows none."""
-        return cls.known(
+        """Return the limits of a robot's profile, with usual ones if it has none."""
+        return cls.with_defaults(
             profile.joint_names,
             profile.joint_types,
             profile.lower,
@@ -84,18 +84,19 @@ class Limits:
 
     @property
     def middle(self) -> Array:
-        """Middle of every joint's range, (n,)."""
+        """Return the middle of every joint's range, (n,)."""
         return (self.lower + self.upper) / 2
 
     @property
     def half(self) -> Array:
-        """Half of every joint's range, (n,)."""
+        """Return half of every joint's range, (n,)."""
         return (self.upper - self.lower) / 2
 
     def within(self, position: float = 1.0, motion: float = 1.0, reach: float | None = None) -> Limits:
-        """A share of these limits: `position` of the range about its middle, `motion` of speed, acceleration, torque.
+        """Return a share of these limits: `position` of the range about its middle, `motion` of speed, acceleration,
+        torque.
 
-        reach: at most so far from the middle, rad or m. Raise ValueError for shares that are not above 0, 1 at most.
+        reach: max distance from the middle, rad or m. Raise ValueError for shares that are not above 0, 1 at most.
         """
         for name, share in (("position", position), ("motion", motion)):
             if not 0 < share <= 1:

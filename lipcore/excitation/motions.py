@@ -1,8 +1,9 @@
-"""Motions within limits: Fourier series at rest at both ends, any vector of numbers as one, and references.
+"""Generate motions within limits: Fourier series at rest at both ends, mapped from any vector of numbers, and
+references.
 
-Swevers et al. (1997): a period of a finite Fourier series can be repeated, and what it does between two instants is
-known from enough of them: the maximum of a trigonometric polynomial of degree K is at most 1 / cos(π K / m) times its
-largest magnitude at m > 2 K even instants of a period (Ehlich & Zeller, 1964).
+Swevers et al. (1997): a period of a finite Fourier series can be repeated, and enough instants bound its values between
+them. Let m > 2 K be the number of evenly spaced instants of a period. The maximum of a trigonometric polynomial of
+degree K is at most 1 / cos(π K / m) times its largest magnitude there (Ehlich & Zeller, 1964).
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ Coefficients = tuple[Array, Array, Array]
 class Series:
     """One period of q(t) = offset + Σ_k sine_k / (kω) sin kωt − cosine_k / (kω) cos kωt with ω = 2π / seconds.
 
-    offset: (n,); sine, cosine: (K, n), amplitudes of the velocity in rad/s (m/s). At rest at both ends where
-    Σ sine_k = 0 and Σ k cosine_k = 0.
+    offset: (n,); sine, cosine: (K, n), amplitudes of the velocity in rad/s (m/s). It is at rest at both ends if Σ
+    sine_k = 0 and Σ k cosine_k = 0.
     """
 
     seconds: float
@@ -39,7 +40,7 @@ class Series:
         return len(self.sine)
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration at times t (N,): each (N, n)."""
+        """Return position, velocity and acceleration at times t (N,): each (N, n)."""
         omega = frequencies(self.seconds, self.harmonics)
         sin, cos = np.sin(np.outer(t, omega)), np.cos(np.outer(t, omega))
         q = self.offset + sin @ (self.sine / omega[:, None]) - cos @ (self.cosine / omega[:, None])
@@ -48,7 +49,7 @@ class Series:
         return q, dq, ddq
 
     def scaled(self, middle: Array, factor: Array | float) -> Series:
-        """The motion shrunk towards `middle`, (n,), by a factor for all or for each joint."""
+        """Return the motion shrunk towards `middle`, (n,), by a factor for all or for each joint."""
         return replace(
             self,
             offset=middle + factor * (self.offset - middle),
@@ -57,7 +58,7 @@ class Series:
         )
 
     def used(self, limits: Limits) -> Array:
-        """Upper bound on the share of the limits that is used at any time: (3, n) of position, speed, acceleration."""
+        """Return an upper bound of the used share of the limits: (3, n) of position, speed, acceleration."""
         m = 64 * self.harmonics  # the bound then lies 0.12 % above the peaks
         q, dq, ddq = self.at(np.arange(m) / m * self.seconds)
         peaks = [np.abs(q - limits.middle).max(0), np.abs(dq).max(0), np.abs(ddq).max(0)]
@@ -66,12 +67,13 @@ class Series:
 
 
 def frequencies(seconds: float, harmonics: int) -> Array:
-    """kω for k = 1 … K, rad/s, with ω = 2π / seconds: (K,)."""
+    """Return kω for k = 1 … K, rad/s, with ω = 2π / seconds: (K,)."""
     return np.asarray(2 * np.pi / seconds * np.arange(1, harmonics + 1), dtype=np.float64)
 
 
 def overshoot(harmonics: int, instants: int) -> float:
-    """Most that a trigonometric polynomial exceeds its largest magnitude at so many even instants, as a factor.
+    """Return the max factor by which a trigonometric polynomial exceeds its largest magnitude at evenly spaced
+    instants.
 
     harmonics: its degree K; 1 / cos(π K / m) (Ehlich & Zeller, 1964).
     """
@@ -80,25 +82,24 @@ def overshoot(harmonics: int, instants: int) -> float:
 
 @dataclass(frozen=True)
 class Shape:
-    """Maps a matrix x (2 K + 1, n) to a motion of n joints that keeps its limits, and derivatives back.
+    """Map of a matrix x (2 K + 1, n) to a motion of n joints within its limits, and of derivatives back.
 
     Row 0 shifts the middle, the next K are sine and the last K cosine amplitudes, each in units of what the limits
-    allow to that harmonic alone. Two projections bring both ends to rest; each joint is then shrunk towards its middle
-    as far as the limits ask for: by (1 + g^p)^(1/p), g the p-norm of all shares of its limits.
-
-    amplitude: (K, n) velocity of each unit; at_rest: (2, K, n) unit directions that are projected out; watched:
-    (3, m, 2 K + 1) shares of limits up to `unit` (3, n).
+    allow to that harmonic alone. Two projections bring both ends to rest. Each joint is then shrunk towards its middle
+    as far as the limits require: by (1 + g^p)^(1/p), g the p-norm of all shares of its limits.
     """
 
     limits: Limits
     seconds: float
     amplitude: Array
+    """Velocity of each unit, (K, n)."""
     at_rest: Array
+    """Unit directions that are projected out, (2, K, n)."""
     omega: Array
 
     @classmethod
     def build(cls, limits: Limits, seconds: float, harmonics: int) -> Shape:
-        """For a motion of so many seconds and harmonics K; raise ValueError for fewer than two harmonics."""
+        """Return the shape of a motion of `seconds` with K harmonics; raise ValueError for fewer than two harmonics."""
         if harmonics < 2:
             raise ValueError(f"harmonics is {harmonics}, expected at least 2: one cannot start and end at rest")
         omega = frequencies(seconds, harmonics)[:, None]
@@ -109,23 +110,25 @@ class Shape:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Shape of x."""
+        """Return the shape of x."""
         harmonics, n = self.amplitude.shape
         return 2 * harmonics + 1, n
 
     def coefficients(self, x: Array) -> Coefficients:
-        """Shift from the middle (n,), sine and cosine amplitudes (K, n) within the limits. x: (2 K + 1, n)."""
+        """Return the shift from the middle (n,), and sine and cosine amplitudes (K, n), within the limits. x: (2 K + 1,
+        n)."""
         shift, sine, cosine = self._free(x)
         shrink, _ = self._shrink(shift, sine, cosine)
         return shift / shrink, sine / shrink, cosine / shrink
 
     def motion(self, x: Array, t: Array) -> tuple[Array, Array, Array]:
-        """Position, velocity and acceleration at times t (N,), each (N, n)."""
+        """Return position, velocity and acceleration at times t (N,), each (N, n)."""
         q, dq, ddq = self._motion(*self.coefficients(x), t)
         return self.limits.middle + q, dq, ddq
 
     def adjoint(self, x: Array, t: Array, q: Array, dq: Array, ddq: Array) -> Array:
-        """Derivatives by x, (2 K + 1, n), given those by what `motion` makes of it at times t (N,), each (N, n)."""
+        """Return the derivatives by x, (2 K + 1, n), given those by the results of `motion` at times t (N,), each (N,
+        n)."""
         free = self._free(x)
         shrink, by_shares = self._shrink(*free)
         slopes = self._motion_adjoint(t, q, dq, ddq)
@@ -141,41 +144,42 @@ class Shape:
         return out
 
     def series(self, x: Array) -> Series:
-        """The motion of x (2 K + 1, n) as a series, held to the limits by their strict bound."""
+        """Return the motion of x (2 K + 1, n) as a series, within the limits by their strict bound."""
         shift, sine, cosine = self.coefficients(x)
         series = Series(self.seconds, self.limits.middle + shift, sine, cosine)
         return series.scaled(self.limits.middle, 1 / np.maximum(1.0, series.used(self.limits).max(0)))
 
     def random(self, rng: np.random.Generator) -> Array:
-        """A start for a search, (2 K + 1, n): harmonics of random strength and phase, faster ones weaker."""
+        """Return a start for a search, (2 K + 1, n): harmonics of random strength and phase, faster ones weaker."""
         rows, n = self.size
         x = rng.standard_normal((rows, n))
         x[0] *= 0.3
-        # so that some starts are mostly slow and far, others fast and short
+        # some starts are mostly slow and far, others fast and short
         fall = rng.uniform(0.0, 1.0, n)
         harmonics = np.arange(1, len(self.omega) + 1)[:, None]
         x[1:] *= np.tile(harmonics**-fall, (2, 1))
         return np.asarray(x)
 
     def _free(self, x: Array) -> Coefficients:
-        """The coefficients of x with both ends at rest, before limits shrink them."""
+        """Return the coefficients of x with both ends at rest, before the limits shrink them."""
         shift = x[0] * self.limits.half
         sine, cosine = self._rested(x[1:].reshape(2, *self.amplitude.shape)) * self.amplitude
         return shift, sine, cosine
 
     def _rested(self, waves: Array) -> Array:
-        """Waves (2, K, n) without what lies along `at_rest`."""
+        """Return waves (2, K, n) without their part along `at_rest`."""
         return np.asarray(waves - self.at_rest * (self.at_rest * waves).sum(1, keepdims=True))
 
     def _shrink(self, shift: Array, sine: Array, cosine: Array) -> tuple[Array, Array]:
-        """By what each joint is shrunk, (n,), and its derivatives by the motion at the watched instants, (3, m, n)."""
+        """Return the divisor of each joint, (n,), and its derivatives by the motion at the watched instants, (3, m,
+        n)."""
         limits, m = self.limits, len(self._watched)
         unit = np.stack([limits.half, limits.speed, limits.acceleration])[:, None] / overshoot(len(self.omega), m)
         motion = np.stack(self._motion(shift, sine, cosine, self._watched))
         shares = np.abs(motion) / unit
-        # every joint by the largest share first: powers overflow otherwise
+        # divide by the largest share first: powers overflow otherwise
         largest = shares.max((0, 1)).clip(1.0)
-        p = 40  # a large norm is near the largest share, but its slope jumps
+        p = 40  # a larger p is closer to the largest share, but its slope jumps
         powers = ((shares / largest) ** p).sum((0, 1)) + largest**-p
         shrink = largest * powers ** (1 / p)
         slopes = powers ** (1 / p - 1) * (shares / largest) ** (p - 1)
@@ -183,7 +187,7 @@ class Shape:
 
     @cached_property
     def _watched(self) -> Array:
-        """Instants (m,) at which limits are watched."""
+        """Return the instants (m,) at which limits are checked."""
         m = 12 * len(self.omega)
         return np.arange(m) / m * self.seconds
 
@@ -194,7 +198,7 @@ class Shape:
         return q, cos @ sine + sin @ cosine, -sin @ (sine * omega) + cos @ (cosine * omega)
 
     def _motion_adjoint(self, t: Array, q: Array, dq: Array, ddq: Array) -> Coefficients:
-        """Derivatives by shift, sine and cosine, given those by `_motion` of them."""
+        """Return the derivatives by shift, sine and cosine, given those by the results of `_motion`."""
         omega, phase = self.omega[:, None], t[:, None] * self.omega
         sin, cos = np.sin(phase).T, np.cos(phase).T
         sine = (sin @ q) / omega + cos @ dq - omega * (sin @ ddq)
@@ -202,21 +206,21 @@ class Shape:
 
 
 def harmonics(limits: Limits, seconds: float) -> int:
-    """How many harmonics K a motion of so many seconds gets.
+    """Return the number of harmonics K of a motion of `seconds`.
 
-    Up to the frequency at which the acceleration limit takes over from the speed limit.
+    They reach the frequency at which the acceleration limit takes over from the speed limit.
     """
     fastest = float(np.max(limits.acceleration / limits.speed)) / (2 * np.pi)
     return int(np.clip(np.ceil(fastest * seconds), 5, 60))
 
 
 def draw(limits: Limits, count: int, seed: int) -> Motion:
-    """`count` instants of motion: one half from anywhere, the other half from random motions within the limits.
+    """Return `count` instants of motion: one half from anywhere, the other half from random motions within the limits.
 
-    Anywhere: positions evenly over the range, speeds and accelerations Gaussian, of a third of the limits and cut off
-    there. That is more than tasks ask for: joints seldom are at the ends of their ranges and fast at the same time.
-    Random motions, some slow and far, some fast and short, leave corners out that a task may ask for. Against one half
-    alone, plans for both did better at what neither half holds.
+    Anywhere: positions evenly over the range, speeds and accelerations Gaussian, of a third of the limits and clipped
+    there. Tasks seldom require so much: joints are rarely at the ends of their ranges and fast at the same time. Random
+    motions, some slow and far, some fast and short, omit corners that a task may require. Plans for both halves did
+    better on motions of neither half than plans for one.
     """
     rng = np.random.default_rng(seed)
     some = count - count // 2

@@ -1,4 +1,4 @@
-"""The motion within limits that takes most of a model's variance away."""
+"""Plan the motion within limits that removes most of a model's variance."""
 
 from __future__ import annotations
 
@@ -13,26 +13,28 @@ from lipcore.data.samples import Array
 from lipcore.excitation.information import Belief, Information
 from lipcore.excitation.limits import Limits
 from lipcore.excitation.motions import Series, Shape, draw, harmonics
-from lipcore.excitation.searching import INSTANTS, Goal, TorqueCheck, search
+from lipcore.excitation.searching import MAX_INSTANTS, Goal, TorqueCheck, search
 from lipcore.robots.library import Robot
 
 
 @dataclass(frozen=True)
 class PlanOptions:
-    """What to plan. seconds, rate (Hz): of the motion; harmonics: of its series, None for what the limits allow.
-
-    iterations, starts: of the search; budget_s: it ends at the latest then, with what it has. references: motions all
-    over the range that variance is counted at.
-    Raise ValueError where a value is impossible.
-    """
+    """Options of a plan. Raise ValueError if a value is impossible."""
 
     seconds: float = 50.0
+    """Duration of the motion, s."""
     rate: float = 100.0
+    """Sampling rate of the motion, Hz."""
     harmonics: int | None = None
+    """Number of harmonics; None for as many as the limits allow."""
     iterations: int = 30
+    """Iterations of the search."""
     starts: int = 8
+    """Random starts of the search."""
     budget_s: float = 60.0
+    """The search ends at the latest then, with the best motion so far."""
     references: int = 100
+    """Motions all over the range at which variance is computed."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -54,37 +56,36 @@ class PlanOptions:
 
     @property
     def samples(self) -> int:
-        """Samples of the motion: it ends where its period does, at rest."""
+        """Return the samples of the motion: it ends with its period, at rest."""
         return round(self.seconds * self.rate) + 1
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A planned motion.
-
-    left: (n,) share of the variance at the references that is left after measuring it, geometric mean over them; used:
-    (4, n) largest share of the limits of position, speed, acceleration and torque, NaN for a torque that could not be
-    checked. out_of_time: whether the budget ended the search.
-    """
+    """A planned motion."""
 
     series: Series
     limits: Limits
     options: PlanOptions
     information: Information
     left: Array
+    """Share of the variance at the references that remains after measuring it, (n,): geometric mean over them."""
     used: Array
+    """Max used share of the limits of position, speed, acceleration and torque, (4, n); NaN for a torque without a
+    check."""
     iterations: int
     seconds: float
     out_of_time: bool
+    """Whether the budget ended the search."""
 
     def table(self) -> tuple[Array, Array, Array, Array]:
-        """Times (N,), and positions, velocities and accelerations (N, n) at the rate asked for."""
+        """Return times (N,), and positions, velocities and accelerations (N, n), at the planned rate."""
         t = np.arange(self.options.samples) / self.options.rate
         return t, *self.series.at(np.minimum(t, self.series.seconds))
 
     def left_by(self, q: Array, dq: Array, ddq: Array, repeats: float = 1.0) -> Array:
-        """What another motion of N samples would leave, each of which stands for `repeats`: (n,)."""
-        every = -(-len(q) // INSTANTS)
+        """Return the share of variance that another motion of N samples leaves, each representing `repeats`: (n,)."""
+        every = -(-len(q) // MAX_INSTANTS)
         motion = Motion.from_arrays(q[::every], dq[::every], ddq[::every])
         return np.asarray(self.information.left(motion, repeats * len(q) / len(motion)))
 
@@ -96,11 +97,11 @@ def plan(
     robot: Robot | None = None,
     on_progress: Callable[[int, float], None] | None = None,
 ) -> Plan:
-    """Search for the motion that leaves least of the variance; equal arguments give equal motions.
+    """Search for the motion that leaves the least variance; equal arguments give equal motions.
 
-    What is minimised is the mean logarithm of the share of variance left, over joints and motions all over the limits.
-    robot: for torque limits. on_progress: called with iterations and that share (geometric mean).
-    Raise ValueError where joints differ or no motion keeps the limits.
+    The objective is the mean logarithm of the remaining share of variance, over joints and motions all over the limits.
+    robot: for torque limits. on_progress: receives iterations and that share (geometric mean). Raise ValueError if
+    joints differ or no motion satisfies the limits.
     """
     options = options or PlanOptions()
     if belief.kernel.n_joints != limits.n_joints:
@@ -115,7 +116,7 @@ def plan(
     result = search(goal, options.starts, options.iterations, options.seed, until, on_progress)
     series = shape.series(result.x)
     if check is not None:
-        series = check.hold(series)
+        series = check.shrink(series)
     torque = np.full(limits.n_joints, np.nan) if check is None else check.used(series)
     used = np.vstack([series.used(limits), torque])
     took = time.monotonic() - began

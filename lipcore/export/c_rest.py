@@ -1,7 +1,7 @@
-"""What a nonlinear term adds to rigid bodies, as C needs it: `lipcore/export/c/energy.c.in` and `local.c.in`.
+"""The nonlinear term of a model as tables for C: `lipcore/export/c/energy.c.in` and `local.c.in`.
 
-Torques of such a term have the covariances c with m torques of inducing samples. They add αᵀ c to the mean and
-k₁ − |Q₁ c|² to the variance, and Q₂ c to what the weights' features make of their deviations, see `CompactPosterior`.
+Torques of such a term have the covariances c with m torques of inducing samples. They add αᵀ c to the mean and k₁ − |Q₁
+c|² to the variance. Q₂ c is added to the product of the weights' features and their deviations, see `CompactPosterior`.
 """
 
 from __future__ import annotations
@@ -24,22 +24,27 @@ LANES = 4
 
 
 @dataclass(frozen=True)
-class Rest:
-    """What a nonlinear term adds. template: of its covariances; tables: that this asks for, by name; groups: of samples
-    in these; places: (S, n), of each torque of a sample among the m that count, else −1; alpha: (m,); learnt: Q₁, (m,
-    m) lower triangular; factor: on deviations."""
+class NonlinearTerm:
+    """The contribution of a nonlinear term."""
 
     template: str
+    """Template of its covariances."""
     tables: dict[str, Array]
+    """Tables of the template, by name."""
     groups: int
+    """Number of groups of samples in these tables."""
     places: NDArray[np.int64]
+    """Index of each torque of a sample among the m inducing torques, else −1, (S, n)."""
     alpha: Array
+    """Weights α of the covariances in the mean, (m,)."""
     learnt: Array
+    """Q₁, (m, m) lower triangular."""
     factor: float
+    """Factor on deviations."""
 
     @classmethod
-    def of(cls, posterior: CompactPosterior) -> Rest | None:
-        """That of a posterior; None where it has no torques of a nonlinear term."""
+    def of(cls, posterior: CompactPosterior) -> NonlinearTerm | None:
+        """Return the nonlinear term of a posterior; None if it has no inducing torques."""
         basis, term = posterior.basis, posterior.basis.term
         if term is None or not len(basis.outputs):
             return None
@@ -59,7 +64,11 @@ class Rest:
 
 
 def _energy(term: ChainKernel, params: Params, motion: Motion) -> dict[str, Array]:
-    """Shares of each joint's kernel, scales: (n,); weights: (n, n); samples: (G, 6, n, LANES), of `joints.read`."""
+    """Return the tables of energies.
+
+    Shares of each joint's kernel, scales: (n,); weights: (n, n); samples: (G, 6, n, LANES), of
+    `lipcore.kernels.fast.joints.read_rows`.
+    """
     shares, scales, weights = term.hyper(params)
     slides = np.array([kind == "prismatic" for kind in term.joint_types])
     rows = read_rows(np.ascontiguousarray(motion.arrays()), slides)
@@ -72,6 +81,9 @@ def _energy(term: ChainKernel, params: Params, motion: Motion) -> dict[str, Arra
 
 
 def _local(params: Params, motion: Motion) -> dict[str, Array]:
-    """rate: (4 n,), one over the lengthscales; scales: (n,), variances; samples: (S, 4 n), in units of these."""
+    """Return the tables of a local term.
+
+    rate: (4 n,), one over the lengthscales; scales: (n,), variances; samples: (S, 4 n), in units of the lengthscales.
+    """
     rate, scales = np.exp(-params["local.log_lengthscales"]), np.exp(params["local.log_scale"])
     return {"rate": rate, "scales": scales, "samples": scaled(params, motion)}

@@ -1,4 +1,4 @@
-"""The weights of arm and friction as C needs them: tau = Φ w, w ~ N(ŵ, C), in as few features as there are.
+"""The weights of arm and friction as tables for C: tau = Φ w, w ~ N(ŵ, C), in as few features as possible.
 
 φ_b are the features that are not sums of others, Φᵀ = T φ_b, and Tᵀ C T = U Uᵀ, so that φᵀ C φ = |Uᵀ φ_b|².
 """
@@ -14,32 +14,34 @@ from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.kernels.geometry import Geometry
-from lipcore.model.body import LOWER
+from lipcore.model.body import LOWER_TRIANGLE
 from lipcore.model.torque_model import TorqueModel
 
 MASS, HX, HY, HZ, XX, XY, YY, XZ, YZ, ZZ = range(PARAMETERS)
 
 
 class UnsupportedEstimatorError(ValueError):
-    """The model is of an estimator that is not written as C."""
+    """The model's estimator cannot be written as C."""
 
 
 @dataclass(frozen=True)
-class Learnt:
-    """A model's weights. arm, friction: its terms; mean: (p,) of all weights, the arm's first; left: Q Λ, (p, p), with
-    their prior variances Λ, so that their covariance is (Q Λ)ᵀ Q Λ; shared: (p, m), what m torques of a nonlinear term
-    add to Q Λ Φᵀ where they have the covariances c with a query's: Q c; factor: on their deviations."""
+class LinearWeights:
+    """The posterior of a model's p weights."""
 
     arm: ArmKernel
     friction: FrictionKernel
     mean: Array
-    left: Array
+    """Mean of all weights, the arm's first, (p,)."""
+    prior_scaled_root: Array
+    """Q Λ with prior variances Λ of the weights, whose covariance is (Q Λ)ᵀ Q Λ, (p, p)."""
     shared: Array
+    """Q, (p, m): m torques of a nonlinear term, with covariances c with a query's, add Q c to Q Λ Φᵀ."""
     factor: float
+    """Factor on the weights' deviations."""
 
     @classmethod
-    def of(cls, model: TorqueModel) -> Learnt:
-        """What a model has learnt; raise UnsupportedEstimatorError where its weights are others than those two's."""
+    def of(cls, model: TorqueModel) -> LinearWeights:
+        """Return a model's weights; raise UnsupportedEstimatorError unless all are of arm and friction."""
         posterior, terms = model.posterior, model.estimator.terms
         arm, friction = terms["rigid_body"], terms["friction"]
         assert isinstance(arm, ArmKernel)
@@ -55,37 +57,42 @@ class Learnt:
         return cls(arm, friction, mean, rows[:, first:] * prior, rows[:, :first], posterior.std_factor)
 
     def root(self, expand: Array) -> tuple[Array, Array]:
-        """U, upper triangular, with U Uᵀ = Tᵀ C T, and V, (p_b, m): the deviation is |Uᵀ φ_b + V c|. expand: T, (p,
-        p_b)."""
+        """Return U, upper triangular, with U Uᵀ = Tᵀ C T, and V, (p_b, m): the deviation is |Uᵀ φ_b + V c|.
+
+        expand: T, (p, p_b).
+        """
         size = expand.shape[1]
-        # with columns and rows in reverse order, and without the product, whose condition is the square
-        turn, made = np.linalg.qr((self.left @ expand)[:, ::-1])
+        # reversed for an upper root; without the product, because its condition number is the square
+        turn, made = np.linalg.qr((self.prior_scaled_root @ expand)[:, ::-1])
         shared = turn.T @ self.shared
         return self.factor * made[::-1, ::-1].T, self.factor * shared[:size][::-1]
 
 
 def axes_of(geometry: Geometry) -> Array:
-    """Axes of the written frames in those of the geometry: (n, 3, 3), the two across the joint's axis and itself."""
+    """Return the axes of the written frames in those of the geometry, the joint's axis last: (n, 3, 3)."""
     return np.concatenate([geometry.across, geometry.axis[:, None]], axis=1).mT
 
 
-def moved(turn: Array, place: Array, body: Array) -> Array:
-    """Ten parameters of a body in the frame where its own, (3, 3) axes turned by `turn`, lies at `place`, (3,) m."""
+def move_parameters(turn: Array, place: Array, body: Array) -> Array:
+    """Return ten parameters of a body in another frame.
+
+    The body's own frame has (3, 3) axes turned by `turn` and lies at `place`, (3,) m.
+    """
     about = np.zeros((3, 3))
-    about[LOWER] = body[XX:]
+    about[LOWER_TRIANGLE] = body[XX:]
     about = about + np.tril(about, -1).T
     mass, first = body[MASS], turn @ body[HX:XX]
-    # second moments, which are those of points
+    # second moments, which transform as those of points
     second = turn @ (0.5 * np.trace(about) * np.eye(3) - about) @ turn.T
     second = second + np.outer(place, first) + np.outer(first, place) + mass * np.outer(place, place)
-    return np.concatenate([[mass], first + mass * place, (np.trace(second) * np.eye(3) - second)[LOWER]])
+    return np.concatenate([[mass], first + mass * place, (np.trace(second) * np.eye(3) - second)[LOWER_TRIANGLE]])
 
 
-def regrouped(learnt: Learnt) -> tuple[list[list[int]], Array]:
-    """Which of each body's ten numbers torque depends on, and T: (p, p_b), rows as the model's weights.
+def group_parameters(learnt: LinearWeights) -> tuple[list[list[int]], Array]:
+    """Return which of each body's ten parameters torque depends on, and T: (p, p_b), rows as the model's weights.
 
-    A body that is symmetric about a joint's axis may as well be fixed to the link before: three numbers of a body
-    behind a revolute joint, and all inertia behind a prismatic one, are sums of those of the link before.
+    A body that is symmetric about a joint's axis may as well be fixed to the previous link. Three parameters of a body
+    behind a revolute joint, and all inertia behind a prismatic one, are therefore sums of those of the previous link.
     """
     arm = learnt.arm.arm
     n, axes, unit = arm.n_joints, axes_of(arm.geometry), np.eye(PARAMETERS)
@@ -105,17 +112,17 @@ def regrouped(learnt: Learnt) -> tuple[list[list[int]], Array]:
         place = before[j].T @ arm.geometry.translation[j]
         if slides[j]:
             for name in range(XX, PARAMETERS):
-                expand[j, name] = moved(turn, place, unit[name]) @ expand[j - 1]
+                expand[j, name] = move_parameters(turn, place, unit[name]) @ expand[j - 1]
         else:
             for name in (MASS, HZ):
-                expand[j, name] = moved(turn, place, unit[name]) @ expand[j - 1]
-            round_ = moved(turn, place, unit[XX] + unit[YY]) @ expand[j - 1]
+                expand[j, name] = move_parameters(turn, place, unit[name]) @ expand[j - 1]
+            round_ = move_parameters(turn, place, unit[XX] + unit[YY]) @ expand[j - 1]
             expand[j, YY] = round_ - expand[j, XX]
     return kept, _in_weights(learnt, axes, expand)
 
 
-def _in_weights(learnt: Learnt, axes: Array, expand: Array) -> Array:
-    """T of all weights. expand: (n, 10, b), what features of the bodies in their written frames are."""
+def _in_weights(learnt: LinearWeights, axes: Array, expand: Array) -> Array:
+    """Return T of all weights. expand: (n, 10, b), features of the bodies in their written frames."""
     arm, n, size = learnt.arm.arm, learnt.arm.n_joints, expand.shape[2]
     rubbing = len(learnt.friction.terms)
     rest = learnt.arm.size - (PARAMETERS + 1) * n
@@ -123,7 +130,7 @@ def _in_weights(learnt: Learnt, axes: Array, expand: Array) -> Array:
     first = n * (1 + rubbing)
     for j, joint in enumerate(arm.order):
         # features turn as the parameters' dual: Y' π' = Y π for π' = M π, so Y = Y' M
-        turned = np.stack([moved(axes[j].T, np.zeros(3), each) for each in np.eye(PARAMETERS)], axis=1)
+        turned = np.stack([move_parameters(axes[j].T, np.zeros(3), each) for each in np.eye(PARAMETERS)], axis=1)
         out[PARAMETERS * joint : PARAMETERS * (joint + 1), first : first + size] = turned.T @ expand[j]
         own = j * (1 + rubbing)
         out[PARAMETERS * n + joint, own] = 1.0

@@ -1,9 +1,9 @@
-"""A model of rigid bodies as C99 for hard real time: a source and a header, from the templates in `lipcore/files/c`.
+"""A model of rigid bodies as C99 for hard real time: source and header, from the templates in `lipcore/export/c`.
 
-Torque is linear in the weights w of arm and friction, tau = Φ w with w ~ N(ŵ, C). The mean is written as one recursion
-over the bodies and their change with the learnt step (no features), the standard deviation as |Uᵀ φ_b|, see
-`c_weights`. A nonlinear term adds its covariances with stored torques, see `c_rest`. Each joint's frame is turned
-so that its axis is z, and the two vectors across it, which the steps of the geometry are about, are x and y.
+Torque is linear in the weights w of arm and friction, tau = Φ w with w ~ N(ŵ, C). The mean is written without features,
+as one recursion over the bodies and their change with the learnt step. The standard deviation is |Uᵀ φ_b|, see
+`c_weights`. A nonlinear term adds its covariances with stored torques, see `c_rest`. Each joint's frame is turned so
+that its axis is z. The two vectors across the axis, about which the geometry steps, are x and y.
 """
 
 from __future__ import annotations
@@ -19,8 +19,14 @@ import numpy as np
 from lipcore.data.metrics import LEVEL, quantile
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
-from lipcore.export.c_rest import Rest
-from lipcore.export.c_weights import Learnt, UnsupportedEstimatorError, axes_of, moved, regrouped
+from lipcore.export.c_rest import NonlinearTerm
+from lipcore.export.c_weights import (
+    LinearWeights,
+    UnsupportedEstimatorError,
+    axes_of,
+    group_parameters,
+    move_parameters,
+)
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.fast.answer import ACCELERATED
 from lipcore.kernels.fast.arm_recursion import PARAMETERS
@@ -35,14 +41,14 @@ SOURCE, HEADER = "lipserve_model.c", "lipserve_model.h"
 WIDE = 8
 """Columns of a panel of the root."""
 VECTORS = 16
-"""Queries that the self-test asks, half of them with PAYLOAD."""
+"""Queries of the self-test, half of them with PAYLOAD."""
 PAYLOAD = Body(1.3, np.array([0.02, -0.03, 0.11]), np.diag([0.004, 0.005, 0.003]))
-"""What these carry."""
+"""Payload of half of the self-test."""
 
 
 @dataclass(frozen=True)
-class Origin:
-    """What a file says of where it is from. model: name; version, revision: numbers; digest: of the model's tensors."""
+class ModelOrigin:
+    """Origin of the exported files. model: name; version, revision: numbers; digest: of the model's tensors."""
 
     model: str
     version: int
@@ -50,14 +56,16 @@ class Origin:
     digest: str
 
 
-def c_files(model: TorqueModel, origin: Origin) -> dict[str, str]:
-    """The texts of SOURCE and HEADER by name, ASCII. Raise UnsupportedEstimatorError for an estimator that is not of
-    ROBOT_ESTIMATORS."""
+def c_files(model: TorqueModel, origin: ModelOrigin) -> dict[str, str]:
+    """Return the texts of SOURCE and HEADER by name, ASCII.
+
+    Raise UnsupportedEstimatorError for an estimator that is not one of ROBOT_ESTIMATORS.
+    """
     if model.estimator.name not in ROBOT_ESTIMATORS:
         raise UnsupportedEstimatorError(
             f"estimator is {model.estimator.name!r}, expected one of {', '.join(ROBOT_ESTIMATORS)} for C"
         )
-    learnt = Learnt.of(model)
+    learnt = LinearWeights.of(model)
     fields = _texts(model, origin) | _tables(model, learnt) | {"stack": _stack(model)}
     written = {}
     for name in (SOURCE, HEADER):
@@ -69,11 +77,11 @@ def _template(name: str) -> Template:
     return Template((Path(__file__).parent / "c" / f"{name}.in").read_text(encoding="ascii"))
 
 
-def _tables(model: TorqueModel, learnt: Learnt) -> dict[str, str]:
-    """All numbers of the source."""
+def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
+    """Return all numbers of the source."""
     arm, posterior = learnt.arm.arm, model.posterior
     n, size, order = arm.n_joints, PARAMETERS * arm.n_joints, arm.order
-    kept, expand = regrouped(learnt)
+    kept, expand = group_parameters(learnt)
     root, shared = learnt.root(expand)
     others = 0 if learnt.arm.others is None else learnt.arm.others.size
     rubbing = learnt.mean[learnt.arm.size :].reshape(n, -1)
@@ -121,7 +129,7 @@ def _tables(model: TorqueModel, learnt: Learnt) -> dict[str, str]:
         "arms": arms,
         "share": share,
         "root": _braced(_panels(root)),
-        **_rest(Rest.of(posterior), shared),
+        **_rest(NonlinearTerm.of(posterior), shared),
         "misfit": _braced(posterior.misfit.packed()),
         "floor": _braced(posterior.floor),
         "range": _braced(np.array(limits)),
@@ -132,8 +140,8 @@ def _tables(model: TorqueModel, learnt: Learnt) -> dict[str, str]:
     }
 
 
-def _texts(model: TorqueModel, origin: Origin) -> dict[str, str]:
-    """All words of both files: names are anyone's, and must not end a comment or a string."""
+def _texts(model: TorqueModel, origin: ModelOrigin) -> dict[str, str]:
+    """Return all words of both files; names are arbitrary, and must not end a comment or a string."""
     names = [name.encode() for name in model.joint_names]
     limits = model.training_range
     joints = []
@@ -163,8 +171,10 @@ def _texts(model: TorqueModel, origin: Origin) -> dict[str, str]:
 
 
 def _arm_table(geometry: Geometry, step: Array, bodies: Array, change: Array, own: Array) -> str:
-    """An `arm_t`. step: (g,), none where the geometry is fixed; bodies, change: (n, 10), own: (n, 4 or 5), base to
-    tip."""
+    """Return the initializer of an `arm_t`.
+
+    step: (g,), empty for a fixed geometry; bodies, change: (n, 10), own: (n, 4 or 5), base to tip.
+    """
     n, axes = geometry.n_joints, axes_of(geometry)
     before = np.concatenate([np.eye(3)[None], axes[:-1]])
     turn = before.mT @ geometry.rotation @ axes
@@ -175,15 +185,17 @@ def _arm_table(geometry: Geometry, step: Array, bodies: Array, change: Array, ow
         along[j, : max(count - 2, 0)] = step[at + 2 : at + count]
         at += count
     shift = (turn @ along[..., None])[..., 0]
-    turned = [np.stack([moved(axes[j].T, np.zeros(3), each[j]) for j in range(n)]) for each in (bodies, change)]
+    turned = [
+        np.stack([move_parameters(axes[j].T, np.zeros(3), each[j]) for j in range(n)]) for each in (bodies, change)
+    ]
     names = ("gravity", "turn", "place", "tilt", "shift", "body", "change", "own")
     numbers = (geometry.gravity, turn.reshape(n, 9), place, tilt, shift, *turned, own)
     fields = [f".{name} = {_braced(value)}" for name, value in zip(names, numbers, strict=True)]
     return "{\n" + ",\n".join(fields) + "}"
 
 
-def _rest(rest: Rest | None, shared: Array) -> dict[str, str]:
-    """What a nonlinear term adds; nothing for rigid bodies alone. shared: V of `Learnt.root`."""
+def _rest(rest: NonlinearTerm | None, shared: Array) -> dict[str, str]:
+    """Return the contribution of a nonlinear term, empty for rigid bodies alone. shared: V of `LinearWeights.root`."""
     if rest is None:
         return {"outputs": "0", "alpha": "{0}", "learnt": "{0}", "shared": "{0}", "factor": "0", "term": ""}
     padded = np.pad(shared, ((0, -len(shared) % WIDE), (0, 0)))
@@ -200,28 +212,28 @@ def _rest(rest: Rest | None, shared: Array) -> dict[str, str]:
 
 
 def _stack(model: TorqueModel) -> str:
-    """Kilobytes that a call takes, of its largest arrays: links; covariances and products of energies."""
+    """Return the stack of a call in kB: of its links, and of covariances and products of energies."""
     n, outputs = model.n_joints, len(model.posterior.basis.outputs)
     return str(round(2 * n + (8e-3 * n * outputs + 0.6 * n**2 if outputs else 0.0)))
 
 
 def _panels(root: Array) -> Array:
-    """The root's columns, WIDE at a time, row by row down to the diagonal: flat; zeros fill the last."""
+    """Return the root's columns, WIDE at a time, row by row down to the diagonal: flat, padded with zeros."""
     size = len(root)
     padded = np.pad(root, ((0, 0), (0, -size % WIDE)))
     starts = range(0, size, WIDE)
     return np.concatenate([padded[: min(at + WIDE, size), at : at + WIDE].reshape(-1) for at in starts])
 
 
-def _vectors(model: TorqueModel, learnt: Learnt) -> Array:
-    """Queries within the training's range, and the model's own answers: (VECTORS, 5, n)."""
+def _vectors(model: TorqueModel, learnt: LinearWeights) -> Array:
+    """Return queries within the training's range, and the model's own predictions: (VECTORS, 5, n)."""
     limits, draw, n = model.training_range, np.random.default_rng(0).uniform, model.n_joints
     motions = [draw(limits[name]["min"], limits[name]["max"], (VECTORS, n)) for name in ("q", "dq", "ddq")]
     out = []
     for rows, carried in ((slice(0, VECTORS // 2), False), (slice(VECTORS // 2, VECTORS), True)):
         motion = [each[rows] for each in motions]
         q, dq, ddq = motion
-        mean, std, *_ = (_carrying(model, learnt) if carried else model).evaluator.many(q, dq, ddq)
+        mean, std, *_ = (_add_payload(model, learnt) if carried else model).evaluator.many(q, dq, ddq)
         more = np.zeros_like(mean)
         if carried:
             more = PayloadKernel(learnt.arm.arm, np.ones(PARAMETERS)).features(Motion(q, dq, ddq)) @ PAYLOAD.parameters
@@ -229,8 +241,8 @@ def _vectors(model: TorqueModel, learnt: Learnt) -> Array:
     return np.concatenate(out)
 
 
-def _carrying(model: TorqueModel, learnt: Learnt) -> TorqueModel:
-    """The model whose torque changes with the geometry as that of an arm with PAYLOAD does."""
+def _add_payload(model: TorqueModel, learnt: LinearWeights) -> TorqueModel:
+    """Return the model whose torque changes with the geometry as that of an arm with PAYLOAD."""
     parameters = learnt.arm.arm.parameters.copy()
     parameters[-1] += PAYLOAD.parameters
     loaded = ArmKernel(replace(learnt.arm.arm, parameters=parameters))
@@ -239,7 +251,7 @@ def _carrying(model: TorqueModel, learnt: Learnt) -> TorqueModel:
 
 
 def _braced(values: Any) -> str:
-    """Numbers as an initializer, from which they read back as they are; a line at most each."""
+    """Return numbers as an initializer that reads back exactly, in lines of about 100 characters."""
     if np.ndim(values) > 1:
         return "{" + ",\n".join(_braced(each) for each in values) + "}"
     texts, lines, line = [repr(float(each)) for each in values], list[str](), ""
@@ -256,11 +268,11 @@ def _integers(values: Iterable[Any]) -> str:
 
 
 def _comment(text: str) -> str:
-    """Text within a comment, which it cannot end: ASCII, without line ends, backslashes and slashes."""
+    """Return text for a comment, which it cannot end: ASCII, without line ends, backslashes and slashes."""
     return "".join(each if each.isascii() and each.isprintable() and each not in "/\\?" else "_" for each in text)
 
 
 def _string(text: bytes) -> str:
-    """A string literal of these bytes: three octal digits for all but letters, digits and a few marks."""
+    """Return a string literal of these bytes: three octal digits for all but letters, digits and a few marks."""
     plain = b"abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-. "
     return '"' + "".join(chr(each) if each in plain else f"\\{each:03o}" for each in text) + '"'

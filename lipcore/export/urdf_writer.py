@@ -1,9 +1,8 @@
-"""A URDF of an arm whose geometry was learnt: a link a joint, with its mass, its friction and its rotor.
+"""A URDF of an arm whose geometry was learnt: one link a joint, with its mass, its friction and its rotor.
 
-URDF has no tag for rotor inertia: it is written as Drake reads it, in a `<transmission>` that others skip. The torque
-of a simulator that skips it lacks rotor · ddq. Offset torque is written as a comment, friction that only slow joints
-have is left out. Where gravity does not point down the base's z axis, a fixed joint from `world` to `base` turns the
-base.
+URDF has no tag for rotor inertia: it is written in a `<transmission>`, as Drake reads it. The torque of a simulator
+that ignores it lacks rotor · ddq. Offset torque is written as a comment. Friction of slow joints only is left out. If
+gravity does not point down the base's z axis, a fixed joint from `world` to `base` turns the base.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.files.entries import Chain, Inertia
-from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, aligned, rotation_of, skew
+from lipcore.kernels.geometry import STANDARD_GRAVITY, Geometry, rotation_of, rotation_to_axis, skew
 
 Element = ElementTree.Element
 
 ROOT, BASE = "world", "base"
-ABOUT = (
+HEADER_COMMENTS = (
     "Learnt from torque by LIPServe.",
     "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.",
     "Limits of position and velocity are the range of the training, not those of the drives.",
@@ -34,21 +33,25 @@ ABOUT = (
 
 @dataclass(frozen=True)
 class ArmJoints:
-    """What a URDF says of an arm's n joints, beside where they lie; base to tip, each (n,).
-
-    lower, upper: rad (m); velocity: rad/s (m/s); viscous: N·m·s/rad (N·s/m); coulomb, offset: N·m (N); rotor: kg·m²
-    (kg); undetermined: what torque does not tell of each joint and its body, in words.
-    """
+    """The n joints of an arm without their poses, base to tip, each array (n,)."""
 
     names: tuple[str, ...]
     lower: Array
+    """Min positions, rad (m)."""
     upper: Array
+    """Max positions, rad (m)."""
     velocity: Array
+    """Max speeds, rad/s (m/s)."""
     viscous: Array
+    """N·m·s/rad (N·s/m)."""
     coulomb: Array
+    """N·m (N)."""
     offset: Array
+    """N·m (N)."""
     rotor: Array
+    """kg·m² (kg)."""
     undetermined: tuple[tuple[str, ...], ...] = ()
+    """Names of unidentifiable parameters of each joint and its body."""
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -66,12 +69,14 @@ class ArmJoints:
 def urdf_text(
     geometry: Geometry, bodies: Array, joints: ArmJoints, name: str = "arm", notes: Sequence[str] = ()
 ) -> str:
-    """URDF of an arm. bodies: (n, 10), ten parameters each about its joint's frame, base to tip; name: the robot's;
-    notes: comments at its beginning.
+    """Return the URDF of an arm.
 
-    With gravity (0, 0, −|g|) in the frame of the root, recursive Newton–Euler on it, plus rotor · ddq and friction, is
-    the torque of the arm. Negative friction, which no simulator takes, is written as zero. Raise ValueError for a mass
-    that is not positive and for sizes that differ.
+    bodies: (n, 10), ten parameters each about its joint's frame, base to tip; name: the robot's; notes: comments at its
+    beginning.
+
+    With gravity (0, 0, −|g|) in the frame of the root, recursive Newton–Euler on the URDF, plus rotor · ddq and
+    friction, is the torque of the arm. Negative friction, which no simulator accepts, is written as zero. Raise
+    ValueError for a mass that is not positive and for inconsistent sizes.
     """
     n = geometry.n_joints
     if bodies.shape != (n, 10) or len(joints.names) != n:
@@ -80,7 +85,7 @@ def urdf_text(
         if not mass > 0:
             raise ValueError(f"the mass that joint {joint!r} moves is {mass:g} kg, expected more than zero")
     robot = Element("robot", {"name": name, "xmlns:drake": "http://drake.mit.edu"})
-    _comments(robot, [*ABOUT, *_about_gravity(geometry), *notes])
+    _comments(robot, [*HEADER_COMMENTS, *_gravity_comments(geometry), *notes])
     parent, reach = BASE, _reach(geometry, bodies, joints)
     line = max(0.02 * float(reach[0]), 1e-3)
     upright = _upright(geometry.gravity)
@@ -110,7 +115,7 @@ def urdf_of_parameters(
     training_range: Mapping[str, Mapping[str, Sequence[float]]],
     name: str = "arm",
 ) -> str:
-    """URDF of the `parameters` that a version's manifest reports, with its physically possible bodies.
+    """Return the URDF of the `parameters` in a version's manifest, with its physically possible bodies.
 
     joint_names and training_range: the manifest's, in the order of the data. Raise ValueError for a model without rigid
     bodies.
@@ -145,7 +150,7 @@ def urdf_of_parameters(
 
 
 def rpy(rotation: Array) -> Array:
-    """Roll, pitch and yaw (3,) rad of a rotation Rz(yaw) Ry(pitch) Rx(roll), exact where pitch is ± 90° too."""
+    """Return roll, pitch and yaw (3,) rad of a rotation Rz(yaw) Ry(pitch) Rx(roll), exact even at a pitch of ± 90°."""
     (a, _, _), (b, _, _), (c, _, _) = rotation
     yaw = np.arctan2(b, a)
     sin, cos = np.sin(yaw), np.cos(yaw)
@@ -155,7 +160,7 @@ def rpy(rotation: Array) -> Array:
 
 
 def _upright(gravity: Array) -> Array:
-    """The shortest turn of the base after which gravity points down the root's z axis; none without gravity."""
+    """Return the shortest turn of the base after which gravity points down the root's z axis; none without gravity."""
     length = float(np.linalg.norm(gravity))
     if length == 0.0:
         return np.eye(3)
@@ -167,7 +172,7 @@ def _upright(gravity: Array) -> Array:
     return rotation_of(axis / sine * np.arctan2(sine, cosine))
 
 
-def _about_gravity(geometry: Geometry) -> list[str]:
+def _gravity_comments(geometry: Geometry) -> list[str]:
     strength = float(np.linalg.norm(geometry.gravity))
     if strength == 0.0:
         return ["Torque was measured without gravity: how the base stands is not known."]
@@ -177,7 +182,7 @@ def _about_gravity(geometry: Geometry) -> list[str]:
 
 
 def _reach(geometry: Geometry, bodies: Array, joints: ArmJoints) -> Array:
-    """How far masses beyond each joint can be from it at most, (n,) m."""
+    """Return the max distance of masses beyond each joint from it, (n,) m."""
     steps = np.linalg.norm(geometry.translation, axis=1)
     slides = [kind == "prismatic" for kind in geometry.joint_types]
     steps = steps + np.maximum(np.abs(joints.lower), np.abs(joints.upper)) * slides
@@ -191,11 +196,11 @@ def _reach(geometry: Geometry, bodies: Array, joints: ArmJoints) -> Array:
 
 
 def _effort(bodies: Array, joints: ArmJoints, reach: Array) -> Array:
-    """A limit of torque that does not bind, (n,) N·m (N): no drive's, as none is known."""
+    """Return a limit of torque that does not bind, (n,) N·m (N): the drives' limits are unknown."""
     carried = np.cumsum(bodies[::-1, 0])[::-1] * STANDARD_GRAVITY
     lever = np.maximum(reach, 1.0)
     friction = np.abs(joints.viscous) * joints.velocity + np.abs(joints.coulomb) + np.abs(joints.offset)
-    return 10.0 * (carried * lever + friction)  # far above what the training has seen
+    return 10.0 * (carried * lever + friction)  # far above the torques of the training
 
 
 def _joint(
@@ -209,7 +214,7 @@ def _joint(
 
 
 def _moving(joint: Element, axis: Array, joints: ArmJoints, k: int, effort: float) -> None:
-    """Axis, limits and friction of a joint."""
+    """Write axis, limits and friction of a joint."""
     ElementTree.SubElement(joint, "axis", xyz=_texts(axis))
     limits = {"lower": joints.lower[k], "upper": joints.upper[k], "velocity": joints.velocity[k], "effort": effort}
     ElementTree.SubElement(joint, "limit", {key: _text(value) for key, value in limits.items()})
@@ -223,7 +228,7 @@ def _moving(joint: Element, axis: Array, joints: ArmJoints, k: int, effort: floa
 
 
 def _link(robot: Element, name: str, body: Array | None, end: Array | None, line: float) -> None:
-    """A link with its mass, a sphere there, and a line to the frame of the next joint."""
+    """Write a link with its mass, a sphere at its centre of mass, and a line to the frame of the next joint."""
     link = ElementTree.SubElement(robot, "link", name=name)
     if body is not None:
         mass, centre = float(body[0]), body[1:4] / body[0]
@@ -235,11 +240,11 @@ def _link(robot: Element, name: str, body: Array | None, end: Array | None, line
         about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) + mass * arm @ arm
         entries = {"ixx": (0, 0), "ixy": (0, 1), "ixz": (0, 2), "iyy": (1, 1), "iyz": (1, 2), "izz": (2, 2)}
         ElementTree.SubElement(inertial, "inertia", {key: _text(about[at]) for key, at in entries.items()})
-        sphere = _visual(link, centre)  # as large as if it were of aluminium
+        sphere = _visual(link, centre)  # the radius of an aluminium ball of this mass
         ElementTree.SubElement(sphere, "sphere", radius=f"{(0.75 * mass / (np.pi * 2700.0)) ** (1 / 3):.4f}")
     length = 0.0 if end is None else float(np.linalg.norm(end))
     if end is not None and length > line:
-        cylinder = _visual(link, 0.5 * end, aligned((end / length).tolist()))
+        cylinder = _visual(link, 0.5 * end, rotation_to_axis((end / length).tolist()))
         ElementTree.SubElement(cylinder, "cylinder", radius=f"{line:.4f}", length=f"{length:.4f}")
 
 
@@ -250,7 +255,7 @@ def _visual(link: Element, place: Array, rotation: Array | None = None) -> Eleme
 
 
 def _transmission(robot: Element, joint: str, rotor: float) -> None:
-    """A drive without a gear: the rotor's inertia is that which the joint feels."""
+    """Write a drive without a gear: the inertia of its rotor is that at the joint."""
     made = ElementTree.SubElement(robot, "transmission", name=f"{joint}_transmission")
     ElementTree.SubElement(made, "type").text = "transmission_interface/SimpleTransmission"
     held = ElementTree.SubElement(made, "joint", name=joint)
@@ -272,7 +277,7 @@ def _comments(element: Element, texts: Sequence[str]) -> None:
 
 
 def _unlike(name: str, others: Sequence[str]) -> str:
-    """The name, made longer until it is none of the others'."""
+    """Return the name, extended until it is none of the others."""
     while name in others:
         name += "_"
     return name

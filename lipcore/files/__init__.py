@@ -1,1 +1,1 @@
-"""A model as files: written, and read from strangers."""
+"""A model as files: writing them, and reading them from untrusted sources."""

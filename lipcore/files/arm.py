@@ -30,13 +30,13 @@ _TENSORS = {
 }
 
 
-def is_of_arm(name: str) -> bool:
-    """Whether a tensor of this name belongs to an arm."""
+def is_arm_tensor(name: str) -> bool:
+    """Return whether a tensor of this name belongs to an arm."""
     return name in _TENSORS
 
 
 def arm_tensors(arm: Arm) -> dict[str, Array]:
-    """All numbers of an arm, float64, by name."""
+    """Return all numbers of an arm, float64, by name."""
     parts = {name: getattr(arm.geometry, name) for name in _GEOMETRY_TENSORS} | {
         name: getattr(arm, name) for name in _ARM_TENSORS
     }
@@ -58,9 +58,10 @@ def arm_tensors(arm: Arm) -> dict[str, Array]:
 
 
 def read_arm(tensors: Mapping[str, Array], joint_types: Sequence[JointType], mode: GeometryMode) -> Arm:
-    """The arm that `arm_tensors` stored; joint_types: in the order of the data; mode: how its geometry was come by.
+    """Return the arm that `arm_tensors` stored.
 
-    Raise ValueError for tensors that are missing or do not fit together.
+    joint_types: in the order of the data; mode: origin of its geometry. Raise ValueError for tensors that are missing
+    or inconsistent.
     """
     try:
         parts = {name: tensors[f"{PREFIX}{name}"] for name in (*_GEOMETRY_TENSORS, *_ARM_TENSORS, "order")}
@@ -71,7 +72,7 @@ def read_arm(tensors: Mapping[str, Array], joint_types: Sequence[JointType], mod
         raise ValueError(f"tensor 'arm/order' is {order.tolist()}, expected each joint once")
     types = tuple(joint_types[joint] for joint in order)
     geometry = Geometry(types, *(parts.pop(name) for name in _GEOMETRY_TENSORS))
-    rotor = tensors.get(f"{PREFIX}rotor")  # nothing is stored where none is expected
+    rotor = tensors.get(f"{PREFIX}rotor")  # rotors of zero inertia are not stored
     parts["rotor"] = np.zeros(len(types)) if rotor is None else rotor
     stribeck = _stribeck(tensors)
     alternatives = _alternatives(tensors, geometry, len(friction_terms(stribeck)))
@@ -79,7 +80,7 @@ def read_arm(tensors: Mapping[str, Array], joint_types: Sequence[JointType], mod
 
 
 def _stribeck(tensors: Mapping[str, Array]) -> bool:
-    """Whether friction has its fourth term: it has not where nothing is stored."""
+    """Return whether friction has its fourth term; False if nothing is stored."""
     if (stored := tensors.get(f"{PREFIX}stribeck")) is None:
         return False
     if (values := stored.tolist()) not in ([0.0], [1.0]):
@@ -88,7 +89,7 @@ def _stribeck(tensors: Mapping[str, Array]) -> bool:
 
 
 def _alternatives(tensors: Mapping[str, Array], geometry: Geometry, terms: int) -> tuple[Alternative, ...]:
-    """terms: of friction."""
+    """Return the alternative arms. terms: number of friction terms a joint."""
     if f"{PREFIX}other/probability" not in tensors:
         return ()
     try:

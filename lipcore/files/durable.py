@@ -1,5 +1,4 @@
-"""Names of files that outlive a power cut: a file that is synced may still be lost with its name, which is kept by its
-folder, and a folder with its name in the folder above."""
+"""File names that survive a power cut: a synced file may still be lost if the name in its folder is not synced."""
 
 from __future__ import annotations
 
@@ -7,8 +6,8 @@ import os
 from pathlib import Path
 
 
-def sync(folder: Path) -> None:
-    """Have the names in a folder on the disk; raise OSError."""
+def sync_folder(folder: Path) -> None:
+    """Write the names in a folder to the disk; raise OSError."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -17,14 +16,16 @@ def sync(folder: Path) -> None:
 
 
 def make_folder(folder: Path, mode: int = 0o777) -> None:
-    """Make a folder of this mode, and those above it that are missing; where it is there, see that its name is on the
-    disk: who has made it may have ended before. Raise OSError."""
+    """Make a folder of this mode, with missing folders above it, and sync its name; raise OSError.
+
+    The name of an existing folder is synced, too: the process that made it may have ended before.
+    """
     if not folder.parent.is_dir():
         make_folder(folder.parent)
     made = not folder.is_dir()
     folder.mkdir(mode, exist_ok=True)
     try:
-        sync(folder.parent)
-    except PermissionError:  # somebody else has made it, where this user may not look
+        sync_folder(folder.parent)
+    except PermissionError:  # another user has made it in a folder that is closed to this one
         if made:
             raise

@@ -1,6 +1,6 @@
-"""What entries of a manifest are made of, and those of an arm.
+"""The parts of a manifest's entries, and the entries of an arm.
 
-A list has one item a joint (`check_lengths`); whatever else repeats is a tuple.
+A list has one item a joint (`check_lengths`); other sequences are tuples.
 """
 
 import re
@@ -17,23 +17,23 @@ from lipcore.model.selection import Count
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.vocabulary import GEOMETRY_MODES, JOINT_TYPES
 
-LARGEST = 1e12
-"""No motion, torque or parameter in SI units is larger."""
+MAX_VALUE = 1e12
+"""Max magnitude of motion, torque and parameters, SI."""
 
 
 def one_of(words: Iterable[str]) -> Meta:
-    """Return the constraint of a text that is one of these words; its error names them, that of a Literal does not."""
+    """Return the constraint of a text to these words; its error names them, unlike that of a Literal."""
     return Meta(pattern=rf"^({'|'.join(map(re.escape, words))})\Z")
 
 
-Number = Annotated[float, Meta(ge=-LARGEST, le=LARGEST)]
-Size = Annotated[float, Meta(ge=0, le=LARGEST)]
-"""A deviation, a duration or anything else that is not below zero."""
+Number = Annotated[float, Meta(ge=-MAX_VALUE, le=MAX_VALUE)]
+NonNegative = Annotated[float, Meta(ge=0, le=MAX_VALUE)]
+"""A deviation, a duration or another number of at least zero."""
 JointKind = Annotated[str, one_of(JOINT_TYPES)]
 Vector = tuple[Number, Number, Number]
 Matrix = tuple[Vector, Vector, Vector]
 Steps = Annotated[tuple[Number, ...], Meta(max_length=2)]
-"""Standard deviations of a joint's two turns or shifts; none of what is fixed."""
+"""Standard deviations of a joint's two turns or shifts, empty if these are fixed."""
 
 
 class Entry(Struct, forbid_unknown_fields=True):
@@ -44,7 +44,7 @@ class Estimate(Entry):
     """Mean and standard deviation of a number of each joint."""
 
     mean: list[Number]
-    std: list[Size]
+    std: list[NonNegative]
 
 
 class Friction(Entry):
@@ -56,7 +56,7 @@ class Friction(Entry):
     stribeck: Estimate | UnsetType = UNSET
 
 
-class Masses(Entry):
+class BodyParameters(Entry):
     """Ten parameters of a body: see `lipcore.model.parameters.InertialParameters`."""
 
     mass: Number
@@ -65,13 +65,13 @@ class Masses(Entry):
 
 
 class Body(Entry):
-    """What a joint moves."""
+    """The body that a joint moves."""
 
     joint: str
-    mean: Masses
-    std: Masses
-    plausible: Masses
-    undetermined: tuple[Annotated[str, one_of(Masses.__struct_fields__)], ...]
+    mean: BodyParameters
+    std: BodyParameters
+    plausible: BodyParameters
+    undetermined: tuple[Annotated[str, one_of(BodyParameters.__struct_fields__)], ...]
 
 
 class Inertia(Entry):
@@ -87,14 +87,14 @@ class Inertia(Entry):
         return np.array(each, np.float64).reshape(-1, PARAMETERS)
 
 
-class Place(Entry):
-    """Where a joint lies in the frame of the one before it."""
+class JointPose(Entry):
+    """Pose of a joint in the frame of the previous one."""
 
     rotation: Matrix
     translation: Vector
 
 
-class Joint(Place):
+class Joint(JointPose):
     """A joint of a chain: see `lipcore.kernels.geometry.Geometry`."""
 
     joint: str
@@ -104,8 +104,8 @@ class Joint(Place):
     turn_std: Steps
     shift_std: Steps
     undetermined: tuple[Annotated[str, one_of(STEPS)], ...]
-    plausible: Place | UnsetType = UNSET
-    """For which the plausible bodies are meant, if it is another place."""
+    plausible: JointPose | UnsetType = UNSET
+    """Pose for the plausible bodies, if it differs."""
 
     def __post_init__(self) -> None:
         for name in ("turn_std", "shift_std"):
@@ -114,7 +114,7 @@ class Joint(Place):
 
 
 class Chain(Entry):
-    """Joints from base to tip; order: the data's joint at each place."""
+    """Joints from base to tip. order: the data's joint at each index."""
 
     mode: Annotated[str, one_of(GEOMETRY_MODES)]
     gravity: Vector
@@ -128,7 +128,7 @@ class Chain(Entry):
             self.geometry(plausible)
 
     def geometry(self, plausible: bool = False) -> Geometry:
-        """Return where the joints lie; plausible: for the plausible bodies. Raise ValueError for no rotation matrix."""
+        """Return the geometry, optionally of the plausible bodies; raise ValueError for an invalid rotation matrix."""
         places = [each.plausible if plausible and each.plausible is not UNSET else each for each in self.joints]
         kinds: tuple[Any, ...] = tuple(joint.type for joint in self.joints)
         return Geometry(
@@ -141,7 +141,7 @@ class Chain(Entry):
 
 
 class Parameters(Entry):
-    """What `lipcore.model.parameters.report` tells of a model."""
+    """The parameters of a model, as `lipcore.model.parameters.report` returns them."""
 
     friction: Friction
     inertia: Inertia | UnsetType = UNSET

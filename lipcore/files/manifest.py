@@ -1,6 +1,6 @@
-"""What a model's manifest may say. It is declared here, once, and every entry is checked before anything is made of it.
+"""The schema of a model's manifest. Every entry is checked before it is used.
 
-The manifest itself stays plain data, as the file has it: what is stored and written again is what was read.
+The manifest itself stays plain data: it is stored again as it was read.
 """
 
 from dataclasses import dataclass
@@ -13,13 +13,13 @@ from lipcore.estimators.catalogue import Calibration
 from lipcore.estimators.options import FitOptions
 from lipcore.files import strict_json
 from lipcore.files.entries import (
-    LARGEST,
+    MAX_VALUE,
     Entry,
     Estimate,
     JointKind,
+    NonNegative,
     Number,
     Parameters,
-    Size,
     check_lengths,
     one_of,
 )
@@ -34,7 +34,7 @@ MANIFEST, TENSORS, ROBOT = "manifest.json", "model.safetensors", "robot.urdf"
 
 
 class ModelFormatError(ValueError):
-    """Files do not hold a valid model; the message names what is wrong, `file` the file that it is in."""
+    """The files are not a valid model; the message names the mistake, and `file` the file."""
 
     def __init__(self, message: str, file: str = MANIFEST) -> None:
         super().__init__(message)
@@ -43,28 +43,28 @@ class ModelFormatError(ValueError):
 
 @dataclass(frozen=True)
 class Limits:
-    """How large a model may be: what it costs to load is bounded before it is loaded.
-
-    joints: n; inducing_samples: S; inducing_torques: S n, whose square is the largest matrix computed;
-    inducing_outputs: m; manifest_bytes, robot_bytes: of the files.
-    """
+    """Max size of a model, which bounds the cost of loading it."""
 
     joints: int = 256
+    """Max number of joints n."""
     inducing_samples: int = 5000
+    """Max number of inducing samples S."""
     inducing_torques: int = 50_000
+    """Max S n, the size of the largest square matrix computed."""
     inducing_outputs: int = 20_000
+    """Max number of inducing torques m of the nonlinear term."""
     manifest_bytes: int = 4 * 1024 * 1024
     robot_bytes: int = 16 * 1024 * 1024
 
 
 DEFAULT_LIMITS = Limits()
-"""Beyond what training can make; for stores of one's own."""
+"""Limits above all that training can make, for local stores."""
 
 
 class Fit(TypedDict, total=False):
-    """What a fit did: see `lipcore.estimators.hyperparameters.FitReport` and `lipcore.arm.learning`.
+    """Report of a fit: see `lipcore.estimators.hyperparameters.FitReport` and `lipcore.arm.learning`.
 
-    Of other names, as other releases have them, only numbers and truth values pass; so it is with `Compact`.
+    Unknown names, as of other releases, may only have numbers and truth values; the same applies to `Compact`.
     """
 
     objective: float
@@ -82,12 +82,12 @@ class Fit(TypedDict, total=False):
         Meta(max_length=300, pattern=r"^\d+ by [a-z]+(, \d+ by [a-z]+)*; the first are rows [\d, ]+, counted from 0$"),
     ]
     refit_error: Name
-    independent_samples: Size
-    row_correlation: Size
-    motion_dimensions: Size
-    jitter: Annotated[float, Meta(ge=0, le=LARGEST**2)]
+    independent_samples: NonNegative
+    row_correlation: NonNegative
+    motion_dimensions: NonNegative
+    jitter: Annotated[float, Meta(ge=0, le=MAX_VALUE**2)]
     """(N·m)²"""
-    seconds: Size
+    seconds: NonNegative
     device: Annotated[str, Meta(pattern=r"^[a-z]{1,10}(:\d{1,3})?$")]
     geometry: Annotated[str, one_of(GEOMETRY_MODES)]
     friction_terms: Count
@@ -99,28 +99,28 @@ class Fit(TypedDict, total=False):
     search_times_best: Count
     search_explained: bool
     search_ended: Annotated[str, Meta(pattern=r"^[a-z]{1,20}$")]
-    search_seconds: Size
+    search_seconds: NonNegative
     search_alternatives: Count
     search_next_nats: float
 
 
 class Compact(TypedDict, total=False):
-    """How near a compact posterior comes to the exact one: see `lipcore.posterior.compression`."""
+    """Accuracy of a compact posterior compared with the exact one: see `lipcore.posterior.compression`."""
 
     inducing_outputs: Count
     inducing_samples: Count
     weights: Count
-    tolerance: Size
+    tolerance: NonNegative
     tolerance_reached: bool
-    mean_rms: Size
-    mean_max: Size
-    std_max: Size
+    mean_rms: NonNegative
+    mean_max: NonNegative
+    std_max: NonNegative
     queries: Count
-    data_samples: Required[Annotated[int, Meta(ge=0, le=int(LARGEST))]]
+    data_samples: Required[Annotated[int, Meta(ge=0, le=int(MAX_VALUE))]]
 
 
-class Ends(Entry):
-    """Smallest and largest value of each joint."""
+class ValueRange(Entry):
+    """Min and max of each joint."""
 
     min: list[Number]
     max: list[Number]
@@ -134,9 +134,9 @@ class Ends(Entry):
 class TrainingRange(Entry):
     """See `lipcore.model.torque_model.training_range`."""
 
-    q: Ends
-    dq: Ends
-    ddq: Ends
+    q: ValueRange
+    dq: ValueRange
+    ddq: ValueRange
 
 
 class File(Entry):
@@ -171,9 +171,9 @@ class Manifest(Entry, kw_only=True):
     joint_names: list[Name]
     joint_types: list[JointKind]
     torque_convention: Annotated[str, one_of(TORQUE_CONVENTIONS)]
-    noise_std: list[Size]
+    noise_std: list[NonNegative]
     options: dict[str, Any]
-    """Of `FitOptions`."""
+    """Fields of `FitOptions`."""
     fit: Fit
     compact: Compact
     calibration: Calibration
@@ -189,7 +189,7 @@ class Manifest(Entry, kw_only=True):
     training_torque: Estimate | UnsetType = UNSET
 
     def __post_init__(self) -> None:
-        """Check what one entry says of another; raise ValueError."""
+        """Raise ValueError if entries contradict each other."""
         n = len(self.joint_names)
         if not n or len(set(self.joint_names)) < n:
             raise ValueError(f"joint_names is {self.joint_names}, expected at least one, and names that differ")
@@ -214,9 +214,9 @@ _DECODER = msgspec.json.Decoder(Manifest)
 
 
 def read_manifest_bytes(payload: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
-    """The manifest that a file's bytes hold, every entry checked.
+    """Return the manifest in a file's bytes, with every entry checked.
 
-    Raise ModelFormatError that names the entry, its value and what was expected.
+    Raise ModelFormatError that names the entry, its value and the expected one.
     """
     try:
         manifest = strict_json.read(payload, limits.manifest_bytes)
@@ -244,7 +244,7 @@ def _check_known(where: str, entry: dict[str, Any], kind: type) -> None:
 
 
 def _check_names(manifest: dict[str, Any]) -> None:
-    """Raise StrictJsonError for names that are none of a type that lets others pass."""
+    """Raise StrictJsonError for unknown names in types that allow them."""
     kinds = {"calibration": Calibration, "conformal": Conformal, "selection": Selection}
     entries: list[tuple[str, Any, type]] = [(name, manifest[name], kinds[name]) for name in kinds if name in manifest]
     if "selection" in manifest:

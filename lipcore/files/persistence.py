@@ -1,6 +1,6 @@
-"""A model on disk: `manifest.json`, which a person can read, `model.safetensors`, and `robot.urdf` where there is one.
+"""A model on disk: a readable `manifest.json`, `model.safetensors`, and `robot.urdf` if the model has a robot.
 
-None of them can hold code, and whatever they hold is checked: what is loaded may come from a stranger.
+None of them can contain code. All their content is checked, because a model may come from an untrusted source.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from safetensors.numpy import save as save_tensors
 
 from lipcore.data.motion import Array, Indices, Motion
 from lipcore.estimators.catalogue import Calibration, make_estimator
-from lipcore.files.arm import arm_tensors, is_of_arm, read_arm
-from lipcore.files.durable import make_folder, sync
+from lipcore.files.arm import arm_tensors, is_arm_tensor, read_arm
+from lipcore.files.durable import make_folder, sync_folder
 from lipcore.files.manifest import (
     DEFAULT_LIMITS,
     FORMAT,
@@ -48,20 +48,35 @@ from lipcore.vocabulary import GEOMETRY_MODES, ROBOT_ESTIMATORS
 
 
 def save(model: TorqueModel, folder: Path, lineage: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Write the model as a new folder, all of it or nothing, and return its manifest.
+    """Write the model as a new folder, completely or not at all, and return its manifest.
 
-    lineage: where the model comes from, stored as given. Raise FileExistsError where the folder exists, ValueError for
-    a model that has learnt online: see `lipcore.online.transfer`.
+    Args:
+        model: a model as trained.
+        folder: the folder to make.
+        lineage: origin of the model, stored as given.
+
+    Returns:
+        The manifest, as `manifest.json` contains it.
+
+    Raises:
+        FileExistsError: The folder exists.
+        ValueError: The model has learnt online: see `lipcore.online.transfer`.
+
+    Example:
+        >>> manifest = lipcore.save(model, Path("models/my-arm"))
+        >>> lipcore.load("models/my-arm").joint_names == tuple(manifest["joint_names"])
+        True
+
     """
     manifest, files = encode(model, lineage)
-    write(folder, files)
+    write_folder(folder, files)
     return manifest
 
 
 def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The manifest of a model and its files by name: `manifest.json`, `model.safetensors`, `robot.urdf`.
+    """Return the manifest of a model and its files by name: `manifest.json`, `model.safetensors`, `robot.urdf`.
 
-    lineage: where the model comes from, stored as given. Raise ValueError as `save` does.
+    lineage: origin of the model, stored as given. Raise ValueError as `save` does.
     """
     basis, statistics = model.posterior.basis, model.posterior.statistics
     if statistics is None:
@@ -71,7 +86,7 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
     tensors |= {OUTPUTS: basis.outputs, A: pack_symmetric(statistics.a), B: statistics.b}
     if bool((model.posterior.floor > 0).any()):
         tensors[FLOOR] = model.posterior.floor
-    if model.posterior.misfit.exists:
+    if model.posterior.misfit.is_nonzero:
         tensors[MISFIT] = model.posterior.misfit.packed()
     if model.arm is not None:
         tensors |= arm_tensors(model.arm)
@@ -117,31 +132,30 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
             "sha256": sha256(files[ROBOT]),
         }
     files[MANIFEST] = manifest_bytes(manifest)
-    read_manifest_bytes(files[MANIFEST])  # nothing is written that would be refused when it is read
+    read_manifest_bytes(files[MANIFEST])  # writes nothing that reading would reject
     return manifest, files
 
 
 def decode(files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS) -> TorqueModel:
-    """The model that these files hold; raise ModelFormatError for anything that `encode` does not make.
+    """Return the model in these files; raise ModelFormatError for anything that `encode` does not write.
 
-    What it costs in time and memory is bounded by the limits, which are checked before anything is computed.
+    The limits bound its cost in time and memory. They are checked before anything is computed.
     """
     manifest, tensors, robot = parse(files, limits)
     try:
-        # what numbers of strangers overflow to is refused by the checks that follow
+        # the checks that follow reject overflows of untrusted numbers
         with np.errstate(over="ignore", invalid="ignore"):
             return _restore(manifest, tensors, robot)
     except ModelFormatError:
         raise
-    except Exception as error:  # whatever numerics make of numbers that no training has made
+    except Exception as error:  # numerics may raise any error for numbers that no training has made
         raise ModelFormatError(f"the tensors do not make a valid model: {_text(error)}", TENSORS) from error
 
 
 def parse(
     files: Mapping[str, bytes], limits: Limits = DEFAULT_LIMITS
 ) -> tuple[dict[str, Any], dict[str, Array], RigidBody | None]:
-    """The manifest, the tensors and the robot that these files hold, before a model is made of them; raise
-    ModelFormatError."""
+    """Return the manifest, the tensors and the robot in these files; raise ModelFormatError."""
     manifest = _manifest(files, limits)
     tensors = read_tensors(_verified(files, TENSORS, manifest["tensors"]), len(manifest["joint_names"]), limits)
     return manifest, tensors, _robot(files, manifest, limits)
@@ -150,13 +164,25 @@ def parse(
 def load(
     folder: Path | str, checksums: Mapping[str, str] | None = None, limits: Limits = DEFAULT_LIMITS
 ) -> TorqueModel:
-    """Load a model that `save` wrote; raise ModelFormatError for anything else.
+    """Return the model that `save` wrote.
 
-    checksums: sha256 of each file by name, as kept elsewhere, which the files then have to match.
+    Args:
+        folder: the folder of the model.
+        checksums: expected sha256 of each file by name, from another source.
+        limits: max size of the model.
+
+    Raises:
+        ModelFormatError: The files are not a valid model, or do not match the checksums.
+
+    Example:
+        >>> model = lipcore.load("models/my-arm")
+        >>> model.predict(q, dq, ddq).tau.shape == q.shape
+        True
+
     """
     files = read_files(Path(folder), limits)
     if checksums is not None:
-        check(files, checksums)
+        check_checksums(files, checksums)
     try:
         return decode(files, limits)
     except ModelFormatError as error:
@@ -164,23 +190,40 @@ def load(
 
 
 def copy_model(source: Path, folder: Path) -> dict[str, Any]:
-    """Copy a saved model to a new folder, all of it or nothing, and return its manifest; raise ModelFormatError."""
+    """Copy a saved model to a new folder, completely or not at all, and return its manifest.
+
+    Args:
+        source: the folder of the model.
+        folder: the folder to make.
+
+    Returns:
+        The manifest of the model.
+
+    Raises:
+        FileExistsError: The new folder exists.
+        ModelFormatError: The files are not a valid model.
+
+    Example:
+        >>> lipcore.copy_model(Path("models/my-arm"), Path("backup/my-arm"))["format"]
+        'lipserve-model'
+
+    """
     files = read_files(source)
     manifest = _manifest(files, DEFAULT_LIMITS)
     _verified(files, TENSORS, manifest["tensors"])
     if "robot" in manifest:
         _verified(files, ROBOT, manifest["robot"])
-    write(folder, {**files, MANIFEST: manifest_bytes(manifest)})
+    write_folder(folder, {**files, MANIFEST: manifest_bytes(manifest)})
     return manifest
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read and check a model's manifest; raise ModelFormatError."""
+    """Return a model's checked manifest; raise ModelFormatError."""
     return read_manifest_bytes(_read(folder / MANIFEST, DEFAULT_LIMITS.manifest_bytes))
 
 
 def read_files(folder: Path, limits: Limits = DEFAULT_LIMITS) -> dict[str, bytes]:
-    """The files of a saved model by name, as they are; raise ModelFormatError where one is missing."""
+    """Return the unchecked files of a saved model by name; raise ModelFormatError if one is missing."""
     files = {MANIFEST: _read(folder / MANIFEST, limits.manifest_bytes)}
     files[TENSORS] = _read(folder / TENSORS)
     if "robot" in _manifest(files, limits):
@@ -188,10 +231,10 @@ def read_files(folder: Path, limits: Limits = DEFAULT_LIMITS) -> dict[str, bytes
     return files
 
 
-def check(files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
-    """Compare files by name with the sha256 that is known of each.
+def check_checksums(files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
+    """Compare files by name with their expected sha256.
 
-    Raise ModelFormatError naming the file that is missing, one too many, or damaged.
+    Raise ModelFormatError naming the file that is missing, unexpected, or damaged.
     """
     for name in sorted(files.keys() | checksums.keys()):
         if name not in files or name not in checksums:
@@ -201,38 +244,38 @@ def check(files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
 
 
 def checksums(manifest: Mapping[str, Any]) -> dict[str, str]:
-    """sha256 of each file of the model with this manifest, by name."""
+    """Return the sha256 of each file of the model with this manifest, by name."""
     sums = {MANIFEST: sha256(manifest_bytes(manifest)), TENSORS: str(manifest["tensors"]["sha256"])}
     return {**sums, ROBOT: str(manifest["robot"]["sha256"])} if "robot" in manifest else sums
 
 
 def manifest_bytes(manifest: Mapping[str, Any]) -> bytes:
-    """The file of a manifest: equal manifests give equal bytes."""
+    """Return the file of a manifest: equal manifests return equal bytes."""
     return json.dumps(manifest, indent=2, allow_nan=False).encode() + b"\n"
 
 
 def sha256(content: bytes) -> str:
-    """Hash of a file, in hexadecimal digits."""
+    """Return the hash of a file, in hexadecimal digits."""
     return hashlib.sha256(content).hexdigest()
 
 
-def write(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files as a new folder that outlives a power cut, all of it or nothing.
+def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files as a new folder that survives a power cut, completely or not at all.
 
-    Raise FileExistsError where the folder exists.
+    Raise FileExistsError if the folder exists.
     """
     if folder.exists():
         raise FileExistsError(f"{folder} exists: a saved model is never overwritten")
     make_folder(folder.parent)
-    # its name tells whose draft it is, where nobody comes to remove it
+    # if nobody removes the draft, its name identifies it
     draft = Path(tempfile.mkdtemp(prefix=f".draft-{folder.name}-", dir=folder.parent))
     try:
         for name, content in files.items():
             _write(draft / name, content)
         draft.chmod(0o755)
-        sync(draft)
+        sync_folder(draft)
         os.rename(draft, folder)
-        sync(folder.parent)
+        sync_folder(folder.parent)
     except BaseException:
         shutil.rmtree(draft, ignore_errors=True)
         raise
@@ -245,7 +288,7 @@ def _manifest(files: Mapping[str, bytes], limits: Limits) -> dict[str, Any]:
 
 
 def _verified(files: Mapping[str, bytes], name: str, entry: Mapping[str, Any]) -> bytes:
-    """A file that is as its manifest says."""
+    """Return a file that has the size and the hash of its manifest entry."""
     if name not in files:
         raise ModelFormatError(f"{name} is missing", name)
     content = files[name]
@@ -265,7 +308,7 @@ def _robot(files: Mapping[str, bytes], manifest: Mapping[str, Any], limits: Limi
         robot = RigidBody.from_urdf(
             content.decode(), manifest["joint_names"], manifest["joint_types"], entry["joints"], entry["name"]
         )
-    except Exception as error:  # Pinocchio raises what its parser does
+    except Exception as error:  # Pinocchio raises any error of its parser
         raise ModelFormatError(f"{ROBOT} is not the robot of this model: {_text(error)}", ROBOT) from error
     return replace(robot, matched=entry["matched"])
 
@@ -275,7 +318,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: Rigi
     compact = dict(manifest["compact"])
     statistics = Statistics(unpack_symmetric(A, tensors[A]), tensors[B], float(compact.pop("data_samples")))
     arm = _arm(manifest, tensors) if manifest["estimator"] in ROBOT_ESTIMATORS else None
-    if arm is None and (strange := next(filter(is_of_arm, tensors), None)) is not None:
+    if arm is None and (strange := next(filter(is_arm_tensor, tensors), None)) is not None:
         raise ModelFormatError(f"{TENSORS} has the tensor {strange!r}, but the estimator has no rigid bodies", TENSORS)
     options, calibration = manifest["options"], Calibration(**manifest["calibration"])
     estimator = make_estimator(manifest["estimator"], manifest["joint_types"], bool(options.get("tied", True)), arm)
@@ -309,7 +352,7 @@ def _restore(manifest: Mapping[str, Any], tensors: dict[str, Array], robot: Rigi
     )
     if manifest["hyperparameters"] != {name: value.tolist() for name, value in params.items()}:
         raise ModelFormatError("hyperparameters are not those of the tensors")
-    # another processor may make a difference
+    # another processor may round differently
     if not np.allclose(model.noise_std, manifest["noise_std"], rtol=1e-6, atol=0):
         raise ModelFormatError(f"noise_std is not that of the tensors, {model.noise_std.tolist()}")
     return model
@@ -328,15 +371,15 @@ def _text(error: Exception) -> str:
     return (str(error).strip() or type(error).__name__)[:300]
 
 
-def _read(path: Path, most: int | None = None) -> bytes:
-    """A file of a saved model; raise ModelFormatError, also for more than `most` bytes."""
+def _read(path: Path, max_bytes: int | None = None) -> bytes:
+    """Return a file of a saved model; raise ModelFormatError, also for more than `max_bytes`."""
     try:
         with path.open("rb") as file:
-            content = file.read(-1 if most is None else most + 1)
+            content = file.read(-1 if max_bytes is None else max_bytes + 1)
     except OSError as error:
         raise ModelFormatError(f"{path} cannot be read: {error}", path.name) from error
-    if most is not None and len(content) > most:
-        raise ModelFormatError(f"{path} has more than {most} bytes", path.name)
+    if max_bytes is not None and len(content) > max_bytes:
+        raise ModelFormatError(f"{path} has more than {max_bytes} bytes", path.name)
     return content
 
 

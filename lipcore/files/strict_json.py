@@ -1,4 +1,4 @@
-"""JSON from strangers: of limited size and depth, and of the types that are expected."""
+"""JSON from untrusted sources: of limited size and depth, and of the expected types."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from lipcore.model.selection import shortened
 T = TypeVar("T")
 
 MAX_DEPTH = 32
-"""Objects and lists within one another: what is written again or checked recurses as deep."""
+"""Max depth of nested objects and lists: writing and checking recurse as deep."""
 MAX_QUOTE = 80
-"""Characters of a quoted value."""
+"""Max characters of a quoted value."""
 
 
 class StrictJsonError(ValueError):
-    """The bytes are not the JSON that is expected; the message says what is wrong and where."""
+    """The bytes are not the expected JSON; the message names the mistake and its place."""
 
 
 def read(payload: bytes, max_bytes: int) -> Any:
@@ -37,8 +37,10 @@ def read(payload: bytes, max_bytes: int) -> Any:
 
 
 def decode(decoder: msgspec.json.Decoder[T], payload: bytes, max_bytes: int) -> T:
-    """Return the typed value of a JSON document; raise StrictJsonError that names the field, its value and what was
-    expected."""
+    """Return the typed value of a JSON document.
+
+    Raise StrictJsonError that names the field, its value and the expected one.
+    """
     value = read(payload, max_bytes)
     try:
         return decoder.decode(payload)
@@ -47,7 +49,7 @@ def decode(decoder: msgspec.json.Decoder[T], payload: bytes, max_bytes: int) -> 
 
 
 def check_texts(where: str, value: Any) -> None:
-    """Raise StrictJsonError for a text that a terminal or a log would not show as it is."""
+    """Raise StrictJsonError for a text that a terminal or a log would not show unchanged."""
     if isinstance(value, str):
         if not all(each.isprintable() or each == "\N{NO-BREAK SPACE}" for each in value):
             raise StrictJsonError(f"{where} is {quote(value)}, which has a character that cannot be printed")
@@ -61,13 +63,13 @@ def check_texts(where: str, value: Any) -> None:
 
 
 def quote(value: object) -> str:
-    """A value as a message quotes it: escaped, and cut where it is long."""
+    """Return a value as a message quotes it: escaped, and cut if it is long."""
     text = ascii(value) if not isinstance(value, list | dict) else f"a {type(value).__name__} of {len(value)} entries"
     return text if len(text) <= MAX_QUOTE else text[:MAX_QUOTE] + "…"
 
 
 def _check_tree(value: Any, left: int) -> None:
-    """Raise StrictJsonError for a deep nest, and for whole numbers that no float holds."""
+    """Raise StrictJsonError for deep nesting, and for integers that no float can represent."""
     if isinstance(value, int) and not -(2**63) <= value < 2**63:
         raise StrictJsonError(f"the number {quote(value)} is too large")
     if isinstance(value, list | dict):
@@ -78,9 +80,9 @@ def _check_tree(value: Any, left: int) -> None:
 
 
 def _explain(error: str, value: Any) -> str:
-    """Say what msgspec found wrong with a value: "noise_std[1] is -1, expected `float` >= 0.0"."""
+    """Return msgspec's error in our words: "noise_std[1] is -1, expected `float` >= 0.0"."""
     found = re.fullmatch(r"(.*?)(?: - at `\$\.?(.*)`)?", error, re.DOTALL)
-    assert found is not None  # the pattern takes any text
+    assert found is not None  # the pattern matches any text
     what, path = found[1], found[2] or ""
     if not what.startswith("Expected "):
         return shortened(f"{path}: {what}" if path else what)

@@ -1,4 +1,4 @@
-"""The tensors of a model, in the safetensors format: checked by their header before anything is read of them."""
+"""The tensors of a model, in the safetensors format: their header is checked before their numbers are read."""
 
 import math
 from typing import Annotated, Any
@@ -9,14 +9,14 @@ from msgspec import Meta, Struct
 
 from lipcore.data.motion import Array
 from lipcore.files import strict_json
-from lipcore.files.arm import is_of_arm
+from lipcore.files.arm import is_arm_tensor
 from lipcore.files.manifest import TENSORS, Limits, ModelFormatError
 from lipcore.files.strict_json import quote
 from lipcore.model.selection import Count
 
-MAX_HEADER = 256 * 1024
-LENGTH = 8
-"""Bytes that hold the header's length."""
+MAX_HEADER_BYTES = 256 * 1024
+HEADER_LENGTH_BYTES = 8
+"""Size of the header's length field."""
 OUTPUTS = "inducing/outputs"
 INDUCING = ("inducing/q", "inducing/dq", "inducing/ddq")
 A, B, FLOOR, MISFIT = "statistics/a", "statistics/b", "floor", "misfit"
@@ -25,7 +25,7 @@ TYPES: dict[str, np.dtype[Any]] = {"F64": np.dtype("<f8"), "I64": np.dtype("<i8"
 
 
 class Tensor(Struct, frozen=True, forbid_unknown_fields=True):
-    """A tensor as the header describes it. data_offsets: its bytes after the header, from and to."""
+    """A tensor in the header. data_offsets: its first and last byte after the header, the last exclusive."""
 
     dtype: str
     shape: Annotated[tuple[Count, ...], Meta(max_length=4)]
@@ -37,9 +37,10 @@ _TENSOR = msgspec.json.Decoder(Tensor)
 
 
 def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Array]:
-    """Tensors of a model of n joints by name, of the right type and dimensions, finite; raise ModelFormatError.
+    """Return the tensors of a model of n joints by name, of the right type and dimensions; raise ModelFormatError.
 
-    Sizes are checked against the limits before a number is read: what is computed from them grows with their square.
+    They are finite. Sizes are checked against the limits before a number is read, because the cost of computing with
+    them grows with their square.
     """
     entries, start = _read_header(payload)
     _check_sizes(entries, n, limits)
@@ -47,9 +48,9 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Array]:
     for name, each in entries.items():
         values = np.frombuffer(payload, TYPES[each.dtype], math.prod(each.shape), start + each.data_offsets[0])
         try:
-            # copied: what is loaded is read-only, which compiled code takes for another type
+            # copied, because a read-only array is another type to compiled code
             value = tensors[name] = values.reshape(each.shape).copy()
-        except ValueError as error:  # empty, but with lengths that no array has
+        except ValueError as error:  # empty, but of lengths that no array can have
             raise _bad(f"tensor {quote(name)} cannot be read: {error}") from None
         if name != OUTPUTS and not np.isfinite(value).all():
             raise _bad(f"tensor {name!r} is not made of finite float64 numbers")
@@ -68,15 +69,21 @@ def _bad(message: str) -> ModelFormatError:
 
 
 def _read_header(payload: bytes) -> tuple[dict[str, Tensor], int]:
-    """The tensors as the header has them, which fill the rest of the file without holes and overlaps, and where that
-    begins."""
-    if len(payload) < LENGTH:
+    """Return the tensors of the header, and the byte at which their data begin.
+
+    Their data fill the rest of the file without gaps and overlaps.
+    """
+    if len(payload) < HEADER_LENGTH_BYTES:
         raise _bad(f"{TENSORS} has {len(payload)} bytes, expected a header")
-    length = int.from_bytes(payload[:LENGTH], "little")
-    if length > min(MAX_HEADER, len(payload) - LENGTH):
-        raise _bad(f"{TENSORS} says that its header has {length} bytes, expected at most {MAX_HEADER} and the file's")
+    length = int.from_bytes(payload[:HEADER_LENGTH_BYTES], "little")
+    if length > min(MAX_HEADER_BYTES, len(payload) - HEADER_LENGTH_BYTES):
+        raise _bad(
+            f"{TENSORS} says that its header has {length} bytes, expected at most {MAX_HEADER_BYTES} and the file's"
+        )
     try:
-        header = strict_json.decode(_HEADER, payload[LENGTH : LENGTH + length], MAX_HEADER)
+        header = strict_json.decode(
+            _HEADER, payload[HEADER_LENGTH_BYTES : HEADER_LENGTH_BYTES + length], MAX_HEADER_BYTES
+        )
     except strict_json.StrictJsonError as error:
         raise _bad(f"the header of {TENSORS} cannot be read: {error}") from None
     entries = {name: _entry(name, value) for name, value in header.items()}
@@ -86,7 +93,7 @@ def _read_header(payload: bytes) -> tuple[dict[str, Tensor], int]:
         if begin != reached:
             raise _bad(f"tensor {quote(name)} begins at byte {begin}, expected {reached}, where the last one ends")
         reached = end
-    start = LENGTH + length
+    start = HEADER_LENGTH_BYTES + length
     if reached != len(payload) - start:
         raise _bad(f"the tensors end at byte {reached}, expected {len(payload) - start}, the end of the file")
     return entries, start
@@ -94,7 +101,7 @@ def _read_header(payload: bytes) -> tuple[dict[str, Tensor], int]:
 
 def _entry(name: str, value: msgspec.Raw) -> Tensor:
     try:
-        entry = strict_json.decode(_TENSOR, bytes(value), MAX_HEADER)
+        entry = strict_json.decode(_TENSOR, bytes(value), MAX_HEADER_BYTES)
     except strict_json.StrictJsonError as error:
         raise _bad(f"tensor {quote(name)}: {error}") from None
     expected = "I64" if name == OUTPUTS else "F64"
@@ -108,7 +115,14 @@ def _entry(name: str, value: msgspec.Raw) -> Tensor:
 
 def _check_sizes(entries: dict[str, Tensor], n: int, limits: Limits) -> None:
     for name in entries:
-        if not (name.startswith(PARAMS) or is_of_arm(name)) and name not in (OUTPUTS, *INDUCING, A, B, FLOOR, MISFIT):
+        if not (name.startswith(PARAMS) or is_arm_tensor(name)) and name not in (
+            OUTPUTS,
+            *INDUCING,
+            A,
+            B,
+            FLOOR,
+            MISFIT,
+        ):
             raise _bad(f"{TENSORS} has the tensor {quote(name)}, which this release does not know")
     for name in (OUTPUTS, *INDUCING, A, B):
         if name not in entries:

@@ -1,1 +1,1 @@
-"""Torque kernels, one idea a file."""
+"""Torque kernels, one for each file."""

@@ -1,4 +1,4 @@
-"""The arm's kernel: torque linear in masses, rotor inertia and small changes of geometry."""
+"""The arm's kernel: torque that is linear in masses, rotor inertia and small changes of geometry."""
 
 from __future__ import annotations
 
@@ -22,17 +22,24 @@ from lipcore.kernels.geometry import Geometry
 from lipcore.kernels.mixture import MixtureKernel
 
 SCALES = 4
-"""Kinds of weights with a scale of their own: masses, first moments, inertias, rotors."""
+"""Number of kinds of weights with their own scale: masses, first moments, inertias, rotors."""
 
 
 class ArmKernel(LinearKernel):
     """tau = Y(θ) π + r ∘ ddq + J (δθ) + Σ c_k δ_k around an arm, J = ∂(Y π)/∂θ.
 
-    Y π is `newton_euler.rigid_body_torque`. Its features, their derivatives and energies equal the formula, compiled.
+    Y π is `newton_euler.rigid_body_torque`. Compiled code computes its features, derivatives and energies; they equal
+    the formula.
 
-    Weights: π, ten parameters a body (10 n,), and rotor inertias r (n,), in the order of the data's joints; steps of
-    the geometry (g,), base to tip; and those of the alternative arms δ_k (K,), see `MixtureKernel`. Standard deviations
-    are those of the arm, of π and r times `exp(rigid_body.log_scale)` (4,) by kind.
+    The weights are, in this order:
+
+    - π, ten parameters for each body, (10 n,), in the order of the data's joints;
+    - the rotor inertias r, (n,), in the same order;
+    - the steps of the geometry, (g,), base to tip;
+    - the weights of the alternative arms δ_k, (K,), see `MixtureKernel`.
+
+    Their standard deviations are those of the arm. Those of π and r are multiplied by `exp(rigid_body.log_scale)`,
+    (4,), one scale for each kind.
     """
 
     def __init__(self, arm: Arm) -> None:
@@ -44,7 +51,7 @@ class ArmKernel(LinearKernel):
         mixed = None if self.others is None else self.others.prior_weights()
         others = np.zeros(0) if mixed is None else mixed
         self._rest = np.concatenate([arm.widths, np.ones(len(others))])
-        self._mean = np.concatenate([_in_data(arm), arm.rotor, arm.expected, others])
+        self._mean = np.concatenate([_mean_in_data_order(arm), arm.rotor, arm.expected, others])
         self._recent: tuple[tuple[Motion, Array], ...] = ()
 
     @property
@@ -54,16 +61,19 @@ class ArmKernel(LinearKernel):
 
     @property
     def steps(self) -> slice:
-        """Places of the geometry's steps among the weights."""
+        """Indices of the geometry's steps among the weights."""
         first = (PARAMETERS + 1) * self.n_joints
         return slice(first, first + self.arm.steps)
 
     def geometry(self, weights: Array) -> Geometry:
-        """The arm's geometry with its steps as these weights, (p,), have them."""
+        """Return the arm's geometry after the steps in these weights, (p,)."""
         return self.arm.geometry.moved(weights[self.steps]) if self.arm.steps else self.arm.geometry
 
     def torque(self, weights: Array, motion: Motion) -> Array:
-        """Y(θ + δθ) π + r ∘ ddq of these weights, (p,), not linearised: (N, n) N·m. Alternative arms are left out."""
+        """Return Y(θ + δθ) π + r ∘ ddq of these weights, (p,), not linearised: (N, n) N·m.
+
+        Alternative arms are not included.
+        """
         n, geometry = self.n_joints, self.geometry(weights)
         bodies = np.ascontiguousarray(weights[: PARAMETERS * n].reshape(n, PARAMETERS)[self.arm.order])
         out = np.zeros((len(motion), n))
@@ -71,42 +81,42 @@ class ArmKernel(LinearKernel):
         return np.asarray(out + weights[PARAMETERS * n : (PARAMETERS + 1) * n] * motion.ddq)
 
     def features(self, x: Motion) -> Array:
-        """Φ at each sample: (N, n, p)."""
+        """Return Φ at each sample, (N, n, p)."""
         for seen, features in self._recent:
             if seen.q is x.q and seen.dq is x.dq and seen.ddq is x.ddq:
                 return features
         features = super().features(x)
-        # the training samples and the query in work are asked for over and over
+        # the training samples and the current query are evaluated many times
         self._recent = ((x, features), *self._recent[:3])
         return features
 
     def regressor(self) -> Regressor:
-        """The same features of one query, for serving."""
+        """Return the regressor that computes the same features for single queries."""
         return ArmRegressor(self)
 
     def variances(self, params: Params) -> Array:
-        """Prior variances of the weights: (p,)."""
+        """Return the prior variances of the weights, (p,)."""
         scale = params["rigid_body.log_scale"]
         xp = array_namespace(scale)
         std = xp.asarray(self._unit) * xp.exp(scale[self._kinds])
         return xp.square(xp.concat([std, xp.asarray(self._rest)]))
 
     def variances_adjoint(self, params: Params, slopes: Array) -> dict[str, Array]:
-        """Derivatives by the scales, given those by the variances, (p,)."""
+        """Return the derivatives by the scales, given the derivatives by the variances, (p,)."""
         count = len(self._kinds)
         scaled = 2 * self.variances(params)[:count] * slopes[:count]
         return {"rigid_body.log_scale": np.bincount(self._kinds, scaled, SCALES).astype(np.float64)}
 
     def prior_weights(self) -> Array | None:
-        """Prior mean of the weights, (p,)."""
+        """Return the prior mean of the weights, (p,)."""
         return self._mean
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """The arm's own scales: (4,)."""
+        """Start with the arm's own scales, (4,)."""
         return {"rigid_body.log_scale": np.zeros(SCALES)}
 
     def energy_features(self, x: Motion) -> Array:
-        """Kinetic and potential energy per unit of each weight: (N, 2, p) J; of alternative arms none is counted."""
+        """Return the kinetic and the potential energy per unit weight, (N, 2, p) J; zero for alternative arms."""
         out, arm = np.empty((len(x), 2, self.steps.stop)), self.arm
         arm_energies(arm.geometry.constants, arm.geometry.gravity, arm.parameters, arm.order, x.arrays(), out)
         none = np.zeros((len(x), 2, self.size - self.steps.stop))
@@ -114,7 +124,7 @@ class ArmKernel(LinearKernel):
 
 
 class ArmRegressor(Regressor):
-    """Features of `ArmKernel`, one query at a time."""
+    """Features of `ArmKernel` for single queries."""
 
     def __init__(self, kernel: ArmKernel) -> None:
         arm = kernel.arm
@@ -137,6 +147,6 @@ class ArmRegressor(Regressor):
             self._others.fill_many(motions, out, first + self._first)
 
 
-def _in_data(arm: Arm) -> Array:
-    """Prior mean of π, flat, in the order of the data."""
+def _mean_in_data_order(arm: Arm) -> Array:
+    """Return the prior mean of π, flat, in the order of the data's joints."""
     return np.asarray(arm.centre[arm.place].reshape(-1))

@@ -1,4 +1,4 @@
-"""An arm as a model stands on it: its geometry, the masses there, and how sure both were beforehand."""
+"""The prior of an arm: its geometry, its masses, and the uncertainty of both."""
 
 from __future__ import annotations
 
@@ -15,48 +15,51 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import GeometryMode, Prior
 
 KINDS = (0, 1, 1, 1, 2, 2, 2, 2, 2, 2)
-"""Which scale each of a body's ten parameters has: mass, first moment or inertia."""
+"""Index of the scale of each of a body's ten parameters: mass, first moment or inertia."""
 
 
 @dataclass(frozen=True)
 class Alternative:
-    """Another arm that explains the recording nearly as well, as the most likely parameters make it.
-
-    geometry: base to tip; parameters: (n, 10), base to tip; rotor: (n,) kg·m²; friction: (n, f), coefficients of the
-    friction kernel's features; both in the order of the data's joints. probability: of it, from the evidence.
-    """
+    """Another arm that explains the recording nearly as well, at its most likely parameters."""
 
     geometry: Geometry
+    """Geometry, base to tip."""
     parameters: Array
+    """Inertial parameters of the bodies, (n, 10), base to tip."""
     rotor: Array
+    """Rotor inertias, (n,) kg·m², in the order of the data's joints."""
     friction: Array
+    """Coefficients of the friction kernel's features, (n, f), in the order of the data's joints."""
     probability: float
+    """Probability of this arm, from the evidence."""
 
 
 @dataclass(frozen=True)
 class Arm:
-    """Rigid bodies whose torque is taken as linear around this geometry and these parameters.
-
-    geometry: base to tip; order: (n,), the data's joint at each place of the chain; mode: where the geometry is from;
-    parameters: (n, 10), base to tip, at which ∂(Y π)/∂θ is taken; centre: (n, 10), prior mean of π, base to tip; unit:
-    (11 n,), prior standard deviations of π and of the rotor inertias, in the order of the data's joints; rotor: (n,),
-    prior mean of the latter, likewise; expected: (g,), the step from the geometry to its prior mean; widths: (g,), its
-    prior standard deviations, rad and m.
-    stribeck: whether friction has its fourth term; alternatives: the arm itself first, then the others; empty where
-    there is no other.
-    """
+    """Rigid bodies, with torque linearised around a geometry and inertial parameters."""
 
     geometry: Geometry
+    """Geometry, base to tip."""
     order: NDArray[np.int64]
+    """The data's joint at each place of the chain, (n,)."""
     mode: GeometryMode
+    """Source of the geometry."""
     parameters: Array
+    """Inertial parameters at which ∂(Y π)/∂θ is computed, (n, 10), base to tip."""
     centre: Array
+    """Prior mean of π, (n, 10), base to tip."""
     unit: Array
+    """Prior standard deviations of π and of the rotor inertias, (11 n,), in the order of the data's joints."""
     rotor: Array
+    """Prior mean of the rotor inertias, (n,) kg·m², in the order of the data's joints."""
     expected: Array
+    """Step from the geometry to its prior mean, (g,) rad and m."""
     widths: Array
+    """Prior standard deviations of the geometry, (g,) rad and m."""
     stribeck: bool = False
+    """Whether friction has its fourth term."""
     alternatives: tuple[Alternative, ...] = field(default=())
+    """The arm itself, then the other arms; empty if there is no other."""
 
     def __post_init__(self) -> None:
         n, steps = self.geometry.n_joints, 0 if self.mode == "fixed" else self.geometry.size
@@ -83,12 +86,12 @@ class Arm:
 
     @property
     def geometries(self) -> tuple[Geometry, ...]:
-        """Its geometry, then those of the alternatives."""
+        """The arm's geometry, then those of the alternatives."""
         return (self.geometry, *(each.geometry for each in self.alternatives[1:]))
 
     @property
     def steps(self) -> int:
-        """Numbers of the geometry that are learnt: none where it is fixed."""
+        """Number of learnt numbers of the geometry; zero if it is fixed."""
         return len(self.widths)
 
     @property
@@ -98,10 +101,10 @@ class Arm:
 
 
 def arm_of_robot(robot: RigidBody, gravity: bool = True, prior: Prior = "urdf", mode: GeometryMode = "fixed") -> Arm:
-    """The arm of a URDF before any samples: its masses expected within a tenth of the URDF's, or within all of them if
-    the prior is "zero", its geometry as `mode` says.
+    """Return the arm of a URDF before any samples. `mode` decides whether its geometry is learnt.
 
-    Raise ValueError for a URDF without masses whose prior is "urdf".
+    The prior standard deviation of the masses is a tenth of the URDF's masses, or all of them if the prior is "zero".
+    Raise ValueError if the prior is "urdf" and the URDF has no masses.
     """
     mass = robot.parameters()[:, 0]
     if mass.sum() <= 0 and prior == "urdf":
@@ -125,13 +128,13 @@ def arm_of_robot(robot: RigidBody, gravity: bool = True, prior: Prior = "urdf", 
 
 
 def widths_of(geometry: Geometry) -> Array:
-    """How far a unit's geometry may lie from that of its type, standard deviations, (g,) rad and m.
+    """Return the standard deviations of a unit's geometry around that of its type, (g,) rad and m.
 
-    Axes of two units, or of a unit and its URDF, lie within 0.005 rad and 0.003 m of each other, and their bases lean
-    by 0.02 rad. Machining leaves less, but what an earlier posterior says of single numbers leaves out what is known
-    only of several together. These and `WIDTHS.unit` of `lipcore.arm.problem` were tuned on simulated arms (50 and 51
-    of `benchmarks/studies/learnt_arm.py transfer`): a fifth of it ended at times in a poor optimum that takes part of
-    the torque for noise.
+    Axes of two units, or of a unit and its URDF, differ by 0.005 rad and 0.003 m; their bases differ by 0.02 rad.
+    Machining is more accurate. But an earlier posterior, reduced to single numbers, loses the correlations between
+    them. These values and `WIDTHS.unit` of `lipcore.arm.problem` were tuned on simulated arms (50 and 51 of
+    `benchmarks/studies/learnt_arm.py transfer`). A fifth of them sometimes ended in a poor optimum that counts part of
+    the torque as noise.
     """
     widths = np.where(geometry.turns, 0.005, 0.003)
     widths[: geometry.screws[0]] = 0.02
@@ -139,8 +142,10 @@ def widths_of(geometry: Geometry) -> Array:
 
 
 def unit_of(robot: RigidBody, rotor: float) -> Array:
-    """Usual size of a URDF's parameters, (11 n,): m_i, m_i ℓ and m_i ℓ² for mass, first moment and inertia of a body,
-    in the order of the data; rotor: kg·m². A link without mass in the URDF may still have 2 % of the arm's.
+    """Return the usual size of a URDF's parameters, (11 n,), in the order of the data's joints.
+
+    The sizes are m_i, m_i ℓ and m_i ℓ² for mass, first moment and inertia of a body. rotor: kg·m². A link without mass
+    in the URDF may still have 2 % of the arm's mass.
     """
     mass = robot.parameters()[:, 0]
     total = float(mass.sum())
@@ -149,10 +154,10 @@ def unit_of(robot: RigidBody, rotor: float) -> Array:
     return np.concatenate([(scale[:, None] * powers).reshape(-1), np.full(robot.n_joints, rotor)])
 
 
-def unit_anywhere(torque: float, joints: int) -> Array:
-    """Usual size of the parameters of an arm of which only its largest torque, N·m, is known: (11 n,).
+def unit_from_torque(torque: float, joints: int) -> Array:
+    """Return the usual size of the parameters of an arm, (11 n,), given only its largest torque, N·m.
 
-    The mass that makes this torque at a lever of 0.3 m, and what it has about such a lever.
+    They are those of a mass that causes this torque at a lever of 0.3 m.
     """
     lever = 0.3
     mass = max(torque, 1e-3) / (9.81 * lever)
@@ -161,14 +166,14 @@ def unit_anywhere(torque: float, joints: int) -> Array:
 
 
 ROTOR_SHARE = 0.03
-"""Rotor inertia expected, m² times the mass of an arm's heaviest body."""
+"""Expected rotor inertia, m² times the mass of an arm's heaviest body."""
 
 
 def chain(robot: RigidBody | None, joints: int) -> NDArray[np.int64]:
-    """The data's joint at each place of the chain, (n,): as the data have them, where no URDF says otherwise."""
+    """Return the data's joint at each place of the chain, (n,). Without a URDF it is the order of the data."""
     return np.arange(joints) if robot is None else np.argsort(robot.order)
 
 
 def in_chain(values: Array, order: Sequence[int] | NDArray[np.int64]) -> Array:
-    """Columns in the order of the data, (N, n), from base to tip."""
+    """Return columns in the order of the data, (N, n), reordered from base to tip."""
     return np.ascontiguousarray(values[:, order])

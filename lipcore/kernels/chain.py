@@ -1,13 +1,13 @@
-"""The serial-chain LIP kernel: each link's kinetic energy prior holds only what a serial chain can produce.
+"""The serial-chain LIP kernel: the kinetic energy prior of each link contains only energies of a serial chain.
 
-In the frame of link l its twist is Σ_a v_a Ad(q_{a+1}..q_l) ξ_a: the column of joint a moves with joints a+1..l alone
+In the frame of link l its twist is Σ_a v_a Ad(q_{a+1}..q_l) ξ_a. The column of joint a depends on joints a+1..l alone
 and is affine in their cosines and sines. So T_l has the kernel h_l² with
 
     h_l = Σ_{a≤l} w_{l,a} v_a v'_a R_{l,a},   R_{l,a} = Π_{a<b≤l} p_b(q_b, q'_b)
 
-(docs/method.md, section 4). A prior that does not know where the zero of a joint is has p = σ + α cos(q − q') for
-revolute joints; prismatic joints have p = σ + α q q'. All of it is written in products of the p_b and of their
-derivatives, never in quotients, so a p_b may pass through zero.
+(docs/method.md, section 4). A prior that does not depend on the zero of a joint has p = σ + α cos(q − q') for revolute
+joints. Prismatic joints have p = σ + α q q'. All formulas are products of the p_b and their derivatives, never
+quotients, so a p_b may pass through zero.
 """
 
 from __future__ import annotations
@@ -36,18 +36,21 @@ from lipcore.kernels.fast.pairs import Hyper
 from lipcore.kernels.polynomial import Product, base_kernels
 from lipcore.vocabulary import JointType
 
-SHARE = 2 / 3
-"""α of a rotation about an axis that is as likely along as across: E[R c · R'c] = (1 + 2 cos(q − q')) / 3 · |c|²."""
+ROTATION_SHARE = 2 / 3
+"""α of a rotation about an axis with uniformly distributed direction: E[R c · R'c] = (1 + 2 cos(q − q')) / 3 · |c|²."""
 
 
 class ChainKernel(CompiledKernel):
-    """One potential and one kinetic energy a link of a serial chain.
+    """One potential and one kinetic energy for each link of a serial chain.
 
-    Link l's potential has the kernel s_l Π_{b≤l} p_b. The same joints turn gravity and the twists, so both energies
-    share the p_b; the first joint turns gravity alone.
+    Link l's potential has the kernel s_l Π_{b≤l} p_b. Gravity and the twists turn with the same joints, so both
+    energies share the p_b. The first joint turns gravity alone.
 
-    Hyperparameters: `chain.logits` (n,), logits of each joint's share α, with σ = 1 − α; `potential.log_scales` (n,),
-    log s_l; and those of `energy.velocity_weights`.
+    Hyperparameters:
+
+    - `chain.logits` (n,): logits of each joint's share α, with σ = 1 − α;
+    - `potential.log_scales` (n,): log s_l;
+    - those of `energy.velocity_weights`.
     """
 
     driver = Driver(chain_size, chain_gram, chain_gradient, chain_cross)
@@ -57,7 +60,7 @@ class ChainKernel(CompiledKernel):
         self.n_joints = len(self.joint_types)
 
     def blocks(self, params: Params, x: State, y: State) -> Array:
-        """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
+        """Return the covariance of torque i at x with torque j at y, (n, n, *batch) (N·m)²."""
         links = self._links(params, x, y)
         total = array_namespace(x.q).zeros_like(links[-1][0].mixed)
         for link, (potential, kinetic) in enumerate(links, 1):
@@ -65,12 +68,12 @@ class ChainKernel(CompiledKernel):
         return total
 
     def hyper(self, params: Params) -> Hyper:
-        """Shares (1, n, 3) of the base kernels, scales of the potentials (n,) and velocity weights (n, n)."""
+        """Return the base kernels' shares (1, n, 3), the potentials' scales (n,) and the velocity weights (n, n)."""
         shares = self._shares(params["chain.logits"])
         return Hyper(shares[None], np.exp(params["potential.log_scales"]), self.weights(params))
 
     def hyper_adjoint(self, hyper: Hyper, slopes: Hyper) -> dict[str, Array]:
-        """Derivatives by the hyperparameters, given those by what `hyper` makes of them."""
+        """Return the derivatives by the hyperparameters, given the derivatives by the result of `hyper`."""
         alpha, (sigma, along, across) = hyper.shares[0, :, 1], slopes.shares[0].T
         share = along - sigma + np.where(self._revolute(), across, 0.0)
         return {
@@ -80,7 +83,7 @@ class ChainKernel(CompiledKernel):
         }
 
     def energies(self, params: Params, x: State, y: State) -> Array:
-        """Covariance of the kinetic and the potential energy at x with torque j at y: (2, n, *batch), J·N·m."""
+        """Return the covariance of kinetic and potential energy at x with torque j at y, (2, n, *batch) J·N·m."""
         links = self._links(params, x, y)
         xp = array_namespace(x.q)
         total = xp.stack([xp.zeros_like(links[-1][0].right)] * 2)
@@ -90,32 +93,32 @@ class ChainKernel(CompiledKernel):
         return total
 
     def energy_covariance(self, params: Params, x: State, y: State) -> Array:
-        """Covariance of the kinetic energies at x and y, Σ_l h_l², and of the potential ones: (2, *batch), J²."""
+        """Return the covariance of kinetic energies at x and y, Σ_l h_l², and of potential energies, (2, *batch) J²."""
         links = self._links(params, x, y)
         kinetic = sum(form.value * form.value for _, form in links)
         return array_namespace(x.q).stack([kinetic, sum(potential.value for potential, _ in links)])
 
     def weights(self, params: Params) -> Array:
-        """Velocity weights w_{l,a} as a lower triangular matrix (n, n)."""
+        """Return the velocity weights w_{l,a} as a lower triangular matrix, (n, n)."""
         return velocity_weights(params, self.n_joints)
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """Potential torques as large as the measured ones; inertia as arms have it that weigh as much."""
+        """Start with potential torques as large as the measured ones, and with the inertia of an arm of that weight."""
         power = np.square(tau).mean(0).clip(1e-12)
-        # variance of the gravity torque at joint i: α_i Σ_{l≥i} s_l
-        moved = np.maximum.accumulate(power[::-1])[::-1] / SHARE
+        # the variance of the gravity torque at joint i is α_i Σ_{l≥i} s_l
+        moved = np.maximum.accumulate(power[::-1])[::-1] / ROTATION_SHARE
         scales = np.maximum(moved - np.append(moved[1:], 0.0), 0.1 * moved)
-        share = np.full_like(power, SHARE)
-        share[0] = max(SHARE * power[0] / power.max(), 1e-6)  # mostly a vertical axis
+        share = np.full_like(power, ROTATION_SHARE)
+        share[0] = max(ROTATION_SHARE * power[0] / power.max(), 1e-6)  # the first axis is mostly vertical
         logits = np.log(share / (1 - share))
         return {"chain.logits": logits, "potential.log_scales": np.log(scales), **initial_weights(tau)}
 
     def prior_std(self) -> dict[str, float]:
-        """How far the weights may stray from their pattern, and the pattern from its start."""
+        """Return how far the weights may differ from their pattern, and the pattern from its start."""
         return {"chain.logits": 2.0, "potential.log_scales": 2.0, **PRIOR_STD}
 
     def _links(self, params: Params, x: State, y: State) -> list[tuple[Product, LinkForm]]:
-        """Kernel s_l Π_{b≤l} p_b of each link's potential, and the form h_l of its kinetic energy, base to tip."""
+        """Return each link's potential kernel s_l Π_{b≤l} p_b and the form h_l of its kinetic energy, base to tip."""
         xp, weights = array_namespace(x.q), self.weights(params)
         base = base_kernels(self._shares(params["chain.logits"]), self.joint_types, x.q, y.q)
         scales = xp.exp(params["potential.log_scales"])
@@ -139,14 +142,14 @@ class ChainKernel(CompiledKernel):
 
 @dataclass(frozen=True)
 class LinkForm:
-    """h = Σ_a c_a(q, q') v_a v'_a of a link with m joints, whose square is the kernel of its kinetic energy.
-
-    columns: c_a = w_a R_a of its m columns; x, y: the two arguments, m joints.
-    """
+    """h = Σ_a c_a(q, q') v_a v'_a of a link with m joints. Its square is the kernel of the link's kinetic energy."""
 
     columns: Sequence[Product]
+    """c_a = w_a R_a of the m columns."""
     x: State
+    """First argument, m joints."""
     y: State
+    """Second argument, m joints."""
 
     @cached_property
     def c(self) -> Array:
@@ -164,7 +167,7 @@ class LinkForm:
         return (self.c * self.x.v * self.y.v).sum(0)
 
     def energy_torque(self) -> Array:
-        """ℒ'_j h² = 2 (h f_j + h' ∂h/∂v'_j): covariance of the energy at x with torque j at y, (m, *batch)."""
+        """Return ℒ'_j h² = 2 (h f_j + h' ∂h/∂v'_j), (m, *batch): covariance of the energy at x with torque j at y."""
         c, right, v, v2, a2 = self.c, self.right, self.x.v, self.y.v, self.y.a
         c2 = (right * v2[:, None]).sum(0)
         f = c2 * v - (right * v * v2).sum(1)
@@ -172,12 +175,12 @@ class LinkForm:
         return 2 * (self.value * f + h2 * c * v)
 
     def blocks(self) -> Array:
-        """ℒ_i ℒ'_j h², (m, m, *batch): eq. 11 of docs/method.md, line by line."""
+        """Return ℒ_i ℒ'_j h², (m, m, *batch): eq. 11 of docs/method.md, line by line."""
         xp, c, right = array_namespace(self.x.q), self.c, self.right
         left = xp.stack([each.left for each in self.columns], axis=1)
         mixed = xp.stack([each.mixed for each in self.columns], axis=2)
         v, a, v2, a2 = self.x.v, self.x.a, self.y.v, self.y.a
-        # derivatives in time along the first argument (1), the second (2) and both (12)
+        # the suffixes mark time derivatives along the first argument (1), the second (2) and both (12)
         c1, c2 = (left * v[:, None]).sum(0), (right * v2[:, None]).sum(0)
         left2, right1 = (mixed * v2[:, None]).sum(1), (mixed * v[:, None, None]).sum(0)
         c12 = (left2 * v[:, None]).sum(0)

@@ -1,8 +1,8 @@
-"""From energy kernels to torque kernels: Lagrange's equations applied to both arguments, in closed form.
+"""Torque kernels from energy kernels: Lagrange's equations applied to both arguments, in closed form.
 
-tau_i = d/dt(∂L/∂dq_i) − ∂L/∂q_i with L = T − V (TR2023-063). Both functions take any position kernel with its
-derivatives, so every estimator built on energies shares them, and the velocity weights w_{l,a} of the links' kinetic
-energies, pooled so that little data cannot overfit them.
+tau_i = d/dt(∂L/∂dq_i) − ∂L/∂q_i with L = T − V (TR2023-063). The functions accept any position kernel with its
+derivatives, so all estimators built on energies share them. The velocity weights w_{l,a} of the links' kinetic energies
+are pooled, so that few data cannot overfit them.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from lipcore.kernels.polynomial import Product
 
 
 def potential_blocks(position: Product) -> Array:
-    """Torque covariance of V with kernel K(q, q'): ∂²K/∂q_i∂q'_j, (n, n, *batch)."""
+    """Return the torque covariance of V with kernel K(q, q'), ∂²K/∂q_i∂q'_j, (n, n, *batch)."""
     return position.mixed
 
 
 def kinetic_blocks(position: Product, weights: Array, x: State, y: State) -> Array:
-    """Torque covariance of T with kernel K(q, q') h², h = Σ_a w_a v_a v'_a: (n, n, *batch).
+    """Return the torque covariance of T with kernel K(q, q') h², h = Σ_a w_a v_a v'_a, (n, n, *batch).
 
-    Primes mark the second argument. With A = Σ ∂_iK v_i, B = Σ ∂'_jK v'_j, C = vᵀHv' (each carries the factor K),
-    H the mixed derivatives, ḣ, h', ḣ' the time derivatives of h along the first, second and both arguments:
+    Primes mark the second argument. With A = Σ ∂_iK v_i, B = Σ ∂'_jK v'_j, C = vᵀHv' (each contains the factor K), H
+    the mixed derivatives, ḣ, h', ḣ' the time derivatives of h along the first, second and both arguments:
 
         2 (w a')(K w a + A w v)ᵀ + 2 (w v')(B w a + C w v − ḣ ∂'K − h Hᵀv)ᵀ − 2 (h' ∂K + h H v')(w v)ᵀ
         + h² H + 2 diag(w (K ḣ' + A h' + B ḣ + C h))
 
-    weights: (n,) velocity weights w of this link; x, y: the same n joints. Written with
-    ∂K and H instead of the logarithmic derivatives ∂K / K, so that K may be zero.
+    weights: (n,), the velocity weights w of this link; x, y: the same n joints. The formula uses ∂K and H instead of
+    the logarithmic derivatives ∂K / K, so that K may be zero.
     """
     n = weights.shape[0]
     w = weights.reshape((n,) + (1,) * (x.q.ndim - 1))
@@ -52,12 +52,12 @@ def kinetic_blocks(position: Product, weights: Array, x: State, y: State) -> Arr
 
 
 def potential_energy_torque(position: Product) -> Array:
-    """Covariance of V at x with its torque j at y: ∂K/∂q'_j, (n, *batch)."""
+    """Return the covariance of V at x with its torque j at y, ∂K/∂q'_j, (n, *batch)."""
     return position.right
 
 
 def kinetic_energy_torque(position: Product, weights: Array, x: State, y: State) -> Array:
-    """Covariance of T at x with its torque j at y: 2 (B h + K h') w v − h² ∂'K, (n, *batch)."""
+    """Return the covariance of T at x with its torque j at y, 2 (B h + K h') w v − h² ∂'K, (n, *batch)."""
     w = weights.reshape((weights.shape[0],) + (1,) * (x.q.ndim - 1))
     wv = w * x.v
     h, h2 = (wv * y.v).sum(0), (wv * y.a).sum(0)
@@ -72,17 +72,23 @@ PRIOR_STD = {
     "kinetic.log_gap": 0.7,
     "kinetic.log_deviation": 0.4,
 }
-"""Chosen on fits to rich simulated data of a Panda and a Kinova: weights differ by orders of magnitude between links,
-and within a link by little."""
+"""Prior standard deviations, tuned on fits to rich simulated data of a Panda and a Kinova.
+
+Weights differ by orders of magnitude between links, but little within a link.
+"""
 
 
 def velocity_weights(params: Params, n: int) -> Array:
-    """Lower triangular (n, n) matrix of w_{l,a} with log w_{l,a} = s + s_l + u_a + g_{l−a} + δ_{l,a}.
+    """Return the lower triangular (n, n) matrix of w_{l,a} with log w_{l,a} = s + s_l + u_a + g_{l−a} + δ_{l,a}.
 
-    `kinetic.log_scale` (), `kinetic.log_link` (n,), `kinetic.log_joint` (n,), `kinetic.log_gap` (n,): how levers grow
-    with the joints in between, and `kinetic.log_deviation` (n (n+1) / 2,): what is particular to a link and a joint. A
-    weight that the data say little of is guessed from its neighbours instead of fitted to zero, which would make the
-    model too sure of itself.
+    - `kinetic.log_scale` (): s;
+    - `kinetic.log_link` (n,): s_l;
+    - `kinetic.log_joint` (n,): u_a;
+    - `kinetic.log_gap` (n,): g, the growth of levers with the number of joints in between;
+    - `kinetic.log_deviation` (n (n+1) / 2,): δ, specific to a link and a joint.
+
+    If the data hardly determine a weight, its neighbours do. Fitted alone it would become zero, and the model
+    overconfident.
     """
     scale, gap, deviation = (params[f"kinetic.log_{name}"] for name in ("scale", "gap", "deviation"))
     xp = array_namespace(scale)
@@ -93,7 +99,7 @@ def velocity_weights(params: Params, n: int) -> Array:
 
 
 def velocity_adjoint(weights: Array, slopes: Array) -> dict[str, Array]:
-    """Derivatives by the hyperparameters of `velocity_weights`, given those by the weights; both (n, n)."""
+    """Return the derivatives by the hyperparameters of `velocity_weights`, given those by the weights; both (n, n)."""
     n = len(weights)
     logs = np.tril(weights * slopes)
     return {
@@ -106,7 +112,10 @@ def velocity_adjoint(weights: Array, slopes: Array) -> dict[str, Array]:
 
 
 def _triangle(n: int) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
-    """Whether l ≥ a, (n, n), and flat, (n²,): |l − a|, and the number of (l, a) among those with l ≥ a, 0 elsewhere."""
+    """Return the mask l ≥ a, (n, n), and two flat index arrays, (n²,).
+
+    The first array is |l − a|. The second is the number of (l, a) among the pairs with l ≥ a, and 0 for other pairs.
+    """
     link, joint = np.indices((n, n))
     number = np.zeros((n, n), np.int64)
     number[np.tril_indices(n)] = np.arange(n * (n + 1) // 2)
@@ -114,7 +123,7 @@ def _triangle(n: int) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.
 
 
 def initial_weights(tau: Array) -> dict[str, Array]:
-    """Inertia as arms have it that need as much torque, shared out between the links. tau: (N, n)."""
+    """Start with the inertia of a typical arm of this torque, divided equally between the links. tau: (N, n)."""
     n, torque = tau.shape[1], np.sqrt(np.square(tau).mean(0).clip(1e-12))
     return {
         # 0.1 kg·m² per N·m: m d² over m g d, for an arm of length d about a metre

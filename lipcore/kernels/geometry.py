@@ -1,14 +1,14 @@
-"""Where the joint axes of a serial arm lie.
+"""Geometry of the joint axes of a serial arm.
 
-Every joint has a frame, placed in the frame of the joint before it; its axis is a fixed vector of its own frame. What
-torque can tell of a joint is where its axis lies relative to the one before: two turns of it and two shifts, across the
-axis (of a prismatic joint the turns alone), and of the first joint how it stands to gravity. A change of a geometry is
-therefore a step in these numbers,
+Every joint has a frame, placed in the frame of the joint before it. Its axis is a fixed vector of its own frame. Torque
+depends on the axis of a joint relative to the one before: two turns and two shifts across the axis. A prismatic joint
+has only the turns. The first joint has only its direction to gravity. A change of geometry is therefore a step in these
+numbers,
 
     T_j ← T_j exp(ε_j),    ε_j = (turn about e1, about e2, shift along e1, along e2),    e1, e2 across the axis,
 
-which is smooth everywhere. (Denavit–Hartenberg's numbers are not: for two parallel axes, of which most arms have some,
-the place of the common normal is undetermined, and a small turn of an axis moves it without bound.)
+which is smooth everywhere. (Denavit–Hartenberg parameters are not: most arms have parallel axes, and for two parallel
+axes the place of the common normal is undetermined. A small turn of an axis then moves it without bound.)
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 
 STANDARD_GRAVITY = 9.81
-"""m/s², as Pinocchio has it."""
+"""m/s², the value of Pinocchio."""
 
 
 @dataclass(frozen=True)
 class Geometry:
-    """Geometry of a serial arm of n joints, from base to tip.
-
-    joint_types: `revolute` or `prismatic`; rotation: (n, 3, 3), axes of joint j's frame in the frame of joint j − 1 (of
-    the base for the first) at q_j = 0; translation: (n, 3) m, its origin there; axis: (n, 3), unit vectors in the
-    joints' own frames; gravity: (3,) m/s² in the base's frame, zero where torques are without it.
-    """
+    """Geometry of a serial arm of n joints, from base to tip."""
 
     joint_types: tuple[JointType, ...]
+    """`revolute` or `prismatic`, (n,)."""
     rotation: Array
+    """Axes of joint j's frame in the frame of joint j − 1 (the first: in the base's frame) at q_j = 0, (n, 3, 3)."""
     translation: Array
+    """Origin of joint j's frame in the same frame, (n, 3) m."""
     axis: Array
+    """Unit vectors of the axes in the joints' own frames, (n, 3)."""
     gravity: Array
+    """Gravity in the base's frame, (3,) m/s²; zero if torques do not contain it."""
 
     def __post_init__(self) -> None:
         check_joint_types(self.joint_types)
@@ -58,7 +58,7 @@ class Geometry:
 
     @classmethod
     def from_robot(cls, robot: RigidBody, gravity: bool = True) -> Geometry:
-        """Geometry of a URDF, frames and axes as it has them; gravity: whether torques contain it."""
+        """Return the geometry of a URDF with its own frames and axes. gravity: whether torques contain gravity."""
         model = robot.model
         places, order = tuple(model.jointPlacements)[1:], np.argsort(robot.order)
         axes = np.array([_axis(model.joints[joint]) for joint in range(1, model.njoints)])
@@ -77,7 +77,7 @@ class Geometry:
 
     @cached_property
     def across(self) -> Array:
-        """Two unit vectors across each joint's axis, in its own frame: (n, 2, 3)."""
+        """Two unit vectors across each joint's axis, in its own frame, (n, 2, 3)."""
         helper = np.eye(3)[np.abs(self.axis).argmin(axis=1)]
         first = np.cross(helper, self.axis)
         first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -85,23 +85,23 @@ class Geometry:
 
     @property
     def screws(self) -> tuple[int, ...]:
-        """How many numbers of each joint torque can tell: four, two of a prismatic one, two or none of the first."""
+        """Count of identifiable numbers of each joint: four, two if it is prismatic, two or none for the first."""
         first = 2 if np.any(self.gravity) else 0
         return (first, *(4 if kind == "revolute" else 2 for kind in self.joint_types[1:]))
 
     @property
     def size(self) -> int:
-        """Numbers of the geometry, g."""
+        """Number of the geometry's numbers, g."""
         return sum(self.screws)
 
     @property
     def turns(self) -> Array:
-        """Which of the numbers are angles, rad; the others are lengths, m: (g,)."""
+        """Mask of the numbers that are angles in rad, (g,); the others are lengths in m."""
         return np.concatenate([np.arange(count) < 2 for count in self.screws]).astype(bool)
 
     @cached_property
     def constants(self) -> Array:
-        """The geometry as `kernels.fast.arm_recursion` reads it: (n, CONSTANTS)."""
+        """The geometry in the layout of `kernels.fast.arm_recursion`, (n, CONSTANTS)."""
         n = self.n_joints
         out = np.zeros((n, CONSTANTS))
         out[:, TURN:PLACE] = (self.rotation[:, None] @ self.turn_parts).reshape(n, -1)
@@ -113,7 +113,7 @@ class Geometry:
         return out
 
     def moved(self, step: Array) -> Geometry:
-        """The geometry a step away, (g,) rad and m."""
+        """Return the geometry after a step, (g,) rad and m."""
         numbers = np.zeros((self.n_joints, 1, 4))
         numbers[:, 0][self._counted] = step
         turn, shift = (numbers[..., part] @ self.across for part in (slice(0, 2), slice(2, 4)))
@@ -122,7 +122,10 @@ class Geometry:
 
     @cached_property
     def turn_parts(self) -> Array:
-        """What times 1, sin q and cos q add up to exp(q axis×), to the identity of a prismatic joint: (n, 3, 3, 3)."""
+        """Matrices M, (n, 3, 3, 3), with M₀ + M₁ sin q + M₂ cos q = exp(q axis×).
+
+        For a prismatic joint the sum is the identity.
+        """
         along, one = self.axis[:, :, None] * self.axis[:, None], np.eye(3)
         parts = np.stack([along, skew(self.axis), one - along], axis=1)
         for j, kind in enumerate(self.joint_types):
@@ -131,29 +134,29 @@ class Geometry:
         return parts
 
     def towards(self, other: Geometry) -> Array:
-        """The step, (g,), that leads to another geometry of the same joints, to first order in what lies between."""
-        turn = turn_of(self.rotation.mT @ other.rotation)
+        """Return the step, (g,), to another geometry of the same joints, to first order in their difference."""
+        turn = rotation_vector_of(self.rotation.mT @ other.rotation)
         return self._step(turn, self.rotation.mT @ (other.translation - self.translation)[..., None])
 
     def shifts(self) -> Array:
-        """Where each axis lies across itself, seen from the frame before: (g,) m, zero in the place of turns."""
+        """Return the position of each axis across itself, relative to the frame before, (g,) m; zero for turns."""
         return self._step(np.zeros_like(self.translation), self.rotation.mT @ self.translation[..., None])
 
     def _step(self, turn: Array, shift: Array) -> Array:
-        """The numbers of turns (n, 3) and shifts (n, 3, 1) of the joints' frames, seen from there."""
+        """Return the numbers that describe turns (n, 3) and shifts (n, 3, 1) of the joints' frames, in these frames."""
         numbers = np.concatenate([self.across @ turn[..., None], self.across @ shift], axis=1)[..., 0]
         return np.asarray(numbers[self._counted])
 
     @cached_property
     def _counted(self) -> NDArray[np.bool_]:
-        """Which of the four numbers of each joint there are, (n, 4)."""
+        """Mask of the numbers of each joint that exist among its four, (n, 4)."""
         return np.arange(4) < np.reshape(self.screws, (-1, 1))
 
     def canonical(self) -> Geometry:
-        """The same arm with each frame where its axis comes closest to the frame before, and the first at the base.
+        """Return the same arm with each frame where its axis comes closest to the frame before.
 
-        Where a frame lies along its axis, torque cannot tell. Revolute joints only: a prismatic joint's frame stays at
-        the origin of the one before.
+        The first frame is at the base. Torque does not depend on the position of a frame along its axis. This applies
+        to revolute joints only: a prismatic joint's frame stays at the origin of the one before.
         """
         translation, moved = self.translation.copy(), np.zeros(3)
         for j, kind in enumerate(self.joint_types):
@@ -163,7 +166,7 @@ class Geometry:
             else:
                 axis = self.rotation[j] @ self.axis[j]
                 kept = place - axis * (axis @ place)
-            # what the frame of this joint was moved by, as the frame itself sees it
+            # the movement of this joint's frame, in the frame's own coordinates
             moved = self.rotation[j].T @ (kept - place)
             if kind == "revolute":
                 moved = self.axis[j] * (self.axis[j] @ moved)
@@ -171,7 +174,7 @@ class Geometry:
         return replace(self, translation=translation)
 
     def placements(self, q: Array) -> tuple[Array, Array]:
-        """Rotations (n, 3, 3) and origins (n, 3) m of all joints' frames in the base's, at positions q (n,)."""
+        """Return rotations (n, 3, 3) and origins (n, 3) m of all joint frames in the base's frame at q, (n,)."""
         turn, place, turns, places = np.eye(3), np.zeros(3), [], []
         for j, kind in enumerate(self.joint_types):
             place, turn = place + turn @ self.translation[j], turn @ self.rotation[j]
@@ -185,7 +188,7 @@ class Geometry:
 
 
 def skew(vector: Array) -> Array:
-    """The matrix of vector × …, (…, 3, 3) of (…, 3)."""
+    """Return the matrix of vector × …, (…, 3) to (…, 3, 3)."""
     out = np.zeros((*vector.shape, 3))
     x, y, z = vector[..., 0], vector[..., 1], vector[..., 2]
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -z, y, -x
@@ -194,21 +197,21 @@ def skew(vector: Array) -> Array:
 
 
 def rotation_of(turn: Array) -> Array:
-    """Rotation by the vector `turn`, rad: exp(turn×), (…, 3, 3) of (…, 3), Rodrigues' formula."""
+    """Return the rotation by the vector `turn`, rad: exp(turn×), (…, 3) to (…, 3, 3), by Rodrigues' formula."""
     angle = np.linalg.norm(turn, axis=-1)[..., None, None]
     unit = skew(turn / np.where(angle[..., 0] > 0, angle[..., 0], 1.0))
     return np.asarray(np.eye(3) + np.sin(angle) * unit + (1 - np.cos(angle)) * unit @ unit)
 
 
-def turn_of(rotation: Array) -> Array:
-    """The vector (…, 3) rad that `rotation_of` makes this rotation (…, 3, 3) of, shorter than π."""
+def rotation_vector_of(rotation: Array) -> Array:
+    """Return the rotation vector of a rotation, (…, 3, 3) to (…, 3) rad, shorter than π; inverts `rotation_of`."""
     from scipy.spatial.transform import Rotation  # noqa: PLC0415 - serving does without it
 
     return np.asarray(Rotation.from_matrix(rotation).as_rotvec())
 
 
-def aligned(axis: Array) -> Array:
-    """A rotation whose third column is the unit vector `axis`: (3, 3)."""
+def rotation_to_axis(axis: Array) -> Array:
+    """Return a rotation with the unit vector `axis` as third column, (3, 3)."""
     third = np.asarray(axis, np.float64)
     first = np.cross(np.eye(3)[int(np.abs(third).argmin())], third)
     first /= np.linalg.norm(first)
@@ -216,7 +219,7 @@ def aligned(axis: Array) -> Array:
 
 
 def _axis(joint: object) -> Array:
-    """Unit vector of the axis of a joint of Pinocchio's, in its own frame."""
+    """Return the unit vector of the axis of a Pinocchio joint, in its own frame."""
     name = joint.shortname()  # type: ignore[attr-defined]
     for place, letter in enumerate("XYZ"):
         if name.endswith(letter):

@@ -27,12 +27,18 @@ from lipcore.vocabulary import JointType
 
 
 class LipKernel(CompiledKernel):
-    """Potential energy over all joints plus one kinetic energy a link, each over the joints that move it.
+    """Potential energy over all joints, plus one kinetic energy for each link over the joints that move it.
 
-    Hyperparameters: `potential.log_scale` (); `potential.logits` (n, 2); `kinetic.<i>.logits` (i, 2) of link i in 1..n;
-    and those of `energy.velocity_weights`. Logits give each joint's shares (σ, α, β), which sum to one: the energies'
-    scale lives in the scale and the weights alone. With `tied` all links share one `kinetic.logits` (n, 2): fewer
-    parameters to overfit with; without, every link has its own as in the paper.
+    Hyperparameters:
+
+    - `potential.log_scale` ();
+    - `potential.logits` (n, 2);
+    - `kinetic.<i>.logits` (i, 2) of link i in 1..n;
+    - those of `energy.velocity_weights`.
+
+    Logits give each joint's shares (σ, α, β), which sum to one: the scale of the energies is in the scale and the
+    weights alone. If `tied`, all links share one `kinetic.logits` (n, 2), which overfits less. Otherwise every link has
+    its own, as in the paper.
     """
 
     driver = Driver(lip_size, lip_gram, lip_gradient, lip_cross)
@@ -43,7 +49,7 @@ class LipKernel(CompiledKernel):
         self.tied = tied
 
     def blocks(self, params: Params, x: State, y: State) -> Array:
-        """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
+        """Return the covariance of torque i at x with torque j at y, (n, n, *batch) (N·m)²."""
         total = potential_blocks(self.potential(params, x, y))
         for link in range(1, self.n_joints + 1):
             kinetic = kinetic_blocks(
@@ -56,9 +62,10 @@ class LipKernel(CompiledKernel):
         return total
 
     def hyper(self, params: Params) -> Hyper:
-        """Shares of the kinetic energies, link by link or one for all, then the potential's: (n + 1 or 2, n, 3).
+        """Return the shares, scales and velocity weights for compiled code.
 
-        Scales (n,), of which a product over all joints has the last alone; velocity weights (n, n).
+        Shares: (n + 1 or 2, n, 3), those of the kinetic energies, link by link or one for all, then those of the
+        potential. Scales: (n,), of which a product over all joints has only the last. Velocity weights: (n, n).
         """
         potential, n = params["potential.logits"], self.n_joints
         links = [params[name] for name in self._kinetic_logits()]
@@ -70,7 +77,7 @@ class LipKernel(CompiledKernel):
         return Hyper(shares(logits.reshape(-1, 2)).reshape(len(logits), n, 3), scales, self.weights(params))
 
     def hyper_adjoint(self, hyper: Hyper, slopes: Hyper) -> dict[str, Array]:
-        """Derivatives by the hyperparameters, given those by what `hyper` makes of them."""
+        """Return the derivatives by the hyperparameters, given the derivatives by the result of `hyper`."""
         sizes = {**self._kinetic_logits(), "potential.logits": self.n_joints}
         logits = shares_adjoint(hyper.shares, slopes.shares)
         return {
@@ -80,19 +87,19 @@ class LipKernel(CompiledKernel):
         }
 
     def potential(self, params: Params, x: State, y: State) -> Product:
-        """Kernel of the potential energy V and its derivatives."""
+        """Return the kernel of the potential energy V and its derivatives."""
         base = base_kernels(shares(params["potential.logits"]), self.joint_types, x.q, y.q)
         scale = params["potential.log_scale"]
         return Product(base, range(self.n_joints), array_namespace(scale).exp(scale), self.n_joints)
 
     def kinetic(self, params: Params, link: int, x: State, y: State) -> Product:
-        """Position factor of the kinetic energy kernel of `link` (1-based) and its derivatives."""
+        """Return the position factor of the kinetic energy kernel of `link` (1-based) and its derivatives."""
         logits = params["kinetic.logits"][:link] if self.tied else params[f"kinetic.{link}.logits"]
         base = base_kernels(shares(logits), self.joint_types[:link], x.q[:link], y.q[:link])
         return Product(base.squared(), range(link), array_namespace(logits).ones_like(logits[0, 0]), link)
 
     def energies(self, params: Params, x: State, y: State) -> Array:
-        """Covariance of the kinetic and the potential energy at x with torque j at y: (2, n, *batch), J·N·m."""
+        """Return the covariance of kinetic and potential energy at x with torque j at y, (2, n, *batch) J·N·m."""
         potential = potential_energy_torque(self.potential(params, x, y))
         xp = array_namespace(potential)
         kinetic = xp.zeros_like(potential)
@@ -103,7 +110,7 @@ class LipKernel(CompiledKernel):
         return xp.stack([kinetic, potential])
 
     def energy_covariance(self, params: Params, x: State, y: State) -> Array:
-        """Covariance of the kinetic energies at x and y, Σ_l K_l h_l², and of the potential ones: (2, *batch), J²."""
+        """Return the covariance of kinetic energies at x and y, Σ_l K_l h_l², and of potential ones, (2, *batch) J²."""
         potential = self.potential(params, x, y).value
         xp = array_namespace(potential)
         kinetic = xp.zeros_like(potential)
@@ -114,9 +121,9 @@ class LipKernel(CompiledKernel):
         return xp.stack([kinetic, potential])
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """Potential torques as large as the measured ones; inertia as arms have it that weigh as much."""
+        """Start with potential torques as large as the measured ones, and with the inertia of an arm of that weight."""
         power = np.square(tau).mean(0).clip(1e-12)
-        # a joint's potential torque grows with its share α or β: start them at the ratio of the torques
+        # a joint's potential torque grows with its share α or β: they start at the ratio of the torques
         ratio = np.log((power / power.max()).clip(1e-6))
         return {
             "potential.log_scale": np.asarray(np.log(power.max() * 3)),
@@ -126,21 +133,24 @@ class LipKernel(CompiledKernel):
         }
 
     def weights(self, params: Params) -> Array:
-        """Velocity weights w_{l,a} as a lower triangular matrix (n, n)."""
+        """Return the velocity weights w_{l,a} as a lower triangular matrix, (n, n)."""
         return velocity_weights(params, self.n_joints)
 
     def _kinetic_logits(self) -> dict[str, int]:
-        """Names of the kinetic energies' logits, and how many joints each has."""
+        """Return the names of the kinetic energies' logits, and the number of joints of each."""
         n = self.n_joints
         return {"kinetic.logits": n} if self.tied else {f"kinetic.{link}.logits": link for link in range(1, n + 1)}
 
     def prior_std(self) -> dict[str, float]:
-        """Weights are pooled between links and joints; a share may stray far from its start."""
+        """Return the prior standard deviations.
+
+        Weights are pooled between links and joints; a share may move far from its start.
+        """
         return dict(PRIOR_STD)
 
 
 def shares(logits: Array) -> Array:
-    """Softmax of (0, logits): (n, 2) to the shares (σ, α, β) of each joint, (n, 3)."""
+    """Return the softmax of (0, logits): (n, 2) to the shares (σ, α, β) of each joint, (n, 3)."""
     xp = array_namespace(logits)
     every = xp.concat([xp.zeros_like(logits[:, :1]), logits], axis=1)
     powers = xp.exp(every - xp.max(every, axis=1, keepdims=True))
@@ -148,6 +158,6 @@ def shares(logits: Array) -> Array:
 
 
 def shares_adjoint(share: Array, slopes: Array) -> Array:
-    """Derivatives by the logits, (…, 2), given the shares and the derivatives by them, (…, 3)."""
+    """Return the derivatives by the logits, (…, 2), given the shares and the derivatives by them, (…, 3)."""
     logits: Array = share * (slopes - (share * slopes).sum(-1, keepdims=True))
     return logits[..., 1:]

@@ -1,4 +1,4 @@
-"""A correction where an arm has been: what rigid bodies and friction leave over there, and nothing anywhere else."""
+"""A local correction near the training motion, for the torque that rigid bodies and friction do not explain."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class LocalKernel(PairKernel):
     Joints share the lengthscales and nothing else. Hyperparameters: `local.log_scale` (n,), log s_i² in (N·m)²;
     `local.log_lengthscales` (4 n,), log ℓ_d in the units of x.
 
-    Example: at the sample itself the covariance is s², ten lengthscales away it is nothing.
+    Example: at the sample itself the covariance is s²; ten lengthscales away it is zero.
 
     >>> x = Motion(*np.zeros((3, 1, 1)))
     >>> y = Motion(np.full((1, 1), 10.0), *np.zeros((2, 1, 1)))
@@ -32,7 +32,7 @@ class LocalKernel(PairKernel):
         self.n_joints = n_joints
 
     def blocks(self, params: Params, x: State, y: State) -> Array:
-        """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)², zero for i ≠ j."""
+        """Return the covariance of torque i at x with torque j at y, (n, n, *batch) (N·m)²; zero for i ≠ j."""
         xp = array_namespace(x.q)
         signs = xp.tanh(x.v / SIGN_WIDTH) - xp.tanh(y.v / SIGN_WIDTH)
         squares = xp.square(xp.concat([x.q - y.q, x.v - y.v, x.a - y.a, signs]))
@@ -40,29 +40,35 @@ class LocalKernel(PairKernel):
         return on_diagonal(xp.exp(per_joint(params["local.log_scale"], exponent) - 0.5 * exponent))
 
     def cross(self, params: Params, inducing: Motion) -> Cross:
-        """Covariance of one query with the inducing samples and itself, compiled."""
+        """Return the compiled covariances of single queries with the inducing samples and with themselves."""
         return _LocalCross(params, inducing)
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """All of the power of tau, (N, n); 0.3 of every input's spread, times √(4 n) as squared distances add up over
-        4 n inputs: a fifth of the distance of two random samples, so that all are far from unknown motion."""
+        """Start with the full power of tau, (N, n), and with 0.3 of every input's spread, times √(4 n).
+
+        Squared distances add up over 4 n inputs. The lengthscales are a fifth of the distance of two random samples, so
+        that all samples are far from unknown motion.
+        """
         lengths = 0.3 * (4 * self.n_joints) ** 0.5 * np.concatenate([spread(each) for each in _inputs(motion)])
         return {"local.log_scale": np.log(power(tau)), "local.log_lengthscales": np.log(lengths)}
 
 
 def scaled(params: Params, motion: Motion) -> Array:
-    """Inputs over their lengthscales, (N, 4 n). params: `local.log_lengthscales`."""
+    """Return the inputs divided by their lengthscales, (N, 4 n). params: `local.log_lengthscales`."""
     return np.concatenate(_inputs(motion), axis=1) * np.exp(-params["local.log_lengthscales"])
 
 
 def nearness(params: Params, x: Motion) -> Array:
-    """Correlation of each joint's correction between all samples, (N, N). params: `local.log_lengthscales`."""
+    """Return the correlation of each joint's correction between all samples, (N, N).
+
+    params: `local.log_lengthscales`.
+    """
     inputs = scaled(params, x)
     return np.asarray(np.exp(-0.5 * cdist(inputs, inputs, "sqeuclidean")))
 
 
 class _LocalCross(Cross):
-    """`Cross` of the local kernel: one distance a sample, for all joints."""
+    """`Cross` of the local kernel, with one distance per sample for all joints."""
 
     def __init__(self, params: Params, inducing: Motion) -> None:
         self.size, self.n_joints = len(inducing), inducing.n_joints

@@ -1,17 +1,17 @@
-"""The Lagrangian squared exponential baseline: L(q, dq) has one smooth prior that knows no polynomial (TR2023-063).
+"""The Lagrangian squared exponential baseline: one smooth prior of L(q, dq), without polynomials (TR2023-063).
 
 Primes mark the second argument, D = Σ_k v_k ∂/∂q_k + a_k ∂/∂v_k is the time derivative and T_i = D ∂/∂v_i − ∂/∂q_i
 makes L a torque. The prior is
 
     K = s² Π_b κ_b(q_b − q'_b) exp(−½ Σ_b c_b (v_b − v'_b)²),   c_b = 1 / m_b²
 
-with κ = exp((cos(q − q') − 1) / ℓ²), the squared exponential of (cos q, sin q), for revolute and
-κ = exp(−(q − q')² / (2 ℓ²)) for prismatic joints. K is nowhere zero and all its derivatives are multiples of it. With
+with κ = exp((cos(q − q') − 1) / ℓ²), the squared exponential of (cos q, sin q), for revolute joints and
+κ = exp(−(q − q')² / (2 ℓ²)) for prismatic joints. K is nowhere zero, and all its derivatives are multiples of K. With
 
     e = ∂ log κ / ∂q,  d = ∂² log κ / ∂q²,  g = −c∘(v − v'),  b = c∘a,  b' = c∘a',
     Λ = e·v + g·a,  Λ' = e·v' + g·a',  Ω = Σ d v v' − Σ c a a',  x = b − Λ g,  y = b' − Λ' g
 
-the nine products of left and right derivatives in T_i T'_j K collect into four of rank one and a diagonal:
+the nine products of left and right derivatives in T_i T'_j K collect into four matrices of rank one and a diagonal:
 
     block / K = (x + e)(y − e)ᵀ + y xᵀ + g ((Ω − ΛΛ') g + d∘v)ᵀ − (d∘v') gᵀ − diag((Ω + ΛΛ') c + d)
 """
@@ -31,10 +31,13 @@ from lipcore.vocabulary import JointType
 
 
 class LagrangianSEKernel(PairKernel):
-    """One squared exponential kernel on (cos q, sin q, dq), q itself where prismatic, for the whole Lagrangian.
+    """One squared exponential kernel for the whole Lagrangian, on (cos q, sin q, dq); on q itself for prismatic joints.
 
-    Hyperparameters: `lse.log_scale` (), log s² in J²; `lse.log_position_lengthscales` (n,), log ℓ, no unit
-    (prismatic: m); `lse.log_velocity_lengthscales` (n,), log m in rad/s (m/s).
+    Hyperparameters:
+
+    - `lse.log_scale` (): log s² in J²;
+    - `lse.log_position_lengthscales` (n,): log ℓ, without unit (prismatic: m);
+    - `lse.log_velocity_lengthscales` (n,): log m in rad/s (m/s).
     """
 
     def __init__(self, joint_types: Sequence[str]) -> None:
@@ -42,7 +45,7 @@ class LagrangianSEKernel(PairKernel):
         self.n_joints = len(self.joint_types)
 
     def blocks(self, params: Params, x: State, y: State) -> Array:
-        """Covariance of torque i at x with torque j at y: (n, n, *batch), (N·m)²."""
+        """Return the covariance of torque i at x with torque j at y, (n, n, *batch) (N·m)²."""
         xp = array_namespace(x.q)
         log_k, e, d = self._position(params["lse.log_position_lengthscales"], x.q, y.q)
         c = per_joint(xp.exp(-2 * params["lse.log_velocity_lengthscales"]), x.v)
@@ -62,7 +65,7 @@ class LagrangianSEKernel(PairKernel):
         return block - on_diagonal(k * ((omega + both) * c + d))
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """Every input's spread, times √(2 n) as distances add up; the scale that gives all torques their power."""
+        """Start with the spread of every input, times √(2 n) because distances add up, and with the measured power."""
         circle = np.hypot(spread(np.cos(motion.q)), spread(np.sin(motion.q)))
         position = np.where(self._revolute(), circle, spread(motion.q))
         inputs = (2 * self.n_joints) ** 0.5
@@ -76,11 +79,11 @@ class LagrangianSEKernel(PairKernel):
         return params
 
     def _position(self, log_lengthscales: Array, q: Array, q2: Array) -> tuple[Array, Array, Array]:
-        """log κ and its first and second derivative by q, each (n, *batch)."""
+        """Return log κ and its first and second derivative by q, each (n, *batch)."""
         xp, z = array_namespace(q), q - q2
         c = per_joint(xp.exp(-2 * log_lengthscales), z)
         sin, cos = xp.sin(z), xp.cos(z)
-        # cos z − 1 without cancellation
+        # this form of cos z − 1 avoids cancellation
         log_k, e, d = -2 * xp.square(xp.sin(0.5 * z)), -sin, -cos
         if "prismatic" in self.joint_types:
             revolute = xp.asarray(self._revolute().reshape((-1,) + (1,) * (z.ndim - 1)), device=device(z))
@@ -90,5 +93,5 @@ class LagrangianSEKernel(PairKernel):
         return c * log_k, c * e, c * d
 
     def _revolute(self) -> NDArray[np.bool_]:
-        """Which joints are revolute, (n,)."""
+        """Return a mask of the revolute joints, (n,)."""
         return np.array([kind == "revolute" for kind in self.joint_types])

@@ -1,4 +1,4 @@
-"""The kernel of other arms: what those that explain samples nearly as well have more torque than the first."""
+"""The kernel of alternative arms: the difference between their torque and that of the first arm."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED
 
 
 class MixtureKernel(LinearKernel):
-    """tau = Σ c_k δ_k, where δ_k = τ_k − τ_0 is the torque of arm k less that of the first.
+    """tau = Σ c_k δ_k with δ_k = τ_k − τ_0, the torque of arm k minus that of the first arm.
 
-    τ_k = Y(θ_k) π_k + r_k ∘ ddq + P f_k, with `newton_euler.rigid_body_torque` and `friction_features`; compiled.
-    With c one of the K others or none, by their probabilities p, c has mean p and covariance C = diag p − p pᵀ = L Lᵀ,
-    so that the sum has the mean and the variance of the mixture of arms. The features are Lᵀ δ, whose weights L⁻¹ c,
-    (K,), are independent with variance one, or a larger one where a few arms stand for many.
+    τ_k = Y(θ_k) π_k + r_k ∘ ddq + P f_k, with `newton_euler.rigid_body_torque` and `friction_features`; compiled. With
+    c one of the K others or none, by their probabilities p, c has mean p and covariance C = diag p − p pᵀ = L Lᵀ. The
+    sum then has the mean and the variance of the mixture of arms. The features are Lᵀ δ. Their weights L⁻¹ c, (K,), are
+    independent with variance one, or a larger one if a few arms represent many.
 
-    arms: the first one and the others, K + 1; order: (n,), the data's joint at each place of the chain; variance: of
+    arms: the first arm and the others, K + 1; order: (n,), the data's joint at each place of the chain; variance: of
     the weights. mixing: L, (K, K).
     """
 
@@ -43,24 +43,24 @@ class MixtureKernel(LinearKernel):
         )
 
     def regressor(self) -> Regressor:
-        """Φ of one query, for serving."""
+        """Return the regressor that computes Φ for single queries."""
         return MixtureRegressor(self._arms, self._order)
 
     def variances(self, params: Params) -> Array:
-        """Prior variances of the weights: (K,)."""
+        """Return the prior variances of the weights, (K,)."""
         return np.full(self.size, self._variance)
 
     def prior_weights(self) -> Array:
-        """Prior mean of the weights, (K,)."""
+        """Return the prior mean of the weights, (K,)."""
         return self._mean
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """No hyperparameters."""
+        """Return no hyperparameters: the kernel has none."""
         return {}
 
 
 class MixtureRegressor(Regressor):
-    """Features of `MixtureKernel`, one query at a time."""
+    """Features of `MixtureKernel` for single queries."""
 
     def __init__(self, arms: tuple[Array, Array, Array, Array, Array], order: NDArray[np.int64]) -> None:
         self.n_joints, self.size = len(order), len(arms[0])

@@ -1,6 +1,6 @@
-"""The torque of rigid bodies as a formula: Newton and Euler, section 5 of docs/method.md.
+"""The torque of rigid bodies as a formula: Newton–Euler, section 5 of docs/method.md.
 
-`ArmKernel` and its kin compute it and its derivatives compiled: `kernels.fast.arm`.
+`kernels.fast.arm` computes the same torque and its derivatives for `ArmKernel`, compiled.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from lipcore.kernels.geometry import Geometry
 
 
 def rigid_body_torque(geometry: Geometry, bodies: Array, x: State) -> Array:
-    """Return Y(θ; q, v, a) π at a batch of motions: (n, *batch) N·m, joints base to tip.
+    """Return Y(θ; q, v, a) π at a batch of motions, (n, *batch) N·m, joints base to tip.
 
-    A body of mass m, first moment h and inertia I about its joint's origin, which moves with ω, α and, less gravity, a,
-    takes the force m a + α × h + ω × (ω × h) and the moment h × a + I α + ω × I ω; all in the base's frame.
+    A body has mass m, first moment h and inertia I about its joint's origin. The origin moves with ω, α and a, which is
+    acceleration minus gravity. The body needs the force m a + α × h + ω × (ω × h) and the moment h × a + I α + ω × I ω;
+    all in the base's frame.
 
     geometry: θ; bodies: π, (n, 10) base to tip; x: motion of the joints base to tip.
     """
@@ -50,7 +51,7 @@ def rigid_body_torque(geometry: Geometry, bodies: Array, x: State) -> Array:
         along.append(axis)
         places.append(place)
     force, moment, torques = forces[-1], moments[-1], []
-    for j in range(n - 1, -1, -1):  # of all bodies from joint j to the tip, about its origin
+    for j in range(n - 1, -1, -1):  # sums over all bodies from joint j to the tip, about its origin
         if j < n - 1:
             moment = moments[j] + moment + _cross(places[j + 1], force)
             force = forces[j] + force

@@ -1,4 +1,4 @@
-"""The kernel of a payload: a body on the last link of an arm, torque linear in its ten parameters."""
+"""The kernel of a payload: a body on the last link of an arm, with torque linear in its ten parameters."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from lipcore.kernels.fast.views import Memory
 class PayloadKernel(LinearKernel):
     """tau = b(θ) π, b = ∂(Y π)/∂π of an arm's last link.
 
-    Y π is `newton_euler.rigid_body_torque`; b equals its derivative, compiled.
+    Y π is `newton_euler.rigid_body_torque`; compiled code computes b, its derivative.
 
-    Where the geometry θ is learnt, what a step of it makes of the payload's torque belongs to the arm's own weights,
-    which are linearised with the payload in their parameters (`ArmKernel`).
+    If the geometry θ is learnt, the change of the payload's torque with a step of θ belongs to the arm's own weights:
+    they are linearised with the payload in their parameters (`ArmKernel`).
 
     Weights: π (10,). arm: θ and the order of its joints; room: prior variance of π, (10,).
     """
@@ -33,27 +33,27 @@ class PayloadKernel(LinearKernel):
         self._last = slice(first, first + PARAMETERS)
 
     def energy_features(self, x: Motion) -> Array:
-        """Kinetic and potential energy per unit of each weight: (N, 2, 10) J."""
+        """Return the kinetic and the potential energy per unit of each weight, (N, 2, 10) J."""
         none = np.zeros((self.n_joints, PARAMETERS))
         out = np.empty((len(x), 2, (PARAMETERS + 1) * self.n_joints))
         arm_energies(self.constants, self.gravity, none, self.order, x.arrays(), out)
         return np.ascontiguousarray(out[..., self._last])
 
     def regressor(self) -> Regressor:
-        """The same features of one query, for serving."""
+        """Return the regressor that computes the same features for single queries."""
         return PayloadRegressor(self)
 
     def variances(self, params: Params) -> Array:
-        """Prior variances of the weights: (10,)."""
+        """Return the prior variances of the weights, (10,)."""
         return self._room
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """No hyperparameters."""
+        """Return no hyperparameters: the kernel has none."""
         return {}
 
 
 class PayloadRegressor(Regressor):
-    """Features of `PayloadKernel`, one query at a time."""
+    """Features of `PayloadKernel` for single queries."""
 
     def __init__(self, kernel: PayloadKernel) -> None:
         self.n_joints, self.size = kernel.n_joints, PARAMETERS

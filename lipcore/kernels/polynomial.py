@@ -1,8 +1,8 @@
-"""Polynomial kernels on joint positions and their derivatives.
+"""Polynomial kernels on joint positions, and their derivatives.
 
-The energies of a manipulator are polynomials in (cos q_b, sin q_b) of revolute and q_b of prismatic joints
-(TR2023-063). A product over joints of one small base kernel each spans them. Everything here is free of
-division, so a base kernel may pass through zero without loss of precision.
+The energies of a manipulator are polynomials in (cos q_b, sin q_b) of revolute joints and q_b of prismatic joints
+(TR2023-063). A product over joints of one small base kernel each spans them. No formula here divides. A base kernel may
+therefore pass through zero without loss of precision.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lipcore.vocabulary import JointType
 
 @dataclass(frozen=True)
 class BaseKernels:
-    """One base kernel p_b(q_b, q'_b) a joint with p, ∂p/∂q, ∂p/∂q', ∂²p/∂q∂q', each (n, *batch)."""
+    """One base kernel p_b(q_b, q'_b) for each joint: p, ∂p/∂q, ∂p/∂q' and ∂²p/∂q∂q', each (n, *batch)."""
 
     value: Array
     left: Array
@@ -28,22 +28,23 @@ class BaseKernels:
     mixed: Array
 
     def squared(self) -> BaseKernels:
-        """p², for the kinetic energy: degree two in each joint's cosine and sine."""
+        """Return p², for the kinetic energy: degree two in each joint's cosine and sine."""
         p = self.value
         return BaseKernels(p * p, 2 * p * self.left, 2 * p * self.right, 2 * (p * self.mixed + self.left * self.right))
 
 
 @dataclass(frozen=True)
 class Product:
-    """K(q, q') = s Π_b p_b of some joints b, with the derivatives that Lagrange's equations need.
-
-    base: base kernels of at least m joints; joints: those of the product; scale: s, (); size: m, the joints derived by.
-    """
+    """K(q, q') = s Π_b p_b over some joints b, with the derivatives that Lagrange's equations need."""
 
     base: BaseKernels
+    """Base kernels of at least m joints."""
     joints: range
+    """Joints of the product."""
     scale: Array
+    """s, ()."""
     size: int
+    """m, the number of joints to differentiate by."""
 
     @cached_property
     def value(self) -> Array:
@@ -67,7 +68,7 @@ class Product:
         return self._stack([self._stack([self._derivative(i, j) for j in joints]) for i in joints])
 
     def _derivative(self, left: int | None = None, right: int | None = None) -> Array:
-        """K, derived by q of joint `left` and by q' of joint `right`: s times a product of p_b or its derivatives."""
+        """Return K, differentiated by q of joint `left` and by q' of joint `right`."""
         nothing = array_namespace(self.base.value).zeros_like(self.base.value[0])
         if not all(joint in self.joints for joint in (left, right) if joint is not None):
             return nothing
@@ -82,16 +83,16 @@ class Product:
 
 
 def base_kernels(shares: Array, joint_types: Sequence[JointType], q: Array, q2: Array) -> BaseKernels:
-    """Base kernels of all joints of the paper, TR2023-063.
+    """Return the base kernels of all joints (TR2023-063).
 
-    revolute: p = σ + α cos q cos q' + β sin q sin q'; prismatic: p = (σ + β) + α q q'.
-    shares: (n, 3) with columns σ, α, β; q, q2: (n, *batch), batches broadcast.
+    revolute: p = σ + α cos q cos q' + β sin q sin q'; prismatic: p = (σ + β) + α q q'. shares: (n, 3) with columns σ,
+    α, β; q, q2: (n, *batch), batches broadcast.
     """
     xp, dims = array_namespace(shares), (-1,) + (1,) * (q.ndim - 1)
     sigma, alpha, beta = (shares[:, column].reshape(dims) for column in range(3))
     if "prismatic" not in joint_types:
         return _revolute(sigma, alpha, beta, q, q2)
-    # computed for every joint, then chosen: robots that mix the two types are small
+    # computing both types for every joint is cheap: robots that mix them are small
     kinds = np.array([kind == "prismatic" for kind in joint_types]).reshape(dims)
     prismatic = xp.asarray(kinds)
     straight, round_ = _prismatic(sigma + beta, alpha, q, q2), _revolute(sigma, alpha, beta, q, q2)

@@ -1,1 +1,1 @@
-"""A trained model, and what it says of torque, energies, dynamics and its own parameters."""
+"""A trained model: torque, energies, dynamics and physical parameters."""

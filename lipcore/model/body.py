@@ -1,4 +1,4 @@
-"""A rigid body that an arm carries, as controllers are given it."""
+"""A rigid body that an arm carries, in the usual terms of a robot controller."""
 
 from __future__ import annotations
 
@@ -11,15 +11,14 @@ from lipcore.data.samples import Array
 
 @dataclass(frozen=True)
 class Body:
-    """A rigid body in the frame of an arm's last link.
-
-    mass: kg, above zero; com: (3,) m, its centre of mass; inertia: (3, 3) kg·m² about the centre of mass, along the
-    axes of the link; that of a point where None. Raise ValueError for a body that cannot exist.
-    """
+    """A rigid body in the frame of an arm's last link. Raise ValueError for a body that cannot exist."""
 
     mass: float
+    """Mass, kg, above zero."""
     com: Array
+    """Centre of mass, (3,) m."""
     inertia: Array | None = None
+    """Inertia about the centre of mass, along the axes of the link, (3, 3) kg·m². None: a point mass."""
 
     def __post_init__(self) -> None:
         if not 0 < self.mass < np.inf:
@@ -42,26 +41,28 @@ class Body:
 
     @property
     def parameters(self) -> Array:
-        """Mass, first moment and inertia about the link's frame, xx, xy, yy, xz, yz, zz: (10,)."""
+        """Mass, first moment and inertia xx, xy, yy, xz, yz, zz about the link's frame, (10,)."""
         own = np.zeros((3, 3)) if self.inertia is None else self.inertia
         about = own + self.mass * (self.com @ self.com * np.eye(3) - np.outer(self.com, self.com))
-        return np.concatenate([[self.mass], self.mass * self.com, about[LOWER]])
+        return np.concatenate([[self.mass], self.mass * self.com, about[LOWER_TRIANGLE]])
 
     @classmethod
     def of(cls, parameters: Array) -> Body:
-        """The body of ten parameters, a point where no more than rounding is its own inertia; raise ValueError where
-        none has these."""
+        """Return the body of ten parameters. Raise ValueError if no body has them.
+
+        It is a point mass if its inertia about the centre of mass is zero to rounding.
+        """
         mass = float(parameters[0])
         if not mass > 0:
             raise ValueError(f"parameters are {parameters.tolist()}, expected a mass above zero")
         com = parameters[1:4] / mass
         about = np.zeros((3, 3))
-        about[LOWER] = parameters[4:]
+        about[LOWER_TRIANGLE] = parameters[4:]
         about = about + np.tril(about, -1).T
         own = about - mass * (com @ com * np.eye(3) - np.outer(com, com))
         rounding = 1e-12 * np.abs(about).max()
         return cls(mass, com, None if np.abs(own).max() <= rounding else own)
 
 
-LOWER = np.tril_indices(3)
-"""Where xx, xy, yy, xz, yz and zz stand in a matrix."""
+LOWER_TRIANGLE = np.tril_indices(3)
+"""Indices of xx, xy, yy, xz, yz and zz in a matrix."""

@@ -1,7 +1,7 @@
-"""What a torque model says beyond torque: inertia, Coriolis, gravity and friction torques, energies, forward dynamics.
+"""Dynamics of a torque model: inertia, Coriolis, gravity and friction torques, energies, forward dynamics.
 
-Rigid-body torque is M(q) ddq + c(q, dq) + g(q): affine in ddq, at standstill and without acceleration gravity alone.
-So every part is a sum or difference of torques at a few motions, with an exact posterior (`functionals`).
+Rigid-body torque is M(q) ddq + c(q, dq) + g(q). It is affine in ddq; at standstill without acceleration it is gravity
+alone. So every part is a sum or difference of torques at a few motions, with an exact posterior (`functionals`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _TORQUES: dict[ComponentName, dict[str, float]] = {
 
 
 class UnavailableComponentError(ValueError):
-    """A component that does not exist or that the model's estimator cannot offer."""
+    """The component does not exist, or the model's estimator does not have it."""
 
 
 class IndefiniteInertiaError(ValueError):
@@ -47,8 +47,8 @@ class IndefiniteInertiaError(ValueError):
         self.index = index
 
 
-def available(estimator: Estimator) -> tuple[ComponentName, ...]:
-    """Components that an estimator can offer: all where its torque comes from energies, else friction only."""
+def available_components(estimator: Estimator) -> tuple[ComponentName, ...]:
+    """Return the components of an estimator: all if its torque is derived from energies, else friction only."""
     terms = _dynamics_terms(estimator)
     return COMPONENTS if terms and len(_energy_terms(estimator)) == len(terms) else ("friction",)
 
@@ -56,16 +56,18 @@ def available(estimator: Estimator) -> tuple[ComponentName, ...]:
 def components(
     model: TorqueModel, motion: Motion, names: Sequence[str], tau: Array | None = None
 ) -> dict[str, Estimate]:
-    """Posterior of components at N queries, by name; friction is in `friction` and `forward_dynamics` alone.
+    """Return the posterior of components at N queries, by name.
 
-    - `inertia_matrix` (N, n, n): M(q), kg·m² where both joints are revolute;
+    Only `friction` and `forward_dynamics` contain friction.
+
+    - `inertia_matrix` (N, n, n): M(q), kg·m² if both joints are revolute;
     - `inertial`, `coriolis`, `gravity`, `friction` (N, n): M(q) ddq, c(q, dq), g(q), f(dq); the torque is their sum;
     - `kinetic_energy` (N,) J: ½ dqᵀ M(q) dq;
-    - `potential_energy` (N,) J: V(q) − V(q₀), q₀ the `reference_posture`, and its uncertainty that of the difference;
-    - `forward_dynamics` (N, n) rad/s²: see `forward_dynamics`, which `tau` (N, n) N·m is for.
+    - `potential_energy` (N,) J: V(q) − V(q₀), q₀ the `reference_posture`, with the uncertainty of the difference;
+    - `forward_dynamics` (N, n) rad/s²: see `forward_dynamics`; needs `tau`, (N, n) N·m.
 
-    Raise UnavailableComponentError for a name that is unknown or not on offer; ValueError for a wrong number of joints,
-    or where `tau` is missing, of another shape or given in vain; IndefiniteInertiaError.
+    Raise UnavailableComponentError for a name that is unknown or that the estimator does not have. Raise ValueError for
+    a wrong number of joints, or if `tau` is missing, of another shape or not needed. Raise IndefiniteInertiaError.
     """
     asked = _check(model, motion, names, tau)
     posterior, terms = model.posterior, _dynamics_terms(model.estimator)
@@ -87,17 +89,17 @@ def components(
 
 
 def reference_posture(model: TorqueModel) -> Array:
-    """Where potential energy counts from, (n,): the middle of each joint's range in the training samples."""
+    """Return the posture of zero potential energy, (n,): the middle of each joint's range in the training samples."""
     q = model.training_range["q"]
     return np.asarray(0.5 * (np.array(q["min"]) + np.array(q["max"])))
 
 
 def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate:
-    """Acceleration under torque tau (N, n) N·m: ddq = M(q)⁻¹ (tau − c − g − f), (N, n) rad/s²; motion.ddq is not read.
+    """Return the acceleration under torque tau (N, n) N·m, ddq = M(q)⁻¹ (tau − c − g − f), (N, n) rad/s².
 
-    Uncertainty to first order: an error ε of the whole torque at (q, dq, ddq) moves ddq by −M⁻¹ ε, M's own error
-    included. It holds while the uncertainty of M is small against M. Raise IndefiniteInertiaError where M is not
-    positive definite.
+    motion.ddq is not read. The uncertainty is of first order: an error ε of the whole torque at (q, dq, ddq) changes
+    ddq by −M⁻¹ ε. This includes the error of M, and it is valid while the uncertainty of M is small compared with M.
+    Raise IndefiniteInertiaError if M is not positive definite.
     """
     posterior, zero = model.posterior, np.zeros_like(motion.q)
     inertia = inertia_matrix(posterior, SumKernel(*_dynamics_terms(model.estimator)), motion.q)
@@ -114,10 +116,10 @@ def forward_dynamics(model: TorqueModel, motion: Motion, tau: Array) -> Estimate
 
 
 def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, q: Array) -> Array:
-    """Posterior mean of M(q), (N, n, n), kg·m² where both joints are revolute.
+    """Return the posterior mean of M(q), (N, n, n), kg·m² if both joints are revolute.
 
-    dynamics: the kernel's terms but friction; q: (N, n) rad or m. Column j is the torque per unit acceleration of joint
-    j, f(q, 0, e_j) − f(q, 0, 0): exact, since torque is affine in ddq.
+    dynamics: the kernel's terms without friction; q: (N, n) rad or m. Column j is the torque per unit acceleration of
+    joint j, f(q, 0, e_j) − f(q, 0, 0). This is exact, since torque is affine in ddq.
     """
     n = q.shape[1]
     zero = np.zeros_like(q)
@@ -129,7 +131,7 @@ def inertia_matrix(posterior: Posterior, dynamics: TorqueKernel, q: Array) -> Ar
 def _torque_parts(
     posterior: Posterior, kernel: TorqueKernel, motion: Motion, names: Sequence[ComponentName]
 ) -> dict[str, Estimate]:
-    """The components of `_TORQUES` and the inertia matrix, from one joint posterior."""
+    """Return the components of `_TORQUES` and the inertia matrix, from one joint posterior."""
     n, zero = motion.n_joints, np.zeros_like(motion.q)
     moves = {"rest": Motion(motion.q, zero, zero)}
     if "coriolis" in names:
@@ -151,7 +153,7 @@ def _torque_parts(
 
 
 def _vector_rows(name: ComponentName, at: dict[str, int], n: int) -> Array:
-    """Coefficients (n, S, n) of a component of `_TORQUES`."""
+    """Return the coefficients of a component of `_TORQUES`, (n, S, n)."""
     rows = np.zeros((n, len(at), n))
     for move, sign in _TORQUES[name].items():
         rows[:, at[move]] = sign * np.eye(n)
@@ -159,7 +161,10 @@ def _vector_rows(name: ComponentName, at: dict[str, int], n: int) -> Array:
 
 
 def _inertia_rows(at: dict[str, int], n: int) -> Array:
-    """Coefficients (n (n+1) / 2, S, n) of ½ (M_ij + M_ji) for i ≤ j; column j of M is f(q, 0, e_j) − f(q, 0, 0)."""
+    """Return the coefficients (n (n+1) / 2, S, n) of ½ (M_ij + M_ji) for i ≤ j.
+
+    Column j of M is f(q, 0, e_j) − f(q, 0, 0).
+    """
     i, j = np.triu_indices(n)
     entry, first_push, rest = np.arange(len(i)), at["push 0"], at["rest"]
     rows = np.zeros((len(i), len(at), n))
@@ -170,7 +175,7 @@ def _inertia_rows(at: dict[str, int], n: int) -> Array:
 
 
 def _symmetric(upper: Array, n: int) -> Array:
-    """Entries i ≤ j, (N, n (n+1) / 2), as symmetric matrices (N, n, n)."""
+    """Return symmetric matrices (N, n, n) from their entries i ≤ j, (N, n (n+1) / 2)."""
     i, j = np.triu_indices(n)
     full = np.empty((len(upper), n, n), dtype=upper.dtype)
     full[:, i, j] = full[:, j, i] = upper
@@ -178,7 +183,7 @@ def _symmetric(upper: Array, n: int) -> Array:
 
 
 def _push(q: Array, joint: int) -> Motion:
-    """Unit acceleration of one joint from standstill."""
+    """Return the unit acceleration of one joint from standstill."""
     zero = np.zeros_like(q)
     push = zero.copy()
     push[:, joint] = 1.0
@@ -194,7 +199,7 @@ def _energy_terms(estimator: Estimator) -> list[EnergyKernel]:
 
 
 def _check(model: TorqueModel, motion: Motion, names: Sequence[str], tau: Array | None) -> list[ComponentName]:
-    offered = available(model.estimator)
+    offered = available_components(model.estimator)
     for name in names:
         if name not in offered:
             raise UnavailableComponentError(

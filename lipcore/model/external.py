@@ -1,4 +1,4 @@
-"""What of a measured torque a model does not explain, and how unlikely that is where nothing touches the arm."""
+"""External torque: the residual of a measured torque, and its probability if nothing touches the arm."""
 
 from __future__ import annotations
 
@@ -13,12 +13,10 @@ from lipcore.kernels.fast.compile import compiled
 
 @dataclass(frozen=True)
 class External:
-    """External torque of N instants of n joints, with its tests. No safety function: see docs/safety.md.
-
-    rows: (N, 3 n + 2), all that follows, side by side and in this order; the last two where a covariance was given.
-    """
+    """External torque of N instants of n joints, with its tests. It is no safety function: see docs/safety.md."""
 
     rows: Array
+    """All values below, side by side in this order, (N, 3 n + 2); the last two only if a covariance was given."""
 
     @property
     def tau(self) -> Array:
@@ -27,23 +25,25 @@ class External:
 
     @property
     def std(self) -> Array:
-        """Standard deviation s of that where nothing touches the arm, (N, n): intervals are tau ± 1.96 s."""
+        """Standard deviation s of e if nothing touches the arm, (N, n). Intervals are tau ± 1.96 s."""
         return self.rows[:, self._joints : 2 * self._joints]
 
     @property
     def z(self) -> Array:
-        """e / s, (N, n): standard normal where nothing touches the arm."""
+        """e / s, (N, n): standard normal if nothing touches the arm."""
         return self.rows[:, 2 * self._joints : 3 * self._joints]
 
     @property
     def statistic(self) -> Array:
-        """T = eᵀ C⁻¹ e of all joints together, (N,): at least the largest z², and more where joints err together as
-        the model does not expect."""
+        """T = eᵀ C⁻¹ e of all joints together, (N,). It is at least the max z².
+
+        It is larger if the errors of the joints are correlated in a way that the model does not expect.
+        """
         return self.rows[:, -2]
 
     @property
     def p(self) -> Array:
-        """P(χ²_n > T), (N,). It is that of one instant: errors of instants close together are alike."""
+        """P(χ²_n > T), (N,). It is that of one instant: errors of neighbouring instants are similar."""
         return self.rows[:, -1]
 
     @property
@@ -59,25 +59,26 @@ def external(
     scale: Array | None = None,
     covariance: Array | None = None,
 ) -> External:
-    """Compare measured torques with predicted ones: e = tau − mean, s = scale · √(std² + noise_std²), z = e / s.
+    """Return the external torque: e = tau − mean, s = scale · √(std² + noise_std²), z = e / s.
 
     T = eᵀ C⁻¹ e with C = S (K + Σ) S, S = diag(scale), Σ = diag(noise_std²): the diagonal of C is s².
 
-    tau, mean, std: (N, n), std of the function; noise_std: (n,); scale: (n,), factor on the half width of intervals, 1
-    where None; covariance: K, (N, n, n), of the function between the joints; without it there are neither T nor p.
-    What is beyond numbers is inf or NaN.
+    tau, mean, std: (N, n), std of the function; noise_std: (n,); scale: (n,), factor on the half width of intervals,
+    None for 1; covariance: K, (N, n, n), of the function between the joints; without it there are neither T nor p.
+    Values outside the range of numbers become inf or NaN.
     """
     count, n = tau.shape
     scale = np.ones(n) if scale is None else scale
     rows = np.empty((count, 3 * n + (0 if covariance is None else 2)))
     between = np.empty((0, n, n)) if covariance is None else covariance
-    tau, mean, std, between = (np.ascontiguousarray(each) for each in (tau, mean, std, between))  # one machine code
+    # contiguous arrays share one machine code
+    tau, mean, std, between = (np.ascontiguousarray(each) for each in (tau, mean, std, between))
     _compare(tau, mean, std, noise_std, scale, between, rows)
     return External(rows)
 
 
 def warm_up() -> None:
-    """Compile what `external` takes, or load it from Numba's cache."""
+    """Compile the code of `external`, or load it from Numba's cache."""
     external(np.zeros((1, 1)), np.zeros((1, 1)), np.ones((1, 1)), np.ones(1), covariance=np.ones((1, 1, 1)))
 
 
@@ -85,7 +86,7 @@ def warm_up() -> None:
 def _compare(
     tau: Array, mean: Array, std: Array, noise_std: Array, scale: Array, covariance: Array, rows: Array
 ) -> None:
-    """Write `External.rows`; covariance: (N, n, n), or (0, n, n) where it is not known."""
+    """Write `External.rows`. covariance: (N, n, n), or (0, n, n) if it is unknown."""
     count, n = tau.shape
     factor, reduced = np.empty((n, n)), np.empty(n)
     for row in range(count):
@@ -96,7 +97,7 @@ def _compare(
         if len(covariance) == 0:
             continue
         statistic = 0.0
-        for i in range(n):  # Cholesky's factor of K + Σ, and the solution y of L y = S⁻¹ e: T = yᵀ y
+        for i in range(n):  # Cholesky factor of K + Σ, and the solution y of L y = S⁻¹ e: T = yᵀ y
             for j in range(i + 1):
                 left = covariance[row, i, j] + (noise_std[i] ** 2 if i == j else 0.0)
                 for k in range(j):
@@ -107,15 +108,15 @@ def _compare(
                 value -= factor[i, k] * reduced[k]
             reduced[i] = value / factor[i, i]
             statistic += reduced[i] ** 2
-        rows[row, 3 * n], rows[row, 3 * n + 1] = statistic, _beyond(statistic, n)
+        rows[row, 3 * n], rows[row, 3 * n + 1] = statistic, _chi_square_tail(statistic, n)
 
 
 @compiled
-def _beyond(statistic: float, freedom: int) -> float:
-    """P(χ² with so many degrees of freedom > statistic), a finite sum.
+def _chi_square_tail(statistic: float, freedom: int) -> float:
+    """Return P(χ² with so many degrees of freedom > statistic), a finite sum.
 
-    With x half the statistic and n the degrees of freedom: e⁻ˣ Σ xᵏ / k! over k from 0 to n/2 − 1 where n is even,
-    erfc(√x) + e⁻ˣ Σ xᵏ⁻¹ᐟ² / Γ(k + ½) over k from 1 to (n − 1)/2 where it is odd.
+    With x half the statistic and n the degrees of freedom: e⁻ˣ Σ xᵏ / k! over k from 0 to n/2 − 1 if n is even,
+    erfc(√x) + e⁻ˣ Σ xᵏ⁻¹ᐟ² / Γ(k + ½) over k from 1 to (n − 1)/2 if it is odd.
     """
     half = 0.5 * statistic
     if freedom % 2:

@@ -1,6 +1,6 @@
-"""Posteriors of what is jointly Gaussian with torques: their sums and differences, and the energies behind them.
+"""Posteriors of quantities that are jointly Gaussian with torques: sums and differences of torques, and energies.
 
-Energies are learnt without a label on either (eq. 2 of docs/method.md).
+Energies are learnt without a measurement of either (eq. 2 of docs/method.md).
 """
 
 from __future__ import annotations
@@ -20,41 +20,41 @@ from lipcore.kernels.payload import PayloadKernel
 from lipcore.posterior.exact import Posterior
 
 RigidKernel = ArmKernel | PayloadKernel
-"""Energies that are linear in weights."""
+"""Kernels with energies that are linear in weights."""
 EnergyKernel = LipKernel | ChainKernel | RigidKernel
-"""Priors of torques that come from priors of the energies."""
+"""Priors of torques that are derived from priors of energies."""
 KINETIC, POTENTIAL = 0, 1
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """Posterior mean and standard deviation of a quantity at N queries, both (N, ...), noise excluded."""
+    """Posterior mean and standard deviation of a quantity at N queries, both (N, ...), without noise."""
 
     mean: Array
     std: Array
 
 
 def condition(posterior: Posterior, prior_mean: Array, prior_variance: Array, cross: Array) -> Estimate:
-    """Posterior of K quantities from their covariance with the posterior's anchors (see `Posterior`).
+    """Return the posterior of K quantities from their covariance with the posterior's anchors (see `Posterior`).
 
     prior_mean, prior_variance: (K,); cross: (M, K).
     """
     explained = np.square(posterior.whiten(cross)).sum(0)
-    std = np.sqrt((prior_variance - explained).clip(0.0))  # rounding may end below zero where all is known
+    std = np.sqrt((prior_variance - explained).clip(0.0))  # rounding may give less than zero
     return Estimate(prior_mean + posterior.weights @ cross, posterior.std_factor * std)
 
 
 def combine_torques(
     posterior: Posterior, kernel: TorqueKernel, motions: Sequence[Motion], coefficients: Array
 ) -> Estimate:
-    """Posterior of F linear combinations of a kernel's torques at S motions a query, (N, F).
+    """Return the posterior of F linear combinations of a kernel's torques at S motions per query, (N, F).
 
-    The joint posterior of all S n torques is used: what they share cancels in a difference, in its uncertainty too.
-    motions: S motions of N queries each; coefficients: (F, S n), motion by motion.
+    It is computed from the joint posterior of all S n torques. What they have in common cancels in a difference, also
+    in its uncertainty. motions: S motions of N queries each; coefficients: (F, S n), motion by motion.
     """
     n, size, count = kernel.n_joints, len(motions), len(motions[0])
     stacked = [np.stack([getattr(m, name) for m in motions], axis=1) for name in ("q", "dq", "ddq")]  # (N, S, n)
-    # right-hand sides whitened together: enough for fast matrix products, few enough to stay within tens of MB
+    # right-hand sides are whitened together: enough for fast matrix products, few enough for tens of MB
     step = max(1, 512 // (size * n))
     means, stds = [], []
     for start in range(0, count, step):
@@ -74,7 +74,7 @@ def combine_torques(
 
 
 def kinetic_energy(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Estimate:
-    """Posterior of the kinetic energy at N queries, summed over the kernels: (N,) J (eq. 2 of docs/method.md)."""
+    """Return the posterior of the kinetic energy at N queries, summed over kernels, (N,) J (docs/method.md, eq. 2)."""
     mean = prior_mean(kernels, query)[KINETIC]
     variance = covariance(posterior.params, kernels, query, query)[KINETIC]
     return condition(posterior, mean, variance, with_anchors(posterior, kernels, query)[KINETIC])
@@ -83,9 +83,9 @@ def kinetic_energy(posterior: Posterior, kernels: Sequence[EnergyKernel], query:
 def potential_energy(
     posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion, reference: Array
 ) -> Estimate:
-    """Posterior of V(q) − V(reference) at N queries, summed over the kernels: (N,) J. reference: (n,).
+    """Return the posterior of V(q) − V(reference) at N queries, summed over the kernels, (N,) J. reference: (n,).
 
-    Torques do not tell the constant of V: only a difference has a useful uncertainty.
+    Torques do not determine the constant of V: only a difference has a useful uncertainty.
     """
     params, zero = posterior.params, np.zeros_like(reference)[None]
     origin = Motion(reference[None], zero, zero)
@@ -100,7 +100,7 @@ def potential_energy(
 
 
 def prior_mean(kernels: Sequence[EnergyKernel], query: Motion) -> Array:
-    """Prior means of the kinetic and the potential energy at N queries, summed over the kernels: (2, N) J."""
+    """Return the prior means of kinetic and potential energy at N queries, summed over the kernels, (2, N) J."""
     total = np.zeros((2, len(query)))
     for kernel in kernels:
         if isinstance(kernel, RigidKernel) and (weights := kernel.prior_weights()) is not None:
@@ -109,9 +109,9 @@ def prior_mean(kernels: Sequence[EnergyKernel], query: Motion) -> Array:
 
 
 def covariance(params: Params, kernels: Sequence[EnergyKernel], x: Motion, y: Motion) -> Array:
-    """Prior covariance of each energy at sample k of x with the same energy at sample k of y: (2, N) J².
+    """Return the prior covariance of each energy at sample k of x with the same energy at sample k of y, (2, N) J².
 
-    x, y: N samples each; y may be a single one, which then is that of every k.
+    x, y: N samples each; y may be a single sample, which is then used for every k.
     """
     total = np.zeros((2, len(x)))
     for kernel in kernels:
@@ -124,7 +124,7 @@ def covariance(params: Params, kernels: Sequence[EnergyKernel], x: Motion, y: Mo
 
 
 def with_anchors(posterior: Posterior, kernels: Sequence[EnergyKernel], query: Motion) -> Array:
-    """Prior covariance of both energies at N queries with the M anchors of the posterior: (2, M, N) (eq. 2)."""
+    """Return the prior covariance of both energies at N queries with the posterior's M anchors, (2, M, N) (eq. 2)."""
     total = np.zeros((2, len(posterior.weights), len(query)))
     for kernel in kernels:
         if isinstance(kernel, RigidKernel):
@@ -138,7 +138,7 @@ def with_anchors(posterior: Posterior, kernels: Sequence[EnergyKernel], query: M
 
 
 def _with_torques(kernel: LipKernel | ChainKernel, params: Params, query: Motion, motion: Motion) -> Array:
-    """Covariance of all torques of S samples with both energies at N queries: (S n, 2 N)."""
+    """Return the covariance of all torques of S samples with both energies at N queries, (S n, 2 N)."""
     n, size, columns = kernel.n_joints, len(motion), State.columns(motion)
     out = np.empty((size, n, 2, len(query)))
     for rows in row_chunks(len(query), size):

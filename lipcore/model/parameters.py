@@ -22,9 +22,9 @@ from lipcore.posterior.linalg import eigen
 from lipcore.robots.urdf import PARAMETERS
 
 STEPS = ("turn 1", "turn 2", "shift 1", "shift 2")
-"""Names of a joint's numbers of geometry: about, and along, the two vectors across its axis."""
-UNDETERMINED = 0.5
-"""Torque does not tell what is still as uncertain as this share of what was expected beforehand."""
+"""Names of a joint's numbers of geometry: turns about, and shifts along, the two vectors across its axis."""
+UNIDENTIFIABLE_SHARE = 0.5
+"""A parameter is unidentifiable if its standard deviation is above this share of the prior one."""
 
 
 @dataclass(frozen=True)
@@ -43,10 +43,10 @@ class WeightPosterior:
 
 @dataclass(frozen=True)
 class Friction:
-    """Coefficients per joint and their standard deviations, each (n,).
+    """Friction coefficients of each joint, with their standard deviations, (n,) each.
 
-    viscous: N·m·s/rad (N·s/m); coulomb, offset: N·m (N); stribeck: N·m (N), of friction that slow joints have besides,
-    None where that is no part of the model.
+    viscous: N·m·s/rad (N·s/m); coulomb, offset: N·m (N). stribeck: N·m (N), additional friction at low speed, None if
+    the model does not have it.
     """
 
     viscous: Array
@@ -63,27 +63,29 @@ class Friction:
 class InertialParameters:
     """Ten parameters of each of n bodies, (n, 10): mass kg, first moment (3) kg·m, inertia (6) kg·m².
 
-    The inertia, xx, xy, yy, xz, yz, zz, is about the frame of the joint that moves the body. mean, std: of the
-    posterior; many are known from torques only in combinations, which std shows. scale: standard deviations
-    beforehand. plausible: the physically possible
-    parameters nearest to the mean in the posterior's metric; mean_is_plausible: whether the mean is possible itself.
-    geometry: that the plausible parameters are meant for; deviation: (n,) N·m, root mean square by which their torque
-    misses the model's where the robot has been.
+    The inertia, xx, xy, yy, xz, yz, zz, is about the frame of the joint that moves the body.
     """
 
     mean: Array
+    """Posterior mean."""
     std: Array
+    """Posterior standard deviation. Torques determine many parameters only in combinations, which makes it large."""
     scale: Array
+    """Prior standard deviation."""
     plausible: Array
+    """Physically possible parameters nearest to the mean, in the metric of the posterior."""
     mean_is_plausible: bool
+    """Whether the mean itself is physically possible."""
     geometry: Geometry
+    """Geometry for the plausible parameters."""
     deviation: Array
+    """Root mean square difference between their torque and the model's, in the range of the training, (n,) N·m."""
 
 
 def weight_posterior(posterior: Posterior, term: LinearKernel) -> WeightPosterior:
-    """Posterior N(E w + cᵀα, Λ − |L⁻¹c|²) of a linear term's p weights, whose prior is N(μ, Λ).
+    """Return the posterior N(E w + cᵀα, Λ − |L⁻¹c|²) of a linear term's p weights with the prior N(μ, Λ).
 
-    term: one of the posterior's kernel. The covariance carries the posterior's calibration.
+    term: one of the posterior's kernel. The covariance includes the posterior's calibration.
     """
     prior = term.variances(posterior.params)
     cross = posterior.with_weights(term, np.diag(prior))  # (M, p)
@@ -96,7 +98,7 @@ def weight_posterior(posterior: Posterior, term: LinearKernel) -> WeightPosterio
 
 
 def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Friction:
-    """Friction of each joint with standard deviations, the weights of the friction term.
+    """Return the friction of each joint with standard deviations, the weights of the friction term.
 
     Raise ValueError for an estimator without friction.
     """
@@ -112,7 +114,7 @@ def friction_coefficients(posterior: Posterior, estimator: Estimator) -> Frictio
 
 
 def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> InertialParameters:
-    """Inertial parameters of each of n bodies, with the plausible ones nearest to them.
+    """Return the inertial parameters of each of n bodies, with the nearest plausible ones.
 
     Raise ValueError for an estimator without rigid bodies.
     """
@@ -122,8 +124,8 @@ def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> In
     geometry = term.geometry(weights.mean)
     if all(is_plausible(body) for body in mean):
         return InertialParameters(mean, std, scale, mean, True, geometry, np.zeros(term.n_joints))
-    # masses for the geometry that the arm is linearised at, where the torque is exactly linear in them; or masses and
-    # geometry together, to first order in the latter
+    # two options: masses alone, for the geometry of the linearisation, where the torque is exactly linear in them; or
+    # masses and geometry together, to first order in the geometry
     start = term.arm.centre[term.arm.place]
     alone = weights.mean.copy()
     metric = precision(posterior, term)
@@ -144,9 +146,9 @@ def inertial_parameters(posterior: CompactPosterior, estimator: Estimator) -> In
 
 
 def precision(posterior: CompactPosterior, term: LinearKernel) -> Array:
-    """Posterior precision of a term's weights, all others at their mean, in units of their prior deviations: (p, p).
+    """Return the posterior precision of a term's weights, all others at their mean, in units of prior std, (p, p).
 
-    From the statistics, I + A, where there are any: a covariance has lost what is known to more than eight digits.
+    It is I + A of the statistics if the posterior has them. A covariance loses precision beyond eight digits.
     """
     rows = posterior.basis.rows(term)
     if posterior.statistics is not None:
@@ -158,10 +160,9 @@ def precision(posterior: CompactPosterior, term: LinearKernel) -> Array:
 
 
 def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Sequence[str]) -> dict[str, Any]:
-    """All parameters of an estimator as plain numbers, for a manifest.
+    """Return all parameters of an estimator as plain numbers, for a manifest that `files.arm` reads.
 
-    Friction, and of an arm inertia, rotor and geometry. joint_names: (n,), in the order of the data. `files.arm` reads
-    it.
+    They are friction, and inertia, rotor and geometry of an arm. joint_names: (n,), in the order of the data.
     """
     friction = friction_coefficients(posterior, estimator)
     out: dict[str, Any] = {
@@ -181,17 +182,19 @@ def report(posterior: CompactPosterior, estimator: Estimator, joint_names: Seque
                     "mean": _body(inertia.mean[j]),
                     "std": _body(inertia.std[j]),
                     "plausible": _body(inertia.plausible[j]),
-                    "undetermined": _open(inertia.std[j], inertia.scale[j]),
+                    "undetermined": _list_unidentifiable(inertia.std[j], inertia.scale[j]),
                 }
                 for j, name in enumerate(joint_names)
             ],
         }
-        out |= _of_arm(posterior, _arm_kernel(estimator), joint_names, inertia.geometry)
+        out |= _report_arm(posterior, _arm_kernel(estimator), joint_names, inertia.geometry)
     return out
 
 
-def _of_arm(posterior: Posterior, term: ArmKernel, joint_names: Sequence[str], plausible: Geometry) -> dict[str, Any]:
-    """Rotor inertias and the geometry as the posterior has it; plausible: that of the plausible bodies."""
+def _report_arm(
+    posterior: Posterior, term: ArmKernel, joint_names: Sequence[str], plausible: Geometry
+) -> dict[str, Any]:
+    """Return the posterior of rotor inertias and geometry. plausible: geometry of the plausible bodies."""
     weights, arm = weight_posterior(posterior, term), term.arm
     n = term.n_joints
     rotors = slice(PARAMETERS * n, (PARAMETERS + 1) * n)
@@ -216,7 +219,9 @@ def _of_arm(posterior: Posterior, term: ArmKernel, joint_names: Sequence[str], p
                 "turn_std": std[:2].tolist(),
                 "shift_std": std[2:].tolist(),
                 "undetermined": [
-                    name for name, one, other in zip(STEPS, std, usual, strict=False) if one > UNDETERMINED * other
+                    name
+                    for name, one, other in zip(STEPS, std, usual, strict=False)
+                    if one > UNIDENTIFIABLE_SHARE * other
                 ],
             }
         )
@@ -238,9 +243,9 @@ def _arm_kernel(estimator: Estimator) -> ArmKernel:
     return term
 
 
-def _open(std: Array, scale: Array) -> list[str]:
-    """Which of a body's parameters the samples leave as they were expected."""
-    left = std > UNDETERMINED * scale
+def _list_unidentifiable(std: Array, scale: Array) -> list[str]:
+    """Return the names of a body's parameters that the samples do not identify."""
+    left = std > UNIDENTIFIABLE_SHARE * scale
     parts = {"mass": left[0], "first_moment": left[1:4].any(), "inertia": left[4:].any()}
     return [name for name, is_open in parts.items() if is_open]
 

@@ -1,12 +1,12 @@
-"""What an arm carries: a body beside those it was learnt with, and the model that answers with it.
+"""A payload: a body in addition to those of the learnt arm, and the model that predicts with it.
 
-A payload is fixed to the last link, and torque is linear in its ten parameters as in those of that link. Where the
-geometry is learnt, too, torque is linearised around the means of both,
+A payload is fixed to the last link. Torque is linear in its ten parameters, as in those of that link. If the geometry
+is learnt too, torque is linearised around the means of both,
 
     tau = Y(θ + δθ) (π + payload) ≈ Y(θ) (π + payload) + J(θ, π + payload) δθ,
 
-where θ is the geometry that the arm was learnt with or, far from it, that which rows with the payload show. The
-variables of the posterior are those of the arm as it was learnt, and the payload's ten.
+where θ is the geometry of the learnt arm or, far from it, the geometry estimated from rows with the payload. The
+variables of the posterior are those of the learnt arm, and the ten of the payload.
 """
 
 from __future__ import annotations
@@ -32,29 +32,30 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.linalg import block_diagonal, eigen
-from lipcore.posterior.statistics import known
+from lipcore.posterior.statistics import make_solution
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 
 
 class NoArmError(ValueError):
-    """The model knows no rigid bodies, to which a payload could be added."""
+    """The model has no rigid bodies that a payload could be added to."""
 
 
 @dataclass(frozen=True)
-class Load:
-    """What is known of a payload and, with it, of a model's whitened variables w, (M,): N(mean, covariance) of (w, π).
-
-    mean: (M + 10,); covariance: (M + 10, M + 10); room: (10,), variances that π has at most, whatever w and π are;
-    geometry: of the arm with this mean, where torque is linearised; where it was learnt if None; others: arms with
-    their payloads that are as probable, this one first; none where the posterior is as good as linear.
-    """
+class PayloadPosterior:
+    """Posterior N(mean, covariance) of (w, π): a model's whitened variables w, (M,), and a payload π."""
 
     mean: Array
+    """Mean of (w, π), (M + 10,)."""
     covariance: Array
+    """Covariance of (w, π), (M + 10, M + 10)."""
     room: Array
+    """Upper bounds of the variances of π for any w and π, (10,)."""
     geometry: Geometry | None = None
+    """Geometry with this mean, at which torque is linearised. None: the geometry of the learnt arm."""
     others: tuple[Alternative, ...] = ()
+    """Arms with their payloads that are equally probable, this one first; empty if the posterior is practically
+    linear."""
 
     @property
     def payload(self) -> Array:
@@ -64,7 +65,7 @@ class Load:
 
 @dataclass(frozen=True)
 class Carrier:
-    """A model with an arm, as what may carry a payload. Raise NoArmError where it has no arm."""
+    """A model with an arm that can carry a payload. Raise NoArmError if it has no arm."""
 
     model: TorqueModel
 
@@ -75,8 +76,11 @@ class Carrier:
                 f"{', '.join(ROBOT_ESTIMATORS)}"
             )
 
-    def knows_as(self, other: Carrier) -> bool:
-        """Whether another revision of the version knows the same: rows that are kept out of learning teach nothing."""
+    def has_same_posterior(self, other: Carrier) -> bool:
+        """Return whether another revision has the same posterior.
+
+        Rows that are excluded from learning do not change it.
+        """
         one, two = self.model.posterior, other.model.posterior
         return self is other or (
             one.basis is two.basis and np.array_equal(one.weights, two.weights) and np.array_equal(one.root, two.root)
@@ -105,9 +109,9 @@ class Carrier:
         """Covariance Σ of the whitened variables, (M, M)."""
         covariance = self.model.posterior.covariance
         values, vectors = eigen(covariance)
-        if values[0] >= 1e-14:  # of prior variance one
+        if values[0] >= 1e-14:  # relative to the prior variance of one
             return np.asarray(covariance)
-        # what samples tell to rounding has a variance of either sign
+        # a variance that the samples determine to rounding may have either sign
         return np.asarray((vectors * np.maximum(values, 1e-14)) @ vectors.T)
 
     @cached_property
@@ -116,20 +120,22 @@ class Carrier:
         return np.asarray(np.linalg.cholesky(self.covariance))
 
     @property
-    def bends(self) -> bool:
-        """Whether the arm's geometry can be followed beyond where it is linear: where it is learnt, and nothing but
-        linear terms explains torque with it, whose variables are few."""
+    def is_nonlinear(self) -> bool:
+        """Whether the arm's geometry can be followed beyond the linear range.
+
+        The geometry must be learnt, and all other terms of the torque must be linear, so that the variables are few.
+        """
         return self.term.arm.steps > 0 and self.model.posterior.basis.term is None
 
     @cached_property
     def memory(self) -> Memory:
-        """What the samples behind the posterior say of arms of another geometry."""
+        """Training memory: the probability of arms with another geometry, given the samples of the posterior."""
         n, limits = self.model.n_joints, self.model.training_range
-        count = int(np.ceil(1.5 * self.term.size / n))  # torques of half as many again as the arm has weights
+        count = int(np.ceil(1.5 * self.term.size / n))  # one and a half times as many torques as the arm has weights
         draw = np.random.default_rng(0).uniform
         q, dq, ddq = (draw(limits[name]["min"], limits[name]["max"], (count, n)) for name in ("q", "dq", "ddq"))
         motion, posterior = Motion.from_arrays(q, dq, ddq), self.model.posterior
-        features, base = Linearised(self, self.known(np.zeros(PARAMETERS))).rows(motion)
+        features, base = LinearisedCarrier(self, self.known(np.zeros(PARAMETERS))).rows(motion)
         variance = posterior.noise_variance + posterior.misfit.variance(motion)
         return Memory.of(motion.arrays(), base, features[:-PARAMETERS], self.rows, self.mean, self.covariance, variance)
 
@@ -140,13 +146,15 @@ class Carrier:
         return slice(first + steps.start, first + steps.stop)
 
     @property
-    def open_tip(self) -> bool:
-        """Whether the training's samples leave open how the last axis lies, which bears next to nothing. It may be
-        expected at a right angle all the same, but then at any."""
+    def is_tip_unidentified(self) -> bool:
+        """Whether the training leaves the direction of the last axis, which bears almost no load, unidentified.
+
+        A right angle may still be expected there, but then any right angle.
+        """
         arm = self.term.arm
         taught = (1 / self.covariance.diagonal()[self.steps] - 1) / arm.widths**2
         first = arm.steps - arm.geometry.screws[-1]
-        return bool((taught[first : first + 2] < 0.1**-2).any())  # turns, rad
+        return bool((taught[first : first + 2] < 0.1**-2).any())  # the first two numbers are turns, rad
 
     @property
     def step(self) -> Array:
@@ -154,7 +162,7 @@ class Carrier:
         return self.weights(self.mean)[self.term.steps]
 
     def alternative(self, mean: Array, geometry: Geometry, payload: Array, probability: float) -> Alternative:
-        """The arm of these variables, (M,), and a geometry, with a payload, (10,)."""
+        """Return the arm of these variables, (M,), and a geometry, with a payload, (10,)."""
         arm, n, friction = self.term.arm, self.model.n_joints, self.model.estimator.terms["friction"]
         assert isinstance(friction, FrictionKernel)
         weights, rows = self.weights(mean), self.model.posterior.basis.rows(friction)
@@ -164,7 +172,7 @@ class Carrier:
         return Alternative(geometry, bodies, rotor, rubbing.reshape(n, -1), probability)
 
     def weights(self, mean: Array) -> Array:
-        """Weights of the arm, (p,), of variables of this mean, (M,)."""
+        """Return the arm's weights, (p,), from the mean of the variables, (M,)."""
         centre = self.term.prior_weights()
         return np.asarray(self.root[self.rows] * mean[self.rows] + (0.0 if centre is None else centre))
 
@@ -174,7 +182,7 @@ class Carrier:
         return np.asarray(self.model.posterior.basis.root.diagonal())
 
     def rest(self, motion: Motion) -> tuple[Array, Array]:
-        """Of N instants: features of w, (M, N, n), zero where they are the arm's; what other terms expect, (N, n)."""
+        """Return features of w at N instants, (M, N, n), zero for the arm's, and prior means of other terms, (N, n)."""
         posterior, base = self.model.posterior, np.zeros(motion.q.shape)
         out = np.zeros((len(self.mean), *base.shape))
         for kernel in posterior.basis.linear:
@@ -186,36 +194,39 @@ class Carrier:
             if weights is not None:
                 base += features @ weights
         if posterior.basis.term is not None:
-            # of the nonlinear term, whose torques are whitened by a root that is not diagonal
+            # features of the nonlinear term: its torques are whitened by a root that is not diagonal
             whitened, _ = posterior.basis.features_and_uncovered(motion)
             count = len(posterior.basis.outputs)
             out[:count] = whitened[:count].reshape(-1, *base.shape)
         return out, base
 
-    def known(self, body: Array, spread: Array | None = None) -> Load:
-        """A payload of ten parameters that is known, with a covariance of (10, 10); exactly where None."""
+    def known(self, body: Array, spread: Array | None = None) -> PayloadPosterior:
+        """Return the posterior of a known payload of ten parameters.
+
+        spread: covariance, (10, 10); None if it is known exactly.
+        """
         size = len(self.mean)
         covariance = np.zeros((size + PARAMETERS, size + PARAMETERS))
         covariance[:size, :size] = self.covariance
         if spread is not None:
             covariance[size:, size:] = spread
-        # Σ ≤ k diag Σ holds for every covariance of k numbers, here a payload's ten: so the posterior is nowhere wider
-        # than its prior, as the evaluator has to assume
+        # Σ ≤ k diag Σ for every covariance of k numbers, here a payload's ten: so the posterior is nowhere wider than
+        # its prior, which the evaluator assumes
         room = PARAMETERS * np.diagonal(covariance)[size:]
-        return Load(np.concatenate([self.mean, body]), covariance, np.maximum(room, 1e-12))
+        return PayloadPosterior(np.concatenate([self.mean, body]), covariance, np.maximum(room, 1e-12))
 
     def warm_up(self) -> None:
-        """Answer once with a payload, and once with several arms that carry one: what is compiled is there then."""
+        """Predict once with a payload, and once with several arms with a payload, so that all code is compiled."""
         n, geometry = self.model.n_joints, self.term.arm.geometry
         load = self.known(np.zeros(PARAMETERS))
-        if self.bends:
+        if self.is_nonlinear:
             other = self.alternative(self.mean, geometry, load.payload, 0.5)
             load = replace(load, geometry=geometry, others=(other, other))
-        self.carrying(load).answer(np.zeros((3, n)))
+        self.with_payload(load).answer(np.zeros((3, n)))
 
-    def carrying(self, load: Load) -> TorqueModel:
-        """The model that answers with a payload, its intervals with what is not known of it."""
-        posterior, around = self.model.posterior, Linearised(self, load)
+    def with_payload(self, load: PayloadPosterior) -> TorqueModel:
+        """Return the model that predicts with a payload. Its intervals include the uncertainty of the payload."""
+        posterior, around = self.model.posterior, LinearisedCarrier(self, load)
         unit = np.concatenate([np.ones(len(self.mean)), np.sqrt(load.room)])
         size, count = len(unit), len(unit) + max(0, len(load.others) - 1)
         mean, covariance = np.zeros(count), np.eye(count)
@@ -223,7 +234,7 @@ class Carrier:
         solved = CompactPosterior.solved(
             around.estimator.kernel,
             around.basis,
-            known(mean, covariance, len(around.basis.outputs)),
+            make_solution(mean, covariance, len(around.basis.outputs)),
             posterior.noise_variance,
             posterior.std_factor,
             posterior.floor,
@@ -233,15 +244,15 @@ class Carrier:
 
 
 @dataclass(frozen=True, eq=False)
-class Linearised:
-    """A carrier around a load: terms whose torque is linear in w and π, see the head of this file."""
+class LinearisedCarrier:
+    """A carrier linearised around a payload posterior: its torque is linear in w and π, see the module."""
 
     carrier: Carrier
-    load: Load
+    load: PayloadPosterior
 
     @cached_property
     def estimator(self) -> Estimator:
-        """The model's terms, the arm's with the payload in its parameters, the payload's, and that of other arms."""
+        """The model's terms, the arm's with the payload in its parameters, the payload's, and those of other arms."""
         estimator, arm = self.carrier.model.estimator, self.carrier.term
         terms = {name: self._arm if each is arm else each for name, each in estimator.terms.items()}
         more = {} if self._others is None else {"others": self._others}
@@ -249,7 +260,7 @@ class Linearised:
 
     @cached_property
     def basis(self) -> Basis:
-        """Its variables: w, π over the root of its room, and those of other arms."""
+        """Basis with the variables w, π divided by the root of its room, and those of other arms."""
         basis = self.carrier.model.posterior.basis
         own = np.diag(np.sqrt(self._payload.variances(basis.params)))
         linear = [self._arm if each is self.carrier.term else each for each in basis.linear]
@@ -260,8 +271,10 @@ class Linearised:
         return replace(basis, linear=tuple(linear), root=block_diagonal(roots))
 
     def rows(self, motion: Motion, rest: tuple[Array, Array] | None = None) -> tuple[Array, Array]:
-        """Of N instants: features of (w, π), (M + 10, N, n), and the torque where both are zero, (N, n) N·m. rest: what
-        `Carrier.rest` has for the same instants, where that is at hand."""
+        """Return the features of (w, π) of N instants, (M + 10, N, n), and the torque if both are zero, (N, n) N·m.
+
+        rest: `Carrier.rest` of the same instants, if it was computed before.
+        """
         features, base = self.carrier.rest(motion) if rest is None else rest
         places, centre = self.carrier.rows, self._arm.prior_weights()
         of_arm = self._arm.features(motion)
@@ -280,15 +293,17 @@ class Linearised:
             size = PARAMETERS * arm.n_joints
             weights = self.carrier.weights(load.mean[:-PARAMETERS])
             parameters = weights[:size].reshape(-1, PARAMETERS)[arm.order]
-            # steps count from the load's geometry on, and their mean is none
+            # steps start at this geometry, and their mean is zero
             step = weights[self.carrier.term.steps]
             arm = replace(arm, geometry=load.geometry, expected=arm.expected - step)
         parameters[-1] += load.payload
         return ArmKernel(replace(arm, parameters=parameters))
 
     def all_rows(self, motion: Motion) -> tuple[Array, Array]:
-        """Of N instants: features of all that is unknown, as `covariance` has it, (M + K + 10, N, n), and the mean of
-        the torque, (N, n) N·m."""
+        """Return the features of all variables of N instants, (M + K + 10, N, n), and the mean torque, (N, n) N·m.
+
+        The order of the variables is that of `covariance`.
+        """
         features, base = self.rows(motion)
         mean = base + np.tensordot(self.load.mean, features, axes=1)
         if self._others is None:
@@ -314,16 +329,22 @@ class Linearised:
     def _others(self) -> MixtureKernel | None:
         arm = self.carrier.term.arm
         others = self.load.others
-        return MixtureKernel(others, arm.order, _of_few([each.probability for each in others])) if others else None
+        return (
+            MixtureKernel(others, arm.order, _variance_factor([each.probability for each in others]))
+            if others
+            else None
+        )
 
     @cached_property
     def _payload(self) -> PayloadKernel:
         return PayloadKernel(self._arm.arm, self.load.room)
 
 
-def _of_few(shares: Sequence[float]) -> float:
-    """How many times their variance so many draws have to be taken for, so that 95 % intervals hold: Student's t, of as
-    many as would be equal ones."""
+def _variance_factor(shares: Sequence[float]) -> float:
+    """Return the variance factor for a mixture of few draws, so that 95 % intervals keep their coverage.
+
+    It is that of Student's t, with the effective number of equal draws.
+    """
     from scipy.stats import t  # noqa: PLC0415 - serving does without it
 
     count = max(1.0, 1 / float(np.square(shares).sum()) - 1)

@@ -1,4 +1,4 @@
-"""Bodies that can exist: which ten parameters are plausible, and the plausible ones nearest to an estimate."""
+"""Physically possible bodies: which ten parameters are plausible, and the plausible ones nearest to an estimate."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from lipcore.robots.urdf import PARAMETERS
 
 
 def pseudo_inertia(body: Array) -> Array:
-    """The pseudo-inertia [[Σ, h], [hᵀ, m]] of ten parameters, (4, 4): positive definite for every real body."""
+    """Return the pseudo-inertia [[Σ, h], [hᵀ, m]] of ten parameters, (4, 4): positive definite for every real body."""
     mass, moment = body[0], body[1:4]
     xx, xy, yy, xz, yz, zz = body[4:]
     inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -21,22 +21,22 @@ def pseudo_inertia(body: Array) -> Array:
 
 
 def is_plausible(body: Array) -> bool:
-    """Whether ten parameters belong to a body that can exist: its pseudo-inertia is positive definite."""
+    """Return whether ten parameters belong to a body that can exist: its pseudo-inertia is positive definite."""
     return bool(np.linalg.eigvalsh(pseudo_inertia(body))[0] > 0)
 
 
 def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: Array | None = None) -> Array:
-    """Weights (p,) nearest to a mean (p,) whose first 10 n are plausible bodies.
+    """Return the weights (p,) nearest to a mean (p,) that describe plausible bodies in their first 10 n elements.
 
-    metric: (p, p), of weights in units of `scale` (p,). A convex problem: ½ |w − μ|² in that metric, subject to each
-    body's pseudo-inertia being at least that of a tiny real one. Newton's method along the central path of a barrier,
-    −t Σ log det, as in Boyd & Vandenberghe, § 11.
-    start: (n, 10), a plausible guess; balls where it is none.
+    metric: (p, p), of weights in units of `scale` (p,). This is a convex problem: ½ |w − μ|² in that metric, subject to
+    each body's pseudo-inertia being at least that of a tiny real one. Newton's method follows the central path of a
+    barrier, −t Σ log det, as in Boyd & Vandenberghe, § 11. start: (n, 10), a plausible guess; balls replace bodies that
+    cannot exist.
     """
     size = PARAMETERS * n
     given = np.zeros((n, PARAMETERS)) if start is None else start
     total = max(float(mean[:size:PARAMETERS].sum()), float(given[:, 0].sum()), 1e-3)
-    # at least a ten-thousandth of the arm's mass, spread by 1 mm along each axis: no real body is a point
+    # at least a ten-thousandth of the arm's mass, spread by 1 mm along each axis, since no real body is a point
     least = 1e-4 * total * np.diag([1e-6, 1e-6, 1e-6, 1.0])
     centre = mean / scale
     basis = np.array([pseudo_inertia(unit) for unit in np.eye(PARAMETERS)])
@@ -53,8 +53,8 @@ def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: A
         return float(0.5 * off @ metric @ off - barrier * logs.sum())
 
     point = centre.copy()
-    point[:size] = np.concatenate([_real(body, total / n, least) for body in given]) / scale[:size]
-    # the last barrier leaves at most 4 n times as much of the squared distance to gain
+    point[:size] = np.concatenate([_replace_impossible(body, total / n, least) for body in given]) / scale[:size]
+    # after the last barrier, at most 4 n times its value of the squared distance remain
     for barrier in [10.0**power for power in range(3, -4, -1)]:
         for _ in range(30):
             inverse = np.linalg.inv(matrices(point))
@@ -69,7 +69,7 @@ def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: A
                 hessian[part, part] += barrier * bend[body] * np.outer(scale[part], scale[part])
             try:
                 step = -np.linalg.solve(hessian, gradient)
-            except np.linalg.LinAlgError:  # at the boundary, but for rounding: the point is plausible all the same
+            except np.linalg.LinAlgError:  # the point is at the boundary to rounding, and still plausible
                 break
             slack, length, now = float(-gradient @ step), 1.0, value(point, barrier)
             while length > 1e-8 and value(point + length * step, barrier) > now - 0.1 * length * slack:
@@ -82,8 +82,8 @@ def nearest_plausible(mean: Array, scale: Array, metric: Array, n: int, start: A
     return np.asarray(point * scale)
 
 
-def _real(body: Array, usual_mass: float, least: Array) -> Array:
-    """A body, or a ball of the usual mass where it is none that can exist."""
+def _replace_impossible(body: Array, usual_mass: float, least: Array) -> Array:
+    """Return the body, or a ball of the usual mass if the body cannot exist."""
     if np.linalg.eigvalsh(pseudo_inertia(body) - 2 * least)[0] > 0:
         return body
     ball = 0.4 * usual_mass * 0.05**2

@@ -1,13 +1,14 @@
-"""What a model says of another unit of its robot before that one has moved.
+"""The prior of another unit of the same robot, from a trained model.
 
-Units of one type have the same geometry but for machining, nearly the same masses, and friction of their own. So of a
-parameter, known as N(m, V), another unit's is expected within
+Units of one type have the same geometry except for machining, nearly the same masses, and their own friction. If a
+parameter has the posterior N(m, V), that of another unit has the prior
 
     N(m, V + (0.1 · size)²),    size² = mean of m² + V over the entries of its kind and body,
 
-and of the geometry likewise with what machining leaves. V is the variance given all other parameters, 1 / Λ_ii of the
-posterior precision Λ: among independent Gaussians those are nearest to the posterior (in KL(q | p)). What torque tells
-only in sums stays as tight as the sums are, instead of as loose as their parts. Nothing is kept of friction or noise.
+and that of the geometry includes the tolerance of machining. V is the variance given all other parameters, 1 / Λ_ii of
+the posterior precision Λ. Among independent Gaussians these are nearest to the posterior (in KL(q | p)). Sums that
+torque determines stay as certain as the sums are, instead of as uncertain as their parts. Friction and noise are not
+transferred.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from lipcore.model.torque_model import TorqueModel
 
 
 def arm_of_sibling(base: TorqueModel) -> Arm:
-    """The arm of another unit of a model's robot, before any samples of it; its geometry may be calibrated.
+    """Return the arm of another unit of a model's robot, before any samples of it. Its geometry may be calibrated.
 
     Raise ValueError for a model without an arm.
     """
@@ -56,13 +57,13 @@ def arm_of_sibling(base: TorqueModel) -> Arm:
 
 
 def arm_as_expected(arm: Arm) -> Arm:
-    """What an arm that was transferred was expected to be, for another training of the same unit."""
+    """Return the prior arm of a transferred arm, for another training of the same unit."""
     geometry = arm.geometry.moved(arm.expected) if arm.steps else arm.geometry
     return replace(arm, geometry=geometry, expected=np.zeros(arm.steps), stribeck=False, alternatives=())
 
 
 def _sizes(squares: Array, n: int) -> Array:
-    """Root mean square of each kind of parameter of a body, (11 n,). squares: of the weights, (p,)."""
+    """Return the root mean square of each kind of parameter of a body, (11 n,). squares: of the weights, (p,)."""
     bodies, rotors = squares[: PARAMETERS * n].reshape(n, PARAMETERS), squares[PARAMETERS * n : (PARAMETERS + 1) * n]
     kinds = np.array(KINDS)
     means = np.stack([bodies[:, kinds == kind].mean(axis=1) for kind in range(SCALES - 1)], axis=1)

@@ -1,4 +1,4 @@
-"""A trained torque model: immutable, asked for torques with their uncertainty."""
+"""A trained torque model: immutable, it predicts torques with their uncertainty."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lipcore.data.metrics import Answer
+from lipcore.data.metrics import TorqueDistribution
 from lipcore.data.motion import Motion, motion_arrays
 from lipcore.data.samples import Array
 from lipcore.estimators.catalogue import NO_CALIBRATION, Calibration, Estimator
@@ -26,17 +26,19 @@ from lipcore.vocabulary import JointType, TorqueConvention
 
 @dataclass(frozen=True)
 class Fallback:
-    """How torques differ from the posterior mean because the training does not determine them.
+    """Difference of torques from the posterior mean, if the training does not determine them.
 
-    share: of the fallback in each torque, 0 to 1; mean: of the posterior, N·m. Both have the shape of the torques.
+    Both arrays have the shape of the torques.
     """
 
     share: Array
+    """Share of the fallback in each torque, 0 to 1."""
     mean: Array
+    """Posterior mean, N·m."""
 
 
 class TorqueAnswer(NamedTuple):
-    """Answer for one query of n joints, N·m: see `TorquePrediction`. tau, tau_std: (n,); covariance: (n, n)."""
+    """Prediction for one query of n joints, N·m: see `TorquePrediction`. tau, tau_std: (n,); covariance: (n, n)."""
 
     tau: Array
     tau_std: Array | None
@@ -45,47 +47,51 @@ class TorqueAnswer(NamedTuple):
 
     @property
     def mean(self) -> Array:
-        """Mean of the posterior, (n,): `tau` unless it falls back."""
+        """Posterior mean, (n,): equals `tau` unless it falls back."""
         return self.tau if self.fallback is None else self.fallback.mean
 
 
 @dataclass(frozen=True)
 class TorquePrediction:
-    """Answer for N queries of n joints, N·m.
+    """Prediction for N queries of n joints, N·m.
 
-    tau: (N, n) mean; tau_std: (N, n) standard deviation of the function; noise_std: (n,) of the measurement; scale:
-    (n,) factor on the half width of intervals, which for 95 % of measurements are
+    The 95 % intervals of measurements are
 
         tau ± 1.96 · scale · √(tau_std² + noise_std²)
 
-    covariance: (N, n, n) of the function between joints, where asked for. fallback: None if every torque is the
-    posterior mean; standard deviations and covariances are always those of the posterior.
+    Standard deviations and covariances are always those of the posterior.
     """
 
     tau: Array
+    """Torque, (N, n)."""
     tau_std: Array
+    """Standard deviation of the function, (N, n)."""
     noise_std: Array
+    """Standard deviation of the measurement noise, (n,)."""
     scale: Array
+    """Factor on the half width of intervals, (n,)."""
     covariance: Array | None = None
+    """Covariance of the function between joints, (N, n, n), if requested."""
     fallback: Fallback | None = None
+    """Fallback, or None if every torque is the posterior mean."""
 
     @property
     def mean(self) -> Array:
-        """Mean of the posterior, (N, n): `tau` unless it falls back."""
+        """Posterior mean, (N, n): equals `tau` unless it falls back."""
         return self.tau if self.fallback is None else self.fallback.mean
 
     @property
-    def interval(self) -> Answer:
-        """What its intervals are made of, to be judged: `lipcore.data.metrics.evaluate(tau, *prediction.interval)`."""
-        return Answer(self.tau, self.tau_std, self.noise_std, self.scale)
+    def interval(self) -> TorqueDistribution:
+        """Parts of the intervals, for `lipcore.data.metrics.evaluate(tau, *prediction.interval)`."""
+        return TorqueDistribution(self.tau, self.tau_std, self.noise_std, self.scale)
 
 
 TrainingRange = dict[str, dict[str, list[float]]]
-"""Smallest (`min`) and largest (`max`) q, dq and ddq of the samples behind a posterior, per joint."""
+"""Min (`min`) and max (`max`) of q, dq and ddq of the posterior's samples, per joint."""
 
 
 def training_range(motion: Motion) -> TrainingRange:
-    """Smallest and largest q, dq and ddq of N instants, SI units."""
+    """Return min and max of q, dq and ddq of N instants, SI units."""
     return {
         name: {"min": values.min(0).tolist(), "max": values.max(0).tolist()}
         for name, values in (("q", motion.q), ("dq", motion.dq), ("ddq", motion.ddq))
@@ -97,40 +103,47 @@ TrainingTorque = dict[str, list[float]]
 
 
 def training_torque(tau: Array) -> TrainingTorque:
-    """Mean and standard deviation of N torques, (N, n) N·m."""
+    """Return the mean and standard deviation of N torques, (N, n) N·m."""
     return {"mean": tau.mean(0).tolist(), "std": tau.std(0).tolist()}
 
 
 @dataclass(frozen=True)
 class TorqueModel:
-    """Fitted inverse dynamics of one robot: immutable, safe to share between threads.
+    """Learnt inverse dynamics of one robot. It is immutable and may be shared between threads.
 
-    joint_names, joint_types: (n,), in the order of the data; torque_convention: what its torques hold; options: those
-    of the fit; fit: what the fit reported, compact: how near the compact posterior comes to the exact one, both for the
-    manifest; training_range: of the samples behind the posterior; robot: the rigid bodies of an estimator that has
-    them; calibration: how the posterior's deviations are corrected; selection: how `auto` has chosen the estimator,
-    None where it was named; conformal: what left-out blocks of the training say of the intervals; training_torque: of
-    the recording. Both are None if an earlier release has trained it.
-
-    If the posterior variance of a torque (without misfit and floor) exceeds its variance in training, the answer falls
-    back to gravity, offset and friction, or to the training's mean if these are not determined either (eq. 26 of
-    docs/method.md). Without `training_torque` no answer does.
+    If the posterior variance of a torque (without misfit and floor) exceeds its variance in training, the prediction
+    falls back to gravity, offset and friction. If these are not determined either, it falls back to the mean torque in
+    training (eq. 26 of docs/method.md). Without `training_torque` no prediction falls back.
     """
 
     estimator: Estimator
+    """Estimator of the model."""
     joint_names: tuple[str, ...]
+    """Names of the joints, (n,), in the order of the data."""
     joint_types: tuple[JointType, ...]
+    """Types of the joints, (n,)."""
     torque_convention: TorqueConvention
+    """Meaning of its torques."""
     options: dict[str, int | float | bool | str]
+    """Options of the fit."""
     fit: dict[str, float | int | bool | str]
+    """Report of the fit, for the manifest."""
     posterior: CompactPosterior
+    """Posterior of the torque."""
     training_range: TrainingRange
+    """Range of the posterior's samples."""
     compact: dict[str, float | int | bool]
+    """Deviation of the compact posterior from the exact one, for the manifest."""
     robot: RigidBody | None = None
+    """Rigid bodies, if the estimator has them."""
     calibration: Calibration = NO_CALIBRATION
+    """Calibration of the posterior's standard deviations."""
     selection: Selection | None = None
+    """How `auto` chose the estimator; None if it was named."""
     conformal: Conformal | None = None
+    """Conformal factors of the intervals; None for a model of an earlier release."""
     training_torque: TrainingTorque | None = None
+    """Torque of the recording; None for a model of an earlier release."""
 
     @property
     def n_joints(self) -> int:
@@ -139,13 +152,15 @@ class TorqueModel:
 
     @property
     def arm(self) -> Arm | None:
-        """What is known of the rigid bodies, of an estimator that has them."""
+        """The learnt rigid bodies, if the estimator has them."""
         term = self.estimator.terms.get("rigid_body")
         return term.arm if isinstance(term, ArmKernel) else None
 
     def position_limits(self, largest: float) -> Array:
-        """Largest |q| of each joint that can be in SI units, (n,) rad (m): `largest`, and any of joints that turn on,
-        which are the revolute ones that were recorded over more than a turn."""
+        """Return the max |q| of each joint for values in SI units, (n,) rad (m).
+
+        It is `largest`, and infinite for joints that turn continuously: revolute joints recorded over more than a turn.
+        """
         return np.where(self._turns, np.inf, largest)
 
     @cached_property
@@ -155,19 +170,29 @@ class TorqueModel:
 
     @property
     def noise_std(self) -> Array:
-        """Standard deviation of the measured torque around the function, (n,) N·m, jitter included."""
+        """Standard deviation of the measured torque around the function, (n,) N·m, with jitter."""
         return np.asarray(np.sqrt(self.posterior.noise_variance))
 
     @property
     def scale(self) -> Array:
-        """Factor on the half width of intervals, (n,): what left-out blocks of the training have proved, at least 1."""
+        """Factor on the half width of intervals, (n,), at least 1, from held-out blocks of the training."""
         return np.ones(self.n_joints) if self.conformal is None else np.array(self.conformal.scale)
 
     def predict(self, q: ArrayLike, dq: ArrayLike, ddq: ArrayLike, covariance: bool = False) -> TorquePrediction:
-        """Torque with uncertainty for arrays of shape (n,) or (N, n), SI units.
+        """Return the torque with its uncertainty at N states, or at one.
 
-        covariance: whether that between the joints is asked for, too.
-        Raise ValueError for a wrong number of joints, differing shapes or a value that is not finite.
+        Args:
+            q: Positions, (n,) or (N, n), rad (m).
+            dq: Velocities, same shape, rad/s (m/s).
+            ddq: Accelerations, same shape, rad/s² (m/s²).
+            covariance: Whether to compute the covariance between the joints.
+
+        Returns:
+            Torques, standard deviations and, if requested, covariances; see `TorquePrediction`.
+
+        Raises:
+            ValueError: The number of joints is wrong, the shapes differ, or a value is not finite.
+
         """
         query = motion_arrays(q, dq, ddq)
         joints = query[0].shape[1]
@@ -182,16 +207,18 @@ class TorqueModel:
         return TorquePrediction(tau, std, self.noise_std, self.scale, between, fallback)
 
     def answer(self, motion: Array, std: bool = True) -> tuple[Array, Array | None]:
-        """Torque at one instant, and its standard deviation where asked for: both (n,) N·m. For control loops.
+        """Return the torque at one instant, and its standard deviation if `std`, both (n,) N·m.
 
-        motion: q, dq and ddq as a float64 array (3, n). Neither shape nor finiteness is checked; what is not finite
-        ends in what is not finite.
+        It is meant for control loops.
+
+        motion: q, dq and ddq as a float64 array (3, n). Neither shape nor finiteness is checked. Values that are not
+        finite give torques that are not finite.
         """
         tau, deviation, share = self.evaluator.one(motion, std)
         return tau if share is None else self._harmless(motion, tau, share), deviation
 
     def answer_fully(self, motion: Array, std: bool = True, covariance: bool = False) -> TorqueAnswer:
-        """Return what `answer` does, with the fallback and, if asked for together with std, the covariance."""
+        """Return the torque like `answer`, with the fallback and, if requested together with std, the covariance."""
         between = np.empty((1, self.n_joints, self.n_joints)) if covariance else None
         mean, deviation, share = self.evaluator.one(motion, std, between)
         tau, fallback = mean, None
@@ -203,13 +230,13 @@ class TorqueModel:
         return np.asarray(self.evaluator.fall_back(motion[None], tau[None], share[None])[0])
 
     def warm_up(self) -> None:
-        """Do all that the first answer would otherwise wait for."""
+        """Compile or load everything that the first prediction needs."""
         self.evaluator.warm_up()
         external.warm_up()
 
     @cached_property
     def evaluator(self) -> Evaluator:
-        """The compiled form of the posterior, which answers queries."""
+        """The compiled form of the posterior, for predictions."""
         posterior, basis, torque = self.posterior, self.posterior.basis, self.training_torque
         return Evaluator(
             basis.term,

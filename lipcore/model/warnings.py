@@ -1,4 +1,4 @@
-"""What to be careful with of a model: where it falls back, what its recording leaves open, how its fits ended."""
+"""Warnings about a model: joints that fall back, parameters that the recording does not identify, and failed fits."""
 
 from __future__ import annotations
 
@@ -16,25 +16,24 @@ from lipcore.model.parameters import weight_posterior
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compression import checks
 
-FARTHER = 2.0
-"""How much farther, or faster, than recorded a joint moves where alternative arms, or shares of the fallback, are
-compared."""
-LISTED = 8
-"""Joints that are named in a sentence, at most."""
+RANGE_FACTOR = 2.0
+"""Factor on the range and speed of the recording, at which alternative arms and shares of the fallback are compared."""
+MAX_LISTED_JOINTS = 8
+"""Max joints named in a sentence."""
 REFIT_ERROR = "refit_error"
-"""Entry of a fit's report: why the last fit, on all rows, has failed."""
+"""Entry of a fit's report: the error of the last fit, on all rows."""
 
 
 def linearisation_error(model: TorqueModel) -> Array | None:
-    """Error of taking an arm's torque as linear, in units of what is stated, root mean square over motions: (n,).
+    """Return the error of an arm's linearised torque relative to the stated error, root mean square over motions, (n,).
 
-    With weights w, linear around ŵ = (π̂, r, 0), and Φ their features (alternative arms left out), it is
+    With weights w, linearised at ŵ = (π̂, r, 0), and their features Φ (without alternative arms), it is
 
         Y(θ + δθ) π + r ∘ ddq − Φ w    over    √(tau_std² + noise_std²)    at    w = ŵ + (I − C Λ⁻¹) (μ − ŵ)
 
-    where μ and C are posterior mean and covariance, Λ the prior's: the step towards μ as far as samples determine it.
-    Along what they leave open μ may lie anywhere, for no torque depends on it. The motions are those that the basis
-    keeps. None for a model without an arm, or with a geometry that is fixed: it is linear.
+    where μ and C are posterior mean and covariance, and Λ the prior's. This is the part of the step towards μ that
+    samples determine. In the other directions μ is arbitrary, because no torque depends on it. The motions are those of
+    the basis. Return None for a model without an arm, or with a fixed geometry: its torque is linear.
     """
     term = model.estimator.terms.get("rigid_body")
     if not isinstance(term, ArmKernel) or not term.arm.steps:
@@ -53,10 +52,10 @@ def linearisation_error(model: TorqueModel) -> Array | None:
 
 
 def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
-    """Sentences about a model: which joints fall back, then about its arm, the gravest first; of a model without one,
-    about the motion of its recording.
+    """Return sentences about a model: joints that fall back, then its arm, the most severe first.
 
-    parameters: the report of `lipcore.model.parameters.report`.
+    For a model without an arm, they are about the motion of its recording. parameters: the report of
+    `lipcore.model.parameters.report`.
     """
     arm, fit, out = model.arm, model.fit, _fallback(model)
     if REFIT_ERROR in fit:
@@ -84,10 +83,10 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
     joints = parameters.get("geometry", {}).get("joints", ())
     names = {each["joint"]: each["undetermined"] for each in joints if each["undetermined"]}
     count = sum(map(len, names.values()))
-    several = count > 2  # no torque depends on the geometry's turn about gravity, and its place along the first axis
+    several = count > 2  # no torque depends on the geometry's turn about gravity and its place along the first axis
     if several:
-        listed = "; ".join([f"{joint}: {', '.join(each)}" for joint, each in names.items()][:LISTED])
-        listed += "; …" if len(names) > LISTED else ""
+        listed = "; ".join([f"{joint}: {', '.join(each)}" for joint, each in names.items()][:MAX_LISTED_JOINTS])
+        listed += "; …" if len(names) > MAX_LISTED_JOINTS else ""
         stand = "are those of the URDF or the base" if arm.mode == "calibrate" else "are only a guess"
         out.append(f"The recording does not tell {count} numbers of the geometry, which {stand} ({listed}).")
     if (several or arm.alternatives) and moved_together:
@@ -96,18 +95,21 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
 
 
 def _fallback(model: TorqueModel) -> list[str]:
-    """Name the joints that fall back at most motions FARTHER and faster than those recombined from the basis' own."""
+    """Return a sentence with the joints that mostly fall back at motions farther and faster than recorded.
+
+    The motions are recombined from those of the basis, and scaled by RANGE_FACTOR.
+    """
     motion = checks(model.posterior.basis.inducing, 40)[-20:]
     low, high = (np.array(model.training_range["q"][end]) for end in ("min", "max"))
     middle = 0.5 * (low + high)
-    q = middle + FARTHER * (motion.q - middle)
-    share = model.evaluator.many(q, FARTHER * motion.dq, FARTHER**2 * motion.ddq)[3]
+    q = middle + RANGE_FACTOR * (motion.q - middle)
+    share = model.evaluator.many(q, RANGE_FACTOR * motion.dq, RANGE_FACTOR**2 * motion.ddq)[3]
     if share is None:
         return []
     names = [name for name, often in zip(model.joint_names, (share > 0).mean(axis=0), strict=True) if often > 0.5]
     if not names:
         return []
-    listed = ", ".join([*names[:LISTED], "…"] if len(names) > LISTED else names)
+    listed = ", ".join([*names[:MAX_LISTED_JOINTS], "…"] if len(names) > MAX_LISTED_JOINTS else names)
     listed = " and ".join(listed.rsplit(", ", 1))
     return [
         f"Twice as far and as fast as recorded, the torque of {listed} is only gravity and friction, as far as the "
@@ -116,10 +118,11 @@ def _fallback(model: TorqueModel) -> list[str]:
 
 
 def _alternatives(model: TorqueModel) -> str:
-    """How likely the alternative arms are, and which joint has to move farther or faster to tell them apart.
+    """Return a sentence with the probabilities of alternative arms, and the joint that would distinguish them.
 
-    Their spread is the standard deviation of their mixture, root mean square over the basis' motions with one joint
-    FARTHER from the middle of its range, or that much faster; the joint is the one where it is largest for the noise.
+    Their spread is the standard deviation of their mixture, root mean square over the basis' motions. In these, one
+    joint moves RANGE_FACTOR times farther from the middle of its range, or that much faster. The joint is the one with
+    the largest spread relative to noise.
     """
     term = model.estimator.terms["rigid_body"]
     assert isinstance(term, ArmKernel)
@@ -130,9 +133,9 @@ def _alternatives(model: TorqueModel) -> str:
         length = "m" if model.joint_types[joint] == "prismatic" else "rad"
         q, dq, ddq = (each.copy() for each in (motion.q, motion.dq, motion.ddq))
         middle = 0.5 * (low[joint] + high[joint])
-        q[:, joint] = middle + FARTHER * (q[:, joint] - middle)
-        dq[:, joint] *= FARTHER
-        ddq[:, joint] *= FARTHER**2
+        q[:, joint] = middle + RANGE_FACTOR * (q[:, joint] - middle)
+        dq[:, joint] *= RANGE_FACTOR
+        ddq[:, joint] *= RANGE_FACTOR**2
         where = f"{name} leaves {low[joint]:.2g} to {high[joint]:.2g} {length}"
         tried.append((_spread(term, replace(motion, q=q)), where))
         where = f"{name} is faster than {fastest[joint]:.2g} {length}/s"
@@ -151,6 +154,6 @@ def _alternatives(model: TorqueModel) -> str:
 
 
 def _spread(term: ArmKernel, motion: Motion) -> Array:
-    """Standard deviation of the mixture of alternative arms, root mean square over motions: (n,)."""
+    """Return the standard deviation of the mixture of alternative arms, root mean square over motions, (n,)."""
     features = term.features(motion)[:, :, term.steps.stop :]
     return np.asarray(np.sqrt(np.mean(np.square(features).sum(2), axis=0)))

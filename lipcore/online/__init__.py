@@ -1,1 +1,1 @@
-"""Learning from a live stream: exact, and honest about what it does not explain."""
+"""Learn from a live stream: exact updates, gates for bad rows, and alarms if the robot changes."""

@@ -1,4 +1,4 @@
-"""Intervals that hold what they promise whatever the robot does: a factor on their width that measurements move."""
+"""Scale the intervals of a stream so that their coverage stays at 95 % whatever the robot does."""
 
 from __future__ import annotations
 
@@ -15,74 +15,75 @@ from lipcore.online.record import HALF_WIDTH, LEVEL
 
 @dataclass(frozen=True)
 class AdaptiveOptions:
-    """How fast a scale s follows measurements, and how far.
+    """How fast and how far a scale s follows measurements.
 
-    `rate`, `share`, `min_rows` and `margin` were tuned with benchmarks/studies/adaptive_intervals.py on its streams for
-    tuning, so that every minute holds 93 to 97 % and each joint at least 85 % from 0.3 s after a payload on, and for
-    the min width then.
+    `rate`, `share`, `min_rows` and `margin` were tuned with benchmarks/studies/adaptive_intervals.py on its tuning
+    streams. Goals: a coverage of 93 to 97 % in every minute and of at least 85 % per joint from 0.3 s after a payload,
+    at the min width.
     """
 
     rate: float = 10.0
-    """What a second of misses moves log s by; if everything lies inside, it falls by 0.5 a second. With 5 some minutes
-    held 98 %."""
+    """Growth of log s per second outside the interval; per second inside, log s falls by 0.5. With 5, the coverage of
+    some minutes was 98 %."""
     share: float = 0.7
     min_rows: int = 5
-    """If this share of so many rows or more lies outside, the scale leaps to what would have held the batch."""
+    """If this share of so many rows or more lies outside, the scale jumps to a value that contains the batch."""
     margin: float = 1.5
-    """Factor on the max error of such a batch: those of a new payload go on growing with the motion."""
+    """Factor on the max error of such a batch: the errors of a new payload continue to grow with the motion."""
     max_step: float = 0.25
-    """Max change of log s by one batch, unless its errors say more: a batch may bring many seconds of rows."""
+    """Max change of log s by one batch, unless its errors require more: a batch may contain many seconds of rows."""
     max_owed: float = 30.0
-    """A minute in which everything lies inside pays as much."""
+    """A minute with all measurements inside reduces `owed` by as much."""
     max_gain: float = 0.5
-    """Max change of log s by one row, however long ago the row before it was."""
+    """Max change of log s by one row, however long ago the previous row was."""
     max_gap_s: float = 1.0
-    """A longer time between two batches is a pause, in which nothing was observed."""
+    """A longer time between two batches is a pause without measurements."""
     usual_step_s: float = 0.01
-    """Time between rows that have no times."""
+    """Time between rows without times."""
     min_scale: float = 0.1
     max_scale: float = 1e4
-    """A small scale is no danger to the stream that has earned it, whose next misses leap; see `widest`."""
+    """A small scale is safe for its own stream, whose next misses raise it at once; for other queries see `widest`."""
 
 
 OPTIONS = AdaptiveOptions()
 
 
 @dataclass(frozen=True, eq=False)
-class Adaptive:
-    """The scale s of a stream's intervals, mean ± s · 1.96 · √(std² + noise_std²), joint by joint; immutable.
+class AdaptiveScale:
+    """The scale s of a stream's intervals, mean ± s · 1.96 · √(std² + noise_std²), per joint; immutable.
 
-    Quantile tracking (adaptive conformal inference, Gibbs & Candès 2021, with a step for log s): rows that stand for dt
-    seconds each move log s by rate · dt · (miss − 0.05), where `miss` says whether one lay outside the interval that it
-    was answered with. So, whatever the errors are, over a stretch of T seconds
+    Quantile tracking (adaptive conformal inference, Gibbs & Candès 2021, with a step for log s). Each row that
+    represents dt seconds changes log s by rate · dt · (miss − 0.05); miss is 1 if the row lay outside its returned
+    interval, else 0. Whatever the errors are, over T seconds
 
-        |share of misses − 0.05| ≤ (|change of log s| + |change of owed| + leaps) / (rate · T)
+        |share of misses − 0.05| ≤ (|change of log s| + |change of owed| + jumps) / (rate · T)
 
-    with the leaps that are added: a scale that grows tenfold shifts the coverage of that minute by 0.4 to 0.8 %. What
-    the misses of a long batch ask for beyond the errors in it is not paid by a larger scale but `owed`: the scale does
-    not fall before that is paid. It holds for rows that are evenly spaced, within the min and max scale.
-
-    log: (n,), of s; owed: (n,), in the same unit; last: event time of the latest row, s.
+    A scale that grows tenfold shifts the coverage of that minute by 0.4 to 0.8 %. If the misses of a long batch require
+    more growth than its errors, the rest does not enlarge the scale but is `owed`: the scale does not fall until that
+    is paid. The bound holds for evenly spaced rows, between the min and the max scale.
     """
 
     log: Array
+    """log s, (n,)."""
     owed: Array
+    """Growth of log s that is still owed, (n,)."""
     last: float | None = None
+    """Event time of the latest row, s."""
 
     @staticmethod
-    def start(factor: Array) -> Adaptive:
-        """Before the first row: the version's own factors s, (n,)."""
-        return Adaptive(np.log(factor), np.zeros(len(factor)))
+    def start(factor: Array) -> AdaptiveScale:
+        """Return the scale before the first row. factor: the version's own s, (n,)."""
+        return AdaptiveScale(np.log(factor), np.zeros(len(factor)))
 
     @property
     def factor(self) -> Array:
-        """s, (n,)."""
+        """Return s, (n,)."""
         return np.asarray(np.exp(self.log))
 
-    def step(self, time: Array, score: Array, answered: Array | None = None) -> Adaptive:
-        """Follow the rows of a batch at event times (N,), s, with their scores (N, n), see `scores`.
+    def step(self, time: Array, score: Array, answered: Array | None = None) -> AdaptiveScale:
+        """Return the scale after the rows of a batch. time: (N,) s; score: (N, n), see `scores`.
 
-        answered: the factors that they were answered with, (N, n) or (n,); that from before the batch where None.
+        answered: the factors of the returned intervals, (N, n) or (n,); None: the factor before the batch.
         """
         if not len(score):
             return self
@@ -100,20 +101,20 @@ class Adaptive:
         log = self.log + np.clip(moved + paid, least, most)
         latest = float(time.max())
         last = latest if self.last is None else max(latest, self.last)
-        return Adaptive(np.clip(log, np.log(OPTIONS.min_scale), np.log(OPTIONS.max_scale)), owed, last)
+        return AdaptiveScale(np.clip(log, np.log(OPTIONS.min_scale), np.log(OPTIONS.max_scale)), owed, last)
 
     def to_json(self) -> dict[str, Any]:
-        """Its state as numbers and lists; `from_json` gives back the same to the last bit."""
+        """Return the state as numbers and lists; `from_json` restores it to the last bit."""
         return {"log": self.log.tolist(), "owed": self.owed.tolist(), "last": self.last}
 
     @staticmethod
-    def from_json(values: Mapping[str, Any]) -> Adaptive:
-        """What `to_json` wrote."""
+    def from_json(values: Mapping[str, Any]) -> AdaptiveScale:
+        """Read what `to_json` returned."""
         log, owed = (np.array(values[name], np.float64) for name in ("log", "owed"))
-        return Adaptive(log, owed, values["last"])
+        return AdaptiveScale(log, owed, values["last"])
 
     def _spacing(self, time: Array) -> float:
-        """Seconds that each of these rows stands for."""
+        """Return the seconds that each row represents."""
         first, latest = float(time.min()), float(time.max())
         if self.last is not None and first - OPTIONS.max_gap_s <= self.last < latest:
             first = self.last
@@ -121,21 +122,23 @@ class Adaptive:
 
 
 def scores(error: Array, std: Array, noise_std: Array) -> Array:
-    """|error| over the half width that the model believes, (N, n): an interval of scale s holds scores of up to s.
+    """Return |error| over the half width of the unscaled interval, (N, n): an interval of scale s contains scores up to
+    s.
 
-    error = tau − mean and std, the function's deviation, (N, n); noise_std (n,), N·m.
+    error = tau − mean and std, the function's standard deviation, (N, n); noise_std: (n,), N·m.
     """
     return np.asarray(np.abs(error) / (HALF_WIDTH * np.sqrt(std**2 + noise_std**2)))
 
 
 def outside(score: Array, factor: Array) -> NDArray[np.bool_]:
-    """Which measurements of these scores, (N, n), lie outside intervals of these scales, (N, n) or (n,)."""
+    """Return which scores, (N, n), lie outside intervals of these scales, (N, n) or (n,)."""
     return np.asarray(score > factor)
 
 
 def widest(factors: Sequence[Array], own: Array) -> Array:
-    """The largest of several streams' scales and the version's own, (n,), for a question that belongs to no stream.
+    """Return the max of several streams' scales and the version's own, (n,), for a query without a stream.
 
-    Not below its own: a smaller one is earned by the motion of the moment, and the question may be of another.
+    It is never below the version's own scale: a smaller one results from a stream's current motion, and the query may
+    be about another.
     """
     return np.asarray(np.maximum.reduce([own, *factors]))

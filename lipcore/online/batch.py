@@ -1,4 +1,4 @@
-"""Rows that arrive online: samples with a time, and what became of each."""
+"""Define the rows that arrive online: samples with a time and a code."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from lipcore.data.samples import Array
 from lipcore.vocabulary import CODES, Code
 
 AHEAD_S = 1.0
-"""By how much the rows of a batch may be dated after its arrival, s, where they are learnt."""
+"""Max time by which learnt rows may be dated after their arrival, s."""
 
 
 @dataclass(frozen=True)
 class Rows:
     """N rows of n joints. time: (N,) event time, s; q, dq, ddq, tau: (N, n), SI; code: (N,) uint8 places in CODES.
 
-    weight: (N,) how many independent samples each counts for (see `data.independence`), one where not given.
+    weight: (N,) effective samples of each row (see `data.independence`), one by default.
     """
 
     time: Array
@@ -51,47 +51,46 @@ class Rows:
 
     @property
     def learnt(self) -> Rows:
-        """The rows that teach."""
+        """Return the rows with the code `learnt`."""
         teaches = self.code == Code.LEARNT
         return self if teaches.all() else self.take(teaches)
 
     def motion(self) -> Motion:
-        """Position, velocity and acceleration as tensors; raise ValueError where one is not finite."""
+        """Return position, velocity and acceleration; raise ValueError if one is not finite."""
         return Motion.from_arrays(self.q, self.dq, self.ddq)
 
     def rejected(self) -> dict[str, int]:
-        """How many rows each code other than `learnt` keeps out."""
+        """Return the number of rows per code other than `learnt`, without zeros."""
         counts = np.bincount(self.code, minlength=len(CODES))
         return {code: int(count) for code, count in zip(CODES, counts, strict=True) if count and code != "learnt"}
 
     @staticmethod
     def concatenate(parts: Sequence[Rows]) -> Rows:
-        """Rows of all parts in order."""
+        """Return the rows of all parts in order."""
         return Rows(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Rows)})
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Where the rows of a logged batch lie in their stream: what the batches next to it need of it.
-
-    own: first and last place of the batch's own rows among those that were logged with it. span: first and last time by
-    the stream's clock, s; None if no row has one. window: rows on either side that its accelerations are derived from;
-    None if they were measured. frames: ranges of sequences, of frames that were logged together.
-    """
+    """Where the rows of a logged batch lie in their stream: what neighbouring batches need."""
 
     own: tuple[int, int]
+    """First and last place of the batch's own rows among the rows logged with it."""
     span: tuple[float, float] | None = None
+    """First and last time by the stream's clock, s; None if no row has a time."""
     window: int | None = None
+    """Rows on either side from which accelerations are derived; None if accelerations were measured."""
     frames: tuple[tuple[int, int], ...] = ()
+    """Ranges of sequences of frames that were logged together."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the fields as the log keeps them; `window` is kept with what was derived."""
+        """Return the fields as the log stores them; `window` is stored with the derived values."""
         frames = {"frames": [list(each) for each in self.frames]} if self.frames else {}
         return {"own": list(self.own), "span": None if self.span is None else list(self.span), **frames}
 
     @staticmethod
     def from_json(report: Mapping[str, Any]) -> Placement:
-        """Read what `to_json` returned, from all that the log keeps of a batch."""
+        """Read what `to_json` returned, from the log's report of a batch."""
         span, derived = report["span"], report["derived"]
         return Placement(
             tuple(report["own"]),

@@ -1,4 +1,4 @@
-"""Which rows may teach: gates for broken, impossible, saturated and standing rows, for contacts and their end."""
+"""Decide which rows are learnt: gates for broken, impossible, saturated and stationary rows, and for contacts."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.outliers import LARGEST_TORQUE
+from lipcore.data.outliers import MAX_TORQUE
 from lipcore.data.samples import Array
 from lipcore.model.external import external
 from lipcore.vocabulary import Code
@@ -19,29 +19,30 @@ Codes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]
 
 MAX_GAP_S = 1.0
-"""A longer step of time within a batch is a pause, s."""
+"""A longer time step within a batch is a gap in the recording, s."""
 STATIONARY_SPEED = 1e-3
-"""Speed of all joints, rad/s or m/s, below which a row tells of stiction only."""
+"""Speed of all joints, rad/s or m/s, below which a row shows only stiction."""
 
 
 @dataclass(frozen=True)
 class RowLimits:
-    """What a row may hold.
-
-    position: largest |q|, of each joint (n,) or of all; velocity, acceleration: largest |dq|, |ddq| of any joint, SI.
-    torque: (n,) largest |tau| of each joint, N·m or N, or None where not known. max_gap_s: a longer step of time
-    is a pause, s. stationary_speed: a robot whose every |dq| lies below it stands; 0: never. saturation_share: share of
-    its limit from which on a torque is taken for cut off, below the limit since a drive's measured torque wavers about
-    it: 0.98 leaves 2 %, four standard deviations of a noise of half a per cent of the limit.
-    """
+    """Limits of a valid row, SI units."""
 
     position: Array | float
+    """Max |q|, of each joint (n,) or of all joints."""
     velocity: float
+    """Max |dq| of any joint."""
     acceleration: float
+    """Max |ddq| of any joint."""
     torque: Array | None
+    """Max |tau| of each joint, (n,), or None if unknown."""
     max_gap_s: float = MAX_GAP_S
+    """A longer time step is a gap, s."""
     stationary_speed: float = STATIONARY_SPEED
+    """The robot is at rest if every |dq| is below this speed; 0: never."""
     saturation_share: float = 0.98
+    """Min share of its limit at which a torque counts as saturated. It is below 1 because a drive's measured torque is
+    noisy: 0.98 leaves 2 %, four standard deviations of a noise of half a per cent of the limit."""
 
 
 def check_rows(
@@ -54,32 +55,32 @@ def check_rows(
     after: float | None = None,
     before: float | None = None,
 ) -> Codes:
-    """Code of each row, (N,) places in CODES: the first that applies, or `learnt`.
+    """Return the code of each row, (N,) places in CODES: the first reason that applies, or `learnt`.
 
-    t: (N,) s, or None; q, dq, ddq, tau: (N, n) with ddq None where it is yet to be derived.
+    t: (N,) s, or None; q, dq, ddq, tau: (N, n), with ddq None if it is derived later.
 
     - `non_finite`: a number of the row is not finite.
-    - `limit`: a magnitude is above its limit.
+    - `limit`: a magnitude exceeds its limit.
     - `time_jump`: of the rows with a finite time between `after` and `before`, all but the longest run of strictly
-      increasing times, so that one wrong time, forward or backward, costs its row and no other.
-    - `saturation`: a |tau| of at least saturation_share of its limit: the robot did not do what the torque says.
-    - `stationary`: every |dq| below stationary_speed: stiction holds any torque within its band.
+      increasing times. One wrong time, forward or backward, therefore rejects its own row and no other.
+    - `saturation`: a |tau| of at least saturation_share of its limit: the drive may have produced less than reported.
+    - `stationary`: every |dq| is below stationary_speed: stiction can balance any torque within its range.
 
-    after, before: times that the rows must lie strictly between, such as `time_span` of the batch before and of the
-    batch after, or the time of arrival with some slack, which stops a leap into the future. Raise ValueError where
-    shapes differ.
+    after, before: times between which the rows must lie, strictly. Examples are `time_span` of the batches before and
+    after, or the time of arrival plus a margin, which rejects a jump into the future. Raise ValueError if shapes
+    differ.
     """
     _check_shapes(t, q, dq, ddq, tau, limits)
     parts = [array for array in (q, dq, ddq, tau) if array is not None]
     finite = np.all([np.isfinite(array).all(axis=1) for array in parts], axis=0)
     if t is not None:
         finite &= np.isfinite(t)
-    # the codes of rows that are not finite are set last; numbers in their place keep comparisons quiet
+    # zeros avoid warnings in the comparisons; rows that are not finite get their code last
     q, dq, tau = (np.nan_to_num(array) for array in (q, dq, tau))
 
     codes = np.full(len(q), Code.LEARNT, dtype=np.uint8)
     codes[(np.abs(dq) < limits.stationary_speed).all(axis=1)] = Code.STATIONARY
-    most = np.full(q.shape[1], LARGEST_TORQUE) if limits.torque is None else limits.torque
+    most = np.full(q.shape[1], MAX_TORQUE) if limits.torque is None else limits.torque
     if limits.torque is not None:
         saturated = np.abs(tau) >= limits.saturation_share * most
         codes[saturated.any(axis=1)] = Code.SATURATION
@@ -94,10 +95,12 @@ def check_rows(
 
 
 def time_span(time: Array, code: Codes) -> tuple[float, float] | None:
-    """First and last time to be believed of a batch of rows, or None: what its neighbours are to lie before and after.
+    """Return the first and last plausible time of a batch of rows, or None. Neighbouring batches must lie before and
+    after.
 
-    Rows coded `time_jump` do not count unless no others have a time: then the clock itself was set, and the next batch
-    is to follow the new one. So a wrong time at the end of a batch costs one row, and a clock set back one batch.
+    Rows coded `time_jump` do not count unless no other row has a time. In that case the clock itself was set, and the
+    next batch must follow the new time. A wrong time at the end of a batch therefore costs one row; a clock set back
+    costs one batch.
     """
     known = np.isfinite(time)
     believed = known & (code != Code.TIME_JUMP)
@@ -106,52 +109,55 @@ def time_span(time: Array, code: Codes) -> tuple[float, float] | None:
 
 
 def is_contact(tau: Array, mean: Array, std: Array, noise_std: Array, threshold: float) -> Mask:
-    """Rows (N,) where |z| of `external` is above the threshold at any joint: tau, mean, std (N, n).
+    """Return the rows (N,) whose |z| (see `external`) exceeds the threshold at any joint. tau, mean, std: (N, n).
 
-    Without a stream's `scale`, which follows what it measures: a contact would widen its own gate.
+    The stream's `scale` is not used: it follows the measurements, so a contact would widen its own gate.
     """
     return np.asarray((np.abs(external(tau, mean, std, noise_std).z) > threshold).any(axis=1))
 
 
-SURELY, ECHOED = 5.0, 1e-9
-"""Standard deviations of the noise from which on a torque is surely another one; N·m or N up to which two are one."""
+MIN_DISTINCT_STDS, MAX_ECHO_DIFFERENCE = 5.0, 1e-9
+"""Min difference of two distinct torques, in standard deviations of the noise; max difference of two equal torques, N·m
+or N."""
 
 
 def is_implausible(tau: Array, mean: Array, noise_std: Array, gravity: bool) -> Mask:
-    """Rows, (N,) in order of time, whose torque nobody has measured; all of them where most are.
+    """Return the rows, (N,) in order of time, whose torque cannot be a measurement; all rows if more than half are
+    such.
 
-    tau, mean: (N, n), said to be measured, and the model's; noise_std: (n,); gravity: whether torques contain it.
+    tau, mean: (N, n), the torque sent as measured, and the model's; noise_std: (n,); gravity: whether torques contain
+    it.
 
-    - Zero at all joints, where gravity makes it surely another one.
-    - The model's own at all joints, of this row or of the one before: a command, or an answer, that is sent back.
-    - The same at all joints from row to row, while the model's surely becomes another one.
+    - Zero at all joints, although gravity requires a distinct torque.
+    - The model's torque at all joints, of this row or of the one before: a command or a prediction that was sent back.
+    - Unchanged at all joints from row to row, while the model's torque becomes a distinct one.
     """
     found = np.zeros(len(tau), np.bool_)
     if not len(tau):
         return found
     if gravity:
-        found |= (tau == 0).all(axis=1) & (np.abs(mean) > SURELY * noise_std).any(axis=1)
-    found |= (np.abs(tau - mean) < ECHOED).all(axis=1)
-    found[1:] |= (np.abs(tau[1:] - mean[:-1]) < ECHOED).all(axis=1)
-    run = np.concatenate([[0], np.cumsum((tau[1:] != tau[:-1]).any(axis=1))])  # of rows that are the same
+        found |= (tau == 0).all(axis=1) & (np.abs(mean) > MIN_DISTINCT_STDS * noise_std).any(axis=1)
+    found |= (np.abs(tau - mean) < MAX_ECHO_DIFFERENCE).all(axis=1)
+    found[1:] |= (np.abs(tau[1:] - mean[:-1]) < MAX_ECHO_DIFFERENCE).all(axis=1)
+    run = np.concatenate([[0], np.cumsum((tau[1:] != tau[:-1]).any(axis=1))])  # number of the run of equal rows
     first = np.searchsorted(run, run)
-    stuck = (np.abs(mean - mean[first]) > SURELY * noise_std).any(axis=1)
+    stuck = (np.abs(mean - mean[first]) > MIN_DISTINCT_STDS * noise_std).any(axis=1)
     found |= np.isin(run, run[stuck])
     return np.ones_like(found) if found.mean() > 0.5 else found
 
 
-LONGEST_SHARE = 0.1
-"""Most of the patience that one step of time uses up: a pause in a stream is not time in contact, and a stream of few
+MAX_STEP_SHARE = 0.1
+"""Max share of the patience that one time step uses up. A pause in a stream is not time in contact, and a stream of few
 rows a second needs at least ten of them."""
 
 
 @dataclass(frozen=True)
 class Patience:
-    """How long torques have been far off: immutable, one per stream, followed in event time.
+    """Time for which torques have been far off; immutable, one per stream, in event time.
 
-    It runs from a contact row on for as long as more than half of the rows since are contacts. Once it has run for
-    `seconds`, at a row that is a contact itself, `exhausted` is set and stays: this is no contact but a change of the
-    robot. A collision ends before; knocks that are further apart than they last start anew each time.
+    The time runs from a contact row on while more than half of the rows since are contacts. `exhausted` is set at a
+    contact row once `seconds` have passed, and stays set: the robot has changed. A collision ends earlier. Knocks that
+    are further apart than they last restart the time.
     """
 
     seconds: float
@@ -162,13 +168,13 @@ class Patience:
     last: float | None = None
 
     def step(self, time: Array, contact: Mask) -> Patience:
-        """Follow rows at event times (N,) s that are contacts or not, (N,); time that goes backwards counts as 0."""
+        """Add rows at event times (N,), s; contact: (N,). Time that goes backwards counts as 0."""
         if self.exhausted or len(time) == 0:
             return self
         if not self.rows and not contact.any():
             return replace(self, last=float(time[-1]))
         elapsed, rows, contacts, last = self.elapsed, self.rows, self.contacts, self.last
-        longest = LONGEST_SHARE * self.seconds
+        longest = MAX_STEP_SHARE * self.seconds
         for now, hit in zip(time.tolist(), contact.tolist(), strict=True):
             if rows:
                 elapsed += min(max(now - last, 0.0), longest) if last is not None else 0.0
@@ -184,59 +190,61 @@ class Patience:
 
 
 CONTACT_PATIENCE_S = 2.0
-"""How long torques may be far off before it is no contact but a change of the robot, s."""
+"""Max duration of a contact, s. If torques are far off for longer, the robot has changed."""
 
 
 @dataclass(frozen=True)
 class ContactGate:
-    """Rejects rows far outside a stream's predictive interval for as long as that can be a contact; immutable.
+    """Gate that rejects rows far outside a stream's predictive interval, for as long as that can be a contact;
+    immutable.
 
-    It stands back while a changed robot is learnt anew. patience: how long rows have been contacts. calm: how long they
-    have not, while the gate stands back; else None.
+    The gate is open while a changed robot is learnt again: it lets contacts through.
     """
 
     patience: Patience
+    """How long rows have been contacts."""
     calm: Patience | None = None
+    """How long they have not, while the gate is open; else None."""
 
     @classmethod
     def start(cls, seconds: float = CONTACT_PATIENCE_S) -> ContactGate:
-        """A gate that keeps contacts out for so long."""
+        """Return a closed gate that rejects contacts of up to `seconds`."""
         return cls(Patience(seconds))
 
     def to_json(self) -> list[list[Any] | None]:
-        """Its state as numbers and lists; `from_json` gives back the same gate to the last bit."""
+        """Return the state as numbers and lists; `from_json` restores it to the last bit."""
         return [None if each is None else list(astuple(each)[1:]) for each in (self.patience, self.calm)]
 
     @classmethod
     def from_json(cls, values: Sequence[Sequence[Any] | None], seconds: float = CONTACT_PATIENCE_S) -> ContactGate:
-        """The gate that `to_json` wrote, with the patience of this release, s."""
+        """Return the gate that `to_json` wrote, with the patience of this release, s."""
         patience, calm = (None if each is None else Patience(seconds, *each) for each in values)
         return cls(patience or Patience(seconds), calm)
 
     @property
-    def open(self) -> bool:
-        """Whether it stands back: contacts and what has changed cannot be told apart."""
+    def is_open(self) -> bool:
+        """Whether the gate lets contacts through, because contacts and the change cannot be told apart."""
         return self.calm is not None
 
     @property
     def exhausted(self) -> bool:
-        """Whether this has lasted too long for a contact."""
+        """Whether rows have been contacts for too long for a contact."""
         return self.patience.exhausted
 
     @property
     def began(self) -> float | None:
-        """Event time of the first of the rows that have been contacts for so long, s."""
+        """Event time of the first row of these contacts, s."""
         return None if self.patience.last is None else self.patience.last - self.patience.elapsed
 
     def step(self, time: Array, contact: Mask) -> ContactGate:
-        """Follow rows at event times (N,) that are contacts or not; a gate that stood back returns once they fit."""
+        """Add rows at event times (N,) that are contacts or not. An open gate closes once most rows fit."""
         if self.calm is None:
             return ContactGate(self.patience.step(time, contact))
         calm = self.calm.step(time, ~contact)
         return ContactGate.start(calm.seconds) if calm.exhausted else ContactGate(self.patience, calm)
 
-    def stand_back(self) -> ContactGate:
-        """Let everything pass until most rows fit again for as long as the patience lasts."""
+    def let_all_pass(self) -> ContactGate:
+        """Open the gate until most rows have fitted for as long as the patience lasts."""
         fresh = Patience(self.patience.seconds)
         return ContactGate(fresh, fresh)
 
@@ -254,7 +262,7 @@ def _check_shapes(t: Array | None, q: Array, dq: Array, ddq: Array | None, tau: 
 
 
 def _time_jumps(t: Array, after: float | None, before: float | None) -> Mask:
-    """Rows (N,) whose time is out of bounds or out of order."""
+    """Return the rows (N,) whose time is out of bounds or out of order."""
     inside = np.isfinite(t)
     inside &= (t > (-np.inf if after is None else after)) & (t < (np.inf if before is None else before))
     kept = np.flatnonzero(inside)
@@ -266,7 +274,8 @@ def _time_jumps(t: Array, after: float | None, before: float | None) -> Mask:
 
 
 def _longest_increasing(values: list[float]) -> list[int]:
-    """Places of a longest strictly increasing subsequence: of equal values the first, of two ends the lower."""
+    """Return the places of a longest strictly increasing subsequence: of equal values the first, of two ends the
+    lower."""
     ends: list[float] = []
     places: list[int] = []
     previous = [-1] * len(values)

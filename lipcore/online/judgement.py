@@ -1,4 +1,4 @@
-"""What judging knows of a model, and what the log keeps of a judgement: enough to follow it from batch to batch."""
+"""Define what judging stores per model, and what the log stores per judgement, to continue from batch to batch."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.online.adaptive import Adaptive
+from lipcore.online.adaptive import AdaptiveScale
 from lipcore.online.batch import Rows
 from lipcore.online.changes.departure import Departure
 from lipcore.online.changes.detectors import Change, ChangeDetector, friction_share
 from lipcore.online.record import Record
-from lipcore.online.scale import HeldIntervals
+from lipcore.online.scale import IntervalCoverage
 
-MOST_INNOVATIONS = 1000
-"""Rows whose innovations are kept to tell friction from a payload."""
+MAX_INNOVATION_ROWS = 1000
+"""Rows whose innovations are stored, to distinguish friction from a payload."""
 
 
 @dataclass(frozen=True)
 class Innovations:
-    """The latest rows that were predicted: event time (N,) s, dq (N, n), error = tau − mean (N, n)."""
+    """The latest predicted rows: event time (N,) s, dq (N, n), error = tau − mean (N, n)."""
 
     time: Array
     dq: Array
@@ -30,46 +30,49 @@ class Innovations:
 
     @staticmethod
     def empty(n: int) -> Innovations:
-        """None yet, of n joints."""
+        """Return no innovations of n joints."""
         return Innovations(np.empty(0), np.empty((0, n)), np.empty((0, n)))
 
-    def then(self, rows: Rows, mean: Array) -> Innovations:
-        """Those of more rows, and as many of the ones before as are kept."""
+    def append(self, rows: Rows, mean: Array) -> Innovations:
+        """Return the latest innovations after more rows."""
         new = rows.time, rows.dq, rows.tau - mean
         old = self.time, self.dq, self.error
-        return Innovations(*(np.concatenate(both)[-MOST_INNOVATIONS:] for both in zip(old, new, strict=True)))
+        return Innovations(*(np.concatenate(both)[-MAX_INNOVATION_ROWS:] for both in zip(old, new, strict=True)))
 
     def friction(self, since: float) -> Array:
-        """Share of friction in those from an event time on, (n,)."""
+        """Return the share of friction in the innovations since an event time, (n,)."""
         late = self.time >= since
         return friction_share(self.dq[late], self.error[late])
 
 
 @dataclass(frozen=True)
 class LoggedJudgement:
-    """What the log keeps of the judgement of a batch beside its rows and their record.
-
-    held: whether its rows wait for a decision about a change; waited: whether learning waited before it. open: whether
-    the stream's gate stands back. doubted: whether the stream did not fit from its first second on; aside: whether
-    nothing of it is learnt. until: latest event time of its predicted rows, s, None without any. departure: of the
-    model, after it. surprise: mean of e²/s² of the rows that count, (n,), see `Found`. answered: what intervals held;
-    accepted_scale: what others are answered with; None of both if intervals do not adapt.
-    """
+    """What the log stores about a batch besides its rows and their record."""
 
     held: bool
+    """Whether its rows await a decision about a change."""
     waited: bool
+    """Whether learning was paused before the batch."""
     open: bool
+    """Whether the stream's contact gate is open."""
     doubted: bool
+    """Whether the stream has not fitted since its first second."""
     aside: bool
+    """Whether no row of the batch is learnt."""
     until: float | None
+    """Latest event time of the predicted rows, s; None if there are none."""
     departure: Departure | None
+    """Departure of the model after the batch."""
     surprise: Array | None
-    answered: HeldIntervals | None
-    accepted_scale: Adaptive | None
+    """Mean of e²/s², (n,), see `ChangeFindings.surprise`."""
+    answered: IntervalCoverage | None
+    """Coverage of the intervals that were returned; None if intervals do not adapt."""
+    accepted_scale: AdaptiveScale | None
+    """Scale for queries without this stream; None if intervals do not adapt."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return the fields as the log keeps them; `from_json` returns the same to the last bit."""
-        adaptive = {name: each.to_json() for name in ADAPTIVE if (each := getattr(self, name)) is not None}
+        """Return the fields as the log stores them; `from_json` restores them to the last bit."""
+        adaptive = {name: each.to_json() for name in ADAPTIVE_FIELDS if (each := getattr(self, name)) is not None}
         return {
             **{name: getattr(self, name) for name in ("held", "waited", "open", "doubted", "aside", "until")},
             "departure": None if self.departure is None else self.departure.to_json(),
@@ -79,7 +82,7 @@ class LoggedJudgement:
 
     @staticmethod
     def from_json(report: Mapping[str, Any]) -> LoggedJudgement:
-        """Read what `to_json` returned, from all that the log keeps of a batch. Release 0.2.0 did not keep `doubted`,
+        """Read what `to_json` returned, from the log's report of a batch. Release 0.2.0 did not store `doubted`,
         `aside` and `accepted_scale`."""
         departure, surprise, answered, scale = (
             report.get(name) for name in ("departure", "surprise", "answered", "accepted_scale")
@@ -93,42 +96,41 @@ class LoggedJudgement:
             report["until"],
             None if departure is None else Departure.from_json(departure),
             None if surprise is None else np.array(surprise, np.float64),
-            None if answered is None else HeldIntervals.from_json(answered),
-            None if scale is None else Adaptive.from_json(scale),
+            None if answered is None else IntervalCoverage.from_json(answered),
+            None if scale is None else AdaptiveScale.from_json(scale),
         )
 
 
-ADAPTIVE = ("answered", "accepted_scale")
+ADAPTIVE_FIELDS = ("answered", "accepted_scale")
 
 
 @dataclass(frozen=True)
 class ModelRecord:
-    """What is known of a model that learns after its last batch, whichever stream it came from; immutable.
-
-    held: whether learning waits for a decision about a change; detector: of errors that grow; departure: from the
-    version as trained, None before the first batch; innovations: those of this service's own batches, as the log has no
-    predictions.
-    """
+    """The record of a learning model after its last batch, of whichever stream; immutable."""
 
     innovations: Innovations
+    """Innovations of the batches of this service: the log stores no predictions."""
     detector: ChangeDetector = field(default_factory=ChangeDetector)
+    """Detects errors that grow."""
     departure: Departure | None = None
+    """Departure from the version as trained; None before the first batch."""
     held: bool = False
+    """Whether learning is paused until a change is decided about."""
 
     def step(self, record: Record, surprise: Array, until: float) -> tuple[ModelRecord, Change | None]:
-        """Let the detector take in the record of a batch, and return the change that it finds."""
+        """Pass the record of a batch to the detector; return the model's record and the change found."""
         detector, change = self.detector.step(replace(record, standardised=surprise), until)
         return replace(self, detector=detector), change
 
     def settled(self, logged: LoggedJudgement) -> ModelRecord:
-        """Return the record once a batch was decided about."""
+        """Return the record after the decision about a batch."""
         waits = logged.held or logged.open or logged.until is None
         detector = self.detector if waits else self.detector.acknowledged()
         return replace(self, detector=detector, departure=logged.departure, held=logged.held)
 
     def follow(self, logged: LoggedJudgement, record: Record | None, recent: bool) -> ModelRecord:
-        """Return the record after a batch that was judged elsewhere, or before a restart. recent: whether the detector
-        still looks back to it."""
+        """Return the record after a batch that was judged by another process or before a restart. recent: whether the
+        batch is still within the detector's window."""
         before = self.decided() if self.held and not logged.waited else self
         if not recent:
             return replace(before, departure=logged.departure, held=logged.held)
@@ -137,9 +139,9 @@ class ModelRecord:
         return before.settled(logged)
 
     def decided(self) -> ModelRecord:
-        """Return the record once the hold has ended."""
+        """Return the record after the change was decided about."""
         return replace(self, held=False, departure=self.departure and self.departure.decided())
 
     def moved(self, step: float) -> ModelRecord:
-        """Return the record by a clock that was set by `step`, s."""
+        """Return the record after the clock was set by `step`, s."""
         return replace(self, detector=self.detector.moved(step))

@@ -1,4 +1,4 @@
-"""Which predicted rows are learnt: contacts are not, nor rows after a change that waits for a decision."""
+"""Decide which predicted rows are learnt: contacts are rejected, and all rows while a change awaits a decision."""
 
 from __future__ import annotations
 
@@ -17,49 +17,52 @@ from lipcore.online.changes.opening import Opening
 from lipcore.online.gates import ContactGate, is_contact
 from lipcore.online.judgement import LoggedJudgement, ModelRecord
 from lipcore.online.record import Record
-from lipcore.online.scale import HeldIntervals, ScaleRecord
-from lipcore.online.screening import Screened, Trained
+from lipcore.online.scale import IntervalCoverage, ScaleRecord
+from lipcore.online.screening import BasePrediction, PredictedBatch
 from lipcore.online.stream import StreamRecord
 from lipcore.vocabulary import Code
 
-ACCEPTED = (Code.LEARNT, Code.STATIONARY, Code.PAYLOAD)
-"""Codes of rows that are not kept out: the model, with the payload it knows of, is to explain them."""
+ACCEPTED_CODES = (Code.LEARNT, Code.STATIONARY, Code.PAYLOAD)
+"""Codes of rows that were not rejected. The model, with the payload it knows of, must explain them."""
 
 
 @dataclass(frozen=True)
 class JudgeOptions:
-    """What the owner of a model has set.
-
-    enabled: whether rows are learnt; on_change: what follows from a change; contact_threshold: standard deviations from
-    which on a row is a contact; adaptive_intervals: whether streams have a scale.
-    """
+    """Options that the owner of a model has set."""
 
     enabled: bool = True
+    """Whether rows are learnt."""
     on_change: Literal["hold", "adapt", "learn"] = "hold"
+    """What a change of the robot does: pause learning, adapt to it, or continue."""
     contact_threshold: float = 8.0
+    """Min standard deviations of a contact."""
     adaptive_intervals: bool = True
+    """Whether streams scale their intervals."""
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What becomes of a batch.
-
-    rows: with their final codes. record: of those that count for quality, None without any. logged: what the log keeps
-    beside both. stream, model: what is known after the batch. change: detected with these rows; departed, opened: what
-    shows it, if that is the distance from the version as trained, or how the stream began.
-    """
+    """The decision about a batch, and the records after it."""
 
     rows: Rows
+    """The rows with their final codes."""
     record: Record | None
+    """Record of the rows that count for quality; None if there are none."""
     logged: LoggedJudgement
+    """What the log stores besides these two."""
     stream: StreamRecord
+    """Record of the stream after the batch."""
     model: ModelRecord
+    """Record of the model after the batch."""
     change: Change | None = None
+    """The change that these rows show."""
     departed: Departure | None = None
+    """The departure from the version as trained, if it is the cause of the change."""
     opened: Opening | None = None
+    """The first second of the stream, if it is the cause of the change."""
 
     def evidence(self, joint_names: Sequence[str]) -> dict[str, Any]:
-        """Evidence of the change, for JSON."""
+        """Return the evidence of the change for JSON."""
         assert self.change is not None
         evidence = self.change.evidence(joint_names, self.model.innovations.friction(self.change.at))
         reason = self.departed or self.opened
@@ -67,33 +70,36 @@ class Judgement:
 
 
 @dataclass(frozen=True)
-class Gated:
-    """The P rows that were predicted, after the gate of contacts. gate: after them; passing: whether contacts are let
-    through; counted: rows that count for quality, (P,)."""
+class GateResult:
+    """The P predicted rows after the contact gate."""
 
     rows: Rows
     contact: NDArray[np.bool_]
     gate: ContactGate
+    """The gate after these rows."""
     passing: bool
+    """Whether contacts are let through."""
     counted: NDArray[np.bool_]
+    """Rows that count for quality, (P,)."""
 
 
 @dataclass(frozen=True)
-class Found:
-    """What the rows of a batch say of the robot. model, opening: after them; surprise: mean of e²/s² of the rows that
-    count, (n,), with s less the floor of past errors, which would hide a change from the detector."""
+class ChangeFindings:
+    """What the rows of a batch show about the robot. `model` and `opening` are the records after them."""
 
     model: ModelRecord
     opening: Opening | None
     record: Record | None = None
     surprise: Array | None = None
+    """Mean of e²/s² of the counted rows, (n,). s excludes the floor of past errors, which would hide a change from the
+    detector."""
     change: Change | None = None
     departed: Departure | None = None
     opened: Opening | None = None
 
 
 def judge(
-    batch: Screened,
+    batch: PredictedBatch,
     stream: StreamRecord,
     model: ModelRecord,
     options: JudgeOptions,
@@ -101,11 +107,11 @@ def judge(
     received: float,
     carried: float | None = None,
 ) -> Judgement:
-    """Decide about the rows of a batch that were predicted.
+    """Decide about the predicted rows of a batch.
 
-    stream, model: what is known before it. usual: returns the record of the time before. received: when the rows came,
-    Unix time, s. carried: event time, s, from which on the arm carries something, None if it does not: such rows teach
-    what it carries, and not the arm.
+    stream, model: the records before the batch. usual: returns the record of the time before. received: when the rows
+    arrived, Unix time, s. carried: event time, s, since when the arm carries a payload, None if it carries none. Rows
+    since then are used to estimate the payload, not the arm.
     """
     gated = gate_rows(batch, stream.gate, model.held, options)
     found = find_change(batch, gated, stream, model, usual, received, carried)
@@ -115,15 +121,15 @@ def judge(
     gate, departure = gated.gate, found.model.departure
     if followed and not held:
         if found.departed is None:
-            gate = gate.stand_back()  # after a departure it does not, as what is learnt is followed too well
+            gate = gate.let_all_pass()  # after a departure errors are small: the gate stays closed
         departure = departure and departure.decided()
-    rows = _coded(batch, gated, gate, held, options, carried)
+    rows = _assign_codes(batch, gated, gate, held, options, carried)
     doubted = held and (found.opened is not None or stream.doubted)
-    scale, answered = _scaled(batch, rows, stream.scale, options)
+    scale, answered = _follow_scale(batch, rows, stream.scale, options)
     logged = LoggedJudgement(
         held=held,
         waited=model.held,
-        open=gate.open,
+        open=gate.is_open,
         doubted=doubted,
         aside=held or not options.enabled,
         until=None if batch.until is None else min(batch.until, received + AHEAD_S),
@@ -144,63 +150,74 @@ def judge(
     )
 
 
-def gate_rows(batch: Screened, gate: ContactGate, waiting: bool, options: JudgeOptions) -> Gated:
-    """Tell contacts from rows that fit. waiting: whether learning waits for a decision, and the gate with it."""
+def gate_rows(batch: PredictedBatch, gate: ContactGate, waiting: bool, options: JudgeOptions) -> GateResult:
+    """Separate contacts from rows that fit. waiting: whether learning is paused by a change, which stops the gate,
+    too."""
     rows = batch.rows.take(batch.predicted)
     contact = is_contact(rows.tau, batch.mean, batch.std, batch.noise_std, options.contact_threshold)
     after = gate if waiting else gate.step(rows.time, contact)
-    passing = waiting or gate.open or after.exhausted
-    return Gated(rows, contact, after, passing, np.ones(len(rows), np.bool_) if passing else ~contact)
+    passing = waiting or gate.is_open or after.exhausted
+    return GateResult(rows, contact, after, passing, np.ones(len(rows), np.bool_) if passing else ~contact)
 
 
 def find_change(
-    batch: Screened,
-    gated: Gated,
+    batch: PredictedBatch,
+    gated: GateResult,
     stream: StreamRecord,
     model: ModelRecord,
     usual: Callable[[], Record],
     received: float,
     carried: float | None,
-) -> Found:
-    """Look for a change of the robot: by how the stream began, by contacts without end, by errors that have grown, by
-    the distance from the version as trained, in this order."""
+) -> ChangeFindings:
+    """Return the change of the robot that the rows show, if any.
+
+    The causes are checked in this order: the stream's first second, contacts that do not end, errors that have grown,
+    and departure from the version as trained.
+    """
     rows, counted, opening = gated.rows, gated.counted, stream.opening
     if not len(rows):
-        return Found(model, opening)
+        return ChangeFindings(model, opening)
     opened: Opening | None = None
     if opening is not None:
-        opening = _begun(opening, batch, rows, carried)
-        opened, opening = (opening if opening.misfit else None), (None if opening.over else opening)
+        opening = _extend_opening(opening, batch, rows, carried)
+        opened, opening = (opening if opening.is_misfit else None), (None if opening.is_complete else opening)
     record, surprise, change, departed, following = None, None, None, None, model
-    known = model.held or stream.gate.open  # a change is known of: what follows from it is none of its own
+    known = model.held or stream.gate.is_open  # consequences of a known change are not another change
     if counted.any():
         error, bare = (rows.tau - batch.mean)[counted], batch.bare[counted]
-        answered = batch.answered or batch
+        answered = batch.stream_answers or batch
         record = Record.of(rows.tau[counted], answered.mean[counted], answered.std[counted], batch.noise_std)
         surprise = (error**2 / (bare**2 + batch.noise_std**2)).mean(axis=0)
         following, change = model.step(record, surprise, min(float(rows.time.max()), received + AHEAD_S))
         if not known and batch.trained is not None:
-            compared = _compared(model.departure, batch, batch.trained, rows, counted)
+            compared = _follow_departure(model.departure, batch, batch.trained, rows, counted)
             following = replace(following, departure=compared)
     departure = following.departure
-    if opened is not None and opened.since is not None and not stream.gate.open:
-        change = Change(opened.since, opened.joints, usual(), _everything(batch, rows), "sudden")
+    if opened is not None and opened.since is not None and not stream.gate.is_open:
+        change = Change(opened.since, opened.joints, usual(), _record_predicted(batch, rows), "sudden")
     elif known:
         change = None
     elif change is None and gated.gate.exhausted:
-        change = _lasting(gated.gate, _everything(batch, rows), usual(), rows)
+        change = _make_lasting_change(gated.gate, _record_predicted(batch, rows), usual(), rows)
     elif change is None and departure is not None and departure.joints:
         departed = departure
-        change = Change(departure.began, departure.joints, usual(), _everything(batch, rows), "departure")
-    following = replace(following, innovations=model.innovations.then(rows, batch.mean))
-    return Found(following, opening, record, surprise, change, departed, opened if change is not None else None)
+        change = Change(departure.began, departure.joints, usual(), _record_predicted(batch, rows), "departure")
+    following = replace(following, innovations=model.innovations.append(rows, batch.mean))
+    return ChangeFindings(
+        following, opening, record, surprise, change, departed, opened if change is not None else None
+    )
 
 
-def _coded(
-    batch: Screened, gated: Gated, gate: ContactGate, held: bool, options: JudgeOptions, carried: float | None
+def _assign_codes(
+    batch: PredictedBatch,
+    gated: GateResult,
+    gate: ContactGate,
+    held: bool,
+    options: JudgeOptions,
+    carried: float | None,
 ) -> Rows:
-    """The rows of a batch with their final codes. gate: once a change was decided about."""
-    learnt = np.where(gated.contact & (not (gated.passing or gate.open)), Code.CONTACT, Code.LEARNT)
+    """Return the rows of a batch with their final codes. gate: after the decision about a change."""
+    learnt = np.where(gated.contact & (not (gated.passing or gate.is_open)), Code.CONTACT, Code.LEARNT)
     if carried is not None:
         learnt = np.where((learnt == Code.LEARNT) & (gated.rows.time >= carried), Code.PAYLOAD, learnt)
     if not options.enabled:
@@ -210,38 +227,39 @@ def _coded(
     return replace(batch.rows, code=codes)
 
 
-def _scaled(
-    batch: Screened, rows: Rows, known: ScaleRecord | None, options: JudgeOptions
-) -> tuple[ScaleRecord | None, HeldIntervals | None]:
-    """The scale of a stream's intervals after a batch, and what its intervals held; None if they do not adapt. Another
-    version begins anew, from its own scale."""
-    if not options.adaptive_intervals or batch.seen is None:
+def _follow_scale(
+    batch: PredictedBatch, rows: Rows, known: ScaleRecord | None, options: JudgeOptions
+) -> tuple[ScaleRecord | None, IntervalCoverage | None]:
+    """Return the scale of a stream's intervals after a batch, and their coverage; None if intervals do not adapt.
+    Another version starts from its own scale."""
+    if not options.adaptive_intervals or batch.interval_scores is None:
         return None, None
     if known is None or known.version != batch.version:
         known = ScaleRecord.start(batch.scale, batch.version)
-    held = HeldIntervals.of(known.state, batch.seen)
-    # other errors were of the arm without what it carries, or with what it no longer does
-    if batch.answered is None:
-        known = known.step(batch.seen, np.isin(rows.code[batch.asked], ACCEPTED))
+    held = IntervalCoverage.of(known.state, batch.interval_scores)
+    # errors of predictions with another payload say nothing about the scale
+    if batch.stream_answers is None:
+        known = known.step(batch.interval_scores, np.isin(rows.code[batch.answerable], ACCEPTED_CODES))
     return known, held
 
 
-def _begun(opening: Opening, batch: Screened, rows: Rows, carried: float | None) -> Opening:
-    """A stream's opening after rows; those that carry what was noticed with them were predicted without it."""
+def _extend_opening(opening: Opening, batch: PredictedBatch, rows: Rows, carried: float | None) -> Opening:
+    """Return a stream's opening after these rows. Rows of a payload noticed in this batch were predicted without it,
+    and are left out."""
     own = np.full(len(rows), True) if carried is None or batch.trained is None else rows.time < carried
     spread = batch.scale * np.sqrt(batch.bare**2 + batch.noise_std**2)
     return opening.step(rows.time[own], rows.weight[own], (rows.tau - batch.mean)[own], spread[own])
 
 
-def _everything(batch: Screened, rows: Rows) -> Record:
-    """Record of the rows that were predicted, contacts too: what a change is shown with."""
+def _record_predicted(batch: PredictedBatch, rows: Rows) -> Record:
+    """Return the record of all predicted rows, contacts included: the evidence of a change."""
     return Record.of(rows.tau, batch.mean, batch.std, batch.noise_std)
 
 
-def _compared(
-    before: Departure | None, batch: Screened, trained: Trained, rows: Rows, counted: NDArray[np.bool_]
+def _follow_departure(
+    before: Departure | None, batch: PredictedBatch, trained: BasePrediction, rows: Rows, counted: NDArray[np.bool_]
 ) -> Departure:
-    """The departure from a version as trained after rows, (P,), those of them that count: (P,)."""
+    """Return the departure from a version as trained after P rows. counted: (P,)."""
     if before is None or before.version != batch.version:
         before = Departure.start(batch.version, rows.tau.shape[1])
     kept = counted[trained.rows]
@@ -250,8 +268,8 @@ def _compared(
     return before.step(compared.time, trained.share * compared.weight, error, std, batch.noise_std)
 
 
-def _lasting(gate: ContactGate, record: Record, usual: Record, rows: Rows) -> Change:
-    """A change that shows as contacts without end."""
+def _make_lasting_change(gate: ContactGate, record: Record, usual: Record, rows: Rows) -> Change:
+    """Return a change that shows as contacts that do not end."""
     far = np.flatnonzero(record.standardised > OPTIONS.ratio)
     joints = far if len(far) else [record.standardised.argmax()]
     at = float(rows.time[0]) if gate.began is None else gate.began

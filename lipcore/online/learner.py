@@ -1,4 +1,4 @@
-"""A model that learns: a trained version and the sums of what has come since."""
+"""Learn online: a trained version and the sums of the rows since."""
 
 from __future__ import annotations
 
@@ -16,35 +16,36 @@ from lipcore.online.regime import WALK, Regime, Walk
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.statistics import Statistics, add_to, empty
 
-CHUNK = 500
-"""Rows whose features are computed together: they take 28 MB at a thousand variables."""
-Novel = Callable[[NDArray[np.bool_]], None]
-"""Called with which of some rows, (N,), lie beyond the basis; see `uncovered`."""
+CHUNK_ROWS = 500
+"""Rows whose features are computed together: 28 MB for a thousand variables."""
+NovelRowsCallback = Callable[[NDArray[np.bool_]], None]
+"""Receives a mask, (N,), of the rows that lie outside the basis; see `uncovered`."""
 
 
 @dataclass(frozen=True)
 class OnlineModel:
-    """A trained version and what it has learnt since; immutable, every method returns another one.
+    """A trained version and what it has learnt since; immutable, every method returns a new one.
 
-    The posterior is a function of the rows learnt, not of their order: a row of event time t counts its own weight (see
-    `data.independence`), times exp(−(reference − t) / forgetting_s) where there is forgetting. What is forgotten leaves
-    its mean behind, with the prior's uncertainty: the version as trained where that is forgotten. A change begins a new
-    regime, whose prior has the mean of what was known before and the variance that a robot never seen has. Friction may
-    drift besides, see `Walk`: then event time is cut into epochs, each of which has friction of its own, and answers
-    have that of the newest one. All else is common to all epochs.
-
-    base: the version as trained; reference: event time, s, that weights refer to, the latest seen; since: when the
-    version's own samples begin to be forgotten, the first row's time unless given; before: the regime before the last
-    change, which late rows of then still reach; walk: how friction drifts, None where it stays as it is.
+    The posterior is a function of the rows learnt, not of their order. A row of event time t has its own weight (see
+    `data.independence`) times exp(−(reference − t) / forgetting_s), if there is forgetting. Forgotten rows leave their
+    mean and the prior's uncertainty; forgotten training samples leave the version's mean. A change starts a new regime,
+    whose prior has the mean learnt before and the variance of an unknown robot. Friction may also drift, see `Walk`:
+    event time is then divided into epochs, each with its own friction, and predictions use the newest. Everything else
+    is common to all epochs.
     """
 
     base: TorqueModel
+    """The version as trained."""
     forgetting_s: float | None
     since: float | None
+    """When the version's own samples begin to be forgotten, s; by default the time of the first row."""
     reference: float
+    """Event time that weights refer to, s: the latest so far."""
     before: Regime | None
+    """The regime before the last change, which late rows can still reach."""
     now: Regime
     walk: Walk | None = None
+    """How friction drifts; None if it is constant."""
 
     @classmethod
     def start(
@@ -53,17 +54,16 @@ class OnlineModel:
         forgetting_s: float | None = None,
         since: float | None = None,
     ) -> OnlineModel:
-        """A version as trained, with nothing learnt yet.
+        """Return a version as trained, with nothing learnt yet.
 
-        forgetting_s: time constant of forgetting, s, None for never; since: event time, s, from which on the version's
-        own samples are forgotten.
-        Raise ValueError for a wrong time, or a model that has learnt already.
+        forgetting_s: time constant of forgetting, s, None for never; since: event time, s, from which the version's own
+        samples are forgotten. Raise ValueError for an invalid time, or for a model that has already learnt.
         """
         _check(forgetting_s)
         statistics = base.posterior.statistics
         if statistics is None:
             raise ValueError("the model has learnt online already, expected one as trained")
-        # (I + A) ŵ = b: samples that say ŵ have A ŵ = b − ŵ, and the prior around ŵ gives the rest
+        # (I + A) ŵ = b: samples with the mean ŵ have A ŵ = b − ŵ, and the prior around ŵ adds the rest
         centre = base.posterior.basis.root.T @ base.posterior.weights
         sums = Statistics(statistics.a, statistics.b - centre, 0.0)
         reference = -math.inf if since is None else since
@@ -72,53 +72,53 @@ class OnlineModel:
 
     @property
     def samples(self) -> float:
-        """Sum of the weights of the rows learnt in this regime."""
+        """Return the sum of the weights of the rows learnt in this regime."""
         return self.now.samples
 
     def begin(self, since: float) -> OnlineModel:
-        """Say from when on, s of event time, the version's own samples are forgotten, where that is not known yet."""
+        """Set the event time, s, from which the version's own samples are forgotten, if it is not set yet."""
         if self.since is not None:
             return self
-        return replace(self, since=since, reference=max(self.reference, since), walk=_begun(self.walk, since))
+        return replace(self, since=since, reference=max(self.reference, since), walk=_begin_walk(self.walk, since))
 
-    def learn(self, rows: Rows, own: bool = False, novel: Novel | None = None) -> OnlineModel:
-        """Learn the rows of code 0, in any order; those from before the regime before this one teach nothing more, and
-        those of an epoch that is folded count in the oldest one kept.
+    def learn(self, rows: Rows, own: bool = False, novel: NovelRowsCallback | None = None) -> OnlineModel:
+        """Learn the rows of code 0, in any order.
 
-        own: whether nobody else has these sums (see `detached`), so that they can be added to where they are: the model
-        that this is called of is not to be used again, the last of many is to be `symmetrised`. The outcome is the same
-        to the last bit. novel: called for the rows as they are learnt, since their features show whether the basis
-        covers them.
+        Rows from before the previous regime are ignored. Rows of a folded epoch count in the oldest epoch that is
+        stored. own: whether nobody else uses these sums (see `detached`), so that they are overwritten. This model must
+        then not be used again, and the last of a series must be `symmetrised`. The result is the same to the last bit.
+        novel: called for the rows as they are learnt, because their features show whether the basis covers them.
         """
         return self._add(rows.learnt, own, novel)
 
     def detached(self) -> OnlineModel:
-        """The same model with sums of its own, which can be added to."""
+        """Return the same model with sums of its own, which can be overwritten."""
         drifts = self.walk is not None
         return replace(self, before=self.before and self.before.detached(drifts), now=self.now.detached(drifts))
 
     def change(self, at: float) -> OnlineModel:
-        """Begin a new regime at an event time: the mean is kept, its uncertainty is opened.
+        """Start a new regime at an event time: the mean stays, its uncertainty is reset.
 
-        It begins after the latest row learnt where that is later: a row belongs to one regime for good.
+        It starts after the latest row learnt, if that is later: a row belongs to one regime for good.
         """
         begins = max(at, math.nextafter(max(self.reference, self.now.begins), math.inf))
         fresh = Regime(begins, self.now.solve(self.walk).mean, empty(len(self.now.centre)))
         return replace(self, before=self.now, now=fresh)
 
     def with_forgetting(self, forgetting_s: float | None) -> OnlineModel:
-        """Forget otherwise from here on. forgetting_s: s, None for never; raise ValueError unless above zero."""
+        """Return the model with another forgetting from now on. forgetting_s: s, None for never; raise ValueError
+        unless positive."""
         _check(forgetting_s)
         return replace(self, forgetting_s=forgetting_s)
 
     def with_walk(self, friction_walk_s: float | None) -> OnlineModel:
-        """Let friction drift otherwise from here on, or not any more; nothing happens where it does so already.
+        """Return the model with another friction drift from now on; unchanged if it is the same.
 
-        friction_walk_s: s, None for never; raise ValueError unless above zero.
+        friction_walk_s: s, None for never; raise ValueError unless positive.
         """
         if friction_walk_s == (None if self.walk is None else self.walk.time_s):
             return self
-        # what has been learnt so far is the past of the first epoch, from one step before it
+        # the sums so far become the past of the first epoch, one step before it
         fresh = self.since is None or self.reference <= self.since
         now, before = (each and each.closed(self.walk, -WALK.cold if fresh else -1) for each in (self.now, self.before))
         assert now is not None
@@ -129,12 +129,12 @@ class OnlineModel:
 
     @property
     def training_torque(self) -> TrainingTorque | None:
-        """The version's, by which answers fall back. None after a change and with forgetting, which widen the variance
-        of torques whose mean is still the best that is known."""
+        """Return the version's, for the fallback of predictions. It is None after a change and with forgetting: these
+        widen the variance of torques whose mean is still the best estimate."""
         return self.base.training_torque if self.before is None and self.forgetting_s is None else None
 
     def model(self, floor: Array | None = None) -> TorqueModel:
-        """Solve for the model that answers. floor: (n,) (N·m)², which its variances are never below."""
+        """Solve for the model that predicts. floor: (n,) (N·m)², the min of its variances."""
         posterior = self.base.posterior
         updated = CompactPosterior.solved(
             posterior.kernel,
@@ -148,22 +148,26 @@ class OnlineModel:
         return replace(self.base, posterior=updated, training_torque=self.training_torque)
 
     def symmetrised(self) -> OnlineModel:
-        """Return the same model with both triangles of its sums, once it has learnt with `own`."""
+        """Return the same model with both triangles of its sums, after learning with `own`."""
         for regime in (self.now, self.before):
             if regime is not None:
                 regime.symmetrise()
         return self
 
-    def _add(self, rows: Rows, own: bool, novel: Novel | None) -> OnlineModel:
+    def _add(self, rows: Rows, own: bool, novel: NovelRowsCallback | None) -> OnlineModel:
         if not len(rows):
             return self
         model = self if own else self.detached()
-        parts = [rows] if len(rows) <= CHUNK else [rows.take(slice(i, i + CHUNK)) for i in range(0, len(rows), CHUNK)]
+        parts = (
+            [rows]
+            if len(rows) <= CHUNK_ROWS
+            else [rows.take(slice(i, i + CHUNK_ROWS)) for i in range(0, len(rows), CHUNK_ROWS)]
+        )
         for part in parts:
             model = model._add_chunk(part, novel)
         return model if own else model.symmetrised()
 
-    def _add_chunk(self, rows: Rows, novel: Novel | None) -> OnlineModel:
+    def _add_chunk(self, rows: Rows, novel: NovelRowsCallback | None) -> OnlineModel:
         latest = max(self.reference, float(rows.time.max()))
         model = self._aged(latest, float(rows.time.min()) if self.since is None else self.since)
         current = rows.time >= model.now.begins
@@ -173,12 +177,12 @@ class OnlineModel:
             now = model._learnt(now, taken, novel)
         if before is not None and (late := ~current & (rows.time >= before.begins)).any():
             before = model._learnt(before, rows.take(late), novel)
-            # folded epochs of `now` were drawn back to the centre of then: a share √(1 − s) from here, which is near 1
+            # folded epochs of `now` keep the centre of that time: a share √(1 − s) of this one, which is near 1
             now = replace(now, centre=before.solve(model.walk).mean)
         return replace(model, now=now, before=before)
 
-    def _learnt(self, regime: Regime, rows: Rows, novel: Novel | None) -> Regime:
-        """A regime, overwritten, with its rows added."""
+    def _learnt(self, regime: Regime, rows: Rows, novel: NovelRowsCallback | None) -> Regime:
+        """Return a regime, overwritten, with the rows added."""
         if self.walk is None:
             return replace(regime, statistics=self._summed(regime.statistics, rows, novel))
         numbers = regime.place(self.walk.number(rows.time))
@@ -188,8 +192,8 @@ class OnlineModel:
             regime = regime.with_epoch(number, self._summed(regime.of_epoch(number), part, novel))
         return regime.folded(self.walk)
 
-    def _summed(self, statistics: Statistics, rows: Rows, novel: Novel | None) -> Statistics:
-        """These statistics, overwritten, with the rows added."""
+    def _summed(self, statistics: Statistics, rows: Rows, novel: NovelRowsCallback | None) -> Statistics:
+        """Return these statistics, overwritten, with the rows added."""
         posterior, motion = self.base.posterior, rows.motion()
         weights = rows.weight
         if self.forgetting_s is not None:
@@ -201,9 +205,9 @@ class OnlineModel:
         return add_to(statistics, features, posterior.row_variance(motion) + open_, residual, weights)
 
     def _aged(self, reference: float, since: float) -> OnlineModel:
-        """The same knowledge as it weighs at a later reference time; its sums are overwritten."""
+        """Return the same knowledge with the weights of a later reference time; its sums are overwritten."""
         age = reference - max(self.reference, since)
-        walk = _begun(self.walk, since)
+        walk = _begin_walk(self.walk, since)
         if self.forgetting_s is None or age <= 0:
             return replace(self, reference=reference, since=since, walk=walk)
         factor = math.exp(-age / self.forgetting_s)
@@ -212,7 +216,8 @@ class OnlineModel:
 
 
 def uncovered(base: TorqueModel, rows: Rows) -> NDArray[np.bool_]:
-    """Which rows lie beyond a version's basis: it leaves more variance of a torque open than its noise has, (N,)."""
+    """Return which rows lie outside a version's basis, (N,): it leaves more variance of a torque open than the noise
+    has."""
     basis, motion = base.posterior.basis, rows.motion()
     open_ = basis.uncovered(motion, basis.features(motion))
     novel = np.asarray((open_ > base.posterior.noise_variance).any(1))
@@ -224,6 +229,6 @@ def _check(forgetting_s: float | None) -> None:
         raise ValueError(f"forgetting_s is {forgetting_s!r}, expected a positive number of seconds, or None")
 
 
-def _begun(walk: Walk | None, since: float) -> Walk | None:
-    """The walk, whose first epoch begins then where that is not known yet."""
+def _begin_walk(walk: Walk | None, since: float) -> Walk | None:
+    """Return the walk with its first epoch beginning at `since`, if that is not set yet."""
     return replace(walk, since=since) if walk is not None and walk.since is None else walk

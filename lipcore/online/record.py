@@ -1,4 +1,4 @@
-"""How well torques were predicted before they were learnt from, in sums that add up: the prequential record."""
+"""Sum up how well torques were predicted before they were learnt: the prequential record."""
 
 from __future__ import annotations
 
@@ -14,57 +14,63 @@ if TYPE_CHECKING:
     from lipcore.data.samples import Array
 
 LEVEL = 0.95
-"""Probability of the interval that `inside` counts."""
+"""Probability of the interval that `inside` refers to."""
 HALF_WIDTH = quantile(LEVEL)
-FIGURES = ("error", "squared", "inside", "nlpd", "standardised", "variance", "noise")
-"""Plain means over the rows; `mean` and `spread` belong together and merge by Chan's formula."""
-FEWEST_ROWS = 50
-"""Fewer rows say too little: noise alone moves the mean of 49 squares by a fifth."""
-DEVIATIONS = 3.0
-"""Standard errors beyond which an excess is not chance."""
+MEAN_FIELDS = ("error", "squared", "inside", "nlpd", "standardised", "variance", "noise")
+"""Plain means over the rows. `mean` and `spread` are merged together, by Chan's formula."""
+MIN_FLOOR_ROWS = 50
+"""Fewer rows raise no floor: noise alone changes the mean of 49 squares by a fifth."""
+MIN_FLOOR_STDS = 3.0
+"""Min standard errors of an excess that is not chance."""
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """What `rows` rows say about predictions made before they were learnt, per joint (n,).
+    """Quality of predictions made before `rows` rows were learnt, per joint (n,). e = tau − mean, s² = std² +
+    noise_std².
 
-    With e = tau − mean and s² = std² + noise_std²: `error` the mean of e, `squared` of e², `standardised` of e²/s²,
-    `nlpd` of ½ log(2π s²) + ½ e²/s² (nats), `variance` of std² (of the function alone), `noise` of noise_std²; `inside`
-    the share of |e| within the 95 % interval ±1.96 s; `mean`, `spread` mean and mean squared deviation of tau itself.
-
-    Records add: `a + b` is the record of the rows of both, associative and commutative up to rounding. Means are kept
-    and not sums, and spread is merged by Chan's formula, so that the weight of an arm does not cancel.
+    Records add: `a + b` is the record of the rows of both, associative and commutative up to rounding. Means are stored
+    instead of sums, and spread is merged by Chan's formula, so that a large constant torque does not cancel digits.
     """
 
     rows: int
     error: Array
+    """Mean of e, N·m."""
     squared: Array
+    """Mean of e²."""
     mean: Array
+    """Mean of tau."""
     spread: Array
+    """Mean squared deviation of tau from its mean."""
     inside: Array
+    """Share of |e| within the 95 % interval ±1.96 s."""
     nlpd: Array
+    """Mean of ½ log(2π s²) + ½ e²/s², nats."""
     standardised: Array
+    """Mean of e²/s²."""
     variance: Array
+    """Mean of std², of the function alone."""
     noise: Array
+    """Mean of noise_std²."""
 
     @staticmethod
     def empty(n: int) -> Record:
-        """The record of no rows of n joints: what adds nothing."""
+        """Return the record of no rows of n joints, the neutral element of addition."""
         return Record(0, *(np.zeros(n) for _ in range(len(fields(Record)) - 1)))
 
     @staticmethod
     def of(tau: Array, mean: Array, std: Array, noise_std: Array, scale: Array | float = 1.0) -> Record:
-        """Record of measured torques tau (N, n) against mean and function std (N, n) and noise std (n,) or (N, n).
+        """Return the record of torques tau (N, n) with predictions mean, std (N, n), and noise_std (n,) or (N, n).
 
-        scale: (n,), factor on the half width of the intervals that hold what is `inside`. Raise ValueError where shapes
-        differ, a value is not finite, or an interval has no width: one such row would spoil every sum that it enters.
+        scale: (n,), factor on the half width of the intervals for `inside`. Raise ValueError if shapes differ, a value
+        is not finite, or an interval has no width: one such row would spoil every sum.
         """
         total = _deviation(tau, mean, std, noise_std)
         if len(tau) == 0:
             return Record.empty(tau.shape[1])
         error = tau - mean
         ratio = (error / total) ** 2
-        # the rounded mean of equal numbers is not always that number, which would give a constant torque a spread
+        # rounding can shift the mean of equal numbers, and a constant torque would get a spread
         centre = np.where(np.ptp(tau, axis=0) > 0, tau.mean(axis=0), tau[0])
         return Record(
             rows=len(tau),
@@ -80,7 +86,7 @@ class Record:
         )
 
     def __add__(self, other: Record) -> Record:
-        """Record of the rows of both; raise ValueError where they have different joints."""
+        """Return the record of the rows of both; raise ValueError if their joints differ."""
         if self.n_joints != other.n_joints:
             raise ValueError(f"records of {self.n_joints} and {other.n_joints} joints do not add")
         if not other.rows:
@@ -89,7 +95,7 @@ class Record:
             return other
         rows = self.rows + other.rows
         share = other.rows / rows
-        means = {name: _between(getattr(self, name), getattr(other, name), share) for name in FIGURES}
+        means = {name: _between(getattr(self, name), getattr(other, name), share) for name in MEAN_FIELDS}
         apart = share * (1 - share) * (other.mean - self.mean) ** 2
         return Record(
             rows=rows,
@@ -105,22 +111,22 @@ class Record:
 
     @property
     def rmse(self) -> Array:
-        """Root of the mean squared error, N·m: (n,), NaN without rows."""
+        """Return the root mean squared error, N·m: (n,), NaN without rows."""
         return np.sqrt(self._known(self.squared))
 
     @property
     def nmse(self) -> Array:
-        """Mean squared error / variance of the torque: (n,), NaN where the torque did not vary."""
+        """Return the mean squared error / variance of the torque: (n,), NaN if the torque did not vary."""
         out = np.full(self.n_joints, np.nan)
         return np.asarray(np.divide(self.squared, self.spread, out=out, where=self.spread > 0))
 
     @property
     def coverage(self) -> Array:
-        """Share of measurements inside the 95 % interval, noise included: (n,), NaN without rows."""
+        """Return the share of measurements inside the 95 % interval, noise included: (n,), NaN without rows."""
         return self._known(self.inside)
 
     def metrics(self) -> dict[str, list[float | None]]:
-        """nmse, rmse, coverage, nlpd and standardised error, one number a joint, for JSON: None where not known."""
+        """Return nmse, rmse, coverage, nlpd and standardised error, one number per joint, for JSON: None if unknown."""
         figures = {
             "nmse": self.nmse,
             "rmse": self.rmse,
@@ -131,12 +137,12 @@ class Record:
         return {name: [number(value) for value in values] for name, values in figures.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """All fields as numbers and lists; `from_json` gives back the same record to the last bit."""
+        """Return all fields as numbers and lists; `from_json` restores them to the last bit."""
         return {"rows": self.rows} | {name: getattr(self, name).tolist() for name in _names()}
 
     @staticmethod
     def from_json(values: Mapping[str, Any]) -> Record:
-        """Record that `to_json` wrote; raise ValueError where a field is missing or is no list of n finite numbers."""
+        """Read what `to_json` returned; raise ValueError if a field is missing or is no list of n finite numbers."""
         if missing := [name for name in ("rows", *_names()) if name not in values]:
             raise ValueError(f"record lacks {', '.join(missing)}")
         rows = values["rows"]
@@ -154,7 +160,7 @@ class Record:
 
 
 def number(value: float) -> float | None:
-    """`value` for JSON, which has no NaN: None in its place."""
+    """Return `value` for JSON, which has no NaN: None instead."""
     return float(value) if np.isfinite(value) else None
 
 
@@ -163,12 +169,12 @@ def _names() -> list[str]:
 
 
 def _between(a: Array, b: Array, share: float) -> Array:
-    """Mean of both where b has `share` of the rows; exactly a where they are equal."""
+    """Return the mean of both if b has `share` of the rows; exactly a if they are equal."""
     return np.asarray(a + share * (b - a))
 
 
 def _deviation(tau: Array, mean: Array, std: Array, noise_std: Array) -> Array:
-    """Standard deviation of a measurement, (N, n); raise ValueError for arrays that no record can be made of."""
+    """Return the standard deviation of a measurement, (N, n); raise ValueError for invalid arrays."""
     if tau.ndim != 2:
         raise ValueError(f"tau has shape {tau.shape}, expected (N, n)")
     for name, array in (("mean", mean), ("std", std)):
@@ -186,14 +192,14 @@ def _deviation(tau: Array, mean: Array, std: Array, noise_std: Array) -> Array:
 
 
 def error_floor(record: Record) -> Array:
-    """Function variance (N·m)², (n,), that the errors of `record` prove: mean e² − noise variance, or 0.
+    """Return the function variance (N·m)², (n,), that the errors of `record` prove: mean e² − noise variance, or 0.
 
-    Where the function is right, e is noise: e²/noise has mean 1 and variance 2 (Gaussian), so its mean over N rows has
-    the standard error √(2/N). The excess is reported beyond three of them, mean e² > noise (1 + 3 √(2/N)), and taken
-    whole then. White noise alone raises a floor in 0.3 % (N = 50) to 0.15 % (N = 2000) of the records of one joint, and
-    a small one: about noise · 3 √(2/N). Fewer than 50 rows: 0.
+    If the function is right, e is noise: e²/noise has mean 1 and variance 2 (Gaussian), so its mean over N rows has the
+    standard error √(2/N). An excess of more than three of them, mean e² > noise (1 + 3 √(2/N)), counts in full. White
+    noise alone raises a floor in 0.3 % (N = 50) to 0.15 % (N = 2000) of the records of one joint, and a small one:
+    about noise · 3 √(2/N). Fewer than 50 rows: 0.
     """
-    if record.rows < FEWEST_ROWS:
+    if record.rows < MIN_FLOOR_ROWS:
         return np.zeros(record.n_joints)
-    chance = record.noise * (1 + DEVIATIONS * np.sqrt(2 / record.rows))
+    chance = record.noise * (1 + MIN_FLOOR_STDS * np.sqrt(2 / record.rows))
     return np.where(record.squared > chance, record.squared - record.noise, 0.0)

@@ -1,4 +1,4 @@
-"""What is known of a robot between two changes: sums of its rows, epoch by epoch where its friction drifts."""
+"""Store what is known of a robot between two changes: sums of its rows, per epoch if its friction drifts."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ class WalkOptions:
     """How friction drifts.
 
     On benchmarks/studies/drifting_friction.py (seeds 50 and 51), a third or three times `share`, ten times `min_size`,
-    and half or twice `epochs` moved the nMSE of no case by more than 1 %.
+    and half or twice `epochs` changed the nMSE of no case by more than 1 %.
     """
 
     share: float = 0.3
-    """Standard deviation of a coefficient's change in one time constant of its walk, as a share of its size."""
+    """Standard deviation of a coefficient's change in one time constant, as a share of its size."""
     min_size: float = 0.03
-    """Min size of a coefficient, in its prior standard deviations."""
+    """Min size of a coefficient, in prior standard deviations."""
     epochs: int = 10
-    """Epochs in a time constant: friction is taken to stand still for as long as an epoch lasts."""
+    """Epochs in a time constant: friction is constant within an epoch."""
     kept: int = 4
-    """Epochs whose rows can still come; earlier ones are folded into what is known of before."""
+    """Epochs that can still receive rows; earlier ones are folded into the past."""
     cold: int = 10
     """Epochs between a version's own samples and the first row of a stream: the arm may have been switched off. One
-    epoch or four time constants did as well there over the first two minutes, within 2 % of the nMSE."""
+    epoch or four time constants gave the same nMSE within 2 % over the first two minutes."""
 
 
 WALK = WalkOptions()
@@ -42,19 +42,18 @@ WALK = WalkOptions()
 
 @dataclass(frozen=True)
 class Walk:
-    """How friction drifts: a random walk in steps of one epoch.
-
-    time_s: s in which a coefficient changes by `share` of its trained size; since: event time, s, at which epoch 0
-    begins, None before the first row.
-    """
+    """How friction drifts: a random walk in steps of one epoch."""
 
     time_s: float
+    """Time, s, in which a coefficient changes by `share` of its trained size."""
     since: float | None
+    """Event time, s, at which epoch 0 begins; None before the first row."""
     drift: Drift
 
     @classmethod
     def of(cls, base: TorqueModel, time_s: float, since: float | None = None) -> Walk:
-        """For a version as trained; raise ValueError for a wrong time, or an estimator without friction."""
+        """Return the walk of a version as trained; raise ValueError for an invalid time, or an estimator without
+        friction."""
         if not 0 < time_s < math.inf:
             raise ValueError(f"friction_walk_s is {time_s!r}, expected a positive number of seconds, or None")
         basis = base.posterior.basis
@@ -67,21 +66,21 @@ class Walk:
         return cls(time_s, since, Drift(places, np.minimum(np.square(WALK.share * size) / WALK.epochs, 1.0)))
 
     def number(self, time: Array) -> NDArray[np.int64]:
-        """Epochs of event times, (N,): those before the first belong to it."""
+        """Return the epochs of event times, (N,): times before the first belong to it."""
         assert self.since is not None  # there are rows
         return np.maximum(np.floor((time - self.since) * (WALK.epochs / self.time_s)), 0.0).astype(np.int64)
 
 
 @dataclass(frozen=True)
 class Epoch:
-    """Sums of the rows of one epoch. shared: whether others have them too, so that they are not to be overwritten."""
+    """Sums of the rows of one epoch. shared: whether others use them, too, so that they must not be overwritten."""
 
     number: int
     statistics: Statistics
     shared: bool = False
 
     def writable(self) -> Statistics:
-        """The sums, which can be added to."""
+        """Return the sums, copied if they are shared."""
         return copied(self.statistics) if self.shared else self.statistics
 
 
@@ -89,39 +88,42 @@ class Epoch:
 class Regime:
     """What is known of a robot between two changes: a prior N(centre, I) and the sums of its rows since.
 
-    begins: event time, s. centre: (M,) whitened variables. The trained version is in the sums of the first regime: as
-    samples that say its mean, which is the centre. Where friction drifts, `statistics` are what is known of the
-    variables at epoch `at`, and `epochs` the rows since, rising; else all rows are in `statistics`. shared: whether
-    others have `statistics`, too.
+    The trained version is part of the sums of the first regime, as samples whose mean is the centre.
     """
 
     begins: float
+    """Event time, s."""
     centre: Array
+    """Whitened variables, (M,)."""
     statistics: Statistics
+    """If friction drifts, the sums about the variables at epoch `at`; else the sums of all rows."""
     at: int = -1
     epochs: tuple[Epoch, ...] = ()
+    """If friction drifts, the rows since `at`, in rising order."""
     shared: bool = False
+    """Whether others use `statistics`, too."""
 
     @property
     def samples(self) -> float:
-        """Sum of the weights of the rows."""
+        """Return the sum of the weights of the rows."""
         return self.statistics.samples + sum(each.statistics.samples for each in self.epochs)
 
     def sums(self, walk: Walk | None) -> Statistics:
-        """What the rows say of the variables in the newest epoch."""
+        """Return the sums about the variables of the newest epoch."""
         return self.folded(walk, 0).statistics
 
     def solve(self, walk: Walk | None = None, first: int = 0) -> Solution:
-        """Posterior of the whitened variables, friction that of the newest epoch. first: see `Solution`."""
+        """Return the posterior of the whitened variables, with the friction of the newest epoch. first: see
+        `Solution`."""
         return solve(self.sums(walk), self.centre, first)
 
     def folded(self, walk: Walk | None, kept: int = WALK.kept) -> Regime:
-        """The same knowledge with at most `kept` epochs left: friction of the others is eliminated for good."""
+        """Return the same knowledge with at most `kept` epochs: the friction of the others is eliminated for good."""
         regime = self
         while walk is not None and len(regime.epochs) > kept:
             first = regime.epochs[0]
             past = walk.drift.ahead(regime.statistics, regime.centre, first.number - regime.at)
-            # sums of rows that come are added to one triangle, see `add_to`
+            # new rows are added to one triangle, see `add_to`
             past = Statistics(
                 past.a + first.statistics.a, past.b + first.statistics.b, past.samples + first.statistics.samples
             )
@@ -129,45 +131,45 @@ class Regime:
         return regime
 
     def closed(self, walk: Walk | None, at: int) -> Regime:
-        """The same knowledge without epochs, as that of epoch `at`, in sums that can be added to."""
+        """Return the same knowledge without epochs, about epoch `at`, in sums that can be overwritten."""
         regime = self.folded(walk, 0)
         statistics = copied(regime.statistics) if regime.shared else regime.statistics
         return replace(regime, statistics=statistics, at=at, shared=False)
 
     def place(self, numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-        """The epochs in which rows of such epochs count: the oldest one kept for those that are folded."""
+        """Return the epochs in which rows of these epochs count: for folded ones the oldest that is stored."""
         folded = numbers <= self.at
         return np.where(folded, self.epochs[0].number, numbers) if folded.any() else numbers
 
     def of_epoch(self, number: int) -> Statistics:
-        """Sums of an epoch, which can be added to."""
+        """Return the sums of an epoch, which can be overwritten."""
         for each in self.epochs:
             if each.number == number:
                 return each.writable()
         return empty(len(self.centre))
 
     def with_epoch(self, number: int, statistics: Statistics) -> Regime:
-        """The same with these sums of an epoch."""
+        """Return the regime with these sums of an epoch."""
         others = [each for each in self.epochs if each.number != number]
         epochs = sorted([*others, Epoch(number, statistics)], key=lambda each: each.number)
         return replace(self, epochs=tuple(epochs))
 
     def decayed(self, factor: float) -> Regime:
-        """The same with rows that count a factor as much; its sums are overwritten, those that others have are not."""
+        """Return the regime with the weights times `factor`; its own sums are overwritten, shared ones are not."""
         epochs = [Epoch(each.number, decay(each.statistics, factor, own=not each.shared)) for each in self.epochs]
         past = decay(self.statistics, factor, own=not self.shared)
         return replace(self, statistics=past, epochs=tuple(epochs), shared=False)
 
     def detached(self, drifts: bool) -> Regime:
-        """The same with sums of its own, which can be added to. drifts: whether there are epochs, which are then copied
-        one by one as they are added to, since most of them are not."""
+        """Return the regime with sums of its own, which can be overwritten. drifts: whether there are epochs. They are
+        copied one by one when rows are added, because most of them get none."""
         epochs = tuple(replace(each, shared=True) for each in self.epochs)
         if drifts:
             return replace(self, epochs=epochs, shared=True)
         return replace(self, statistics=copied(self.statistics), epochs=epochs)
 
     def symmetrise(self) -> None:
-        """Make both triangles of the sums equal, once rows were added; those that others have are so already."""
+        """Make both triangles of the sums equal after rows were added; shared sums are equal already."""
         if not self.shared:
             mirror(self.statistics.a)
         for each in self.epochs:

@@ -1,4 +1,4 @@
-"""Rows of a batch before they are learnt: predicted by the version that serves, beside it as trained."""
+"""Predict the rows of a batch before they are learnt, by the serving version and by that version as trained."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from lipcore.online.batch import Rows
 from lipcore.online.gates import is_implausible
 from lipcore.vocabulary import Code
 
-COMPARED, LEAST_COMPARED = 4.0, 10
-"""Rows that are compared with the version as trained, for each effective row, and of a batch at least: neighbours of a
-fast stream say the same, and each prediction takes time of a core."""
+COMPARED_PER_SAMPLE, MIN_COMPARED_ROWS = 4.0, 10
+"""Rows compared with the version as trained: this many per effective sample, and at least so many per batch. Neighbours
+in a fast stream are redundant, and each prediction takes time of a core."""
 
 
 class Version(Protocol):
-    """A version that serves. model: with what it has learnt; base: as trained; version: its number."""
+    """A serving version. model: with what it has learnt online; base: as trained; version: its number."""
 
     @property
     def model(self) -> TorqueModel: ...  # noqa: D102
@@ -34,78 +34,85 @@ class Version(Protocol):
 
 
 @dataclass(frozen=True)
-class Trained:
-    """What the version as trained, which learns nothing, predicts of some of the P rows that were predicted.
-
-    rows: (M,), their places among these; share: rows that each stands for; mean, std: (M, n).
-    """
+class BasePrediction:
+    """Predictions of the version as trained, which learns nothing, for some of the P predicted rows."""
 
     rows: NDArray[np.int64]
+    """Their places among these rows, (M,)."""
     share: float
+    """Number of rows that each of them represents."""
     mean: Array
+    """Predicted torque, (M, n) N·m."""
     std: Array
+    """Its standard deviation, (M, n) N·m."""
 
 
 @dataclass(frozen=True)
-class Seen:
-    """M measurements beside the intervals that the model believes, of rows that were predicted and of rows at rest.
-
-    time: (M,) event time, s; score: (M, n), see `adaptive.scores`; factor: (M, n), on the half width that they were
-    answered with, where a stream has answered them.
-    """
+class IntervalScores:
+    """M measurements compared with the model's intervals: predicted rows and rows at rest."""
 
     time: Array
+    """Event time, (M,) s."""
     score: Array
+    """Errors over half widths, (M, n), see `adaptive.scores`."""
     factor: Array | None
+    """Factor on the half width that the stream's predictions had, (M, n); None if the rows were not predicted
+    before."""
 
 
 @dataclass(frozen=True)
-class Answered:
-    """What a stream has answered N rows with. mean, std: (N, n); factor: (N, n), on half the width of its intervals.
-
-    other_load: whether that was with another load than the arm carries by what is known now: it had noticed none, or
-    one that is gone. Rows are then judged by what is known now.
-    """
+class StreamAnswers:
+    """The predictions that a stream returned for N rows."""
 
     mean: Array
+    """Predicted torque, (N, n) N·m."""
     std: Array
+    """Its standard deviation, (N, n) N·m."""
     factor: Array | None = None
+    """Factor on half the width of its intervals, (N, n)."""
     other_load: bool = False
+    """Whether they were made with another payload than is known now: one that was not noticed yet, or is gone. The rows
+    are then judged with the payload known now."""
 
-    def take(self, rows: NDArray[np.bool_]) -> Answered:
-        """Those of some of the rows, (N,)."""
+    def take(self, rows: NDArray[np.bool_]) -> StreamAnswers:
+        """Return the predictions for the chosen rows, a mask (N,)."""
         factor = None if self.factor is None else self.factor[rows]
-        return Answered(self.mean[rows], self.std[rows], factor, self.other_load)
+        return StreamAnswers(self.mean[rows], self.std[rows], factor, self.other_load)
 
 
 @dataclass(frozen=True)
-class Screened:
-    """Rows, and the predictions of the version that serves for those that passed so far.
-
-    own: which of the rows are of this batch, the others had waited for it. asked: (N,), rows with a finite answer, at
-    rest or not; predicted: (N,); mean, std, bare: (P, n) of these, bare the standard deviation without the floor that
-    past errors put under `std`. noise_std: (n,). version: its number; scale: of its intervals as trained, (n,).
-    trained: see there; None where nothing is compared with it. seen: what intervals are judged by. answered: of the P
-    rows, where that was with another load.
-    """
+class PredictedBatch:
+    """The rows of a batch, with the serving version's predictions for those that passed the gates so far."""
 
     rows: Rows
     own: slice
-    asked: NDArray[np.bool_]
+    """Which rows belong to this batch. The others waited for it."""
+    answerable: NDArray[np.bool_]
+    """Rows with a finite prediction, at rest or not, (N,)."""
     predicted: NDArray[np.bool_]
+    """Rows that passed, P of (N,)."""
     mean: Array
+    """Predicted torque, (P, n) N·m."""
     std: Array
+    """Its standard deviation, (P, n) N·m."""
     bare: Array
+    """`std` without the floor that past errors put under it, (P, n)."""
     noise_std: Array
+    """Standard deviation of the noise, (n,) N·m."""
     version: int
+    """Number of the serving version."""
     scale: Array
-    trained: Trained | None = None
-    seen: Seen | None = None
-    answered: Answered | None = None
+    """Scale of its intervals as trained, (n,)."""
+    trained: BasePrediction | None = None
+    """Predictions of the version as trained; None if they are not compared."""
+    interval_scores: IntervalScores | None = None
+    """Measurements from which the coverage is computed."""
+    stream_answers: StreamAnswers | None = None
+    """Predictions for the P rows, if they were made with another payload."""
 
     @property
     def until(self) -> float | None:
-        """Latest event time of the rows that were predicted, s; None where there are none."""
+        """Latest event time of the predicted rows, s; None if there are none."""
         return float(self.rows.time[self.predicted].max()) if self.predicted.any() else None
 
 
@@ -113,13 +120,15 @@ def predict(
     rows: Rows,
     version: Version,
     own: slice,
-    answered: Answered | None = None,
+    answered: StreamAnswers | None = None,
     carrying: TorqueModel | None = None,
-) -> Screened:
-    """Let a version predict the rows that passed, with what it has learnt and as trained; those it has no finite answer
-    for are beyond its limits, and those whose torque nobody has measured are implausible. answered: of all rows, where
-    a stream has answered them already; carrying: the version with what the arm carries, where it does: it is compared
-    with the version as trained no more."""
+) -> PredictedBatch:
+    """Return the predictions of a version for the rows that passed, with what it has learnt and as trained.
+
+    Rows without a finite prediction get the code `limit`, and torques that cannot be measurements `implausible`.
+    answered: the predictions for all rows, if a stream has returned them already. carrying: the version with the
+    payload, if the arm carries one; it is not compared with the version as trained.
+    """
     model = version.model if carrying is None else carrying
     codes, predicted = rows.code.copy(), rows.code == Code.LEARNT
     asked = predicted | ((codes == Code.STATIONARY) & np.isfinite(rows.ddq).all(axis=1))
@@ -132,14 +141,14 @@ def predict(
         mean, std = given.mean, given.std
         bare = _answers(good, model)[1] if floor.any() else std
     if given is None:
-        given = Answered(mean, std)
+        given = StreamAnswers(mean, std)
     known = np.asarray(np.isfinite(mean).all(axis=1) & np.isfinite(std).all(axis=1))
     invented, gravity = np.zeros_like(known), model.torque_convention == "gravity_included"
     invented[known] = is_implausible(good.tau[known], given.mean[known], model.noise_std, gravity)
     known &= ~invented
     reached = given.take(known)
     score = scores(good.tau[known] - reached.mean, reached.std, model.noise_std)
-    seen = Seen(good.time[known], score, reached.factor)
+    seen = IntervalScores(good.time[known], score, reached.factor)
     answerable = asked.copy()
     answerable[asked] = known
     judged, known = known & predicted[asked], known[predicted[asked]]
@@ -147,7 +156,7 @@ def predict(
     codes[np.flatnonzero(asked)[invented]] = Code.IMPLAUSIBLE
     predicted[predicted] = known
     mean, std, bare = mean[judged], std[judged], bare[judged]
-    return Screened(
+    return PredictedBatch(
         replace(rows, code=codes),
         own,
         answerable,
@@ -164,25 +173,25 @@ def predict(
     )
 
 
-def _as_trained(rows: Rows, version: Version, mean: Array, bare: Array) -> Trained:
-    """What the version as trained predicts of some of the rows, of which it predicts mean and bare, (P, n), by now."""
-    compared = evenly(rows.weight)
+def _as_trained(rows: Rows, version: Version, mean: Array, bare: Array) -> BasePrediction:
+    """Return the predictions of the version as trained for some rows. mean, bare: (P, n), of what it has learnt."""
+    compared = choose_compared(rows.weight)
     same = version.model is version.base
     answers = (mean[compared], bare[compared]) if same else _answers(rows.take(compared), version.base)
-    return Trained(compared, len(rows) / max(1, len(compared)), *answers)
+    return BasePrediction(compared, len(rows) / max(1, len(compared)), *answers)
 
 
-def evenly(weight: Array) -> NDArray[np.int64]:
-    """Places of the rows that are compared, out of rows of these weights, (N,)."""
-    count = min(len(weight), max(LEAST_COMPARED, int(np.ceil(COMPARED * weight.sum()))))
+def choose_compared(weight: Array) -> NDArray[np.int64]:
+    """Return the places of the rows to compare. weight: (N,), of all rows."""
+    count = min(len(weight), max(MIN_COMPARED_ROWS, int(np.ceil(COMPARED_PER_SAMPLE * weight.sum()))))
     return np.linspace(0, len(weight) - 1, count).round().astype(np.int64)
 
 
 def _answers(rows: Rows, model: TorqueModel) -> tuple[Array, Array]:
-    """Mean and standard deviation, without floor, of rows that are finite: (N, n) each.
+    """Return mean and standard deviation without floor, (N, n) each, of finite rows.
 
-    These are the posterior's. Learning never sees the fallback of an answer, because sums over samples stay sums only
-    if innovations are linear in the torque.
+    Both are the posterior's. Learning never uses the fallback of a prediction, because sums over samples remain sums
+    only if innovations are linear in the torque.
     """
     evaluator = model.evaluator.revised(model.evaluator.packed, np.zeros(model.n_joints))
     mean, std, *_ = evaluator.many(rows.q, rows.dq, rows.ddq)

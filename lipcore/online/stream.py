@@ -1,5 +1,5 @@
-"""What is known of a stream after its last batch: one immutable record, which lasts over restarts, other versions,
-rollbacks and the retention of the log."""
+"""Store what is known of a stream after its last batch, across restarts, other versions, rollbacks and log
+retention."""
 
 from __future__ import annotations
 
@@ -14,72 +14,76 @@ from lipcore.model.payload import Carrier
 from lipcore.online.batch import Rows
 from lipcore.online.changes.opening import Opening
 from lipcore.online.gates import ContactGate
-from lipcore.online.payload.holding import Watch
+from lipcore.online.payload.holding import PayloadTracker
 from lipcore.online.scale import ScaleRecord
 
 FORMAT = 1
-"""Of a record's JSON; a later release that changes it reads this one, too."""
+"""Format of a record's JSON. A later release that changes it can still read this one."""
 
 
 @dataclass(frozen=True)
 class PayloadRecord:
-    """The latest known payload of a stream, declared or noticed.
-
-    event: number of the event that declared or noticed it; received: Unix time of the latest rows that show it, s.
-    watch: the estimate of `version`, see `Watch.to_json`; None for a declaration. body: the declared body, None for
-    no payload.
-    """
+    """The latest known payload of a stream, declared or noticed."""
 
     event: int
+    """Number of the event that declared or noticed it."""
     received: float
+    """Unix time of the latest rows that show it, s."""
     watch: Mapping[str, Any] | None = None
+    """The estimate by `version`, see `PayloadTracker.to_json`; None for a declaration."""
     version: int | None = None
     body: Mapping[str, Any] | None = None
+    """The declared body; None for no payload."""
 
     @property
-    def holds(self) -> bool:
-        """Whether something is carried."""
+    def has_payload(self) -> bool:
+        """Whether the arm carries a payload."""
         return self.body is not None or (self.watch is not None and self.watch["held"] is not None)
 
-    def seen_by(self, carrier: Carrier, version: int, rows: Rows | None = None) -> Watch:
-        """Return the payload as a version sees it. One whose geometry was learnt has a frame of its own, in which a
-        payload that another version has seen lies elsewhere. rows: that the payload was seen on, None if unknown."""
+    def build_tracker(self, carrier: Carrier, version: int, rows: Rows | None = None) -> PayloadTracker:
+        """Return the payload in the frame of a version.
+
+        A version with learnt geometry has its own frame, in which a payload noticed by another version lies elsewhere.
+        rows: in which the payload was noticed, None if unknown.
+        """
         n, noticed, body = carrier.model.n_joints, self.watch, self.body
         if noticed is not None:
             if carrier.term.arm.mode == "learn" and self.version != version:
-                return Watch.of_another(noticed, n, carrier)
-            return Watch.from_json(noticed, n, carrier, rows)
+                return PayloadTracker.from_other_version(noticed, n, carrier)
+            return PayloadTracker.from_json(noticed, n, carrier, rows)
         if body is None:
-            return Watch(n).put_down(self.received)
+            return PayloadTracker(n).put_down(self.received)
         inertia = None if body["inertia"] is None else np.array(body["inertia"])
-        return Watch(n).declare(carrier, Body(body["mass"], np.array(body["com"]), inertia), self.received)
+        return PayloadTracker(n).declare(carrier, Body(body["mass"], np.array(body["com"]), inertia), self.received)
 
     def to_json(self) -> dict[str, Any]:
-        """All fields as JSON has them; `PayloadRecord(**values)` reads them."""
+        """Return all fields for JSON; `PayloadRecord(**values)` reads them."""
         return {name: getattr(self, name) for name in self.__dataclass_fields__}
 
 
 @dataclass(frozen=True)
 class StreamRecord:
-    """What is known of a stream after its last batch; immutable.
-
-    gate: which of its rows are contacts; opening: its first second, None once that is judged; doubted: whether that did
-    not fit, and nobody has confirmed the stream since; scale: of its intervals, None where they do not adapt; payload:
-    what it carries, None where nothing was said or noticed; leapt: whether its clock has leapt ahead of its rows'
-    arrival; begun: number of its first batch's event; received: when the last batch came, Unix time, s.
-    """
+    """The record of a stream after its last batch; immutable."""
 
     gate: ContactGate = field(default_factory=ContactGate.start)
+    """The gate that rejects contacts."""
     opening: Opening | None = None
+    """The stream's first second; None once that is judged."""
     doubted: bool = False
+    """Whether the first second did not fit and nobody has confirmed the stream since."""
     scale: ScaleRecord | None = None
+    """Scale of the stream's intervals; None if they do not adapt."""
     payload: PayloadRecord | None = None
+    """The payload; None if none was declared or noticed."""
     leapt: bool = False
+    """Whether its clock has jumped ahead of the arrival of its rows."""
     begun: int = 0
+    """Number of the event of its first batch."""
     received: float = 0.0
+    """When the last batch arrived, Unix time, s."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return what the stream's row keeps: all but `received`, which has a column."""
+        """Return what the stream's database row stores: all but `received`, which has a column."""
         return {
             "format": FORMAT,
             "gate": self.gate.to_json(),
@@ -92,17 +96,17 @@ class StreamRecord:
         }
 
     def decided(self) -> StreamRecord:
-        """The same after learning was held: what has changed is no contact."""
-        return replace(self, gate=self.gate.stand_back())
+        """Return the record after a decision: what has changed is no contact, so the gate opens."""
+        return replace(self, gate=self.gate.let_all_pass())
 
     @classmethod
     def start(cls, n: int) -> StreamRecord:
-        """Return the record of a stream of n joints that has just begun."""
+        """Return the record of a new stream of n joints."""
         return cls(opening=Opening.start(n))
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any] | None, received: float) -> StreamRecord:
-        """Read what `to_json` returned, or None, which a service of an earlier release has left."""
+        """Read what `to_json` returned, or None, which an earlier release has stored."""
         if values is None:
             return cls(received=received)
         opening, scale, payload = (values[name] for name in ("opening", "scale", "payload"))

@@ -1,4 +1,4 @@
-"""What a model has learnt online, as it leaves the process: a model to save, arrays to answer with, a snapshot."""
+"""Convert what a model has learnt online: to a model to save, to arrays for prediction, to a snapshot."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ ABSENT = float("nan")
 
 
 def consolidate(online: OnlineModel, floor: Array | None = None) -> TorqueModel:
-    """The model that answers as `online.model(floor)` does, to the last bit, and that can be saved.
+    """Return a model that can be saved and predicts as `online.model(floor)` does, to the last bit.
 
-    The posterior of a regime is that of the sums A and b with the prior N(centre, I): its mean (I + A)⁻¹ (centre + b)
-    is also that of the sums A and centre + b with the prior of a trained model, N(0, I). What it no longer holds is
-    which part was trained and which learnt: it does not forget the rows of before.
+    The posterior of a regime follows from the sums A and b with the prior N(centre, I). Its mean (I + A)⁻¹ (centre + b)
+    is also that of the sums A and centre + b with the prior of a trained model, N(0, I). The result no longer separates
+    training from learning: it does not forget the rows of before.
     """
     base, now = online.base.posterior, online.now
     trained = base.statistics
-    # a change of the robot leaves nothing of the training samples but their mean
+    # after a change, only the mean of the training samples remains
     sums = now.sums(online.walk)
     samples = online.samples + (trained.samples if trained is not None and online.before is None else 0.0)
     posterior = CompactPosterior.build(
@@ -50,21 +50,22 @@ def consolidate(online: OnlineModel, floor: Array | None = None) -> TorqueModel:
 
 @dataclass(frozen=True)
 class Revision:
-    """Answers of one basis after some learning.
-
-    weights: (M,); root: (M, M), see `CompactPosterior`; packed: both as the evaluator lays them out; floor: (n,);
-    falls_back: (1,), whether answers may.
-    """
+    """Arrays that predict with one basis after some learning."""
 
     weights: Array
+    """Weights of the posterior, (M,)."""
     root: Array
+    """Root of the posterior, (M, M), see `CompactPosterior`."""
     packed: Array
+    """Both in the layout of the evaluator."""
     floor: Array
+    """Min variance of a prediction, (n,) (N·m)²."""
     falls_back: NDArray[np.bool_]
+    """Whether predictions may fall back, (1,)."""
 
     @classmethod
     def of(cls, model: TorqueModel) -> Revision:
-        """The arrays of a model that has learnt."""
+        """Return the arrays of a model that has learnt."""
         posterior = model.posterior
         arrays = posterior.weights, posterior.root, model.evaluator.packed, posterior.floor
         falls_back = np.array([model.training_torque is not None])
@@ -72,9 +73,9 @@ class Revision:
         return cls(weights, root, packed, floor, falls_back)
 
     def apply(self, base: TorqueModel) -> TorqueModel:
-        """Return the model of the same basis that answers so; raise ValueError where shapes do not fit.
+        """Return the model of the same basis with these arrays; raise ValueError if shapes do not fit.
 
-        No linear algebra, and nothing is copied: the arrays may be memory-mapped. They must not change any more.
+        It needs no linear algebra and copies nothing: the arrays may be memory-mapped. They must not change any more.
         """
         for name, like in (("weights", base.posterior.weights), ("root", base.posterior.root)):
             if getattr(self, name).shape != tuple(like.shape):
@@ -83,15 +84,15 @@ class Revision:
         posterior = replace(base.posterior, weights=weights, root=root, floor=floor, statistics=None)
         falls_back = bool(self.falls_back.all())
         model = replace(base, posterior=posterior, training_torque=base.training_torque if falls_back else None)
-        # the cached property, filled without laying anything out again
+        # fill the cached property: the arrays have its layout already
         model.__dict__["evaluator"] = base.evaluator.revised(self.packed, self.floor, falls_back)
         return model
 
 
 def dump(online: OnlineModel) -> bytes:
-    """All of an online model but the version as trained, as the bytes of a safetensors file.
+    """Return an online model, without the version as trained, as the bytes of a safetensors file.
 
-    Its size does not grow with what was learnt.
+    Its size does not grow with the rows learnt.
     """
     numbers = [ABSENT if each is None else each for each in (online.forgetting_s, online.since, online.reference)]
     tensors = {"numbers": np.array(numbers), "base": _trained(online.base)}
@@ -106,9 +107,9 @@ def dump(online: OnlineModel) -> bytes:
 
 
 def load(base: TorqueModel, payload: bytes) -> OnlineModel:
-    """The online model that `dump` wrote. base: the version as trained that it was started from.
+    """Return the online model that `dump` wrote. base: the version as trained from which it was started.
 
-    Raise ValueError for bytes that are no such state, or one of another version.
+    Raise ValueError for bytes that are no such state, or the state of another version.
     """
     try:
         tensors = {name: value.copy() for name, value in load_tensors(payload).items()}
@@ -132,7 +133,8 @@ def load(base: TorqueModel, payload: bytes) -> OnlineModel:
 
 
 def _trained(base: TorqueModel) -> Array:
-    """What tells a version from another: read from its files, so that it is the same in every process."""
+    """Return what identifies a version. It is read from the version's files, so that it is the same in every
+    process."""
     statistics = base.posterior.statistics
     return base.posterior.weights if statistics is None else statistics.b
 

@@ -1,4 +1,4 @@
-"""Sums of prequential records over the last minutes."""
+"""Sum prequential records over the last minutes."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from functools import reduce
 from operator import add
 
 from lipcore.online.record import Record
-from lipcore.online.scale import HeldIntervals
+from lipcore.online.scale import IntervalCoverage
 
 PARTS = 60
-"""Buckets of a window: its length is true to a sixtieth."""
+"""Buckets of a window: its length is exact to a sixtieth."""
 
 
 class Window:
-    """Records and counts of the last `seconds`, in at most PARTS + 1 buckets. Read it from any thread."""
+    """Records and counts of the last `seconds`, in at most PARTS + 1 buckets. Any thread may read it."""
 
     def __init__(self, seconds: float, n_joints: int) -> None:
         self.seconds, self._n_joints = seconds, n_joints
         self._length = max(seconds / PARTS, 1.0)
-        self._buckets: tuple[tuple[int, Record, Counter[str], HeldIntervals], ...] = ()
+        self._buckets: tuple[tuple[int, Record, Counter[str], IntervalCoverage], ...] = ()
 
     def add(
-        self, record: Record | None, counts: Mapping[str, int], at: float, held: HeldIntervals | None = None
+        self, record: Record | None, counts: Mapping[str, int], at: float, held: IntervalCoverage | None = None
     ) -> None:
-        """Add a batch's record and counts at a Unix time, s, and what intervals held. From one thread at a time."""
+        """Add a batch's record, counts and coverage (`held`) at a Unix time, s. Only one thread at a time may add."""
         number = int(at // self._length)
-        empty = number, Record.empty(self._n_joints), Counter[str](), HeldIntervals.none(self._n_joints)
+        empty = number, Record.empty(self._n_joints), Counter[str](), IntervalCoverage.none(self._n_joints)
         *rest, last = self._buckets or (empty,)
         if last[0] != number:
             rest, last = [*rest, last], empty
@@ -37,33 +37,34 @@ class Window:
             last[2] + Counter(counts),
             last[3] if held is None else last[3] + held,
         )
-        # another tuple each time: readers keep the one they have
+        # a new tuple each time, because other threads may be reading the old one
         self._buckets = tuple(bucket for bucket in (*rest, changed) if self._holds(bucket[0], at))
 
     def record(self, now: float) -> Record:
-        """Sum of the records within the window before a Unix time, s."""
+        """Return the sum of the records in the window before a Unix time, s."""
         records = (bucket[1] for bucket in self._buckets if self._holds(bucket[0], now))
         return reduce(add, records, Record.empty(self._n_joints))
 
     def course(self, now: float) -> list[tuple[float, Record]]:
-        """The records of the window's buckets, oldest first, each with when it began: Unix times, s."""
+        """Return the records of the window's buckets, oldest first, each with the Unix time at which it began, s."""
         return [(number * self._length, record) for number, record, *_ in self._buckets if self._holds(number, now)]
 
     def counts(self, now: float) -> Counter[str]:
-        """Sum of the counts within the window before a Unix time, s."""
+        """Return the sum of the counts in the window before a Unix time, s."""
         counts = (bucket[2] for bucket in self._buckets if self._holds(bucket[0], now))
         return reduce(add, counts, Counter[str]())
 
-    def held(self, now: float) -> HeldIntervals:
-        """What intervals, as answered, held of the rows within the window before a Unix time, s."""
+    def held(self, now: float) -> IntervalCoverage:
+        """Return the coverage of the returned intervals in the window before a Unix time, s."""
         parts = (bucket[3] for bucket in self._buckets if self._holds(bucket[0], now))
-        return reduce(add, parts, HeldIntervals.none(self._n_joints))
+        return reduce(add, parts, IntervalCoverage.none(self._n_joints))
 
     def set_clock(self, step: float) -> None:
-        """Take the buckets with a clock that was set by `step`, s."""
+        """Shift the buckets after the clock was set by `step`, s."""
         moved = round(step / self._length)
         self._buckets = tuple((bucket[0] + moved, *bucket[1:]) for bucket in self._buckets)
 
     def _holds(self, number: int, now: float) -> bool:
-        """Whether a bucket is in the window before a Unix time, s; none is that a wrong clock has put behind it."""
+        """Whether a bucket lies in the window before a Unix time, s. Buckets that a wrong clock dated after it do
+        not."""
         return -self.seconds < (number + 1) * self._length - now <= 2 * self._length

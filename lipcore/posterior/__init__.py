@@ -1,1 +1,1 @@
-"""Gaussian posteriors of the torque: exact, and compact ones made of sums over samples."""
+"""Gaussian posteriors of the torque: exact, and compact from sums over samples."""

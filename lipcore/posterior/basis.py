@@ -1,4 +1,4 @@
-"""The functions that a compact posterior is written in."""
+"""Basis functions of a compact posterior."""
 
 from __future__ import annotations
 
@@ -17,26 +17,28 @@ from lipcore.posterior.linalg import block_diagonal, cholesky, solve_lower
 class Basis:
     """m torques of the nonlinear term, chosen among those of S inducing samples, and all weights of the linear terms.
 
-    These M = m + p variables u have the prior covariance B Bᵀ, and φ(x) = B⁻¹ cov(u, f(x)): in their whitened form they
-    are independent with variance one, and the torque is φᵀ w plus a remainder of variance k(x, x) − φᵀφ.
-
-    term: the nonlinear term, None for an estimator without one; linear: the linear terms; inducing: S samples;
-    outputs: (m,) places of the chosen torques among the S n, sample by sample; root: B, (M, M) lower triangular.
+    These M = m + p variables u have the prior covariance B Bᵀ, and φ(x) = B⁻¹ cov(u, f(x)). In whitened form they are
+    independent with variance one. The torque is φᵀ w plus a remainder of variance k(x, x) − φᵀφ.
     """
 
     term: PairKernel | None
+    """Nonlinear term, or None if the estimator has none."""
     linear: tuple[LinearKernel, ...]
+    """Linear terms."""
     params: Params
     inducing: Motion
+    """S inducing samples."""
     outputs: Indices
+    """Places of the chosen torques among the S n torques, sample by sample, (m,)."""
     root: Array
+    """B, (M, M) lower triangular."""
 
     @classmethod
     def build(cls, kernel: TorqueKernel, params: Params, inducing: Motion, outputs: Indices) -> Basis:
-        """Basis of a kernel's terms.
+        """Return the basis of a kernel's terms.
 
-        params: hyperparameters; inducing: S samples, whose torques `outputs` (m,) counts as sample · n + joint. Raise
-        ValueError where outputs and terms do not fit together.
+        params: hyperparameters; inducing: S samples; outputs: (m,), chosen torques, numbered as sample · n + joint.
+        Raise ValueError if outputs and terms do not match.
         """
         term, linear = split(kernel)
         places = len(inducing) * kernel.n_joints
@@ -54,7 +56,7 @@ class Basis:
         return len(self.root)
 
     def rows(self, linear: LinearKernel) -> slice:
-        """Places of a linear term's weights among the variables."""
+        """Return the places of a linear term's weights among the variables."""
         start = len(self.outputs)
         for each in self.linear:
             size = len(each.variances(self.params))
@@ -64,22 +66,25 @@ class Basis:
         raise ValueError("the linear term is none of this basis")
 
     def features(self, query: Motion) -> Array:
-        """φ(x) = B⁻¹ cov(u, f(x)) for the torques of N queries (eq. 24 of docs/method.md): (M, N n)."""
+        """Return φ(x) = B⁻¹ cov(u, f(x)) for the torques of N queries, (M, N n) (eq. 24 of docs/method.md)."""
         gram = None if self.term is None else self.term.gram(self.params, self.inducing, query)[self.outputs]
         return self._whitened(gram, query)
 
     def uncovered(self, query: Motion, features: Array) -> Array:
-        """Variance k(x, x) − φᵀφ that the basis leaves open at N queries, (N, n). features: φ(x), (M, N n)."""
+        """Return the variance k(x, x) − φᵀφ outside the basis at N queries, (N, n). features: φ(x), (M, N n)."""
         return self._open(self.prior(query), features)
 
     def prior(self, query: Motion) -> Array:
-        """Prior variance of the nonlinear term's torques at N queries, (N, n), zero without one."""
+        """Return the prior variance of the nonlinear term's torques at N queries, (N, n); zero without such a term."""
         if self.term is None:
             return np.zeros_like(query.q)
         return np.ascontiguousarray(self.term.variance(self.params, query).diagonal(axis1=1, axis2=2))
 
     def features_and_uncovered(self, query: Motion) -> tuple[Array, Array]:
-        """`features` (M, N n) and `uncovered` (N, n) of N queries, for few of them at a time: compiled, on the CPU."""
+        """Return `features` (M, N n) and `uncovered` (N, n) of N queries.
+
+        This is compiled code for the CPU, fast for few queries at a time.
+        """
         if self._cross is None:
             features = self.features(query)
             return features, self.uncovered(query, features)
@@ -95,7 +100,7 @@ class Basis:
         return None if self.term is None else self.term.cross(self.params, self.inducing)
 
     def _whitened(self, gram: Array | None, query: Motion) -> Array:
-        """φ of N queries, (M, N n). gram: covariance of the chosen torques with theirs, (m, N n)."""
+        """Return φ of N queries, (M, N n). gram: covariance of the chosen torques with theirs, (m, N n)."""
         out = np.empty((len(self), len(query) * query.n_joints))
         first = len(self.outputs)
         if gram is not None:
@@ -109,7 +114,7 @@ class Basis:
 
     @cached_property
     def scales(self) -> Array:
-        """What B⁻¹ Λ makes of each linear weight's features, as both are diagonal there: (M,), 0 for the torques."""
+        """Factors B⁻¹ Λ of the linear weights' features, (M,), both diagonal there; 0 for the torques."""
         scales = np.zeros(len(self))
         for each in self.linear:
             rows = self.rows(each)
@@ -117,14 +122,14 @@ class Basis:
         return scales
 
     def _open(self, prior: Array, features: Array) -> Array:
-        # the linear terms' own features leave nothing open
+        # the linear terms' own features explain all of their variance
         chosen = features[: len(self.outputs)]
         explained = np.einsum("mk,mk->k", chosen, chosen).reshape(prior.shape)
         return np.asarray(np.maximum(prior - explained, 0.0))
 
 
 def split(kernel: TorqueKernel) -> tuple[PairKernel | None, tuple[LinearKernel, ...]]:
-    """The nonlinear term of a kernel, if it has one, and its linear terms; raise ValueError for any other kernel."""
+    """Return the nonlinear term of a kernel, or None, and its linear terms. Raise ValueError for any other kernel."""
     terms: Sequence[TorqueKernel] = kernel.terms if isinstance(kernel, SumKernel) else (kernel,)
     nonlinear = [each for each in terms if isinstance(each, PairKernel)]
     linear = tuple(each for each in terms if isinstance(each, LinearKernel))

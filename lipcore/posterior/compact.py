@@ -1,4 +1,4 @@
-"""The compact posterior: a Gaussian over M basis functions, made of sums over samples."""
+"""The compact posterior: a Gaussian over M basis functions, computed from sums over samples."""
 
 from __future__ import annotations
 
@@ -19,28 +19,32 @@ from lipcore.posterior.statistics import Solution, Statistics, learnt_root, solv
 
 @dataclass(frozen=True)
 class CompactPosterior(Posterior):
-    """Posterior whose anchors are the M variables of a basis (DESIGN §4).
+    """Posterior with the M variables of a basis as anchors (DESIGN §4).
 
-    The whitened variables have the posterior N(ŵ, Σ), from statistics alone N((I + A)⁻¹ b, (I + A)⁻¹). With
-    c = cov(u, f(x)) = B φ(x):
+    The whitened variables have the posterior N(ŵ, Σ), from statistics alone N((I + A)⁻¹ b, (I + A)⁻¹). With c = cov(u,
+    f(x)) = B φ(x):
 
         mean       E f(x) + φᵀ ŵ                = E f(x) + cᵀ α,     α = B⁻ᵀ ŵ
         variance   k(x, x) − φᵀφ + φᵀ Σ φ       = k₁(x, x) − |Q₁ c|² + |Q₂ c|²,     Q = R B⁻¹
 
-    where φ does not reach, the variance is the prior's. k₁ is the nonlinear term, to whose torques the rows Q₁ belong:
-    of the linear ones, which may be far less certain beforehand than afterwards, nothing is subtracted (see
-    `Solution`). root: Q, (M, M) lower triangular; noise_variance: (n,) R;
-    floor: (n,) (N·m)², which the variance of a torque is never below, whatever the samples say; zero but for models
-    that learn online (see `online.record.error_floor`). misfit: variance of the torque besides.
-    statistics: what it was made from; None where that is more than one sum.
+    Outside the reach of φ, the variance is that of the prior. k₁ is the nonlinear term, to whose torques the rows Q₁
+    belong. For the linear terms nothing is subtracted, because they may be far less certain a priori than a posteriori
+    (see `Solution`).
     """
 
     basis: Basis
+    """Basis of M variables."""
     noise_variance: Array
+    """R, (n,) (N·m)²."""
     root: Array
+    """Q, (M, M) lower triangular."""
     floor: Array
+    """Min variance of each torque for any samples, (n,) (N·m)². Zero unless the model learns online, see
+    `online.record.error_floor`."""
     misfit: Misfit
+    """Additional variance of the torque."""
     statistics: Statistics | None = None
+    """Statistics that the posterior was computed from, or None if they are more than one sum."""
 
     @classmethod
     def build(
@@ -52,10 +56,10 @@ class CompactPosterior(Posterior):
         std_factor: float = 1.0,
         misfit: Misfit | None = None,
     ) -> CompactPosterior:
-        """Posterior of statistics (eq. 24 of docs/method.md).
+        """Return the posterior of statistics (eq. 24 of docs/method.md).
 
-        noise_variance: (n,) (N·m)²; std_factor: calibration; misfit: none where None. Raise NotPositiveDefiniteError
-        for statistics that no samples have.
+        noise_variance: (n,) (N·m)²; std_factor: calibration; misfit: None for no misfit. Raise NotPositiveDefiniteError
+        for statistics that no samples can have.
         """
         posterior = cls.solved(
             kernel, basis, solve(statistics, None, len(basis.outputs)), noise_variance, std_factor, None, misfit
@@ -74,10 +78,10 @@ class CompactPosterior(Posterior):
         std_factor: float = 1.0,
         misfit: Misfit | None = None,
     ) -> CompactPosterior:
-        """Rebuild a posterior from what a file holds: hyperparameters, inducing outputs (see `Basis`) and statistics.
+        """Return the posterior of a file's content: hyperparameters, inducing outputs (see `Basis`) and statistics.
 
-        jitter: (N·m)², what the fit has added to the noise's variance.
-        Raise ValueError naming what is missing, unknown or of the wrong shape.
+        jitter: (N·m)², added to the noise variance by the fit. Raise ValueError with the name of a value that is
+        missing, unknown or of the wrong shape.
         """
         expected = {**kernel.shapes(), "noise.log_std": (kernel.n_joints,)}
         for name in expected.keys() | params.keys():
@@ -105,27 +109,27 @@ class CompactPosterior(Posterior):
         floor: Array | None = None,
         misfit: Misfit | None = None,
     ) -> CompactPosterior:
-        """Posterior of the torques, given that of the whitened variables.
+        """Return the posterior of the torques, given the posterior of the whitened variables.
 
-        solution: whose `first` are the nonlinear term's; noise_variance: (n,) (N·m)²; floor: (n,) (N·m)²; misfit; none
-        where None.
+        solution: its `first` variables are those of the nonlinear term; noise_variance: (n,) (N·m)²; floor: (n,)
+        (N·m)²; misfit: None for no misfit.
         """
         assert solution.first == len(basis.outputs)
         weights = solve_lower(basis.root, solution.mean, transposed=True)
-        # and not from QᵀQ itself: B⁻¹ is badly conditioned
+        # not from QᵀQ itself, because B⁻¹ is badly conditioned
         root = solve_lower_right(solution.root, basis.root)
         floor = np.zeros_like(noise_variance) if floor is None else floor
         misfit = Misfit.none(len(noise_variance)) if misfit is None else misfit
         return cls(kernel, basis.params, std_factor, weights, basis, noise_variance, root, floor, misfit)
 
     def row_variance(self, motion: Motion) -> Array:
-        """Variance R with which each of N rows teaches, as far as the basis reaches: (N, n) (N·m)²."""
+        """Return the variance R of each of N rows when it is learnt, (N, n) (N·m)², within the reach of the basis."""
         return self.misfit.of_row(self.noise_variance, motion.dq)
 
     def predict(self, query: Motion, component: TorqueKernel | None = None) -> Prediction:
-        """Posterior mean and n×n covariance of the torques at each of N queries, or of one term of the kernel.
+        """Return the posterior mean and n×n covariance of the torques at each of N queries, or of one kernel term.
 
-        Floor and misfit are those of the whole torque: no term's share of them is known.
+        Floor and misfit belong to the whole torque. Their share in one term is unknown, so it is not added there.
         """
         prediction = super().predict(query, component)
         if component is not None:
@@ -141,18 +145,21 @@ class CompactPosterior(Posterior):
 
     @cached_property
     def learnt(self) -> Array:
-        """What samples explain of any quantity: (M, M) lower triangular, whose square is B⁻ᵀ (I − Σ) B⁻¹."""
+        """Root of the variance that samples explain, (M, M) lower triangular; its square is B⁻ᵀ (I − Σ) B⁻¹."""
         return solve_lower_right(learnt_root(self.covariance), self.basis.root)
 
     def whiten(self, cross: Array) -> Array:
-        """Columns whose square is explained, (M, K). cross: covariance of the variables with K quantities, (M, K)."""
+        """Return columns with the explained variance as their square, (M, K).
+
+        cross: covariance of the variables with K quantities, (M, K).
+        """
         return self.learnt @ cross
 
     def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Array]) -> Array:
-        """Covariance of the variables with K quantities of the nonlinear term, zero for linear weights: (M, K).
+        """Return the covariance of the variables with K quantities of the nonlinear term, (M, K); zero for weights.
 
-        covariance: that of the term's torques at N motions with the quantities, (N n, K). Raise ValueError for another
-        term.
+        covariance: function that returns the covariance of the term's torques at N motions with the quantities,
+        (N n, K). Raise ValueError for another term.
         """
         if term is not self.basis.term:
             raise ValueError("the term is none of this posterior")
@@ -160,7 +167,7 @@ class CompactPosterior(Posterior):
         return np.concatenate([inducing, np.zeros((len(self.basis) - len(inducing), inducing.shape[1]))])
 
     def with_weights(self, term: LinearKernel, covariance: Array) -> Array:
-        """Covariance of the variables with K quantities of a linear term, zero for all other variables: (M, K).
+        """Return the covariance of the variables with K quantities of a linear term, (M, K); zero for all others.
 
         covariance: cov(w, s), (p, K).
         """

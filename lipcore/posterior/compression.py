@@ -1,4 +1,4 @@
-"""From an exact posterior to a compact one: as few basis functions as answer alike."""
+"""Compression of an exact posterior to a compact one with as few basis functions as the tolerance allows."""
 
 from __future__ import annotations
 
@@ -17,81 +17,83 @@ from lipcore.posterior.misfit import Misfit
 from lipcore.posterior.selection import Pivots, pivots, spread_out
 from lipcore.posterior.statistics import collect
 
-NONE = np.empty(0, np.int64)
+NO_OUTPUTS = np.empty(0, np.int64)
 """No inducing outputs."""
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far a compact posterior lies from the exact one, in the exact one's standard deviations.
+    """Difference of a compact posterior from the exact one, over all joints of `queries` motions.
 
-    Those of the function, noise excluded and before calibration.
-
-    mean_rms, mean_max: of the mean torque; std_max: largest relative difference of standard deviations; over all joints
-    of `queries` motions.
+    The unit is the exact posterior's standard deviation of the function, without noise and before calibration.
     """
 
     mean_rms: float
+    """Root mean square difference of the mean torque."""
     mean_max: float
+    """Max difference of the mean torque."""
     std_max: float
+    """Max relative difference of the standard deviations."""
     queries: int
+    """Number of motions compared."""
 
     @classmethod
     def between(cls, exact: Prediction, mean: Array, std: Array, noise_std: Array) -> Deviation:
-        """Compare means and standard deviations, (N, n), with the exact prediction. noise_std: (n,)."""
-        unit = np.maximum(exact.std, 1e-3 * noise_std)  # what is certain has no deviation of its own
+        """Return the deviation of means and standard deviations, (N, n), from the exact prediction. noise_std: (n,)."""
+        unit = np.maximum(exact.std, 1e-3 * noise_std)  # a certain torque has a std of zero
         off, ratio = (mean - exact.mean) / unit, (std - exact.std) / unit
         rms = float(np.sqrt(np.square(off).mean()))
         return cls(rms, float(np.abs(off).max()), float(np.abs(ratio).max()), len(mean))
 
     def within(self, tolerance: float) -> bool:
-        """Whether mean and standard deviation deviate by no more than `tolerance` anywhere."""
+        """Return whether mean and standard deviation differ by at most `tolerance` everywhere."""
         return self.mean_max <= tolerance and self.std_max <= tolerance
 
 
 @dataclass(frozen=True)
 class Compression:
-    """A compact posterior, and how near it comes to the exact one. reached: whether it keeps the tolerance asked for.
-
-    deviation: at motions that `checks` draws; tolerance: in standard deviations of the exact one.
-    """
+    """A compact posterior and its deviation from the exact one."""
 
     posterior: CompactPosterior
+    """The compact posterior."""
     deviation: Deviation
+    """Deviation at the motions of `checks`."""
     tolerance: float
+    """Requested max deviation, in standard deviations of the exact posterior."""
     reached: bool
+    """Whether the deviation is within the tolerance."""
 
     def report(self) -> dict[str, float | int | bool]:
-        """For the manifest: sizes, tolerance and what was achieved."""
+        """Return sizes, tolerance and achieved deviation for the manifest."""
         basis = self.posterior.basis
         sizes = {"inducing_outputs": len(basis.outputs), "inducing_samples": len(basis.inducing), "weights": len(basis)}
         return {**sizes, "tolerance": self.tolerance, "tolerance_reached": self.reached, **asdict(self.deviation)}
 
 
-def compressed(
+def compress_samples(
     kernel: TorqueKernel, params: Params, samples: Samples, tolerance: float, most: int, std_factor: float
 ) -> tuple[Compression, float]:
-    """The compact posterior of N samples, and the jitter, (N·m)², that the exact one took.
+    """Return the compact posterior of N samples, and the jitter of the exact one, (N·m)².
 
-    tolerance, most: as in `compress`; std_factor: calibration of the function's deviation.
-    Raise NotPositiveDefiniteError where the exact posterior cannot be computed.
+    tolerance, most: as in `compress`; std_factor: calibration of the function's standard deviation. Raise
+    NotPositiveDefiniteError if the exact posterior cannot be computed.
     """
     exact = ExactPosterior.fit(kernel, params, samples.motion(), samples.tau, std_factor)
     return compress(exact, samples.tau, tolerance, most), exact.factor.jitter
 
 
 def compress(exact: ExactPosterior, tau: Array, tolerance: float, most: int) -> Compression:
-    """Smallest compact posterior within `tolerance` of the exact one, or the best with `most` inducing outputs.
+    """Return the smallest compact posterior within `tolerance` of the exact one, or the best with `most` outputs.
 
-    tau: the (N, n) torques that the exact posterior is conditioned on.
-    Outputs are taken in the order of pivoted Cholesky; how many, a bisection tells.
+    tau: (N, n), the torques that the exact posterior is conditioned on. Outputs are added in the order of pivoted
+    Cholesky. A bisection finds their number.
     """
     check = checks(exact.motion)
     calibration, exact = exact.std_factor, replace(exact, std_factor=1.0)
     expected = exact.predict(check)
     noise = np.exp(2 * exact.params["noise.log_std"]) + exact.factor.jitter
     candidates = _Candidates.build(exact, tau, noise, check, most)
-    sizes = _ladder(candidates.most)
+    sizes = _candidate_sizes(candidates.most)
     low, high = 0, len(sizes) - 1
     while low < high:
         middle = (low + high) // 2
@@ -105,7 +107,7 @@ def compress(exact: ExactPosterior, tau: Array, tolerance: float, most: int) -> 
     return Compression(replace(posterior, std_factor=calibration), deviation, tolerance, deviation.within(tolerance))
 
 
-def linear(
+def build_linear(
     kernel: TorqueKernel,
     params: Params,
     samples: Samples,
@@ -114,14 +116,14 @@ def linear(
     std_factor: float,
     misfit: Misfit,
 ) -> Compression:
-    """The posterior of a kernel whose terms are all linear, which is compact as it is: nothing is left out.
+    """Return the posterior of a kernel with linear terms only. It is compact by itself: nothing is approximated.
 
-    samples: N; variance: (N, n) (N·m)², with which each torque teaches; std_factor: calibration. Of the motion, 32
-    spread-out instants are kept: to ask the model where it should know.
+    samples: N; variance: (N, n) (N·m)², of each torque when it is learnt; std_factor: calibration. 32 spread-out
+    instants of the motion are kept as queries near the training data.
     """
     motion = samples.motion()
     kept = motion[spread_out(motion, 32)]
-    basis = Basis.build(kernel, params, kept, NONE)
+    basis = Basis.build(kernel, params, kept, NO_OUTPUTS)
     noise = np.exp(2 * params["noise.log_std"])
     statistics = collect(basis, variance, motion, samples.tau - kernel.mean(motion))
     posterior = CompactPosterior.build(kernel, basis, statistics, noise, std_factor, misfit)
@@ -129,10 +131,10 @@ def linear(
 
 
 def checks(motion: Motion, queries: int = 200) -> Motion:
-    """Motions to compare posteriors at: half of them training samples, half recombined from several.
+    """Return motions for comparing posteriors: one half training samples, one half recombined from several samples.
 
-    A recombined motion takes position, velocity and acceleration from three samples: it lies where the robot has been,
-    but was never seen.
+    A recombined motion has the position, velocity and acceleration of three samples. It is in the region of the
+    training motion, but it is new.
     """
     draw, size = np.random.default_rng(0), len(motion)
     seen = draw.permutation(size)[: queries // 2]
@@ -143,39 +145,46 @@ def checks(motion: Motion, queries: int = 200) -> Motion:
 
 @dataclass(frozen=True)
 class _Candidates:
-    """Every prefix of the pivots is a basis: its features are the first rows of the largest one's.
+    """Bases of all sizes: every prefix of the pivots is a basis.
 
-    order: the pivots; a, b: statistics of the largest basis, the linear terms' weights first; features: φ at the
-    checks, likewise, (p + most, Q n); variance: prior variances there, (Q, n).
+    Its features are the first rows of the largest one's.
     """
 
     exact: ExactPosterior
+    """Exact posterior, before calibration."""
     noise: Array
+    """Noise variance, (n,) (N·m)²."""
     order: Pivots
+    """Pivots."""
     a: Array
+    """A of the largest basis, the weights of the linear terms first."""
     b: Array
+    """b of the largest basis, likewise."""
     features: Array
+    """φ at the checks, the weights of the linear terms first, (p + most, Q n)."""
     variance: Array
+    """Prior variances at the checks, (Q, n)."""
     mean: Array
+    """Prior means at the checks, (Q, n)."""
 
     @classmethod
     def build(cls, exact: ExactPosterior, tau: Array, noise: Array, check: Motion, most: int) -> _Candidates:
         kernel, params, motion = exact.kernel, exact.params, exact.motion
         term, linear = split(kernel)
         precision = np.tile(1 / np.sqrt(noise), len(motion))
-        weights_only = Basis.build(SumKernel(*linear), params, motion[:0], NONE)
+        weights_only = Basis.build(SumKernel(*linear), params, motion[:0], NO_OUTPUTS)
         trained, asked = weights_only.features(motion) * precision, weights_only.features(check)
-        order = Pivots(NONE, np.zeros((len(precision), 0)), np.zeros(0))
+        order = Pivots(NO_OUTPUTS, np.zeros((len(precision), 0)), np.zeros(0))
         if term is not None:
             gram = term.symmetric_gram(params, motion)
             gram *= precision
             gram *= precision[:, None]
-            order = pivots(gram, kernel.n_joints, most, 1e-6)  # of the noise's variance
+            order = pivots(gram, kernel.n_joints, most, 1e-6)  # relative to the noise variance
             del gram
             outputs = order.outputs
             samples, places = np.unique(outputs // kernel.n_joints, return_inverse=True)
             cross = term.gram(params, motion[samples], check)[places * kernel.n_joints + outputs % kernel.n_joints]
-            root = order.lower[outputs]  # Cholesky factor of the chosen outputs' covariance in units of the noise
+            root = order.lower[outputs]  # Cholesky factor of the chosen outputs' covariance, relative to the noise
             whitened = solve_lower(root, cross * precision[outputs][:, None])
             trained, asked = np.concatenate([trained, order.lower.T]), np.concatenate([asked, whitened])
         residual = (tau - kernel.mean(motion)).reshape(-1) * precision
@@ -187,7 +196,7 @@ class _Candidates:
         return len(self.order)
 
     def predict(self, count: int) -> tuple[Array, Array]:
-        """Mean and standard deviation at the checks with the first `count` pivots, both (Q, n)."""
+        """Return mean and standard deviation at the checks with the first `count` pivots, both (Q, n)."""
         used = len(self.a) - self.most + count
         features = self.features[:used]
         factor = cholesky(np.eye(used) + self.a[:used, :used])
@@ -206,8 +215,8 @@ class _Candidates:
         return CompactPosterior.build(exact.kernel, basis, statistics, self.noise)
 
 
-def _ladder(most: int) -> list[int]:
-    """Numbers of outputs to choose from, each about 1.05 times the one before, `most` the last."""
+def _candidate_sizes(most: int) -> list[int]:
+    """Return the candidate numbers of outputs, each about 1.05 times the one before, up to `most`."""
     sizes = [most]
     while sizes[-1] > 1:
         sizes.append(min(sizes[-1] - 1, int(sizes[-1] / 1.05)))

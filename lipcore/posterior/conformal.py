@@ -1,7 +1,8 @@
-"""What left-out blocks of the training say of a posterior's intervals: a factor on their widths that these prove.
+"""Conformal factors: how much intervals must be widened to reach their coverage on held-out training blocks.
 
-Split conformal prediction over blocks (Vovk et al. 2005; Dunn, Wasserman and Ramdas 2023 for samples in groups). What
-was fitted to all blocks, hyperparameters and what the basis is linearised around, stays when one is left out.
+Split conformal prediction over blocks (Vovk et al. 2005; Dunn, Wasserman and Ramdas 2023 for samples in groups). The
+hyperparameters and the linearisation of the basis were fitted to all blocks. They stay as they are when one is held
+out.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ MAX_SCALE = 1e12
 
 @dataclass(frozen=True)
 class Conformal:
-    """The factor on the half width of each joint's intervals, (n,), at least 1, and what it stands on.
-
-    scale: the finite-sample quantile of the scores, |error| over the half width that the model believes; where there
-    are too few blocks for one, their plain quantile; guaranteed: (n,), the share of the measurements of another such
-    block that intervals of this scale hold at least, on average, as far as so many blocks can say; blocks: how many.
-    """
+    """Factor on the half width of each joint's intervals, with the evidence for it."""
 
     scale: tuple[float, ...]
+    """Factor of each joint, (n,), at least 1: the finite-sample quantile of the scores. A score is |error| divided by
+    the half width of the model. If there are too few blocks for it, the factor is the plain quantile of the scores."""
     guaranteed: tuple[float, ...]
+    """Min average coverage of another such block by intervals of this scale, (n,), as guaranteed by this number of
+    blocks."""
     blocks: int
+    """Number of blocks."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for what no blocks say."""
+        """Raise ValueError for values that no blocks can have."""
         object.__setattr__(self, "scale", tuple(self.scale))
         object.__setattr__(self, "guaranteed", tuple(self.guaranteed))
         if not all(1.0 <= each <= MAX_SCALE for each in self.scale):
@@ -46,15 +47,15 @@ class Conformal:
             raise ValueError(f"blocks is {self.blocks}, expected at least 1")
 
     def widened(self, factors: Sequence[float]) -> Conformal:
-        """The same with scales times factors, (n,), at least 1."""
+        """Return the same with scales times factors, (n,), at least 1."""
         return replace(self, scale=tuple(np.multiply(self.scale, factors).tolist()))
 
 
-def conform(posterior: CompactPosterior, samples: Samples, variance: Array) -> Conformal:
-    """The factor that the samples behind a posterior prove, in blocks of a second or whole episodes.
+def fit_conformal(posterior: CompactPosterior, samples: Samples, variance: Array) -> Conformal:
+    """Return the factors from the samples of a posterior, in blocks of a second or whole episodes.
 
-    samples: N, in any order; variance: (N, n) (N·m)², with which each torque of them has taught, beside what the basis
-    leaves open. Raise NotPositiveDefiniteError where a block cannot be left out.
+    samples: N, in any order; variance: (N, n) (N·m)², of each torque when it was learnt, without the variance outside
+    the basis. Raise NotPositiveDefiniteError if a block cannot be held out.
     """
     order = np.lexsort((samples.t, samples.episode))
     ordered = samples.rows(order)
@@ -65,18 +66,18 @@ def conform(posterior: CompactPosterior, samples: Samples, variance: Array) -> C
 
 
 def scores(posterior: CompactPosterior, samples: Samples, variance: Array, starts: NDArray[np.int64]) -> Array:
-    """|error| over half the width of the 95 % interval, (N, n), of a posterior without the row's block and GUARD_S of
-    its episode on both sides.
+    """Return |error| / half width of the 95 % interval, (N, n), of a posterior without the row's surroundings.
 
-    samples: N behind the posterior, in order; variance: as of `conform`; starts: first row of each block. With the
-    whitened variables' posterior N(ŵ, Σ), P = φᵀΣφ among the torques that are left out and R their variances,
+    The surroundings are the row's block, and GUARD_S of its episode on both sides. samples: N of the posterior, in
+    order; variance: as in `fit_conformal`; starts: first row of each block. With N(ŵ, Σ) of the
+    whitened variables, P = φᵀΣφ among the torques that are held out, and R their variances,
 
         error     (I − P R⁻¹)⁻¹ (y − E y − φᵀŵ)
-        variance  (I − P R⁻¹)⁻¹ P, and what the basis leaves open
+        variance  (I − P R⁻¹)⁻¹ P, plus the variance outside the basis
 
     as if their φ R⁻¹ φᵀ had been subtracted from the statistics.
     """
-    assert posterior.statistics is not None  # as trained
+    assert posterior.statistics is not None  # online posteriors have no single sum
     basis, motion, n = posterior.basis, samples.motion(), samples.n_joints
     features = basis.features(motion)
     beyond = basis.uncovered(motion, features)
@@ -88,7 +89,7 @@ def scores(posterior: CompactPosterior, samples: Samples, variance: Array, start
     stated = posterior.noise_variance + posterior.misfit.variance(motion)
     out = np.empty(samples.tau.shape)
     for first, last in zip(starts, [*starts[1:], len(out)], strict=True):
-        rows = _guarded(samples, int(first), int(last))
+        rows = _guard_rows(samples, int(first), int(last))
         torques = slice(rows.start * n, rows.stop * n)
         share = whitened[:, torques].T @ whitened[:, torques]
         rest = cholesky(np.eye(len(share)) - share)
@@ -100,8 +101,8 @@ def scores(posterior: CompactPosterior, samples: Samples, variance: Array, start
     return out
 
 
-def _guarded(samples: Samples, first: int, last: int) -> slice:
-    """Rows first to last, last exclusive, and those of their first and last episode that are nearer than GUARD_S."""
+def _guard_rows(samples: Samples, first: int, last: int) -> slice:
+    """Return rows first to last (exclusive), and the rows of their first and last episode within GUARD_S of them."""
     t, episode = samples.t, samples.episode
     before = (episode[:first] == episode[first]) & (t[:first] > t[first] - GUARD_S)
     after = (episode[last:] == episode[last - 1]) & (t[last:] < t[last - 1] + GUARD_S)
@@ -109,10 +110,10 @@ def _guarded(samples: Samples, first: int, last: int) -> slice:
 
 
 def _quantile(score: Array, rows: NDArray[np.int64]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Scale and guaranteed level of each joint, from scores (N, n) of B blocks of so many `rows` each.
+    """Return the scale and the guaranteed level of each joint, from scores (N, n) of B blocks with so many `rows` each.
 
-    With F_b(s) the share of a block's scores up to s, the least s >= 1 with Σ F_b(s) / (B + 1) >= LEVEL, or, where no
-    s has, with Σ F_b(s) / B >= LEVEL; guaranteed is Σ F_b(s) / (B + 1) at that s.
+    F_b(s) is the share of a block's scores up to s. The scale is the least s >= 1 with Σ F_b(s) / (B + 1) >= LEVEL. If
+    there is none, it is the least s with Σ F_b(s) / B >= LEVEL. The guaranteed level is Σ F_b(s) / (B + 1) at that s.
     """
     count, weight = len(rows), np.repeat(1 / rows, rows)
     needed = LEVEL * (count + 1 if LEVEL * (count + 1) <= count else count)

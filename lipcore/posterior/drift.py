@@ -1,4 +1,4 @@
-"""Weights that drift from step to step: what sums over samples say of them some steps later."""
+"""Drift of weights from step to step: propagation of sums over samples by some steps."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from lipcore.posterior.statistics import Statistics
 
 @dataclass(frozen=True)
 class Drift:
-    """A random walk of f of the M whitened variables, which is drawn back so slowly that they keep their prior.
+    """Random walk of f of the M whitened variables, with a slow pull to their centre that preserves their prior.
 
     In one step the deviation d of a variable from its centre becomes
 
         d' = √(1 − s) d + N(0, s),
 
-    so that N(centre, 1) beforehand is N(centre, 1) after any number of steps: variance is added, but never beyond what
-    was possible at first. places: (f,) of the variables; step: (f,) s, from 0, which stands still, to 1.
+    so that the prior N(centre, 1) stays N(centre, 1) after any number of steps. Variance is added, but never beyond the
+    initial one. places: (f,) of the variables; step: (f,) s, from 0 (no drift) to 1.
     """
 
     places: Indices
     step: Array
 
     def ahead(self, statistics: Statistics, centre: Array, steps: int) -> Statistics:
-        """Sums that say of the variables `steps` later what these say of them now: earlier ones are integrated out.
+        """Return the sums about the variables `steps` later. The earlier variables are integrated out.
 
-        With D = diag(√(1 − s)^steps), or 1 for what stands still, G the columns of the identity at `places`, Q the
-        variance s grown over the steps, Q = 1 − (1 − s)^steps, and h = b − A centre:
+        With D = diag(√(1 − s)^steps), or 1 for variables without drift, G the columns of the identity at `places`, Q
+        the variance s accumulated over the steps, Q = 1 − (1 − s)^steps, and h = b − A centre:
 
             A' = D (A − A G Q^½ S⁻¹ Q^½ Gᵀ A) D,   S = I + Q^½ Gᵀ A G Q^½,
 
         and h alike. centre: (M,) of the prior. A is read from its lower triangle. Raise NotPositiveDefiniteError for
-        statistics that no samples have.
+        statistics that no samples can have.
         """
         sums = Statistics(statistics.a.copy(), statistics.b, statistics.samples)
         mirror(sums.a)

@@ -1,4 +1,4 @@
-"""The compiled evaluator of a compact posterior: NumPy and Numba only once it is made (baselines: PyTorch)."""
+"""The compiled evaluator of a compact posterior. Once built, it needs only NumPy and Numba (baselines: PyTorch)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 QUERIES = 16
-"""Queries answered together: enough that each panel of the root is read once for many, few enough for the cache."""
+"""Queries computed together. Each panel of the root is then read once for many queries, and they still fit the
+cache."""
 
 
 class _Scratch(threading.local):
-    """One thread's memory for a number of queries: each thread gets its own when it first asks."""
+    """One thread's memory for a number of queries. It is created at the thread's first query."""
 
     def __init__(self, queries: int, samples: int, anchors: int, linear: int, n: int) -> None:
         groups = -(-n // WIDTH)
@@ -41,21 +42,22 @@ class _Scratch(threading.local):
 class Evaluator:
     """Posterior torques of a robot with n joints from M = m + P anchors: m inducing outputs, then all linear weights.
 
-    With g(x) the covariance of the anchors with the torques at x, (M, n), the mean is E f(x) + gᵀ weights and the
-    covariance std_factor² (k₁(x, x) − (Q₁ g)ᵀ (Q₁ g) + (Q₂ g)ᵀ (Q₂ g)), with k₁ of the nonlinear term and Q₁ the first
-    m rows of Q, to whose diagonal the misfit is added, and which is raised to `floor` where it is below.
+    g(x) is the covariance of the anchors with the torques at x, (M, n). The mean is E f(x) + gᵀ weights. The covariance
+    is std_factor² (k₁(x, x) − (Q₁ g)ᵀ (Q₁ g) + (Q₂ g)ᵀ (Q₂ g)), with k₁ of the nonlinear term and Q₁ the first m rows
+    of Q. The misfit is added to its diagonal, which is then raised to at least `floor`.
 
     term: the kernel's nonlinear term, None if it has none. params: hyperparameters of all terms. inducing: S samples,
-    None without `term`. outputs: (m,), which of their torques, as sample · n + joint. linear: the linear terms in the
-    order of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,)
-    (N·m)²; misfit: (5, n), see `Misfit.packed`; none where None. usual: mean and variance of the torque in training,
-    (n,) each, of a model whose answers may fall back.
+    None without `term`. outputs: (m,), the chosen torques, as sample · n + joint. linear: the linear terms in the order
+    of the anchors. weights: (M,). root: Q, (M, M) lower triangular. std_factor: calibration. floor: (n,) (N·m)²;
+    misfit: (5, n), see `Misfit.packed`; None for no floor or misfit. usual: mean and variance of the torque in
+    training, (n,) each, if predictions may fall back.
 
-    `one` and `many` return the mean of the posterior: learning and external torque need it. They also return the share
-    of the fallback in the torque to send, which `fall_back` computes.
+    `one` and `many` return the mean of the posterior, which learning and external torque need. They also return the
+    share of the fallback in the torque to send, which `fall_back` computes.
 
-    Safe from several threads, each of which has memory of its own. `many` computes without the GIL, at the same time as
-    others; `one` keeps it, but for a nonlinear term. Raises ValueError naming the argument that does not fit.
+    The evaluator is thread-safe: each thread has its own memory. `many` computes without the GIL, in parallel with
+    other threads. `one` keeps the GIL, except for a nonlinear term. Raise ValueError with the name of an argument that
+    does not match.
     """
 
     def __init__(
@@ -110,14 +112,14 @@ class Evaluator:
 
     @property
     def packed(self) -> Array:
-        """What of this evaluator depends on weights and root, laid out for compiled code: to make another `revised`."""
+        """The part that depends on weights and root, laid out for compiled code; argument of `revised`."""
         return self._fixed
 
     def revised(self, packed: Array, floor: Array, falls_back: bool = True) -> Evaluator:
-        """Return an evaluator with other weights, root and floor, from `packed` of one of the same anchors. falls_back:
-        whether its answers may, if those of this one may.
+        """Return an evaluator with other weights, root and floor, from `packed` of an evaluator with the same anchors.
 
-        What is compiled and the memory of threads are shared with this one: an answer uses either of them at a time.
+        falls_back: whether its predictions may fall back, if those of this one may. Compiled code and the memory of
+        threads are shared with this one: a prediction uses one of the two at a time.
         """
         if packed.shape != self._fixed.shape or floor.shape != self._floor.shape:
             raise ValueError(f"packed has shape {packed.shape}, expected {self._fixed.shape}")
@@ -130,14 +132,14 @@ class Evaluator:
     def one(
         self, motion: Array, std: bool = True, covariance: Array | None = None
     ) -> tuple[Array, Array | None, Array | None]:
-        """Torque (n,) and, if asked for, its standard deviation (n,) at one query, (3, n): q, dq and ddq. Third, the
-        share of the fallback, (n,), None if it is zero for all joints.
+        """Return the torque, (n,), at one query, (3, n) q, dq and ddq, and its standard deviation, (n,), if `std`.
 
-        covariance: (1, n, n), takes that between the joints where given, with std. Neither shape nor finiteness is
-        checked. The same numbers as of `many`, to the last bit.
+        Third, return the share of the fallback, (n,), or None if it is zero for all joints. covariance: (1, n, n),
+        receives the covariance between the joints if given, with std. Neither shape nor finiteness is checked. The
+        numbers are those of `many`, to the last bit.
         """
         scratch, what = self._one, STD if std or self._falls_back else MEAN
-        # slicing takes as long as the arithmetic
+        # slicing would cost as much as the arithmetic
         query, blocks, features, work, memory, own, share = scratch.of_one
         if covariance is not None:
             work, what = covariance, COVARIANCE
@@ -170,10 +172,10 @@ class Evaluator:
     def many(
         self, q: Array, dq: Array, ddq: Array, covariance: bool = False
     ) -> tuple[Array, Array, Array | None, Array | None]:
-        """Torques (N, n), their standard deviations (N, n) and, if asked for, covariances (N, n, n) of N queries.
-        Fourth, the shares of the fallback, (N, n), None if all are zero.
+        """Return torques (N, n), their standard deviations (N, n) and, if requested, covariances (N, n, n).
 
-        q, dq, ddq: (N, n); neither shapes nor finiteness are checked.
+        Fourth, return the shares of the fallback, (N, n), or None if all are zero. q, dq, ddq: (N, n); neither shapes
+        nor finiteness are checked.
         """
         scratch, (size, n) = self._many, q.shape
         tau, std, share = np.empty((size, n)), np.empty((size, n)), np.empty((size, n))
@@ -190,11 +192,11 @@ class Evaluator:
         return tau, std, covariances, share if doubtful else None
 
     def fall_back(self, motions: Array, tau: Array, share: Array) -> Array:
-        """Return the torques to send at N queries that `many` answers with tau and share, (N, n) each (eq. 26).
+        """Return the torques to send at N queries, given tau and share of `many`, (N, n) each (eq. 26).
 
         They are (1 − share) tau + share h, with the fallback h = (1 − share_s) s + share_s (t + p). s is the posterior
-        mean at rest in the same posture, but with friction and payload as they move, and share_s its own share. t is
-        the training's mean, p the mean torque of the payload. motions: (N, 3, n).
+        mean at rest in the same posture, but with friction and payload in motion, and share_s its own share. t is the
+        mean torque in training, p the mean torque of the payload. motions: (N, 3, n).
         """
         scratch, harmless = self._many, np.empty_like(tau)
         slopes = self._slopes[self._payload]
@@ -210,7 +212,7 @@ class Evaluator:
         return np.asarray((1.0 - share) * tau + share * harmless)
 
     def warm_up(self) -> None:
-        """Compile everything that an answer takes, or load it from Numba's cache."""
+        """Compile all code that a prediction needs, or load it from Numba's cache."""
         zeros = np.zeros((1, self.n_joints))
         self.many(zeros, zeros, zeros, covariance=True)
         self.one(np.zeros((3, self.n_joints)))
@@ -224,7 +226,7 @@ class Evaluator:
     def _answer(
         self, scratch: _Scratch, moving: Array, what: int, tau: Array, std: Array, covariance: Array, share: Array
     ) -> bool:
-        """Answer the first N queries in `scratch`. moving: (N, 3, n), what friction and payload see of them."""
+        """Compute the first N queries in `scratch`. moving: (N, 3, n), their motion for friction and payload."""
         count = len(moving)
         motions, blocks, features = scratch.motions[:count], scratch.blocks[:count], scratch.features[:count]
         if self._cross is not None:
@@ -251,7 +253,7 @@ class Evaluator:
 
 
 def _linear_prior(linear: Sequence[LinearKernel], params: Params) -> tuple[Array, Array]:
-    """Prior means and variances of all linear weights, term after term, (P,) each."""
+    """Return the prior means and variances of all linear weights, term after term, (P,) each."""
     means, variances = [np.zeros(0)], [np.zeros(0)]
     for term in linear:
         variance, mean = term.variances(params), term.prior_weights()
@@ -261,7 +263,7 @@ def _linear_prior(linear: Sequence[LinearKernel], params: Params) -> tuple[Array
 
 
 def _check(outputs: Indices, torques: int, weights: Array, root: Array, linear_weights: int) -> None:
-    """Raise ValueError where shapes do not fit, an output is none of `torques`, or root is not lower triangular."""
+    """Raise ValueError if shapes do not match, an output is not one of `torques`, or root is not lower triangular."""
     size = len(outputs) + linear_weights
     if outputs.ndim != 1 or np.any((outputs < 0) | (outputs >= torques)):
         raise ValueError(f"outputs are {outputs}, expected numbers from 0 to {torques - 1}")
@@ -276,12 +278,12 @@ def _check(outputs: Indices, torques: int, weights: Array, root: Array, linear_w
 
 
 def _lay_out(weights: Array, root: Array, means: Array, variances: Array) -> Array:
-    """The `fixed` array of `compiled.answer`, for features Φᵀ in the place of their covariances Λ Φᵀ."""
+    """Return the `fixed` array of `answer`, for features Φᵀ instead of their covariances Λ Φᵀ."""
     scale = np.ones(len(weights))
     scale[len(scale) - len(variances) :] = variances
     slopes = weights * scale
     slopes[len(scale) - len(means) :] += means
     root, chosen = root * scale, len(weights) - len(variances)
-    # a panel has rows of one sign
+    # rows of a panel have the same sign
     panels = [pack(root[:chosen], 0), pack(root[chosen:], chosen)]
     return np.concatenate([pack(slopes[None], len(slopes)), *panels])

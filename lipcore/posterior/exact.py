@@ -1,4 +1,4 @@
-"""Gaussian process posteriors of the joint torques: what all have in common, the exact one, and its evidence."""
+"""Gaussian process posteriors of the joint torques: their interface, the exact one, and its evidence."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 from lipcore.data.motion import Array, Motion
 from lipcore.kernels.base import LinearKernel, Params, SumKernel, TorqueKernel
 from lipcore.posterior.linalg import Factor, add_diagonal, cholesky
-from lipcore.vocabulary import Place
+from lipcore.vocabulary import Device
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Torque of a function f(q, dq, ddq), noise excluded. mean: (N, n) N·m; covariance: (N, n, n) (N·m)²."""
+    """Torque of a function f(q, dq, ddq), without noise. mean: (N, n) N·m; covariance: (N, n, n) (N·m)²."""
 
     mean: Array
     covariance: Array
@@ -30,40 +30,44 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Posterior(ABC):
-    """What is known of anything jointly Gaussian with M anchors u, which hold all that the data say.
+    """Gaussian posterior of any quantity that is jointly Gaussian with M anchors u.
+
+    The anchors contain all of the data.
 
     A quantity s with prior mean E s, prior variance var s and c = cov(u, s) has the posterior mean E s + cᵀ weights and
     the posterior variance var s − |whiten(c)|².
-
-    kernel: prior of the torques; params: its hyperparameters; std_factor: calibration of every standard deviation that
-    is not noise (see `lipcore.estimators.catalogue`); weights: (M,).
     """
 
     kernel: TorqueKernel
+    """Prior of the torques."""
     params: Params
+    """Hyperparameters of the prior."""
     std_factor: float
+    """Calibration of every standard deviation that is not noise, see `lipcore.estimators.catalogue`."""
     weights: Array
+    """Weights of the anchors, (M,)."""
 
     @abstractmethod
     def whiten(self, cross: Array) -> Array:
-        """Columns whose squared length is what the data explain: (M, K) to (r, K)."""
+        """Return columns with the explained variance as their squared length, (M, K) to (r, K)."""
 
     @abstractmethod
     def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Array]) -> Array:
-        """Covariance of the anchors with K quantities that belong to one term of the kernel: (M, K).
+        """Return the covariance of the anchors with K quantities that belong to one term of the kernel, (M, K).
 
-        covariance: that of the term's torques at N motions with the quantities, (N n, K).
+        covariance: function that returns the covariance of the term's torques at N motions with the quantities,
+        (N n, K).
         """
 
     @abstractmethod
     def with_weights(self, term: LinearKernel, covariance: Array) -> Array:
-        """Covariance of the anchors with K quantities, from that of a linear term's weights with them.
+        """Return the covariance of the anchors with K quantities of a linear term, (M, K).
 
-        term: with p weights; covariance: cov(w, s), (p, K). Return cov(u, s), (M, K).
+        term: with p weights; covariance: cov(w, s), (p, K), of its weights with the quantities.
         """
 
     def cross(self, kernel: TorqueKernel, query: Motion) -> Array:
-        """Covariance of the anchors with all torques of N queries, or with one term's share of them: (M, N n).
+        """Return the covariance of the anchors with the torques of N queries, or with one term's share, (M, N n).
 
         kernel: the posterior's own, or a term of it.
         """
@@ -76,18 +80,17 @@ class Posterior(ABC):
         return total
 
     def mean(self, query: Motion, component: TorqueKernel | None = None) -> Array:
-        """Posterior mean torque, (N, n) N·m.
+        """Return the posterior mean torque, (N, n) N·m.
 
-        query: N instants; component: a term of the kernel, whose share of the mean is asked for.
+        query: N instants; component: a term of the kernel, to return its share of the mean.
         """
         kernel = component or self.kernel
         return kernel.mean(query) + (self.weights @ self.cross(kernel, query)).reshape(len(query), -1)
 
     def predict(self, query: Motion, component: TorqueKernel | None = None) -> Prediction:
-        """Posterior mean (N, n) N·m and covariance (N, n, n) (N·m)² of the torques at each of N queries.
+        """Return the posterior mean (N, n) N·m and covariance (N, n, n) (N·m)² of the torques at each of N queries.
 
-        component: a term of the kernel, whose share is asked for. The covariance is that between the joints of one
-        query.
+        component: a term of the kernel, to return its share. The covariance is between the joints of one query.
         """
         kernel, n = component or self.kernel, self.kernel.n_joints
         means, covariances = [], []
@@ -103,9 +106,9 @@ class Posterior(ABC):
 
 @dataclass(frozen=True)
 class ExactPosterior(Posterior):
-    """Posterior of f given N noisy torques: K = k(X, X) + R, weights α = K⁻¹ y, with R one variance a joint.
+    """Posterior of f given N noisy torques: K = k(X, X) + R, weights α = K⁻¹ y, with one variance in R per joint.
 
-    The anchors are the torques themselves, so cost and memory grow with N: the reference for `CompactPosterior`.
+    The anchors are the torques themselves, so cost and memory grow with N. It is the reference for `CompactPosterior`.
     motion: the N training samples; factor: Cholesky of K, (N n, N n); weights: (N n,), sample by sample.
     """
 
@@ -116,32 +119,32 @@ class ExactPosterior(Posterior):
     def fit(
         cls, kernel: TorqueKernel, params: Params, motion: Motion, tau: Array, std_factor: float = 1.0
     ) -> ExactPosterior:
-        """Condition the prior on measured torques.
+        """Return the posterior given measured torques.
 
-        params: hyperparameters, `noise.log_std` among them; motion: N samples; tau: (N, n) N·m; std_factor:
-        calibration. Raise NotPositiveDefiniteError where K cannot be factored.
+        params: hyperparameters, with `noise.log_std`; motion: N samples; tau: (N, n) N·m; std_factor: calibration.
+        Raise NotPositiveDefiniteError if K cannot be factored.
         """
         factor = cholesky(noisy_gram(kernel, params, motion))
         weights = factor.solve((tau - kernel.mean(motion)).reshape(-1))
         return cls(kernel, params, std_factor, weights, motion, factor)
 
     def whiten(self, cross: Array) -> Array:
-        """L⁻¹ c with K = L Lᵀ."""
+        """Return L⁻¹ c with K = L Lᵀ."""
         return self.factor.whiten(cross)
 
     def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Array]) -> Array:
-        """Covariance of the training torques with K quantities, from that of a term's torques: (N n, K)."""
+        """Return the covariance of the training torques with K quantities of a term, (N n, K)."""
         return covariance(self.motion)
 
     def with_weights(self, term: LinearKernel, covariance: Array) -> Array:
-        """Φ(X) cov(w, s), (N n, K). covariance: cov(w, s), (p, K)."""
+        """Return Φ(X) cov(w, s), (N n, K). covariance: cov(w, s), (p, K)."""
         return term.flat_features(self.motion) @ covariance
 
 
 def noisy_gram(kernel: TorqueKernel, params: Params, motion: Motion) -> Array:
-    """K = k(X, X) + R: (N n, N n), exactly symmetric, sample by sample.
+    """Return K = k(X, X) + R, (N n, N n), exactly symmetric, sample by sample.
 
-    params: hyperparameters, `noise.log_std` among them; motion: N samples.
+    params: hyperparameters, with `noise.log_std`; motion: N samples.
     """
     gram = kernel.symmetric_gram(params, motion)
     add_diagonal(gram, np.tile(np.exp(2 * params["noise.log_std"]), len(motion)))
@@ -150,21 +153,24 @@ def noisy_gram(kernel: TorqueKernel, params: Params, motion: Motion) -> Array:
 
 @dataclass(frozen=True)
 class Evidence:
-    """value: −log p(tau | hyperparameters) in nats; gradient: its derivative by each hyperparameter."""
+    """Objective of a fit, without its penalty.
+
+    value: −log p(tau | hyperparameters) in nats; gradient: derivative by each hyperparameter.
+    """
 
     value: float
     gradient: dict[str, Array]
 
 
 def negative_log_evidence(
-    kernel: TorqueKernel, params: Params, motion: Motion, tau: Array, device: Place = "cpu"
+    kernel: TorqueKernel, params: Params, motion: Motion, tau: Array, device: Device = "cpu"
 ) -> Evidence:
-    """½ yᵀK⁻¹y + ½ log det K + ½ N n log 2π with K = k(X, X) + R, and its gradient.
+    """Return ½ yᵀK⁻¹y + ½ log det K + ½ N n log 2π with K = k(X, X) + R, and its gradient.
 
-    The gradient is the sum of W ∘ ∂K with W = ½ (K⁻¹ − ααᵀ), α = K⁻¹y (Rasmussen & Williams, eq. 5.9); y is what the
-    prior mean leaves. W is a constant once K is factored, so each kernel differentiates Σ W ∘ K in its own way.
+    The gradient is the sum of W ∘ ∂K with W = ½ (K⁻¹ − ααᵀ), α = K⁻¹y (Rasmussen & Williams, eq. 5.9). y is the torque
+    minus its prior mean. W is a constant once K is factored, so each kernel differentiates Σ W ∘ K in its own way.
 
-    motion: N samples; tau: (N, n); device: to compute on. Raise NotPositiveDefiniteError where K cannot be factored.
+    motion: N samples; tau: (N, n); device: to compute on. Raise NotPositiveDefiniteError if K cannot be factored.
     """
     if device != "cpu":
         from lipcore.posterior.on_device import evidence_on  # noqa: PLC0415 - it imports torch

@@ -1,7 +1,7 @@
 """Triangular linear algebra, the project's only jitter policy, and symmetric matrices stored as triangles.
 
-LAPACK and BLAS of SciPy read arrays in Fortran's order. A lower triangular L in C's order is, as it lies in memory, the
-upper triangular Lᵀ in Fortran's: every routine is asked for that one, and nothing is copied into another order.
+LAPACK and BLAS of SciPy read arrays in Fortran order. In memory, a lower triangular L in C order is the upper
+triangular Lᵀ in Fortran order. Every routine is called with Lᵀ, and nothing is copied into another order.
 """
 
 from __future__ import annotations
@@ -16,40 +16,40 @@ from scipy.linalg import blas, eigh, lapack
 from lipcore.data.motion import Array
 
 JITTERS = (0.0, 1e-12, 1e-11, 1e-10, 1e-9, 1e-8)
-"""Diagonal added, relative to the mean diagonal, tried in this order."""
-_blas, _lapack = cast(Any, blas), cast(Any, lapack)  # made by f2py, without types
+"""Values added to the diagonal, relative to its mean, in the order of the attempts."""
+_blas, _lapack = cast(Any, blas), cast(Any, lapack)  # f2py modules have no types
 
 
 class NotPositiveDefiniteError(ArithmeticError):
-    """A covariance matrix is not positive definite even with the largest jitter of the policy."""
+    """A covariance matrix is not positive definite, even with the largest jitter of the policy."""
 
 
 @dataclass(frozen=True)
 class Factor:
-    """Lower Cholesky factor L of K + jitter·I: `lower` (m, m) and the absolute jitter that it took."""
+    """Lower Cholesky factor L of K + jitter·I, (m, m), and the absolute jitter."""
 
     lower: Array
     jitter: float
 
     def solve(self, right: Array) -> Array:
-        """K⁻¹ right for right of shape (m,) or (m, k)."""
+        """Return K⁻¹ right for right of shape (m,) or (m, k)."""
         return solve_factored(self.lower, right)
 
     def whiten(self, right: Array) -> Array:
-        """L⁻¹ right for right of shape (m,) or (m, k)."""
+        """Return L⁻¹ right for right of shape (m,) or (m, k)."""
         return solve_lower(self.lower, right)
 
     def inverse(self) -> Array:
-        """K⁻¹, (m, m), exactly symmetric."""
+        """Return K⁻¹, (m, m), exactly symmetric."""
         return inverse_factored(self.lower)
 
     def log_determinant(self) -> float:
-        """log det K."""
+        """Return log det K."""
         return 2 * float(np.log(self.lower.diagonal()).sum())
 
 
 def cholesky(matrix: Array) -> Factor:
-    """Factor a symmetric positive definite matrix; raise NotPositiveDefiniteError where the jitter policy fails."""
+    """Return the Cholesky factor of a symmetric matrix. Raise NotPositiveDefiniteError if the jitter policy fails."""
     if not np.isfinite(matrix).all():
         raise NotPositiveDefiniteError("the covariance matrix holds a value that is not finite")
     scale = float(matrix.diagonal().mean()) if len(matrix) else 0.0
@@ -64,7 +64,7 @@ def cholesky(matrix: Array) -> Factor:
 
 
 def lower_root(matrix: Array, added: float = 0.0) -> Array | None:
-    """L, (m, m) lower triangular, with L Lᵀ = matrix + added·I; None where that is not positive definite.
+    """Return L, (m, m) lower triangular, with L Lᵀ = matrix + added·I, or None if that is not positive definite.
 
     The matrix is read from its lower triangle.
     """
@@ -77,23 +77,23 @@ def lower_root(matrix: Array, added: float = 0.0) -> Array | None:
 
 
 def solve_lower(lower: Array, right: Array, transposed: bool = False) -> Array:
-    """L⁻¹ right, or L⁻ᵀ right; lower: (m, m) in C's order; right: (m,) or (m, k)."""
+    """Return L⁻¹ right, or L⁻ᵀ right. lower: (m, m) in C order; right: (m,) or (m, k)."""
     if not right.size:
         return right.copy()
     if right.ndim == 1:
         return np.asarray(_blas.dtrsv(lower.T, right, lower=0, trans=0 if transposed else 1))
-    # the transpose is asked for: Xᵀ = Bᵀ L⁻ᵀ
+    # the call computes the transpose: Xᵀ = Bᵀ L⁻ᵀ
     solved = _blas.dtrsm(1.0, lower.T, right.T, side=1, lower=0, trans_a=1 if transposed else 0)
     return np.asarray(solved.T)
 
 
 def solve_lower_right(left: Array, lower: Array) -> Array:
-    """left L⁻¹; left: (k, m); lower: (m, m)."""
+    """Return left L⁻¹. left: (k, m); lower: (m, m)."""
     return solve_lower(lower, left.T, transposed=True).T
 
 
 def whiten_rows(lower: Array, rows: Array) -> None:
-    """Overwrite rows, (K, m), each a right-hand side x, by L⁻¹ x. rows: in C's order."""
+    """Overwrite each row x of `rows`, (K, m), by L⁻¹ x. rows: in C order."""
     if not rows.flags.c_contiguous:
         raise ValueError("rows are not C-contiguous, expected an array that BLAS can write to in place")
     if rows.size:
@@ -101,12 +101,12 @@ def whiten_rows(lower: Array, rows: Array) -> None:
 
 
 def solve_factored(lower: Array, right: Array) -> Array:
-    """(L Lᵀ)⁻¹ right; lower: (m, m); right: (m,) or (m, k)."""
+    """Return (L Lᵀ)⁻¹ right. lower: (m, m); right: (m,) or (m, k)."""
     return solve_lower(lower, solve_lower(lower, right), transposed=True)
 
 
 def inverse_factored(lower: Array) -> Array:
-    """(L Lᵀ)⁻¹, (m, m), exactly symmetric."""
+    """Return (L Lᵀ)⁻¹, (m, m), exactly symmetric."""
     if not len(lower):
         return lower.copy()
     upper, failed = _lapack.dpotri(lower.T, lower=0)
@@ -118,10 +118,10 @@ def inverse_factored(lower: Array) -> Array:
 
 
 def eigen(matrix: Array) -> tuple[Array, Array]:
-    """Eigenvalues of a symmetric matrix, (m,), rising, and its eigenvectors, the columns of (m, m).
+    """Return the eigenvalues of a symmetric matrix, (m,), ascending, and its eigenvectors, the columns of (m, m).
 
-    By divide and conquer, which does not converge for every matrix; for such by QR iterations, which take longer. The
-    matrix is read from its lower triangle. Raise NotPositiveDefiniteError for a number that is not finite.
+    Divide and conquer does not converge for every matrix. QR iterations, which are slower, are the fallback. The matrix
+    is read from its lower triangle. Raise NotPositiveDefiniteError for a number that is not finite.
     """
     if not np.isfinite(matrix).all():
         raise NotPositiveDefiniteError("a symmetric matrix holds a number that is not finite")
@@ -138,7 +138,7 @@ def add_diagonal(matrix: Array, values: Array | float) -> None:
 
 
 def add_square(a: Array, features: Array) -> None:
-    """Add F Fᵀ to the lower triangle of A, in place. a: (M, M); features: F, (M, K); both in C's order."""
+    """Add F Fᵀ to the lower triangle of A, in place. a: (M, M); features: F, (M, K); both in C order."""
     if not (a.flags.c_contiguous and features.flags.c_contiguous):
         raise ValueError("a and features are not both C-contiguous, expected arrays that BLAS can write to in place")
     if features.size:
@@ -146,7 +146,7 @@ def add_square(a: Array, features: Array) -> None:
 
 
 def add_square_of_rows(a: Array, rows: Array) -> None:
-    """Add RᵀR to the upper triangle of A, in place. a: (M, M); rows: R, (K, M); both in C's order."""
+    """Add RᵀR to the upper triangle of A, in place. a: (M, M); rows: R, (K, M); both in C order."""
     if not (a.flags.c_contiguous and rows.flags.c_contiguous):
         raise ValueError("a and rows are not both C-contiguous, expected arrays that BLAS can write to in place")
     if rows.size:
@@ -159,7 +159,7 @@ def mirror(a: Array) -> None:
 
 
 def block_diagonal(blocks: list[Array]) -> Array:
-    """Square matrices along the diagonal of one that is zero elsewhere."""
+    """Return a matrix with square blocks along its diagonal and zeros elsewhere."""
     size = sum(map(len, blocks))
     out, at = np.zeros((size, size)), 0
     for block in blocks:
@@ -169,14 +169,14 @@ def block_diagonal(blocks: list[Array]) -> Array:
 
 
 def pack_symmetric(symmetric: Array) -> Array:
-    """Upper triangle of a symmetric matrix (M, M), row by row: (M (M + 1) / 2,)."""
+    """Return the upper triangle of a symmetric matrix (M, M), row by row, (M (M + 1) / 2,)."""
     return np.asarray(symmetric[np.triu_indices(len(symmetric))])
 
 
 def unpack_symmetric(name: str, packed: Array) -> Array:
-    """The symmetric matrix (M, M) of `pack_symmetric`; name: of the tensor, for the message.
+    """Return the symmetric matrix (M, M) of `pack_symmetric`. name: of the tensor, for the error message.
 
-    Raise ValueError for a length that no triangle has.
+    Raise ValueError if no triangle has this length.
     """
     size = math.isqrt(2 * packed.size)
     if packed.ndim != 1 or size * (size + 1) // 2 != len(packed):

@@ -1,4 +1,4 @@
-"""What no estimator expresses, as variance: friction of joints at rest, errors that last, motion faster than seen."""
+"""Variance that no estimator models: friction of joints at rest, lasting errors, and motion faster than in training."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lipcore.data.independence import INDEPENDENT_HZ, recording_weights
 from lipcore.data.motion import Motion
-from lipcore.data.repetition import distinct
+from lipcore.data.repetition import measure_distinct_share
 from lipcore.data.samples import Array, Samples
 from lipcore.data.signals import noise_level
 from lipcore.kernels.fast.answer import ACCELERATED
@@ -19,20 +19,22 @@ from lipcore.kernels.friction import SIGN_WIDTH
 
 @dataclass(frozen=True)
 class MisfitOptions:
-    """What lasts of errors, and what variance at low speed must gain."""
+    """Constants of lasting errors, and of the variance at low speed."""
 
     lasting_s: float = 1.0
-    """Time over which an error that is no white noise is the same, s: as long as the motion is. Tuned on simulated arms
-    with `Dirt` (seeds 50 and 51 of `benchmarks/studies/dirty_arms.py`) among 0.5, 0.67 and 1."""
+    """Time over which an error that is not white noise stays the same, s. The motion stays the same for this time.
+    Tuned on simulated arms with `Dirt` (seeds 50 and 51 of `benchmarks/studies/dirty_arms.py`) among 0.5, 0.67 and
+    1."""
     rest_share: float = 0.5
-    """Variance of the torque that holds a joint at rest, in units of its Coulomb torque squared: that of a joint which
-    stopped anywhere on a slow oscillation; 1/3 if all holding torques were equally likely, 1 if only the largest."""
+    """Variance of the torque that keeps a joint at rest, relative to its squared Coulomb torque. This value is that of
+    a joint that stopped anywhere on a slow oscillation. It would be 1/3 if all such torques were equally likely, and 1
+    if only the largest one occurred."""
     speeds: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
     """Speeds below which friction may be unknown, rad/s (m/s)."""
     min_gain_nats: float = 10.0
-    """Min gain of more variance at low speed."""
+    """Min gain in evidence from additional variance at low speed."""
     white_ratio: float = 1.5
-    """Variance over the estimated one of white noise that chance explains."""
+    """Ratio of the variance to its estimate from white noise that chance explains."""
     min_share: float = 0.01
     """Min variance of faster motion, as a share of the mean square."""
 
@@ -42,101 +44,107 @@ OPTIONS = MisfitOptions()
 
 @dataclass(frozen=True)
 class Misfit:
-    """Variance besides noise and posterior, of joints at N velocities dq (eq. 25 of docs/method.md).
+    """Variance in addition to noise and posterior, of joints at N velocities dq (eq. 25 of docs/method.md).
 
         at rest      rest_j exp(−(dq_j / slow_j)²)
         faster       lasting_j (max(0, mean_i (dq_i / speed_i)² − 1) + ACCELERATED max(0, mean_i (ddq_i / u_i)² − 1))
 
-    rest: (n,) (N·m)², of friction that has not broken away or has just turned round; slow: (n,) rad/s (m/s); lasting:
-    (n,) (N·m)², share of the noise's variance that lasts: the error of neighbouring rows is the same, and grows with
-    motion beyond what was seen, as what causes it does; speed, acceleration u: (n,) root mean squares of dq and ddq in
-    training.
+    u is `acceleration`. The variance of faster motion depends on all joints i.
     """
 
     rest: Array
+    """Variance of friction before breakaway or just after a reversal, (n,) (N·m)²."""
     slow: Array
+    """Speed at which that variance has decayed to exp(−1), (n,) rad/s (m/s)."""
     lasting: Array
+    """Part of the noise variance that lasts, (n,) (N·m)². Its error is the same in neighbouring rows. It grows with
+    motion beyond that of the training, as its cause does."""
     speed: Array
+    """Root mean square of dq in training, (n,)."""
     acceleration: Array
+    """Root mean square of ddq in training, (n,)."""
 
     @classmethod
     def none(cls, n: int) -> Misfit:
-        """No such variance, for n joints."""
+        """Return a misfit of zero, for n joints."""
         zero, one = np.zeros(n), np.ones(n)
         return cls(zero, one, zero, one, one)
 
     @classmethod
     def unpacked(cls, values: Array) -> Misfit:
-        """From what `packed` returns, (5, n)."""
+        """Return the misfit from the result of `packed`, (5, n)."""
         return cls(*values)
 
     def packed(self) -> Array:
-        """Its fields one below the other, (5, n)."""
+        """Return the fields as rows, (5, n)."""
         return np.stack([self.rest, self.slow, self.lasting, self.speed, self.acceleration])
 
     def of_joints(self, joints: NDArray[np.int64]) -> Misfit:
-        """The same with the joints in another order. joints: (n,), their places in this one."""
+        """Return the same with the joints in another order. joints: (n,), their places in this one."""
         return Misfit.unpacked(self.packed()[:, joints])
 
     def with_friction(self, coulomb: Array) -> Misfit:
-        """The same with at least `rest_share` of the squared Coulomb torques at rest, (n,) N·m, moved so far or not."""
+        """Return the same with at least `rest_share` of the squared Coulomb torques, (n,) N·m, as variance at rest.
+
+        It applies to joints that never moved, too.
+        """
         return replace(self, rest=np.maximum(self.rest, OPTIONS.rest_share * coulomb**2))
 
     def with_rest(self, other: Misfit) -> Misfit:
-        """The same with the variance at rest, and its speed, of another where that is larger."""
+        """Return the same with the variance at rest, and its speed, of another misfit if that variance is larger."""
         larger = other.rest > self.rest
         rest, slow = np.where(larger, other.rest, self.rest), np.where(larger, other.slow, self.slow)
         return replace(self, rest=rest, slow=slow)
 
     @property
-    def exists(self) -> bool:
-        """Whether there is any."""
+    def is_nonzero(self) -> bool:
+        """Whether any variance is above zero."""
         return bool((self.rest > 0).any() or (self.lasting > 0).any())
 
     def at_rest(self, dq: Array) -> Array:
-        """Variance of friction at low speed, (N, n) (N·m)². dq: (N, n)."""
+        """Return the variance of friction at low speed, (N, n) (N·m)². dq: (N, n)."""
         return np.asarray(self.rest * np.exp(-((dq / self.slow) ** 2)))
 
     def variance(self, motion: Motion) -> Array:
-        """Variance of the torques at N instants, (N, n) (N·m)²."""
+        """Return the variance of the torques at N instants, (N, n) (N·m)²."""
         speed = ((motion.dq / self.speed) ** 2).mean(axis=-1, keepdims=True) - 1
         acceleration = ((motion.ddq / self.acceleration) ** 2).mean(axis=-1, keepdims=True) - 1
         faster = speed.clip(0.0) + ACCELERATED * acceleration.clip(0.0)
         return np.asarray(self.at_rest(motion.dq) + self.lasting * faster)
 
     def of_row(self, noise: Array, dq: Array, rows: float = INDEPENDENT_HZ * OPTIONS.lasting_s) -> Array:
-        """Variance R with which each of N rows teaches, (N, n) (N·m)²: white noise is new in every row, an error that
-        lasts is that of `rows` rows, which count together as one.
+        """Return the variance R of each of N rows when it is learnt, (N, n) (N·m)².
 
-        noise: (n,) (N·m)², white or lasting.
+        White noise is new in every row. A lasting error is common to `rows` rows, which count together as one. noise:
+        (n,) (N·m)², white or lasting.
         """
         return noise + (rows - 1) * self.lasting + rows * self.at_rest(dq)
 
 
 def shared_rows(samples: Samples, joint_types: Sequence[str], count: int) -> float:
-    """Of `count` rows chosen from all over a recording, how many have an error in common where it lasts: at least 1.
+    """Return how many of `count` rows, chosen from a whole recording, share one lasting error: at least 1.
 
-    Such errors are functions of motion, so motion that repeats itself has the same again. joint_types: (n,).
+    Such errors are functions of the motion, so repeated motion has the same errors. joint_types: (n,).
     """
-    seconds = float(recording_weights(samples.t, samples.episode, 1 / OPTIONS.lasting_s).sum()) * distinct(
-        samples, joint_types
-    )
+    seconds = float(
+        recording_weights(samples.t, samples.episode, 1 / OPTIONS.lasting_s).sum()
+    ) * measure_distinct_share(samples, joint_types)
     return max(1.0, count / seconds) if seconds > 0 else 1.0
 
 
-def estimate(
+def estimate_misfit(
     residual: Array, tau: Array, motion: Array, episodes: Sequence[slice], least: Array | float = 0.0
 ) -> tuple[Misfit, Array]:
-    """The misfit that residuals prove, and the variance of the noise in motion, (n,) (N·m)².
+    """Return the misfit from residuals, and the variance of the noise in motion, (n,) (N·m)².
 
-    residual: (N, n) N·m, what a model leaves of contiguous samples; tau: (N, n), their torques; motion: (2, N, n),
-    their velocities and accelerations; episodes: their rows; least: (n,) (N·m)², that the noise has at least. What
-    differences of neighbours say, of torques or of residuals, is white noise, and `white_ratio` times that; the rest
+    residual: (N, n) N·m, of contiguous samples; tau: (N, n), their torques; motion: (2, N, n), their velocities and
+    accelerations; episodes: their rows; least: (n,) (N·m)², min noise variance. The white noise is estimated from
+    differences of neighbouring torques or residuals. Up to `white_ratio` times its variance counts as white; the rest
     lasts.
     """
     noise, rest, slow = low_speed_variance(residual, motion[0])
     noise = np.maximum(noise, least)
-    # residuals may be rougher than torques, where the model's friction turns round at once
+    # residuals may be rougher than torques if the model's friction reverses at once
     white = np.minimum(*(noise_level([each[part] for part in episodes]) for each in (residual, tau)))
     lasting = np.maximum(noise - OPTIONS.white_ratio * white**2, 0.0)
     usual = np.maximum(np.sqrt(np.mean(motion**2, axis=1)), SIGN_WIDTH)
@@ -144,9 +152,10 @@ def estimate(
 
 
 def low_speed_variance(residual: Array, dq: Array) -> tuple[Array, Array, Array]:
-    """Most likely s², r and w of residuals of variance s² + r exp(−(dq / w)²): (n,) each, w one of the speeds.
+    """Return the most likely s², r and w of residuals with variance s² + r exp(−(dq / w)²), (n,) each.
 
-    residual, dq: (N, n). Fisher scoring of both variances at once; r is zero where it gains less than `min_gain_nats`.
+    residual, dq: (N, n); w is one of the speeds. Fisher scoring estimates both variances at once. r is zero if it gains
+    less than `min_gain_nats`.
     """
     unit = np.maximum(np.mean(residual**2, axis=0), np.finfo(float).tiny)
     squares, mean = residual**2 / unit, np.ones_like(unit)

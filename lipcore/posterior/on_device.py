@@ -1,6 +1,6 @@
-"""The fit of `se`, `gip` and `lse`, and sums over very many samples, on a GPU: as on the CPU, to rounding.
+"""The fit of `se`, `gip` and `lse`, and sums over very many samples, on a GPU. Results equal the CPU's, to rounding.
 
-The formula of the kernel is computed there; the features of friction are moved there.
+The kernel's formula is computed on the GPU. The features of friction are copied to it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from lipcore.posterior.linalg import JITTERS, NotPositiveDefiniteError
 def evidence_on(
     kernel: TorqueKernel, params: Params, motion: Motion, tau: Array, device: str
 ) -> tuple[float, dict[str, Array]]:
-    """−log evidence, nats, and its gradient: see `exact.negative_log_evidence`, whose arguments these are."""
+    """Return −log evidence, nats, and its gradient. Arguments: see `exact.negative_log_evidence`."""
     term, linear = split(kernel)
     assert term is not None
     n, size, noise = kernel.n_joints, len(motion), tensor(params["noise.log_std"], device)
@@ -53,7 +53,7 @@ class DeviceBasis:
         self._root, self._scales = tensor(basis.root, device), tensor(basis.scales, device)
 
     def weighed(self, motion: Motion, residual: Array, noise: Array, weights: Array) -> tuple[Array, Array]:
-        """Features of N samples' torques, (N n, M), times the root of their precision, and Σ φ R⁻¹ residual, (M,).
+        """Return the features of N samples' torques times their root precision, (N n, M), and Σ φ R⁻¹ residual, (M,).
 
         residual, noise: (N, n); weights: (N,).
         """
@@ -77,7 +77,7 @@ class DeviceBasis:
 
 
 def _lower(gram: Tensor) -> Tensor:
-    """Cholesky factor by the project's jitter policy, see `linalg.cholesky`."""
+    """Return the Cholesky factor by the project's jitter policy, see `linalg.cholesky`."""
     scale = float(gram.diagonal().mean())
     for relative in JITTERS:
         shifted = gram if relative == 0.0 else gram + relative * scale * torch.eye(len(gram), device=gram.device)

@@ -1,4 +1,4 @@
-"""Choosing few samples, or few torques, that stand for all: farthest points, and pivoted Cholesky."""
+"""Selection of few samples, or few torques, that represent all: farthest points, and pivoted Cholesky."""
 
 from __future__ import annotations
 
@@ -10,18 +10,19 @@ from lipcore.data.motion import Array, Indices, Motion
 from lipcore.kernels.friction import friction_features
 
 PREFERENCE = 10.0
-"""An output of a sample that is chosen already is taken as long as its residual is at least a tenth of the largest.
+"""Preference for outputs of samples that are already chosen: one is chosen if its residual is at least a tenth of the
+max.
 
-All outputs of a sample cost a query little more than one. On a 500-sample simulated Panda, 350 outputs then lie in 51
-samples instead of 240, and deviate from the exact posterior no more.
+All outputs of a sample cost a query little more than one. On a 500-sample simulated Panda, 350 outputs then belong to
+51 samples instead of 240, with no larger deviation from the exact posterior.
 """
 
 
 def spread_out(motion: Motion, count: int) -> Indices:
-    """Indices of `count` samples that lie far from each other, sorted; all where there are no more.
+    """Return the indices of `count` samples that are far from each other, sorted; all indices if there are no more.
 
-    Farthest-point selection on (cos q, sin q, q − mean, dq, sign dq, ddq), each scaled to the motion's spread:
-    every region of positions and every regime of speed that occurs is represented.
+    Farthest-point selection on (cos q, sin q, q − mean, dq, sign dq, ddq), each scaled to the motion's spread. Every
+    region of positions and every range of speeds is represented.
     """
     size = len(motion)
     if size <= count:
@@ -45,16 +46,16 @@ def spread_out(motion: Motion, count: int) -> Indices:
     while len(chosen) < count:
         last = chosen[-1]
         distance = np.minimum(distance, squares + squares[last] - 2 * (features @ features[last]))
-        distance[chosen] = -1.0  # a sample that repeats a chosen one is new, a chosen one is not
+        distance[chosen] = -1.0  # a chosen sample must not be chosen again; another sample that equals it may be
         chosen.append(int(distance.argmax()))
     return np.array(sorted(chosen))
 
 
 @dataclass(frozen=True)
 class Pivots:
-    """Outputs in the order chosen, (m,), and the columns of L that belong to them, (M, m), for all M outputs.
+    """Outputs in the order of choice, (m,), with their columns of L, (M, m), for all M outputs.
 
-    residual: (m,), largest variance that the outputs chosen before each step leave unexplained.
+    residual: (m,), max variance that the outputs chosen before each step do not explain.
     """
 
     outputs: Indices
@@ -66,14 +67,14 @@ class Pivots:
 
 
 def pivots(gram: Array, per_sample: int, most: int, residual: float) -> Pivots:
-    """Choose at most `most` outputs until no residual variance exceeds `residual`.
+    """Return at most `most` outputs, chosen until no residual variance exceeds `residual`.
 
-    gram: (M, M), outputs sample by sample, `per_sample` a sample; it is read column by column and not changed.
+    gram: (M, M), outputs sample by sample, `per_sample` each. It is read column by column and not modified.
     """
     size = len(gram)
-    lower = np.zeros((min(most, size), size))  # rows are contiguous: L transposed
+    lower = np.zeros((min(most, size), size))  # L transposed, so that its columns are contiguous
     left = gram.diagonal().copy()
-    stop = max(residual, 1e-13 * float(left.max()))  # less is rounding
+    stop = max(residual, 1e-13 * float(left.max()))  # below this, variances are rounding errors
     handicap = np.full((size,), 1 / PREFERENCE)
     chosen: list[int] = []
     residuals: list[float] = []

@@ -1,7 +1,7 @@
-"""What a compact posterior needs to know of the data: sums over samples, and how they are added, aged and solved.
+"""Statistics of a compact posterior: sums over samples, and how they are added, decayed and solved.
 
-All functions are pure. Sums know no order: fitting all samples at once, or in parts, or one by one, gives the same
-posterior.
+All functions are pure. The order of samples does not matter: fitting all samples at once, in parts, or one by one gives
+the same posterior.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from lipcore.posterior.linalg import (
     solve_lower_right,
 )
 
-BELOW = 1e-5
-"""How far below zero the eigenvalues of the statistics may lie by rounding without being looked at: by such a share a
-variance of which samples say nothing may exceed the prior's."""
+EIGENVALUE_TOLERANCE = 1e-5
+"""Tolerance for negative eigenvalues of the statistics, which rounding causes. A variance may exceed the prior's by
+this share if samples do not determine it."""
 
 
 @dataclass(frozen=True)
 class Statistics:
-    """A = Σ φ R⁻¹ φᵀ, (M, M), and b = Σ φ R⁻¹ (y − E y), (M,), over samples, each with a weight of one unless aged.
+    """A = Σ φ R⁻¹ φᵀ, (M, M), and b = Σ φ R⁻¹ (y − E y), (M,), over samples. Each sample has weight one unless decayed.
 
-    R: diagonal; of each torque the noise variance and what the basis leaves open, k(x, x) − φᵀφ. So a sample beyond the
-    basis teaches the little that it can, instead of being explained by functions that do not reach it (the fully
-    independent training conditional of Snelson & Ghahramani, 2006). samples: sum of the weights.
+    R is diagonal. For each torque it is the noise variance plus the variance outside the basis, k(x, x) − φᵀφ. A sample
+    outside the basis therefore has little influence, instead of being explained by functions that do not reach it (the
+    fully independent training conditional of Snelson & Ghahramani, 2006). samples: sum of the weights.
     """
 
     a: Array
@@ -45,10 +45,11 @@ class Statistics:
 
 @dataclass(frozen=True)
 class Solution:
-    """Posterior N(mean, Σ) of the M whitened variables, and what its variances are sums of, without a difference.
+    """Posterior N(mean, Σ) of the M whitened variables. Its variances are sums of squares, without differences.
 
-    root: R, (M, M) lower triangular. Its first rows R₁, of `first` variables, are what is learnt of them by who knows
-    the others, I − R₁ᵀR₁ = Σ₁₁ − Σ₁₂ Σ₂₂⁻¹ Σ₂₁; the others R₂ are what is left of all: Σ = I₁ − R₁ᵀR₁ + R₂ᵀR₂.
+    root: R, (M, M) lower triangular. Its first rows R₁, of `first` variables, are the variance learnt about them if the
+    others are known, I − R₁ᵀR₁ = Σ₁₁ − Σ₁₂ Σ₂₂⁻¹ Σ₂₁. The other rows R₂ are the remaining variance of all:
+    Σ = I₁ − R₁ᵀR₁ + R₂ᵀR₂.
     """
 
     mean: Array
@@ -65,17 +66,17 @@ class Solution:
 
 
 def empty(size: int) -> Statistics:
-    """Statistics of no samples, for M = size variables."""
+    """Return the statistics of no samples, for M = size variables."""
     return Statistics(np.zeros((size, size)), np.zeros(size), 0)
 
 
 def collect(
     basis: Basis, noise_variance: Array, motion: Motion, residual: Array, weights: Array | None = None
 ) -> Statistics:
-    """Sums over N samples, A = Σ φ R⁻¹ φᵀ and b = Σ φ R⁻¹ residual (eq. 24 of docs/method.md).
+    """Return the sums over N samples, A = Σ φ R⁻¹ φᵀ and b = Σ φ R⁻¹ residual (eq. 24 of docs/method.md).
 
-    noise_variance: (n,) or (N, n) (N·m)²; residual: torque less its prior mean, (N, n) N·m; weights: (N,),
-    what each sample counts, one where None.
+    noise_variance: (n,) or (N, n) (N·m)²; residual: torque minus its prior mean, (N, n) N·m; weights: (N,), one for
+    each sample, None for all one.
     """
     features = basis.features(motion)
     variance = noise_variance + basis.uncovered(motion, features)
@@ -89,16 +90,16 @@ def collect(
 
 
 def merge(one: Statistics, other: Statistics) -> Statistics:
-    """Statistics of the samples of both, from parts, streams or robots that share a basis."""
+    """Return the statistics of both sets of samples, from parts, streams or robots that share a basis."""
     return Statistics(one.a + other.a, one.b + other.b, one.samples + other.samples)
 
 
 def add_to(statistics: Statistics, features: Array, variance: Array, residual: Array, weights: Array) -> Statistics:
-    """Statistics with N samples more, that overwrite these: for few samples, often.
+    """Return the statistics with N more samples, overwriting the given ones. It is fast for few samples, often.
 
-    Of A only the lower triangle is kept up, which is all that `solve` reads; `mirror` follows with the other. The same
-    to rounding as to `merge` what `collect` finds. features: φ, (M, N n), overwritten; variance: R, (N, n); residual:
-    (N, n); weights: (N,).
+    Only the lower triangle of A is updated, which is all that `solve` reads; `mirror` updates the other. The result
+    equals `merge` with that of `collect`, to rounding. features: φ, (M, N n), overwritten; variance: R, (N, n);
+    residual: (N, n); weights: (N,).
     """
     root = np.sqrt(weights[:, None] / variance)
     features *= root.reshape(-1)
@@ -108,9 +109,9 @@ def add_to(statistics: Statistics, features: Array, variance: Array, residual: A
 
 
 def decay(statistics: Statistics, factor: float, own: bool = False) -> Statistics:
-    """Statistics whose samples count a `factor` from 0 to 1 as much as before; raise ValueError for another.
+    """Return the statistics with all sample weights multiplied by `factor`, 0 to 1. Raise ValueError for other factors.
 
-    own: whether these are not needed any more and may be overwritten, to the same bits.
+    own: whether the given statistics may be overwritten, which gives the same bits.
     """
     if not 0.0 <= factor <= 1.0:
         raise ValueError(f"factor is {factor!r}, expected a number from 0 to 1")
@@ -119,15 +120,15 @@ def decay(statistics: Statistics, factor: float, own: bool = False) -> Statistic
 
 
 def copied(statistics: Statistics) -> Statistics:
-    """The same statistics in memory of their own."""
+    """Return a copy of the statistics."""
     return Statistics(statistics.a.copy(), statistics.b.copy(), statistics.samples)
 
 
 def solve(statistics: Statistics, centre: Array | None = None, first: int = 0) -> Solution:
-    """Posterior of the whitened variables given the statistics, with the prior N(centre, I).
+    """Return the posterior of the whitened variables given the statistics, with the prior N(centre, I).
 
-    Mean (I + A)⁻¹ (centre + b), covariance Σ = (I + A)⁻¹ = L⁻ᵀ L⁻¹. centre: (M,), zero where None; first: see
-    `Solution`. Raise NotPositiveDefiniteError for statistics that no samples have.
+    Mean (I + A)⁻¹ (centre + b), covariance Σ = (I + A)⁻¹ = L⁻ᵀ L⁻¹. centre: (M,), None for zero; first: see `Solution`.
+    Raise NotPositiveDefiniteError for statistics that no samples can have.
     """
     right = statistics.b if centre is None else centre + statistics.b
     factor = _by_cholesky(statistics.a)
@@ -138,10 +139,10 @@ def solve(statistics: Statistics, centre: Array | None = None, first: int = 0) -
     return Solution(mean, _stacked(inverse_factored(np.ascontiguousarray(factor[:first, :first])), left), first)
 
 
-def known(mean: Array, covariance: Array, first: int = 0) -> Solution:
-    """The posterior N(mean, Σ) of whitened variables, (M,) and (M, M), as it stands; Σ is nowhere above the prior's I.
+def make_solution(mean: Array, covariance: Array, first: int = 0) -> Solution:
+    """Return the given posterior N(mean, Σ) of whitened variables, (M,) and (M, M), as a solution.
 
-    Raise NotPositiveDefiniteError where it is.
+    Raise NotPositiveDefiniteError if Σ exceeds the prior's I anywhere.
     """
     learnt_root(covariance)
     left = _lower_root(covariance)
@@ -150,9 +151,9 @@ def known(mean: Array, covariance: Array, first: int = 0) -> Solution:
 
 
 def learnt_root(covariance: Array) -> Array:
-    """Q, (M, M) lower triangular, with QᵀQ = I − Σ: what is learnt of whitened variables of covariance Σ.
+    """Return Q, (M, M) lower triangular, with QᵀQ = I − Σ: the variance learnt about whitened variables.
 
-    Raise NotPositiveDefiniteError where Σ exceeds the prior's I.
+    Raise NotPositiveDefiniteError if Σ exceeds the prior's I.
     """
     explained = -covariance
     add_diagonal(explained, 1.0)
@@ -160,7 +161,7 @@ def learnt_root(covariance: Array) -> Array:
 
 
 def _stacked(given: Array, left: Array) -> Array:
-    """R of `Solution`. given: Σ₁₁ − Σ₁₂ Σ₂₂⁻¹ Σ₂₁; left: R₂."""
+    """Return R of `Solution`. given: Σ₁₁ − Σ₁₂ Σ₂₂⁻¹ Σ₂₁; left: R₂."""
     first = len(given)
     if not first:
         return np.ascontiguousarray(left)
@@ -170,30 +171,33 @@ def _stacked(given: Array, left: Array) -> Array:
 
 
 def _lower_root(matrix: Array) -> Array:
-    """Q, lower triangular, with QᵀQ a symmetric matrix; raise NotPositiveDefiniteError for one that is no square."""
+    """Return Q, lower triangular, with QᵀQ a symmetric matrix. Raise NotPositiveDefiniteError if there is none."""
     some = matrix.diagonal() != 0
-    if not some.all():  # of others nothing is learnt, or all is known
+    if not some.all():  # the rows of the other variables are zero
         out = np.zeros_like(matrix)
         out[np.ix_(some, some)] = _lower_root(matrix[np.ix_(some, some)])
         return out
-    # with the variables in reverse order it is L Lᵀ: the factor that is sought is Lᵀ, reversed
+    # with the variables in reverse order it is L Lᵀ: the required factor is Lᵀ, reversed
     root = lower_root(matrix[::-1, ::-1])
     if root is not None:
         return np.ascontiguousarray(root.T[::-1, ::-1])
     values, vectors = eigen(matrix)
-    if not float(values[0]) >= -BELOW:
+    if not float(values[0]) >= -EIGENVALUE_TOLERANCE:
         raise NotPositiveDefiniteError(f"a covariance is {-float(values[0]):.3g} above the prior's or below zero")
     root = np.sqrt(values.clip(0.0))[:, None] * vectors.T
     return np.ascontiguousarray(_upper(root[:, ::-1])[::-1, ::-1])
 
 
 def _by_cholesky(a: Array) -> Array | None:
-    """L, lower triangular, with L Lᵀ = I + A; None where A is not one that samples have, to BELOW."""
-    return None if lower_root(a, BELOW) is None else lower_root(a, 1.0)
+    """Return L, lower triangular, with L Lᵀ = I + A, or None if A has eigenvalues below −EIGENVALUE_TOLERANCE."""
+    return None if lower_root(a, EIGENVALUE_TOLERANCE) is None else lower_root(a, 1.0)
 
 
 def _by_eigenvalues(a: Array) -> Array:
-    """The same from any statistics, at three times the cost; raise NotPositiveDefiniteError for impossible ones."""
+    """Return the same for any statistics, at three times the cost.
+
+    Raise NotPositiveDefiniteError for impossible ones.
+    """
     values, vectors = eigen(a)
     if not float(values[0]) >= -1e-8 * max(float(values[-1]), 1.0):  # less is rounding
         raise NotPositiveDefiniteError(
@@ -201,10 +205,10 @@ def _by_eigenvalues(a: Array) -> Array:
         )
     root = np.sqrt(1 + values.clip(0.0))[:, None] * vectors.T
     upper = _upper(root)
-    # the Cholesky factor has a positive diagonal
+    # a Cholesky factor has a positive diagonal
     return np.ascontiguousarray((upper * np.sign(upper.diagonal())[:, None]).T)
 
 
 def _upper(matrix: Array) -> Array:
-    """R of the QR decomposition."""
+    """Return R of the QR decomposition."""
     return np.asarray(np.linalg.qr(matrix, mode="r"))

@@ -1,8 +1,8 @@
-"""Statistics of very many samples, fast and in memory that does not grow: those of `statistics.collect`, to rounding.
+"""Statistics of very many samples, fast and in constant memory. They equal `statistics.collect`, to rounding.
 
-Profiled for a thousand variables and seven joints on the CPU: the Gram matrix, the triangular solve and the product of
-the features with themselves are nearly all that is left. The first is compiled; the second is done in place for all
-torques of a chunk; the third adds to the sum by BLAS's `syrk`, which computes one triangle only.
+On the CPU, with a thousand variables and seven joints, three steps use nearly all of the time. The Gram matrix is
+compiled. The triangular solve is done in place for all torques of a chunk. The product of the features with themselves
+is added to the sum by BLAS's `syrk`, which computes one triangle only.
 """
 
 from __future__ import annotations
@@ -21,61 +21,61 @@ from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.linalg import add_square_of_rows, pack_symmetric, whiten_rows
 from lipcore.posterior.misfit import Misfit
-from lipcore.vocabulary import Place
+from lipcore.vocabulary import Device
 
 if TYPE_CHECKING:
     from lipcore.posterior.on_device import DeviceBasis
 
 CHUNK = 1024
-"""Samples whose product is computed together: the more, the less often the sum is read and written."""
+"""Samples of one matrix product. Larger chunks read and write the sum less often."""
 PIECE = 256
-"""Samples whose features are computed together."""
+"""Samples per computation of features."""
 
 
 @dataclass
 class Total:
-    """A sum that grows: the upper triangle of A, (M, M), and b, (M,)."""
+    """A running sum: the upper triangle of A, (M, M), and b, (M,)."""
 
     a: Array
     b: Array
 
     @classmethod
     def empty(cls, size: int) -> Total:
-        """The sum of no samples, for M = size variables."""
+        """Return the sum of no samples, for M = size variables."""
         return cls(np.zeros((size, size)), np.zeros(size))
 
     def packed(self) -> Array:
-        """Upper triangle of A row by row, (M (M + 1) / 2,)."""
+        """Return the upper triangle of A row by row, (M (M + 1) / 2,)."""
         return pack_symmetric(self.a)
 
 
 @dataclass(frozen=True)
 class Summing:
-    """How samples are summed up for a posterior: its kernel, basis, noise and misfit.
+    """Summation of samples for a posterior, with its kernel, basis, noise and misfit.
 
-    device: what computes all but the sum; a GPU for `se`, `gip` and `lse` alone.
+    device: computes everything except the sum; a GPU for `se`, `gip` and `lse` alone.
     """
 
     kernel: TorqueKernel
     basis: Basis
     noise_variance: Array
     misfit: Misfit
-    device: Place
+    device: Device
 
     @classmethod
-    def of(cls, posterior: CompactPosterior, device: Place = "cpu") -> Summing:
-        """For a posterior, on a device."""
+    def of(cls, posterior: CompactPosterior, device: Device = "cpu") -> Summing:
+        """Return the summation for a posterior, on a device."""
         return cls(posterior.kernel, posterior.basis, posterior.noise_variance, posterior.misfit, device)
 
     def add(self, total: Total, samples: Samples, weights: Array | None = None) -> None:
-        """Add samples to a total. weights: (N,), one for each, all equal where None."""
+        """Add samples to a total. weights: (N,), one for each sample, None for all one."""
         scale = np.ones(len(samples)) if weights is None else np.ascontiguousarray(weights, np.float64)
         on_cpu = self.device == "cpu"
         features = self._on_cpu(total, samples, scale) if on_cpu else self._elsewhere(total, samples, scale)
         add_square_of_rows(total.a, features)
 
     def _on_cpu(self, total: Total, samples: Samples, weights: Array) -> Array:
-        """Weighed features of the torques of N samples, (N n, M), piece by piece: a piece stays in the cache."""
+        """Return the weighed features of N samples' torques, (N n, M), piece by piece: a piece stays in the cache."""
         n, first = samples.n_joints, len(self.basis.outputs)
         out = np.empty((len(samples) * n, len(self.basis)))
         for start in range(0, len(samples), PIECE):
@@ -121,9 +121,9 @@ def weigh(
 ) -> None:
     """Scale the features φ of N samples' torques by the square root of their precision, and add Σ φ R⁻¹ residual to b.
 
-    R is the noise and what of the prior variance the first `inducing` features leave open, see `statistics.Statistics`.
-    features: (N n, M), in place; prior: (N, n) variances of the nonlinear term; noise: (N, n); weights: (N,);
-    residual: (N, n); b: (M,).
+    R is the noise plus the prior variance that the first `inducing` features do not explain, see
+    `statistics.Statistics`. features: (N n, M), in place; prior: (N, n) variances of the nonlinear term; noise: (N, n);
+    weights: (N,); residual: (N, n); b: (M,).
     """
     count, n = prior.shape
     size = features.shape[1]

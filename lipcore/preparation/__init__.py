@@ -1,1 +1,1 @@
-"""From recordings as robots make them to samples: a recipe, a plan of what it does to a recording, and its steps."""
+"""Preparation of raw recordings as samples: a recipe, its plan for one recording, and a record of the steps."""

@@ -1,4 +1,4 @@
-"""The recipe as a live stream can follow it: from rows so far only, late by a delay that is known."""
+"""The recipe for a live stream: a causal filter with a known delay."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.data.signals import ORDER
-from lipcore.preparation.filtering import QUANTITIES, Filters, Read
-from lipcore.preparation.resampling import BLOCK
+from lipcore.preparation.filtering import QUANTITIES, Filters, QuantityReader
+from lipcore.preparation.resampling import BLOCK_ROWS
 
 
 class CausalFilter:
-    """Low-pass and differences of evenly spaced rows, one after the other, as `Filters` says; thins nothing.
+    """Low-pass and differences of evenly spaced rows, row after row, as `Filters` configures them, without thinning.
 
-    All quantities pass one and the same filter, so that they stay those of one moment, `delay_s` before the last row.
-    Differences are central, hence exact on quadratics and of the row before the last: two rows tell nothing yet.
+    All quantities pass the same filter, so they stay those of one moment, `delay_s` before the last row. Differences
+    are central, hence exact on quadratics, and belong to the row before the last: two rows are too few.
     """
 
     def __init__(self, work: Filters, n_joints: int) -> None:
@@ -34,15 +34,15 @@ class CausalFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the rows so far: after a gap, or before another recording."""
+        """Forget all rows: after a gap, or before another recording."""
         self._state: Array | None = None
         self._history = np.empty((0, len(self.work.given) * self.n_joints))
 
     def batch(self, rows: Mapping[str, Array]) -> dict[str, Array]:
-        """Further rows, (N, n) of every quantity given; all of q, dq, ddq, tau of N rows, (N, n) each.
+        """Return q, dq, ddq, tau, (N, n) each, for further rows, (N, n) of every quantity given.
 
-        The first time two rows fewer come out where something is derived. Raise ValueError for rows of another shape,
-        or that are not finite: the filter would never forget these.
+        If a quantity is derived, the first batch returns two rows fewer. Raise ValueError for rows of another shape, or
+        that are not finite: the filter would never forget these.
         """
         signals = np.hstack([self._checked(name, rows) for name in self.work.given])
         smooth = self._low_pass(signals)
@@ -62,15 +62,15 @@ class CausalFilter:
             middle["dq"] = slope["q"]
         return middle
 
-    def part(self, read: Read) -> Iterator[tuple[str, Array]]:
-        """All quantities, in turn, of one contiguous part of one joint, as a live stream has them: columns (N,)."""
+    def part(self, read: QuantityReader) -> Iterator[tuple[str, Array]]:
+        """Yield all quantities, in turn, of one contiguous part of one joint, filtered causally: columns (N,)."""
         self.reset()
         signals = {name: read(name)[:, None] for name in self.work.given}
         rows = len(signals["q"])
         columns = {name: np.empty(rows - 2 * self.lag) for name in QUANTITIES}
         done = 0
-        for begin in range(0, rows, BLOCK):
-            block = self.batch({name: values[begin : begin + BLOCK] for name, values in signals.items()})
+        for begin in range(0, rows, BLOCK_ROWS):
+            block = self.batch({name: values[begin : begin + BLOCK_ROWS] for name, values in signals.items()})
             for name, values in block.items():
                 columns[name][done : done + len(values)] = values[:, 0]
             done += len(block["q"])
@@ -88,19 +88,19 @@ class CausalFilter:
     def _low_pass(self, signals: Array) -> Array:
         if self._sections is None or self._at_rest is None or not len(signals):
             return signals
-        if self._state is None:  # as if the first row had always been there
+        if self._state is None:  # starts at rest at the first row
             self._state = self._at_rest[:, :, None] * signals[0]
         smooth, self._state = self._sosfilt(self._sections, signals, axis=0, zi=self._state)
         return np.asarray(smooth)
 
     def _named(self, table: Array) -> dict[str, Array]:
-        """Columns of the quantities given; those derived are there, to be replaced."""
+        """Return columns of the quantities given, and placeholders for those derived."""
         n = self.n_joints
         columns = {name: table[:, index * n : (index + 1) * n] for index, name in enumerate(self.work.given)}
         return {name: columns.get(name, columns["q"]) for name in QUANTITIES}
 
     def _group_delay(self) -> float:
-        """Of slow motions, in samples: minus the slope of the phase at frequency 0, section by section."""
+        """Return the delay of slow motions, in samples: minus the slope of the phase at frequency 0."""
         if self._sections is None:
             return 0.0
         late = 0.0

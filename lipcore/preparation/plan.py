@@ -1,4 +1,4 @@
-"""What a recipe does to one recording: worked out once from its times, then applied to one joint after the other."""
+"""The plan of a recipe for one recording: computed once from its times, then applied joint by joint."""
 
 from __future__ import annotations
 
@@ -12,12 +12,21 @@ from numpy.typing import NDArray
 from lipcore.data.samples import Array
 from lipcore.preparation import steps as record
 from lipcore.preparation.causal import CausalFilter
-from lipcore.preparation.filtering import QUANTITIES, Filters, Read, ZeroPhase, derived, filters, settle, without_delay
+from lipcore.preparation.filtering import (
+    QUANTITIES,
+    Filters,
+    QuantityReader,
+    ZeroPhase,
+    list_derived,
+    resolve_filters,
+    should_low_pass,
+    without_delay,
+)
 from lipcore.preparation.recipe import PreparationError, Recipe
-from lipcore.preparation.resampling import Sampling, between, clock_of, grid, interpolate, thinned
+from lipcore.preparation.resampling import Sampling, clock_of, grid, interpolate, interpolate_even, thin_positions
 
-BRIDGE = 0.3
-"""Longest gap, in periods of the cut-off, that is bridged rather than split at where signals are low-passed.
+MAX_BRIDGED_PERIODS = 0.3
+"""Max gap, in periods of the cut-off, that is bridged instead of split if signals are low-passed.
 
 Splitting costs a period at either side. Measured on sums of sinusoids up to 1.6 Hz, cut-off 4 Hz, with white noise of
 0.1 N·m on tau, as errors in the gap and elsewhere: at 30 Hz a gap of 67 ms (0.27 periods) leaves ddq at 3.4 and 3.2 %,
@@ -28,58 +37,63 @@ and 0.6 N·m.
 
 @dataclass(frozen=True)
 class Stretch:
-    """One contiguous part of a recording.
-
-    rows: of those kept; at: even times it is put on, None where its own are even; inner: samples between the ends that
-    are cut off; taken: positions among those, all where None; out: where they come to lie.
-    """
+    """One contiguous part of a recording."""
 
     rows: slice
+    """Its rows among those that are kept."""
     at: Array | None
+    """Even times, s, at which it is interpolated, None if its own are even."""
     inner: slice
-    taken: NDArray[np.int64] | Array | None
+    """Its samples without the ends that are cut off."""
+    positions: NDArray[np.int64] | Array | None
+    """Positions among `inner` that are returned, None for all."""
     out: slice
+    """Its samples among those returned."""
 
     def on_clock(self, values: Array, times: Array) -> Array:
-        """Of a column (N,) of the rows kept, with their times (N,), the samples of this part on its even clock."""
+        """Return the samples of this part on its even clock. values, times: (N,), of the kept rows."""
         part = values[self.rows]
         return part if self.at is None else interpolate(times[self.rows], part, self.at)
 
-    def coming_out(self, values: Array) -> Array:
-        """Of samples of this part, those that come out."""
-        return values[self.inner] if self.taken is None else taken_at(values[self.inner], self.taken)
+    def select_output(self, values: Array) -> Array:
+        """Return the samples of this part that remain after trimming and thinning."""
+        return values[self.inner] if self.positions is None else interpolate_at(values[self.inner], self.positions)
 
 
-def taken_at(values: Array, positions: NDArray[np.int64] | Array) -> Array:
-    """Values (N,) at whole positions (M,), or between them."""
+def interpolate_at(values: Array, positions: NDArray[np.int64] | Array) -> Array:
+    """Return values (N,) at positions (M,), interpolated between samples unless these are integers."""
     if positions.dtype.kind == "i":
         return np.asarray(values[positions])
-    return between(values, np.asarray(positions, dtype=np.float64))
+    return interpolate_even(values, np.asarray(positions, dtype=np.float64))
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What comes out of a recording, M samples, and how.
-
-    t: (M,) s, the moments they tell of; counted from 0 where the recording has no times; episode: (M,) parts, from 0;
-    steps: what is done, see `steps`; rate: Hz, None without times; delay_s: by which
-    a live stream would have them late; gaps: where the recording is split; missing, first_missing (from 1), repeated:
-    rows left out; edges: samples cut off.
-    """
+    """The plan of a recipe for one recording, which returns M samples."""
 
     t: Array
+    """Times of the samples, (M,) s, or row numbers from 0 if the recording has no times."""
     episode: NDArray[np.int64]
+    """Part of each sample, (M,), from 0."""
     steps: list[record.Step]
+    """Record of the steps, see `lipcore.preparation.steps`."""
     derived: tuple[str, ...]
     rate: float | None
+    """Hz, None without times."""
     cutoff: float | None
     delay_s: float
+    """Delay of the samples in a live stream."""
     resampled: bool
     gaps: int
+    """Number of gaps at which the recording is split."""
     missing: int
+    """Number of rows left out because of a missing value."""
     first_missing: int | None
+    """The first of these rows, counted from 1."""
     repeated: int
+    """Number of rows left out because of a repeated time."""
     edges: int
+    """Number of samples cut off at the ends of parts."""
     _kept: NDArray[np.bool_] | None
     _times: Array
     _parts: list[Stretch]
@@ -92,15 +106,15 @@ class Plan:
 
     @property
     def episodes(self) -> int:
-        """Number of parts that come out."""
+        """Return the number of parts."""
         return len(self._parts)
 
     def apply(self, joint: Mapping[str, Array]) -> dict[str, Array]:
-        """Of one joint: the quantities given, (N,) each, to all of q, dq, ddq, tau, (M,) each."""
+        """Return q, dq, ddq, tau, (M,) each, of one joint from its recorded quantities, (N,) each."""
         return dict(self.columns(joint.__getitem__))
 
-    def columns(self, read: Read) -> Iterator[tuple[str, Array]]:
-        """The same, one quantity after the other: of a recording in one part, no more than one is held at a time."""
+    def columns(self, read: QuantityReader) -> Iterator[tuple[str, Array]]:
+        """Yield the same, one quantity after the other: of a recording in one part, only one is in memory at a time."""
 
         def kept(name: str) -> Array:
             return read(name) if self._kept is None else read(name)[self._kept]
@@ -108,19 +122,19 @@ class Plan:
         if len(self._parts) == 1:
             part = self._parts[0]
             for name, values in self._of(part, kept):
-                yield name, part.coming_out(values)
+                yield name, part.select_output(values)
             return
         given = QUANTITIES if self._work is None else self._work.given
         signals = {name: kept(name) for name in given}
         columns = {name: np.empty(len(self.t)) for name in QUANTITIES}
         for part in self._parts:
             for name, values in self._of(part, signals.__getitem__):
-                columns[name][part.out] = part.coming_out(values)
+                columns[name][part.out] = part.select_output(values)
         for name in QUANTITIES:
             yield name, columns.pop(name)
 
-    def _of(self, part: Stretch, read: Read) -> Iterator[tuple[str, Array]]:
-        """Samples of one part, before its ends are cut off."""
+    def _of(self, part: Stretch, read: QuantityReader) -> Iterator[tuple[str, Array]]:
+        """Yield the samples of one part, before its ends are cut off."""
 
         def samples(name: str) -> Array:
             return part.on_clock(read(name), self._times)
@@ -135,14 +149,15 @@ class Plan:
 
 @dataclass(frozen=True)
 class _Rows:
-    """The rows that are worked on. t, episode: of these; kept: (N,) where some are left out, else None; apart: (M - 1,)
-    where rows between two of them are missing and no times tell.
-    """
+    """The rows that are used."""
 
     t: Array
+    """(M,) s, or row numbers without times."""
     episode: Array
     kept: NDArray[np.bool_] | None
+    """Mask of the used rows among all, (N,), None if all are used."""
     apart: NDArray[np.bool_] | None
+    """Whether rows are missing between two neighbouring rows without times, (M - 1,)."""
     missing: int
     first_missing: int | None
     repeated: int
@@ -156,15 +171,16 @@ def plan(
     recipe: Recipe,
     corrupt: NDArray[np.bool_] | None = None,
 ) -> Plan:
-    """Work out what the recipe does to a recording of N rows.
+    """Return the plan of the recipe for a recording of N rows.
 
-    t: (N,) s, rising within an episode, None where not recorded; episode: (N,) numbers, None where there is one;
-    missing: (N,) rows that are to be left out, t or a value being unknown; given: of q, dq, ddq, tau, those recorded;
-    corrupt: (N,) other rows that are to be left out (`data.outliers`), before a filter spreads them.
-    Raise PreparationError where the recording does not allow what the recipe asks for.
+    t: (N,) s, rising within an episode, None if not recorded; episode: (N,) numbers, None if there is only one;
+    missing: (N,) mask of rows with an unknown time or value; given: the recorded ones of q, dq, ddq, tau; corrupt: (N,)
+    mask of other rows to leave out before a filter spreads them (`lipcore.data.outliers`).
+
+    Raise PreparationError if the recording does not allow the recipe.
     """
     given = tuple(name for name in QUANTITIES if name in given)
-    to_derive = derived(given)
+    to_derive = list_derived(given)
     steps: list[record.Step] = []
     damaged = np.zeros_like(missing) if corrupt is None else corrupt & ~missing
     rows = _rows(t, episode, missing, damaged, steps)
@@ -174,19 +190,19 @@ def plan(
         ends = changes if rows.apart is None else changes | rows.apart
         clock, work, resamples = None, None, False
     else:
-        bridge = BRIDGE / recipe.cutoff_hz if filters(given, recipe) else 0.0
+        bridge = MAX_BRIDGED_PERIODS / recipe.cutoff_hz if should_low_pass(given, recipe) else 0.0
         clock = clock_of(rows.t, rows.episode, recipe.gap_steps, recipe.jitter, bridge)
         ends = clock.ends
-        work = settle(1 / clock.usual, given, recipe)
+        work = resolve_filters(1 / clock.usual, given, recipe)
         resamples = work.needs_even_steps and not clock.even
         if resamples:
-            work = settle(clock.rate, given, recipe)
+            work = resolve_filters(clock.rate, given, recipe)
     if (changes_of_episode := int(np.count_nonzero(np.diff(rows.episode)))) > 0:
-        steps.append(record.split_by_episodes(changes_of_episode + 1))
+        steps.append(record.describe_episode_split(changes_of_episode + 1))
     if clock is not None and clock.gaps:
-        steps.append(record.split_at_gaps(clock.gaps, clock.longest))
+        steps.append(record.describe_gap_split(clock.gaps, clock.longest))
     if clock is not None and work is not None and resamples:
-        steps.append(record.resampled(work.rate, clock.worst, clock.longest))
+        steps.append(record.describe_resampling(work.rate, clock.worst, clock.longest))
     return _lay_out(rows, ends, clock, work, resamples, to_derive, steps)
 
 
@@ -197,14 +213,14 @@ def _rows(
     corrupt: NDArray[np.bool_],
     steps: list[record.Step],
 ) -> _Rows:
-    """Leave out rows that are missing or corrupt, and those whose time was there before."""
+    """Return the rows that are neither missing nor corrupt and whose time is not repeated."""
     numbers = np.zeros(len(missing)) if episode is None else episode
     count = int(missing.sum())
     first = int(missing.argmax()) + 1 if count else None
     if first is not None:
-        steps.append(record.left_out("missing", count, first))
+        steps.append(record.describe_rows_left_out("missing", count, first))
     if corrupt.any():
-        steps.append(record.left_out("corrupt", int(corrupt.sum()), int(corrupt.argmax()) + 1))
+        steps.append(record.describe_rows_left_out("corrupt", int(corrupt.sum()), int(corrupt.argmax()) + 1))
     kept = ~(missing | corrupt)
     repeated = 0
     if t is not None:
@@ -218,7 +234,7 @@ def _rows(
         again = places[1:][same & (step == 0)]
         if repeated := len(again):
             kept[again] = False
-            steps.append(record.left_out("repeated", repeated, int(again[0]) + 1))
+            steps.append(record.describe_rows_left_out("repeated", repeated, int(again[0]) + 1))
     if not kept.any():
         raise PreparationError("rows", 0, "rows without missing values")
     times = np.arange(len(kept), dtype=np.float64) if t is None else t
@@ -232,7 +248,7 @@ def _rows(
 def _check_times_are_not_needed(given: tuple[str, ...], to_derive: tuple[str, ...], recipe: Recipe) -> None:
     if to_derive:
         why = f"{' and '.join(to_derive)} must be derived"
-    elif filters(given, recipe):
+    elif should_low_pass(given, recipe):
         why = "signals are to be low-passed"
     elif recipe.rate_hz is not None:
         why = f"a rate of {recipe.rate_hz:g} Hz is asked for"
@@ -252,7 +268,7 @@ def _lay_out(
     to_derive: tuple[str, ...],
     steps: list[record.Step],
 ) -> Plan:
-    """Say for every contiguous part what of it comes out, and where it comes to lie."""
+    """Return the plan: which samples of every contiguous part remain, and their place among all."""
     causal = CausalFilter(work, 1) if work is not None and work.form == "causal" else None
     late, lag = (0.0, 0) if causal is None else (causal.delay_s, causal.lag)
     bounds = [0, *(np.flatnonzero(ends) + 1).tolist(), len(rows.t)]
@@ -263,7 +279,7 @@ def _lay_out(
         at = None
         t = rows.t[begin:end]
         if work is None:
-            first, last, taken = 0, len(t), None
+            first, last, positions = 0, len(t), None
         else:
             if resamples:
                 t = at = grid(float(t[0]), float(t[-1]), work.rate)
@@ -273,16 +289,16 @@ def _lay_out(
                 continue
             edges += len(t) - (last - first)
             t = (t[lag : len(t) - lag] - late + lag / work.rate)[first:last] if causal else t[first:last]
-            taken = thinned(len(t), work.every) if work.every > 1 else None
-            t = t if taken is None else taken_at(t, taken)
-        parts.append(Stretch(slice(begin, end), at, slice(first, last), taken, slice(out, out + len(t))))
+            positions = thin_positions(len(t), work.every) if work.every > 1 else None
+            t = t if positions is None else interpolate_at(t, positions)
+        parts.append(Stretch(slice(begin, end), at, slice(first, last), positions, slice(out, out + len(t))))
         times.append(t)
         out += len(t)
     if work is not None and not parts:
         raise PreparationError("rows", len(rows.t), _long_enough(work))
     rate = None
     if work is not None:
-        by_rows = parts[0].taken is None or parts[0].taken.dtype.kind == "i"
+        by_rows = parts[0].positions is None or parts[0].positions.dtype.kind == "i"
         rate = work.rate / (round(work.every) if by_rows else work.every)
         steps += _work_steps(work, late, edges, rate)
     return Plan(
@@ -311,13 +327,13 @@ def _lay_out(
 def _work_steps(work: Filters, late: float, edges: int, rate: float) -> list[record.Step]:
     steps = []
     if work.cutoff is not None:
-        steps.append(record.low_passed(work, late))
+        steps.append(record.describe_low_pass(work, late))
     if work.derived:
-        steps.append(record.differentiated(work))
+        steps.append(record.describe_differentiation(work))
     if work.cutoff is not None or edges:
-        steps.append(record.trimmed(work, edges))
+        steps.append(record.describe_trimming(work, edges))
     if work.every > 1:
-        steps.append(record.thinned(work, rate))
+        steps.append(record.describe_thinning(work, rate))
     return steps
 
 

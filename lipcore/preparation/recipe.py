@@ -1,4 +1,4 @@
-"""What is to be done with a recording before it is learnt from, and what it may be refused for."""
+"""The recipe that prepares a recording, and the error if it cannot."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import Any, Literal, get_args
 from lipcore.data.signals import CUTOFF
 
 Form = Literal["acausal", "causal"]
-"""acausal: without delay, from what came before and after, for recordings; causal: as a live stream can, late."""
+"""acausal: without delay, from samples before and after, for recordings; causal: as a live stream can, with a delay."""
 Filtering = Literal["derived", "always", "never"]
-"""When signals are low-passed: where velocity or acceleration is derived (as in the paper), always, or never."""
+"""When signals are low-passed: if velocity or acceleration is derived (as in the paper), always, or never."""
 
 
 class PreparationError(ValueError):
-    """A recording cannot be prepared as asked: `field` is `value`, but `expected` was expected."""
+    """A recording cannot be prepared as requested: `field` is `value`, but `expected` was expected."""
 
     def __init__(self, field: str, value: object, expected: str) -> None:
         super().__init__(f"{field} is {value}, expected {expected}")
@@ -23,23 +23,25 @@ class PreparationError(ValueError):
 
 @dataclass(frozen=True)
 class Recipe:
-    """The choices; the defaults are the paper's: 4 Hz without delay, acausal differentiation.
+    """Settings of the preparation. The defaults are the paper's: 4 Hz without delay, acausal differentiation.
 
-    cutoff_hz: of the low-pass; filtering: when it is used; rate_hz: of the samples that come out, None keeps the
-    recording's; trim_s: cut off at both ends of every part, None cuts what the filter spoils (one period of its
-    cut-off); gap_steps: a step of time longer than so many usual ones splits a recording, where signals are low-passed
-    only if it is also longer than 0.3 periods of the cut-off; jitter: largest deviation of
-    a step from the usual one, as a share of it, that counts as even: what is less even is resampled.
-    Raise ValueError where a value is impossible.
+    Raise ValueError if a value is impossible.
     """
 
     cutoff_hz: float = CUTOFF
+    """Cut-off of the low-pass."""
     filtering: Filtering = "derived"
+    """When the low-pass is used."""
     form: Form = "acausal"
     rate_hz: float | None = None
+    """Rate of the samples that are returned, None for the recording's."""
     trim_s: float | None = None
+    """Time cut off at both ends of every part; None cuts what the filter spoils, one period of its cut-off."""
     gap_steps: float = 1.5
+    """A step of time longer than this many usual ones splits a recording. If signals are low-passed, it must also be
+    longer than 0.3 periods of the cut-off."""
     jitter: float = 0.25
+    """Max deviation of a step from the usual one, as a share of it, on an even clock. An uneven clock is resampled."""
 
     def __post_init__(self) -> None:
         for name, choices in (("filtering", get_args(Filtering)), ("form", get_args(Form))):
@@ -53,12 +55,12 @@ class Recipe:
             raise ValueError(f"trim_s is {self.trim_s!r}, expected seconds, at least 0")
 
     def to_json(self) -> dict[str, Any]:
-        """The choices by name."""
+        """Return the settings by name."""
         return asdict(self)
 
     @staticmethod
     def from_json(choices: dict[str, Any]) -> Recipe:
-        """The inverse of `to_json`; raise ValueError for a name that is unknown."""
+        """Return the recipe with these settings; raise ValueError for an unknown name."""
         known = [each.name for each in fields(Recipe)]
         if unknown := sorted(set(choices) - set(known)):
             raise ValueError(f"recipe has {unknown[0]!r}, expected names out of {', '.join(known)}")

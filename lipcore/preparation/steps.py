@@ -1,4 +1,4 @@
-"""What was done with a recording: JSON objects, each with `step`, its parameters and `text`, a sentence for people."""
+"""The record of a preparation: JSON objects, each with `step`, its parameters and `text`, a sentence for people."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from lipcore.preparation.filtering import Filters
 Step = dict[str, Any]
 
 
-def left_out(why: str, rows: int, first: int) -> Step:
-    """Rows left out, the first of them counted from 1; why: "missing", "corrupt" or "repeated"."""
+def describe_rows_left_out(why: str, rows: int, first: int) -> Step:
+    """Return the step of rows left out, the first of them counted from 1. why: "missing", "corrupt" or "repeated"."""
     reason = {
         "missing": "with missing values",
         "corrupt": "that fit neither what went before nor what follows",
@@ -20,19 +20,19 @@ def left_out(why: str, rows: int, first: int) -> Step:
     return {"step": "leave_out", "why": why, "rows": rows, "first_row": first, "text": text}
 
 
-def split_by_episodes(episodes: int) -> Step:
-    """Episodes kept apart."""
+def describe_episode_split(episodes: int) -> Step:
+    """Return the step that separates episodes."""
     return {"step": "split", "by": "episode", "episodes": episodes, "text": f"{episodes} episodes kept apart"}
 
 
-def split_at_gaps(gaps: int, longer_than_s: float) -> Step:
-    """Parts made of what lies between gaps in time."""
+def describe_gap_split(gaps: int, longer_than_s: float) -> Step:
+    """Return the step that splits a recording at gaps in time."""
     text = f"split at {_count(gaps, 'gap')} in time"
     return {"step": "split", "by": "gap", "gaps": gaps, "longer_than_s": longer_than_s, "text": text}
 
 
-def resampled(rate: float, worst: float, bridged_s: float) -> Step:
-    """Uneven stamps replaced by an even clock."""
+def describe_resampling(rate: float, worst: float, bridged_s: float) -> Step:
+    """Return the step that replaces uneven stamps by an even clock. bridged_s: longest step that is no gap."""
     text = f"put on an even clock of {rate:.4g} Hz: steps of time differed from the usual one by up to {worst:.0%}"
     return {
         "step": "resample",
@@ -44,8 +44,8 @@ def resampled(rate: float, worst: float, bridged_s: float) -> Step:
     }
 
 
-def low_passed(work: Filters, delay_s: float) -> Step:
-    """A Butterworth filter, run both ways or, as in a live stream, forwards only."""
+def describe_low_pass(work: Filters, delay_s: float) -> Step:
+    """Return the step of a Butterworth filter, run both ways or, as in a live stream, forwards only."""
     late = "without delay" if work.form == "acausal" else f"as in a live stream, {delay_s:.3g} s late"
     return {
         "step": "low_pass",
@@ -58,14 +58,14 @@ def low_passed(work: Filters, delay_s: float) -> Step:
     }
 
 
-def differentiated(work: Filters) -> Step:
-    """Velocities or accelerations derived."""
+def describe_differentiation(work: Filters) -> Step:
+    """Return the step that derives velocities or accelerations."""
     text = f"{' and '.join(work.derived)} derived by central differences"
     return {"step": "differentiate", "derived": list(work.derived), "rate_hz": work.rate, "text": text}
 
 
-def trimmed(work: Filters, samples: int) -> Step:
-    """Ends of parts cut off, and parts with nothing between them."""
+def describe_trimming(work: Filters, samples: int) -> Step:
+    """Return the step that cuts off the ends of parts, and parts too short to use."""
     where = "at the filter's edges" if work.cutoff is not None else "at the ends of parts"
     return {
         "step": "trim",
@@ -77,8 +77,8 @@ def trimmed(work: Filters, samples: int) -> Step:
     }
 
 
-def thinned(work: Filters, rate: float) -> Step:
-    """A lower rate."""
+def describe_thinning(work: Filters, rate: float) -> Step:
+    """Return the step to a lower rate."""
     return {"step": "thin", "rate_hz": rate, "every": work.every, "text": f"thinned to {rate:.4g} Hz"}
 
 

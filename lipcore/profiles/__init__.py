@@ -1,4 +1,4 @@
-"""Robot profiles: joints, limits, torque limits, and what the effort field of a recording means."""
+"""Robot profiles: joints, limits, torque limits, and the meaning of the effort field of a recording."""
 
 from lipcore.profiles.catalogue import names, profile, profiles, recognise
 from lipcore.profiles.profile import Profile, from_urdf

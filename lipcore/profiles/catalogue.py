@@ -1,4 +1,4 @@
-"""The robots that are known by name, and which of them a recording's joint names fit."""
+"""The robots with a profile, and those among them that match a recording's joint names."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from lipcore.profiles.names import is_number, makes
-from lipcore.profiles.profile import Limits, Profile, Sheet, array, read_limits
-from lipcore.robots.library import ROBOTS, UnknownRobotError, installed_profiles, profile_urdf
+from lipcore.profiles.names import find_makes, is_number
+from lipcore.profiles.profile import Limits, Profile, ProfileEntry, array_or_nan, read_limits
+from lipcore.robots.library import ROBOTS, UnknownRobotError, list_installed_robots, profile_urdf
 from lipcore.vocabulary import JointType
 
 REVOLUTE: tuple[JointType, ...] = ("revolute",)
 
 
 @cache
-def sheets() -> dict[str, Sheet]:
-    """The robots of `arms.toml` by name."""
+def read_entries() -> dict[str, ProfileEntry]:
+    """Return the robots of `arms.toml` by name."""
     text = resources.files(__package__).joinpath("arms.toml").read_text("utf-8")
     entries: dict[str, dict[str, Any]] = {}
     for family in tomllib.loads(text)["family"]:
@@ -31,23 +31,23 @@ def sheets() -> dict[str, Sheet]:
             name: {"joints": ROBOTS[name].free if name in ROBOTS else (), **family, **robot}
             for name, robot in robots.items()
         }
-    return msgspec.convert(entries, dict[str, Sheet])
+    return msgspec.convert(entries, dict[str, ProfileEntry])
 
 
 def profiles() -> tuple[Profile, ...]:
-    """Every robot that is known here; some are only where example-robot-data is installed."""
-    installed = installed_profiles()
+    """Return every robot with a profile on this machine; some need example-robot-data."""
+    installed = list_installed_robots()
     return tuple(_profile(name, name in installed) for name in _names(installed))
 
 
 def names() -> tuple[str, ...]:
-    """Names of the robots that `profile` returns here."""
-    return _names(installed_profiles())
+    """Return the names of the robots that `profile` returns on this machine."""
+    return _names(list_installed_robots())
 
 
 def profile(name: str) -> Profile:
-    """The profile of a robot by name; raise UnknownRobotError naming those that are known here."""
-    installed = installed_profiles()
+    """Return the profile of a robot by name; raise UnknownRobotError naming the robots with a profile."""
+    installed = list_installed_robots()
     known = _names(installed)
     if name not in known:
         raise UnknownRobotError(f"robot is {name!r}, expected one of {', '.join(known)}")
@@ -55,17 +55,20 @@ def profile(name: str) -> Profile:
 
 
 def _names(installed: Container[str]) -> tuple[str, ...]:
-    return tuple(name for name, sheet in sheets().items() if sheet.ranges is not None or name in installed)
+    return tuple(name for name, sheet in read_entries().items() if sheet.ranges is not None or name in installed)
 
 
 def recognise(joint_names: Sequence[str]) -> tuple[str, ...]:
-    """Names of the robots that these joints may be of, those with the most joints first; none for joints that only
-    have numbers, which every robot has.
+    """Return the names of the robots that may have these joints, those with the most joints first.
+
+    Joints that only have numbers match no robot, because every robot has them.
     """
-    mentioned = frozenset().union(*map(makes, joint_names))
+    mentioned = frozenset().union(*map(find_makes, joint_names))
     fitting = []
     for each in profiles():
-        all_there = any(len(reading) == each.n_joints for reading in each.readings(joint_names, bool(mentioned)))
+        all_there = any(
+            len(reading) == each.n_joints for reading in each.list_assignments(joint_names, bool(mentioned))
+        )
         telling = mentioned or not all(is_number(name) for name in each.joint_names)
         if all_there and telling and mentioned <= each.makes:
             fitting.append(each)
@@ -74,20 +77,20 @@ def recognise(joint_names: Sequence[str]) -> tuple[str, ...]:
 
 @lru_cache(maxsize=128)
 def _profile(name: str, installed: bool) -> Profile:
-    sheet = sheets()[name]
+    sheet = read_entries()[name]
     n_joints = len(sheet.joints)
     urdf = profile_urdf(name) if installed else None
     if sheet.ranges is not None:
         lower, upper = np.array(sheet.ranges).T
-        speed = array(sheet.speed, n_joints)
+        speed = array_or_nan(sheet.speed, n_joints)
         if sheet.degrees:
             lower, upper, speed = map(np.radians, (lower, upper, speed))
-        limits = Limits(REVOLUTE * n_joints, lower, upper, speed, array(sheet.torque, n_joints))
+        limits = Limits(REVOLUTE * n_joints, lower, upper, speed, array_or_nan(sheet.torque, n_joints))
     else:
         assert urdf is not None, f"{name} has neither ranges nor a URDF"
         limits = read_limits(urdf, sheet.joints)
         if sheet.placeholders:
-            limits = replace(limits, speed=array(None, n_joints), torque=array(None, n_joints))
+            limits = replace(limits, speed=array_or_nan(None, n_joints), torque=array_or_nan(None, n_joints))
     return Profile(
         name=name,
         title=sheet.title,
@@ -96,7 +99,7 @@ def _profile(name: str, installed: bool) -> Profile:
         lower=limits.lower,
         upper=limits.upper,
         speed=limits.speed,
-        acceleration=array(sheet.acceleration, n_joints),
+        acceleration=array_or_nan(sheet.acceleration, n_joints),
         torque=limits.torque,
         effort=sheet.effort,
         effort_note=sheet.effort_note,

@@ -1,4 +1,4 @@
-"""What is known of a robot apart from its data: joints, limits, and what its effort field means; also from a URDF."""
+"""The profile of a robot: joints, limits, and the meaning of its effort field; also from a URDF."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ import numpy as np
 from msgspec import Struct
 
 from lipcore.data.motion import Array
-from lipcore.profiles.names import Assignment, assignments, is_number, makes
+from lipcore.profiles.names import Assignment, find_assignments, find_makes, is_number
 from lipcore.robots.urdf import describe
 from lipcore.robots.urdf_text import MOVABLE, UrdfError
 from lipcore.vocabulary import EffortMeaning, JointType
 
 
-class Sheet(Struct, frozen=True, forbid_unknown_fields=True):
-    """A robot as `arms.toml`, which documents the fields, writes it down, before its URDF is looked for."""
+class ProfileEntry(Struct, frozen=True, forbid_unknown_fields=True):
+    """The entry of a robot in `arms.toml`, which documents the fields, without its URDF."""
 
     title: str
     effort: EffortMeaning
@@ -36,37 +36,42 @@ class Sheet(Struct, frozen=True, forbid_unknown_fields=True):
     placeholders: bool = False
 
 
-def array(values: Sequence[float] | None, n_joints: int) -> Array:
-    """Values as an array (n,), NaN where there are none."""
+def array_or_nan(values: Sequence[float] | None, n_joints: int) -> Array:
+    """Return values as an array (n,), NaN if there are none."""
     return np.full(n_joints, np.nan) if values is None else np.array(values, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Profile:
-    """An arm with n joints, from base to tip.
-
-    lower, upper: (n,) rad or m, infinite where the joint turns without end; speed, acceleration: (n,) rad/s, rad/s² or
-    m/s, m/s²; torque: (n,) N·m or N. Each is NaN where it is not known. torque_constants: (n,) N·m/A of motor currents.
-    joint_aliases: (n) other names of each joint; urdf: its text, None where none is at hand; source: of the numbers;
-    complete: whether data of this robot hold every joint, as those of an uploaded URDF with its fingers need not.
-    """
+    """An arm with n joints, from base to tip. Limits are NaN if unknown."""
 
     name: str
     title: str
     joint_names: tuple[str, ...]
     joint_types: tuple[JointType, ...]
     lower: Array
+    """Min positions, (n,) rad (m), infinite for continuous joints."""
     upper: Array
+    """Max positions, (n,) rad (m), infinite for continuous joints."""
     speed: Array
+    """Max speeds, (n,) rad/s (m/s)."""
     acceleration: Array
+    """Max accelerations, (n,) rad/s² (m/s²)."""
     torque: Array
+    """Max torques, (n,) N·m (N)."""
     effort: EffortMeaning
+    """Meaning of the effort field."""
     effort_note: str
     torque_constants: Array | None
+    """Torque per motor current, (n,) N·m/A."""
     joint_aliases: tuple[tuple[str, ...], ...]
+    """Other names of each joint, (n)."""
     urdf: str | None = field(repr=False)
+    """Text of the URDF, None if there is none."""
     source: str
+    """Source of the numbers."""
     complete: bool = True
+    """Whether data of this robot contain every joint. Data for an uploaded URDF may lack its fingers."""
 
     def __post_init__(self) -> None:
         n = len(self.joint_names)
@@ -80,26 +85,26 @@ class Profile:
 
     @property
     def n_joints(self) -> int:
-        """Number of joints n."""
+        """Return the number of joints n."""
         return len(self.joint_names)
 
     @cached_property
     def makes(self) -> frozenset[str]:
-        """Makes that names of its joints may mention."""
+        """Return the makes that names of its joints may contain."""
         text = " ".join((self.name, self.title, *self.joint_names, *sum(self.joint_aliases, ())))
-        return makes(text)
+        return find_makes(text)
 
-    def readings(self, names: Sequence[str], numbers: bool = True) -> list[Assignment]:
-        """Each way to read the names as joints of this robot, joint → place; two arms side by side give two.
+    def list_assignments(self, names: Sequence[str], numbers: bool = True) -> list[Assignment]:
+        """Return each assignment of the names to joints of this robot; two arms side by side return two.
 
-        numbers: whether a joint may be known by its number alone.
+        numbers: whether a number alone may name a joint.
         """
         aliases = [(name, *others) for name, others in zip(self.joint_names, self.joint_aliases, strict=True)]
-        return list(assignments(tuple(names), aliases, self.makes, numbers))
+        return list(find_assignments(tuple(names), aliases, self.makes, numbers))
 
     def match(self, names: Sequence[str]) -> tuple[int | None, ...]:
-        """Which joint each of the names means, None where none or not one alone: (N,)."""
-        readings = self.readings(names)
+        """Return the joint of each name, None if there is none or more than one: (N,)."""
+        readings = self.list_assignments(names)
         largest = max(map(len, readings), default=0)
         best = [each for each in readings if len(each) == largest]
         if len(best) != 1 or 2 * largest <= min(self.n_joints, len(names)):
@@ -108,9 +113,9 @@ class Profile:
         return tuple(joint_at.get(place) for place in range(len(names)))
 
     def order_of(self, names: Sequence[str]) -> list[int] | None:
-        """Places of this robot's joints among the names, from base to tip; other names, as of grippers, are left out.
+        """Return the indices of this robot's joints among the names, from base to tip; other names are ignored.
 
-        None where a joint is missing, or where more than one name could be it. Not `complete`: those that are there.
+        None if a joint is missing or has several candidates. An incomplete profile returns the joints that are present.
         """
         matched = self.match(names)
         places = {joint: place for place, joint in enumerate(matched) if joint is not None}
@@ -118,18 +123,18 @@ class Profile:
             return None
         return [places[joint] for joint in sorted(places)]
 
-    def called(self, names: Sequence[str]) -> tuple[str, ...] | None:
-        """What this robot calls each of the names; None unless every one is a joint of it.
+    def official_names(self, names: Sequence[str]) -> tuple[str, ...] | None:
+        """Return this robot's own name of each joint; None unless every name is a joint of it.
 
-        Where only some of its joints are named, numbers do not do: joints 1 and 2 are those of any robot.
+        If only some of its joints are named, numbers are not enough: joints 1 and 2 exist on any robot.
         """
         matched = [joint for joint in self.match(names) if joint is not None]
         if len(matched) < len(names) or (len(names) < self.n_joints and all(map(is_number, names))):
             return None
         return tuple(self.joint_names[joint] for joint in matched)
 
-    def why_no_urdf(self) -> str:
-        """A sentence that says why rigid bodies cannot be built by this name."""
+    def explain_missing_urdf(self) -> str:
+        """Return a sentence with the reason why rigid bodies cannot be built by this name."""
         return (
             f"{self.title} has a profile, for data, but no URDF is installed for it: for rigid bodies upload its URDF "
             "and give the id"
@@ -138,22 +143,21 @@ class Profile:
 
 @dataclass(frozen=True)
 class Limits:
-    """Types and limits of joints in the order they were asked for, (n,) each, SI units.
-
-    lower, upper: position; speed; torque. Infinite where a joint turns freely, NaN where unknown.
-    """
+    """Types and limits of joints in the requested order, (n,) each, SI units. Limits are NaN if unknown."""
 
     types: tuple[JointType, ...]
     lower: Array
+    """Min positions, infinite for continuous joints."""
     upper: Array
+    """Max positions, infinite for continuous joints."""
     speed: Array
     torque: Array
 
 
 def from_urdf(text: str, name: str) -> Profile:
-    """The profile of a URDF's joints that move, from base to tip, branch after branch, mimicking ones left out.
+    """Return the profile of a URDF's moving joints, from base to tip, branch after branch, without mimicking ones.
 
-    Data need not hold every joint of it: grippers may be missing. Raise UrdfError where the text cannot be used.
+    Data may lack joints of it, such as grippers. Raise UrdfError if the text cannot be used.
     """
     moving = set(describe(text).joint_names)
     joints = tuple(name for name in _from_base(text) if name in moving)
@@ -180,7 +184,7 @@ def from_urdf(text: str, name: str) -> Profile:
 
 
 def _from_base(text: str) -> list[str]:
-    """Names of all joints, those of a branch together and from base to tip, whatever the order of the text."""
+    """Return the names of all joints, branch by branch and from base to tip, for any order of the text."""
     below: defaultdict[str, list[tuple[str, str]]] = defaultdict(list)
     for joint in _root(text).findall("joint"):
         below[_link(joint, "parent")].append((joint.get("name", ""), _link(joint, "child")))
@@ -201,16 +205,16 @@ def _link(joint: ElementTree.Element, which: str) -> str:
 
 def _root(text: str) -> ElementTree.Element:
     try:
-        # whoever calls has refused document types, entities and deep nesting, or trusts the file
+        # callers reject document types, entities and deep nesting before, or trust the file
         return ElementTree.fromstring(text)  # noqa: S314
     except ElementTree.ParseError as error:
         raise UrdfError(f"the URDF is not well-formed XML: {error}") from None
 
 
 def read_limits(text: str, joints: Sequence[str]) -> Limits:
-    """What a URDF that was checked says of these joints; raise UrdfError for one that it has not, or for a bad number.
+    """Return the limits of these joints in a checked URDF; raise UrdfError for a missing joint or a bad number.
 
-    A limit of speed or effort that is not above 0 is none, nor is a range that holds no interval.
+    A limit of speed or effort that is not above 0, or an empty range, counts as unknown.
     """
     elements = {joint.get("name", ""): joint for joint in _root(text).findall("joint")}
     types: list[JointType] = []

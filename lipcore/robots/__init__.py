@@ -1,1 +1,1 @@
-"""Robots as Pinocchio has them: those that are installed, random ones, URDFs, and simulated recordings."""
+"""Robots as Pinocchio models: installed ones, URDFs, and simulated recordings."""

@@ -1,6 +1,6 @@
-"""Arms as Pinocchio models: those of example-robot-data, with every other joint locked.
+"""Arms of example-robot-data as Pinocchio models, with every other joint locked.
 
-The URDFs come with the package `example-robot-data` (extra `sim`).
+The URDFs are part of the package `example-robot-data` (extra `sim`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.extras import MissingExtraError, need, need_folder
+from lipcore.extras import MissingExtraError, find_data_folder, import_extra
 from lipcore.vocabulary import JointType
 
 
@@ -78,26 +78,26 @@ ROBOTS: dict[str, RobotSource] = {
 
 @dataclass(frozen=True)
 class Robot:
-    """A serial arm by name: its Pinocchio model and what the simulator needs to know of its joints.
-
-    lower, upper: (n,) position limits in rad or m; speed: (n,) velocity limits in rad/s or m/s.
-    """
+    """A serial arm by name: its Pinocchio model, and its joints for the simulator."""
 
     name: str
     model: Any
     joint_names: tuple[str, ...]
     joint_types: tuple[JointType, ...]
     lower: Array
+    """Min positions, (n,) rad (m)."""
     upper: Array
+    """Max positions, (n,) rad (m)."""
     speed: Array
+    """Max speeds, (n,) rad/s (m/s), infinite if unknown."""
 
     @property
     def n_joints(self) -> int:
-        """Number of free joints n."""
+        """Return the number of free joints n."""
         return len(self.joint_names)
 
     def configuration(self, q: Array) -> Array:
-        """Pinocchio's configuration of joint positions q (n,): unbounded joints take (cos, sin)."""
+        """Return Pinocchio's configuration of joint positions q (n,), with (cos, sin) of unbounded joints."""
         out = np.empty(self.model.nq)
         for at, size, place in self._places:
             angle = q[place]
@@ -106,18 +106,21 @@ class Robot:
 
     @cached_property
     def _places(self) -> list[tuple[int, int, int]]:
-        """Of each joint: where its configuration starts, how long that is, where its position is."""
-        model = self.model  # looked at once: asking Pinocchio takes longer than the dynamics of a sample
+        """Return the start and length of each joint's configuration, and the index of its position."""
+        model = self.model  # read once: each access takes longer than the dynamics of a sample
         return [(model.idx_qs[joint], model.joints[joint].nq, model.idx_vs[joint]) for joint in range(1, model.njoints)]
 
 
 def pinocchio() -> Any:
-    """The pinocchio module; raise MissingExtraError. A minimal system may also lack its OpenMP runtime, libgomp1."""
-    return need("pinocchio", "robots")
+    """Return the pinocchio module; raise MissingExtraError.
+
+    A minimal system may lack its OpenMP runtime, libgomp1.
+    """
+    return import_extra("pinocchio", "robots")
 
 
 def load_robot(name: str) -> Robot:
-    """Load a robot by name; raise UnknownRobotError or MissingExtraError."""
+    """Return a robot by name; raise UnknownRobotError or MissingExtraError."""
     if name not in ROBOTS:
         raise UnknownRobotError(f"robot is {name!r}, expected one of {', '.join(ROBOTS)}")
     pin, source = pinocchio(), ROBOTS[name]
@@ -134,15 +137,15 @@ def load_robot(name: str) -> Robot:
         types.append("prismatic" if joint.shortname().startswith("JointModelP") else "revolute")
         at = model.idx_qs[index]
         low, high = model.lowerPositionLimit[at], model.upperPositionLimit[at]
-        # unbounded joints carry limits of (cos, sin), and some URDFs none at all
+        # unbounded joints have limits of (cos, sin), and some URDFs have none
         limits.append((low, high) if joint.nq == 1 and high > low else (-np.pi, np.pi))
     lower, upper = np.array(limits).T
     speed = np.where(model.velocityLimit > 0, model.velocityLimit, np.inf)
     return Robot(name, model, names, tuple(types), lower, upper, speed)
 
 
-def installed_profiles() -> tuple[str, ...]:
-    """Names of the robots whose URDFs are installed here."""
+def list_installed_robots() -> tuple[str, ...]:
+    """Return the names of the robots whose URDFs are installed."""
     try:
         folder = _robots_folder()
     except MissingExtraError:
@@ -151,11 +154,11 @@ def installed_profiles() -> tuple[str, ...]:
 
 
 def profile_urdf(name: str) -> str:
-    """The URDF of a robot of ROBOTS as text; raise UnknownRobotError or MissingExtraError."""
+    """Return the URDF of a robot of ROBOTS as text; raise UnknownRobotError or MissingExtraError."""
     if name not in ROBOTS:
         raise UnknownRobotError(f"robot is {name!r}, expected one of {', '.join(ROBOTS)}")
     return (_robots_folder() / ROBOTS[name].urdf).read_text()
 
 
 def _robots_folder() -> Path:
-    return need_folder("sim")
+    return find_data_folder("sim")

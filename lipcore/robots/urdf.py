@@ -1,4 +1,4 @@
-"""Rigid bodies of a URDF, arranged as the joints of the data are."""
+"""Rigid bodies of a URDF, in the order of the data's joints."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from lipcore.data.motion import check_joint_types
 from lipcore.data.samples import Array
 from lipcore.robots.library import ROBOTS, UnknownRobotError, pinocchio, profile_urdf
-from lipcore.robots.urdf_text import MOVABLE, UrdfError, UrdfJoint, read
+from lipcore.robots.urdf_text import MOVABLE, UrdfError, UrdfJoint, read_urdf
 from lipcore.vocabulary import JointType
 
 Matching = Literal["name", "order", "list"]
@@ -28,32 +28,32 @@ class JointMismatchError(ValueError):
 
 @dataclass(frozen=True)
 class Description:
-    """What a URDF says of itself. joints: those that move, mimicking ones left out, in the order of the text."""
+    """Name and joints of a URDF. joints: those that move, without mimicking ones, in the order of the text."""
 
     name: str
     joints: tuple[UrdfJoint, ...]
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints that move."""
+        """Return the names of the joints that move."""
         return tuple(joint.name for joint in self.joints)
 
 
 @dataclass(frozen=True)
 class RigidBody:
-    """A serial arm with a fixed base, n moving bodies, everything in the order of the data's joints.
-
-    urdf: its text; urdf_joints: the URDF's name of each joint of the data; matched: how these were matched; model:
-    Pinocchio's, every other joint locked at neutral.
-    """
+    """A serial arm with a fixed base and n moving bodies, in the order of the data's joints."""
 
     name: str
     urdf: str
+    """Text of the URDF."""
     joint_names: tuple[str, ...]
     joint_types: tuple[JointType, ...]
     urdf_joints: tuple[str, ...]
+    """The URDF's name of each joint of the data."""
     matched: Matching
+    """How the joints were matched."""
     model: Any = field(repr=False, compare=False)
+    """Pinocchio's model, with every other joint locked at neutral."""
 
     @classmethod
     def from_urdf(
@@ -73,7 +73,7 @@ class RigidBody:
 
     @classmethod
     def from_profile(cls, profile: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:
-        """Build a robot of ROBOTS; its joints are matched by name, or by order where the data have other names.
+        """Build a robot of ROBOTS; its joints are matched by name, or by order if the data have other names.
 
         Raise UnknownRobotError, MissingExtraError without example-robot-data, JointMismatchError.
         """
@@ -81,7 +81,7 @@ class RigidBody:
             raise UnknownRobotError(f"robot is {profile!r}, expected one of {', '.join(ROBOTS)}")
         free, given = ROBOTS[profile].free, tuple(joint_names)
         by_name = set(given) == set(free)
-        # names that fit in part, or at other places, say that another robot or another order is meant
+        # names that match in part, or at other places, mean another robot or another order
         if not by_name and (
             len(given) != len(free) or any(a != b and a in free for a, b in zip(given, free, strict=True))
         ):
@@ -101,7 +101,7 @@ class RigidBody:
         matched: Matching,
     ) -> RigidBody:
         types, names = check_joint_types(joint_types), tuple(joint_names)
-        text = read(urdf)
+        text = read_urdf(urdf)
         everything = text.joints
         movable = {joint.name: joint for joint in everything if joint.kind in MOVABLE}
         robot, chosen = name or text.robot, set(urdf_joints)
@@ -121,35 +121,35 @@ class RigidBody:
 
     @property
     def n_joints(self) -> int:
-        """Number of joints n."""
+        """Return the number of joints n."""
         return len(self.joint_names)
 
     @property
     def sha256(self) -> str:
-        """Hash of the URDF's text."""
+        """Return the hash of the URDF's text."""
         return hashlib.sha256(self.urdf.encode()).hexdigest()
 
     @property
     def order(self) -> tuple[int, ...]:
-        """Place of each joint of the data in Pinocchio's chain, which runs from base to tip: (n,)."""
+        """Return the index of each joint of the data in Pinocchio's chain, which runs from base to tip: (n,)."""
         place = {name: index for index, name in enumerate(tuple(self.model.names)[1:])}
         return tuple(place[name] for name in self.urdf_joints)
 
     def parameters(self) -> Array:
-        """The URDF's inertial parameters of the body that each joint moves, fixed and locked links merged: (n, 10)."""
+        """Return the inertial parameters of the body that each joint moves, locked links included: (n, 10)."""
         chain = [inertia.toDynamicParameters() for inertia in tuple(self.model.inertias)[1:]]
         return np.array(chain)[list(self.order)]
 
     def length(self) -> float:
-        """Characteristic length, m: the mean distance from one joint to the next."""
+        """Return the characteristic length, m: the mean distance from one joint to the next."""
         steps = [float(np.linalg.norm(place.translation)) for place in tuple(self.model.jointPlacements)[2:]]
         mean = float(np.mean(steps)) if steps else 0.0
-        return mean if mean > 0.01 else 0.3  # shorter ones say nothing about the links
+        return mean if mean > 0.01 else 0.3  # shorter distances do not measure the links
 
 
 def describe(urdf: str) -> Description:
-    """Read what a URDF holds and check that Pinocchio takes it; raise UrdfError."""
-    text = read(urdf)
+    """Return the name and joints of a URDF that Pinocchio can read; raise UrdfError."""
+    text = read_urdf(urdf)
     joints = tuple(joint for joint in text.joints if joint.kind in MOVABLE and joint.mimics is None)
     if not joints:
         raise UrdfError("the URDF has no joint that moves, expected revolute, continuous or prismatic joints")
@@ -158,14 +158,14 @@ def describe(urdf: str) -> Description:
 
 
 def _check_bodies(model: Any) -> None:
-    """Raise UrdfError where no body of its mass and size can have an inertia; zero inertia counts as not given.
+    """Raise UrdfError if no body of its mass and size can have an inertia; zero inertia counts as missing.
 
-    Of principal moments I₁ ≤ I₂ ≤ I₃ about the centre of mass, I₃ ≤ I₁ + I₂; the radius of gyration √(I₃/m) is within
-    the robot's reach; and no matter is denser than 25 000 kg/m³, more than osmium: of all bodies of one mass and
-    density a ball has the smallest I₁ + I₂ + I₃ = 6/5 m r². The first may be missed by rounding, by 5 %.
+    Principal moments I₁ ≤ I₂ ≤ I₃ about the centre of mass satisfy I₃ ≤ I₁ + I₂, with 5 % for rounding. The radius of
+    gyration √(I₃/m) is within the robot's reach. No matter is denser than 25 000 kg/m³, more than osmium: of all bodies
+    of one mass and density a ball has the smallest I₁ + I₂ + I₃ = 6/5 m r².
     """
     reach = max(1.0, sum(float(np.linalg.norm(place.translation)) for place in tuple(model.jointPlacements)))
-    for name, inertia in tuple(zip(tuple(model.names), tuple(model.inertias), strict=True))[1:]:  # what is fixed first
+    for name, inertia in tuple(zip(tuple(model.names), tuple(model.inertias), strict=True))[1:]:  # the base is first
         mass, moments = float(inertia.mass), np.linalg.eigvalsh(inertia.inertia)
         if mass <= 0 or moments[2] <= mass * 1e-6**2:
             continue
@@ -214,7 +214,7 @@ def _parse(plain: str) -> Any:
 
 
 def _reduce(full: Any, free: Sequence[str]) -> Any:
-    """Lock every joint but `free`, which have to form one chain from base to tip."""
+    """Return the model with every joint locked but `free`, which have to form one chain from base to tip."""
     pin = pinocchio()
     locked = [full.getJointId(name) for name in tuple(full.names)[1:] if name not in free]
     try:

@@ -1,9 +1,9 @@
-"""The text of a URDF, checked before Pinocchio sees it.
+"""The text of a URDF, checked before Pinocchio parses it.
 
-A URDF comes from strangers: it is read as text, never as a path, and what could run away while it is parsed (document
-types, deep nesting, loops, endless chains) is refused. Pinocchio is given only what has been checked: links with their
-inertias and joints, written anew. What is left out (meshes, materials, transmissions) cannot be opened, and the parser
-below Pinocchio, which writes what it dislikes straight to stderr, has nothing to say.
+A URDF may be hostile: it is read as text, never as a path. Document types, deep nesting, loops and endless chains are
+rejected, because they could exhaust a parser. Pinocchio reads only a new document of the checked links, with their
+inertias, and joints. Meshes, materials and transmissions are omitted, so nothing opens them. Pinocchio's parser, which
+writes complaints straight to stderr, has nothing to complain about.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from lipcore.vocabulary import JointType
 MOVABLE: dict[str, JointType] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 MAX_DEPTH = 32
 MAX_LINKS = 500
-"""Links of a URDF: parsers and Pinocchio recurse from link to link, and a long enough chain would exhaust the stack."""
-LARGEST = {"mass": 1e6, "inertia": 1e9, "limit": 1e18}
-"""Max numbers of a URDF by element, kg, kg·m² and of any unit, and 1e4 of every other, m and rad: what is computed with
-them stays a number."""
+"""Max links of a URDF: parsers and Pinocchio recurse from link to link, and a long chain would exhaust the stack."""
+MAX_VALUES = {"mass": 1e6, "inertia": 1e9, "limit": 1e18}
+"""Max magnitudes of numbers by element, kg, kg·m² and of any unit, and 1e4 of every other, m and rad: results
+computed from them stay finite."""
 NUMBERS = {
     "origin": {"xyz": 3, "rpy": 3},
     "mass": {"value": 1},
@@ -34,7 +34,7 @@ NUMBERS = {
     "limit": dict.fromkeys(("lower", "upper", "effort", "velocity"), 1),
     "mimic": {"multiplier": 1, "offset": 1},
 }
-"""Attributes that are numbers, and how many, of the elements that are read."""
+"""Attributes of the elements read that are numbers, with their count."""
 NAMES = {"parent": ("link",), "child": ("link",), "mimic": ("joint",)}
 TREE = {
     "robot": ("link", "joint"),
@@ -43,16 +43,16 @@ TREE = {
     "joint": ("origin", "parent", "child", "axis", "limit", "mimic"),
     **dict.fromkeys((*NUMBERS, *NAMES), ()),
 }
-"""Elements that are read, by the one that they are in."""
+"""Elements that are read, by their parent element."""
 
 
 class UrdfError(ValueError):
-    """The text is no URDF that can be used; the message says why."""
+    """The text is no usable URDF; the message says why."""
 
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """A joint as the URDF has it. kind: its `type` there; mimics: the joint that it follows."""
+    """A joint of the URDF. kind: its `type` there; mimics: the joint that it follows."""
 
     name: str
     kind: str
@@ -63,16 +63,18 @@ class UrdfJoint:
 
 @dataclass(frozen=True)
 class UrdfText:
-    """A URDF that has been checked. robot: its name; joints: all of them; plain: links with their inertias and joints
-    written anew, for Pinocchio."""
+    """A checked URDF. joints: all of them; plain: links with their inertias and joints written anew, for Pinocchio."""
 
     robot: str
     joints: tuple[UrdfJoint, ...]
     plain: str
 
 
-def read(urdf: str) -> UrdfText:
-    """What a URDF says, from one pass that refuses what must not reach a recursive parser; raise UrdfError."""
+def read_urdf(urdf: str) -> UrdfText:
+    """Return the checked content of a URDF, in one pass that rejects what must not reach a recursive parser.
+
+    Raise UrdfError.
+    """
     scanner = _Scanner()
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = scanner.start, scanner.end
@@ -105,7 +107,7 @@ def _joint(entry: ElementTree.Element) -> UrdfJoint:
 
 
 def _check_tree(links: Sequence[str], joints: Sequence[UrdfJoint]) -> None:
-    """Raise UrdfError unless joints make links one tree, each with a name of its own."""
+    """Raise UrdfError unless joints connect links to one tree, each with a unique name."""
     for kind, names in (("links", links), ("joints", [joint.name for joint in joints])):
         if twice := [name for name, count in Counter(names).items() if count > 1]:
             raise UrdfError(f"two {kind} are called {twice[0]!r}, expected names of their own")
@@ -161,7 +163,7 @@ class _Scanner:
         raise UrdfError("the URDF declares a document type or an entity (<!DOCTYPE>, <!ENTITY>), which is not accepted")
 
     def _checked(self, tag: str, attributes: dict[str, str]) -> dict[str, str]:
-        """Attributes of an element that are used, in plain numbers."""
+        """Return the used attributes of an element, in plain numbers."""
         if tag in ("link", "joint"):
             kind = {"type": attributes.get("type", "")[:40]} if tag == "joint" else {}
             return {"name": _name(attributes.get("name", ""), f"a {tag}")} | kind
@@ -170,7 +172,7 @@ class _Scanner:
         kept = {name: _name(attributes.get(name, ""), f"the {tag} of {where}") for name in NAMES.get(tag, ())}
         for name, count in NUMBERS.get(tag, {}).items():
             if (text := attributes.get(name)) is not None:
-                numbers = _numbers(text, count, LARGEST.get(tag, 1e4), f"<{tag} {name}> of {where}")
+                numbers = _numbers(text, count, MAX_VALUES.get(tag, 1e4), f"<{tag} {name}> of {where}")
                 kept[name] = " ".join(repr(each) for each in numbers)
                 moves = tag == "axis" and top.get("type") in MOVABLE  # a fixed joint's is often 0 0 0
                 if moves and not 1e-3 <= (length := float(np.hypot.reduce(numbers))) <= 1e3:
@@ -187,7 +189,7 @@ def _name(text: str, what: str) -> str:
 
 
 def _numbers(text: str, count: int, largest: float, what: str) -> list[float]:
-    """The numbers of an attribute; raise UrdfError unless they are so many, and none is larger."""
+    """Return the numbers of an attribute; raise UrdfError for another count or a number above `largest`."""
     try:
         numbers = [float(word) for word in text.split()]
     except ValueError:

@@ -1,1 +1,1 @@
-"""Training: samples in, a model out; `auto` chooses the estimator."""
+"""Training of models from samples; `auto` chooses the estimator."""

@@ -1,4 +1,4 @@
-"""The estimator `auto`: several are trained, and one is chosen by what they predict of held-out samples.
+"""The estimator `auto`: several estimators are trained, and one is chosen by its predictions of held-out samples.
 
 The simplest is chosen unless another one is surely better (`lipcore.training.choice`). It then learns all samples.
 """
@@ -11,22 +11,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lipcore.arm import search
-from lipcore.arm.learning import Learnt, learn
+from lipcore.arm.learning import ArmFit, learn
 from lipcore.arm.posing import mode_of
 from lipcore.arm.search import known_geometries
-from lipcore.data.metrics import Answer, compare, evaluate
+from lipcore.data.metrics import TorqueDistribution, compare, evaluate
 from lipcore.data.samples import Samples
 from lipcore.data.signals import noise_level
-from lipcore.data.splits import SplitError, taken
+from lipcore.data.splits import SplitError, select_rows
 from lipcore.estimators.hyperparameters import FitCancelledError, FitProgress, Progress
 from lipcore.estimators.task import Task
-from lipcore.model.selection import Candidate, HeldOut, plain, selection, unjudged
+from lipcore.model.selection import Candidate, HeldOut, plain, selection, unevaluated_candidate
 from lipcore.model.torque_model import TorqueModel
 from lipcore.training.choice import HeldOutSamples, choose_estimator
 from lipcore.training.correction import corrected_joints
 from lipcore.training.fit import fit_estimator
 from lipcore.training.held_out import HoldOut, hold_out
-from lipcore.training.refit import refit, widened
+from lipcore.training.refit import refit, widen_intervals
 from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
 
 CHAIN = "lip-chain"
@@ -38,22 +38,22 @@ PLACES = {
     "all": (0.97, 1),
     "few": (0, 1),
 }
-"""Which share of all the work each fit is, from and to."""
+"""Range of each fit within the whole work, as fractions."""
 FAILURES = (ArithmeticError, ValueError)
-"""What an estimator may fail with on samples that do not suit it."""
+"""Errors of an estimator on unsuitable samples."""
 
 
-def choose(task: Task) -> TorqueModel:
+def train_auto(task: Task) -> TorqueModel:
     """Train the estimator that suits the samples of a task.
 
-    Raise FitCancelledError, or what the first estimator has failed with where all have failed.
+    Raise FitCancelledError, or the error of the first estimator if all have failed.
     """
-    work = Fits(task, Overall(task.on_progress))
+    work = FitContext(task, OverallProgress(task.on_progress))
     try:
         held = hold_out(task.samples, task.joint_types)
     except SplitError as error:
-        return _unjudged(work, f"too little to hold some out and judge by: {error}")
-    contest = Contest(work, held)
+        return _train_simplest(work, f"too little to hold some out and judge by: {error}")
+    contest = EstimatorComparison(work, held)
     contest.run()
     chosen, reason = contest.verdict()
     rows, edge_rows = int(held.parts.held_out.sum()), int(held.edge.sum())
@@ -61,16 +61,16 @@ def choose(task: Task) -> TorqueModel:
         rows=rows, blocks=held.blocks, repeats=held.repeats, edge_rows=edge_rows, edge_blocks=held.edge_blocks
     )
     model = contest.entries[chosen].model
-    assert model is not None  # what is chosen was trained
+    assert model is not None  # a chosen estimator was trained
     model = replace(
-        widened(model, contest.held.samples), selection=selection(chosen, reason, contest.table(), held_out)
+        widen_intervals(model, contest.held.samples), selection=selection(chosen, reason, contest.table(), held_out)
     )
     model = refit(model, replace(task, on_progress=work.overall.of(chosen, "all")))
     return replace(model, fit={**model.fit, "seconds": work.overall.elapsed})
 
 
-def _unjudged(work: Fits, reason: str) -> TorqueModel:
-    """Of few samples the simplest estimator that can be trained learns all."""
+def _train_simplest(work: FitContext, reason: str) -> TorqueModel:
+    """Train the simplest possible estimator on all samples, because they are too few to hold some out."""
     table: list[Candidate] = []
     errors: list[Exception] = []
     for name in (RIGID, CHAIN):
@@ -79,26 +79,26 @@ def _unjudged(work: Fits, reason: str) -> TorqueModel:
             model = work.fit(work.task.samples, name, "few")
         except FAILURES as error:
             errors.append(error)
-            table.append(unjudged(name, time.monotonic() - began, error))
+            table.append(unevaluated_candidate(name, time.monotonic() - began, error))
             continue
-        table.append(unjudged(name, time.monotonic() - began))
+        table.append(unevaluated_candidate(name, time.monotonic() - began))
         return replace(model, selection=selection(name, reason, table))
     raise errors[0]
 
 
-class Overall:
-    """The progress of all fits as one: its fraction never falls."""
+class OverallProgress:
+    """Progress of all fits together. Its fraction never decreases."""
 
     def __init__(self, on_progress: Progress | None) -> None:
         self.on_progress, self.began, self.highest = on_progress, time.monotonic(), 0.0
 
     @property
     def elapsed(self) -> float:
-        """Seconds since the first fit began."""
+        """Seconds since the start of the first fit."""
         return time.monotonic() - self.began
 
     def of(self, estimator: str, place: str) -> Progress:
-        """What the fit of an estimator reports to; place: one of PLACES."""
+        """Return the progress callback for the fit of an estimator. place: one of PLACES."""
         low, high = PLACES[place]
 
         def report(at: FitProgress) -> None:
@@ -110,22 +110,25 @@ class Overall:
 
 
 @dataclass(frozen=True)
-class Fits:
-    """What all fits share: what the training is given, and its progress."""
+class FitContext:
+    """Input and progress that all fits share."""
 
     task: Task
-    overall: Overall
+    overall: OverallProgress
 
-    def learn(self, samples: Samples, place: str, before: Learnt | None = None) -> Learnt:
-        """The arm of some samples. place: one of PLACES; before: an earlier search, where this one begins, too."""
+    def learn(self, samples: Samples, place: str, before: ArmFit | None = None) -> ArmFit:
+        """Learn the arm of some samples.
+
+        place: one of PLACES; before: an earlier result, an additional start of this search.
+        """
         task = replace(self.task.on(samples), on_progress=self.overall.of(RIGID, place))
         shapes = () if before is None else before.arm.geometries
         if before is None and task.robot is None and task.sibling is None:
             shapes = known_geometries(task.joint_types, task.gravity)
         return learn(task, shapes, (), int(before is not None))
 
-    def fit(self, samples: Samples, name: str, place: str, learnt: Learnt | None = None) -> TorqueModel:
-        """A model of one estimator, which makes of an arm that is learnt already what `fit_estimator` says.
+    def fit(self, samples: Samples, name: str, place: str, learnt: ArmFit | None = None) -> TorqueModel:
+        """Train one estimator; see `fit_estimator` for its use of a learnt arm.
 
         samples: of the task's recordings; name: of the estimator; place: one of PLACES.
         """
@@ -136,33 +139,41 @@ class Fits:
 
 
 @dataclass(frozen=True)
-class Contestant:
-    """What became of an estimator: its model, what that answers of the held-out samples and the log density of these,
-    nats a sample; or the error that it failed with. seconds: that it took."""
+class EstimatorResult:
+    """Result of the training of one estimator."""
 
     seconds: float
+    """Duration, s."""
     model: TorqueModel | None = None
-    answer: Answer | None = None
+    """The model, None if the training failed."""
+    answer: TorqueDistribution | None = None
+    """Its prediction of the held-out samples."""
     density: float = -np.inf
+    """Their log density, nats per sample."""
     error: Exception | None = None
+    """Error of the training."""
 
 
-class Contest:
-    """One contest on the samples of a task."""
+class EstimatorComparison:
+    """Comparison of estimators on the samples of a task."""
 
-    def __init__(self, work: Fits, hold: HoldOut) -> None:
+    def __init__(self, work: FitContext, hold: HoldOut) -> None:
         self.work, parts = work, hold.parts
-        self.training, held = taken(work.task.samples, parts.train), taken(work.task.samples, parts.held_out)
+        self.training, held = (
+            select_rows(work.task.samples, parts.train),
+            select_rows(work.task.samples, parts.held_out),
+        )
         rows = np.unique(np.linspace(0, len(held) - 1, 2000).round().astype(np.int64))
         self.held = HeldOutSamples(held.rows(rows), hold.edge[parts.held_out][rows])
-        self.entries: dict[str, Contestant] = {}
-        self.learnt: Learnt | None = None
+        self.entries: dict[str, EstimatorResult] = {}
+        self.learnt: ArmFit | None = None
 
     def run(self) -> None:
-        """Train and judge the estimators; raise the error of the first if all have failed.
+        """Train and evaluate the estimators. Raise the error of the first if all have failed.
 
-        The others are not trained if the arm leaves only the sensor's noise. If the chain predicts most joints better
-        than the arm, the search may have missed the arm: it is repeated once, for as long.
+        The others are not trained if the arm's residuals are at the level of the sensor's noise. If the chain predicts
+        most joints better than the arm, the search may have missed the arm: it is repeated once, with the same time
+        limit.
         """
         self.entries[RIGID], self.learnt = self._rigid(RIGID)
         if self._is_explained():
@@ -179,10 +190,10 @@ class Contest:
             raise errors[0]
 
     def verdict(self) -> tuple[str, str]:
-        """The estimator that is chosen, and why."""
+        """Return the chosen estimator, and the reason."""
         if len(self.entries) == 1:
             return RIGID, "it explains the held-out torque to the sensor's noise, so no other estimator was trained"
-        # the simplest first: an estimator that knows the arm errs less where nothing was measured
+        # the simplest first: an estimator with an arm has smaller errors away from the data
         answers = {name: self.entries[name].answer for name in (RIGID, LOCAL, CHAIN)}
         local = self.entries[LOCAL].model
         if local is None or not corrected_joints(local.fit):
@@ -190,34 +201,34 @@ class Contest:
         return choose_estimator(self.held, {name: each for name, each in answers.items() if each is not None})
 
     def table(self) -> list[Candidate]:
-        """How each estimator did, the simplest first."""
+        """Return the figures of all estimators, the simplest first."""
         best = max(self.entries.values(), key=lambda entry: entry.density)
         rows = []
         for name, entry in self.entries.items():
-            row = unjudged(name, entry.seconds, entry.error)
+            row = unevaluated_candidate(name, entry.seconds, entry.error)
             if entry.answer is not None and best.answer is not None:
                 row["log_density"], row["difference"] = entry.density, entry.density - best.density
                 row["nmse"] = plain(self.held.nmse(entry.answer))
                 row["edge_nmse"] = plain(self.held.edge_nmse(entry.answer))
-                row["coverage"] = plain(entry.answer.holds(self.held.samples.tau).mean(axis=0))
+                row["coverage"] = plain(entry.answer.contains(self.held.samples.tau).mean(axis=0))
                 if entry is not best:
                     total = compare(self.held.samples, best.answer, entry.answer).total
                     row["standard_error"] = plain(total.standard_error)[0]
             rows.append(row)
         return rows
 
-    def _rigid(self, place: str, before: Learnt | None = None) -> tuple[Contestant, Learnt | None]:
-        """Learn the arm and judge it alone."""
+    def _rigid(self, place: str, before: ArmFit | None = None) -> tuple[EstimatorResult, ArmFit | None]:
+        """Learn the arm and evaluate it alone."""
         began = time.monotonic()
         try:
             learnt = self.work.learn(self.training, place, before)
         except FAILURES as error:
-            return Contestant(time.monotonic() - began, error=error), None
+            return EstimatorResult(time.monotonic() - began, error=error), None
         entry = self._enter(RIGID, place, learnt)
         return replace(entry, seconds=time.monotonic() - began), learnt
 
-    def _enter(self, name: str, place: str, learnt: Learnt | None = None) -> Contestant:
-        """Train an estimator and judge it."""
+    def _enter(self, name: str, place: str, learnt: ArmFit | None = None) -> EstimatorResult:
+        """Train an estimator and evaluate it."""
         began = time.monotonic()
         if self.work.task.cancelled is not None and self.work.task.cancelled():
             raise FitCancelledError("the fit was cancelled")
@@ -230,13 +241,13 @@ class Contest:
             if not np.isfinite(density):
                 raise ValueError("what it predicts is not finite")
         except FAILURES as error:
-            return Contestant(time.monotonic() - began, error=error)
-        return Contestant(time.monotonic() - began, model, answer, density)
+            return EstimatorResult(time.monotonic() - began, error=error)
+        return EstimatorResult(time.monotonic() - began, model, answer, density)
 
     def _is_explained(self) -> bool:
-        """Whether the arm predicts all joints to the sensor's noise.
+        """Return whether the arm predicts all joints to the sensor's noise.
 
-        It is known from signals in order of time, where the noise of positions is below 1 % of their spread.
+        This needs signals in order of time, with a noise of positions below 1 % of their spread.
         """
         answer, signals = self.entries[RIGID].answer, self.work.task.signals
         if answer is None:
@@ -246,7 +257,7 @@ class Contest:
         return bool((q < 0.01 * signals.q.std(axis=0)).all() and (error <= search.OPTIONS.explained_ratio * tau).all())
 
     def _chain_leads(self) -> bool:
-        """Whether the chain predicts most joints better than the arm, by more than chance."""
+        """Return whether the chain predicts most joints better than the arm, beyond chance."""
         arm, chain = self.entries[RIGID].answer, self.entries[CHAIN].answer
         if arm is None or chain is None:
             return False

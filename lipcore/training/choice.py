@@ -1,4 +1,4 @@
-"""The choice between estimators, by what they predict of held-out samples."""
+"""The choice between estimators, by their predictions of held-out samples."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lipcore.data.metrics import Answer, compare
+from lipcore.data.metrics import TorqueDistribution, compare
 from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import Mask
 from lipcore.vocabulary import LOCAL
@@ -15,35 +15,35 @@ from lipcore.vocabulary import LOCAL
 
 @dataclass(frozen=True)
 class HeldOutSamples:
-    """Samples to judge estimators by."""
+    """Held-out samples, for the evaluation of estimators."""
 
     samples: Samples
     edge: Mask
     """Rows at the edge of the data, (N,)."""
 
-    def nmse(self, answer: Answer) -> Array:
+    def nmse(self, answer: TorqueDistribution) -> Array:
         """Return the mean squared error of each joint over the variance of its torque, (n,); NaN if that is zero."""
         return np.asarray(self._errors(answer).mean(axis=0))
 
-    def edge_nmse(self, answer: Answer) -> Array:
-        """Return the same of the rows at the edge, over the variance of all rows, (n,); NaN if there are none."""
+    def edge_nmse(self, answer: TorqueDistribution) -> Array:
+        """Return the same for the rows at the edge, over the variance of all rows, (n,); NaN if there are none."""
         errors = self._errors(answer)[self.edge]
         return errors.mean(axis=0) if len(errors) else np.full(self.samples.n_joints, np.nan)
 
-    def _errors(self, answer: Answer) -> Array:
+    def _errors(self, answer: TorqueDistribution) -> Array:
         tau = self.samples.tau
         # rounding gives a constant column a variance above zero
         variance = np.where(np.ptp(tau, axis=0) > 0, tau.var(axis=0), np.nan)
         return np.asarray(np.square(tau - answer.mean) / variance)
 
 
-def choose_estimator(held_out: HeldOutSamples, answers: Mapping[str, Answer]) -> tuple[str, str]:
+def choose_estimator(held_out: HeldOutSamples, answers: Mapping[str, TorqueDistribution]) -> tuple[str, str]:
     """Return the name of the estimator to train on all samples, and the reason.
 
     The first is chosen unless a later one is surely better: its log density is higher beyond chance (95 %), and its
-    error is no larger, neither on all rows nor at the edge. LOCAL, which exists where its own samples have shown a
-    gain and changes nothing away from them, takes the place of an arm alone unless it is worse.
-    answers: what each estimator predicts of the samples, the simplest estimator first, at least one.
+    error is no larger, neither on all rows nor at the edge. LOCAL replaces an arm alone unless it is worse: it exists
+    only if its own samples have shown a gain, and it changes nothing away from them. answers: predictions of the
+    samples by at least one estimator, the simplest first.
     """
     first, *others = answers
     chosen, reasons = first, []
@@ -58,10 +58,12 @@ def choose_estimator(held_out: HeldOutSamples, answers: Mapping[str, Answer]) ->
     return chosen, "; ".join(reasons) or "no other estimator was trained"
 
 
-def _objection(held_out: HeldOutSamples, simple: Answer, other: Answer, *, surely: bool) -> str | None:
+def _objection(
+    held_out: HeldOutSamples, simple: TorqueDistribution, other: TorqueDistribution, *, surely: bool
+) -> str | None:
     """Return why another estimator should not replace a simpler one, None if it should.
 
-    surely: it has to be better beyond chance, and no worse at the edge.
+    surely: it must be better beyond chance, and no worse at the edge.
     """
     total = compare(held_out.samples, simple, other).total
     if surely and not total.mean[0] < -total.half_width[0]:

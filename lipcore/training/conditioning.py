@@ -1,4 +1,4 @@
-"""What a fitted model would know had it seen more samples than its fit stands on: one pass over all of them."""
+"""Conditioning of a fitted model on all samples, beyond those of its fit, in one pass."""
 
 from __future__ import annotations
 
@@ -19,22 +19,26 @@ from lipcore.training.correction import side_by_side
 from lipcore.vocabulary import LOCAL
 
 SHARD = 2048
-"""Samples that are summed up by themselves, whoever does it: about a second of one core for seven joints."""
+"""Samples of one shard, which one worker sums up: about a second of one core for seven joints."""
 
 
 @dataclass(frozen=True)
 class ShardStatistics:
-    """Sums over some samples for a model: plain arrays, which go from process to process.
+    """Sums over some samples for a model, as plain arrays for transfer between processes.
 
-    a: upper triangle of the statistics' A row by row, (M (M + 1) / 2,); b: (M,); weight: sum of the samples' weights;
-    low, high: (3, n), smallest and largest q, dq and ddq. Sums of them are to be made in one order for equal bits.
+    Add them in one fixed order for equal bits.
     """
 
     a: Array
+    """Upper triangle of the statistics' A row by row, (M (M + 1) / 2,)."""
     b: Array
+    """b, (M,)."""
     weight: float
+    """Sum of the samples' weights."""
     low: Array
+    """Min q, dq and ddq, (3, n)."""
     high: Array
+    """Max q, dq and ddq, (3, n)."""
 
     def __add__(self, other: ShardStatistics) -> ShardStatistics:
         return ShardStatistics(
@@ -47,13 +51,12 @@ class ShardStatistics:
 
 
 def should_condition(options: FitOptions, count: int, independent: float) -> bool:
-    """Whether a posterior is to stand on all of `count` samples, which together count as so many independent ones,
-    and not on those alone that the fit has chosen.
+    """Return whether to condition a posterior on all `count` samples, and not only on those chosen by the fit.
 
-    Measured (`all_rows.py panda` of benchmarks/studies) on a simulated Panda with friction that no estimator expresses,
-    of 100 to 1000 s at 10 Hz to 1 kHz: where all samples counted more, their nMSE was 0.58 to 1.04 times that of
-    the 500 chosen ones, and 95 % intervals covered 93 to 98 % instead of 93 to 96 %. Counted in full instead of by
-    their time, 100 s of slow motion at 1 kHz covered 85 %.
+    independent: number of effective samples. Measured (`all_rows.py panda` of benchmarks/studies) on a simulated Panda
+    with friction that no estimator models, of 100 to 1000 s at 10 Hz to 1 kHz: if all samples counted more, their nMSE
+    was 0.58 to 1.04 times that of the 500 chosen ones, and 95 % intervals covered 93 to 98 % instead of 93 to 96 %.
+    With weight one instead of weights by time, 100 s of slow motion at 1 kHz covered 85 %.
     """
     if options.statistics == "chosen" or count <= options.posterior_samples:
         return False
@@ -63,9 +66,9 @@ def should_condition(options: FitOptions, count: int, independent: float) -> boo
 def sum_samples(
     summing: Summing, samples: Samples, weights: Array | None = None, cancelled: Callable[[], bool] | None = None
 ) -> ShardStatistics:
-    """Sum up samples, at least one, chunk by chunk. weights: (N,), one for each sample, all equal where None.
+    """Return the sums over samples, at least one, chunk by chunk. weights: (N,), one for each sample, None for all one.
 
-    Raise FitCancelledError when `cancelled` says so.
+    Raise FitCancelledError when `cancelled` returns true.
     """
     total = Total.empty(len(summing.basis))
     for first in range(0, len(samples), CHUNK):
@@ -80,9 +83,9 @@ def sum_samples(
 
 
 def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> TorqueModel:
-    """The model with the posterior of `count` samples with these sums, instead of those of its fit.
+    """Return the model with the posterior of `count` samples with these sums, instead of those of its fit.
 
-    Hyperparameters and basis stay, and so does a local correction: the sums are of the arm beside it.
+    Hyperparameters and basis stay. A local correction stays too: the sums are those of the arm alone.
     """
     posterior = model.posterior
     statistics = Statistics(unpack_symmetric("a", sums.a), sums.b, sums.weight)
@@ -108,9 +111,9 @@ def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> To
 def condition(
     model: TorqueModel, samples: Samples, weights: Array | None = None, cancelled: Callable[[], bool] | None = None
 ) -> TorqueModel:
-    """Return the model with the posterior of all these samples, instead of the few that its fit has chosen of them.
+    """Return the model with the posterior of all these samples, instead of the few that its fit has chosen.
 
-    The statistics are summed anew, so that it does not matter which samples the fit has chosen. weights: (N,), one for
-    each sample, all equal where None. Raise FitCancelledError when `cancelled` says so.
+    The statistics are summed again, so the choice of the fit does not matter. weights: (N,), one for each sample, None
+    for all one. Raise FitCancelledError when `cancelled` returns true.
     """
     return with_statistics(model, sum_samples(Summing.of(model.posterior), samples, weights, cancelled), len(samples))

@@ -1,8 +1,8 @@
-"""A local correction beside an arm: what it leaves over, where another part of the recording predicts that.
+"""A local correction of an arm: the arm's residual, if another part of the recording predicts it.
 
-What an arm leaves over lasts: next to a sample it is the same, whether or not the arm comes back to it. So blocks of
-the recording are left out in turn, with the instants next to them, and predicted from the others. A joint is corrected
-if its error falls so by more than chance. The arm stays as it is.
+The residual of an arm lasts: it is the same near a sample, whether or not the arm returns there. So blocks of the
+recording are held out in turn, with the instants next to them, and predicted from the others. A joint is corrected if
+this reduces its error beyond chance. The arm does not change.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from lipcore.data.samples import Array, Samples
-from lipcore.data.splits import GUARD_S, guarded
+from lipcore.data.splits import GUARD_S, apply_guard
 from lipcore.kernels.base import TorqueKernel
 from lipcore.kernels.local import LocalKernel, nearness
 from lipcore.posterior.basis import Basis
@@ -26,53 +26,55 @@ from lipcore.posterior.statistics import Statistics, collect
 
 @dataclass(frozen=True)
 class CorrectionOptions:
-    """How a correction is judged, and how much of it is kept."""
+    """Evaluation of a correction, and its size."""
 
     max_rows: int = 1000
-    """Max number of rows that are used."""
+    """Max rows that are used."""
     blocks: int = 10
-    """Blocks that are left out in turn."""
+    """Blocks that are held out in turn."""
     noise_shares: tuple[float, ...] = (1e-3, 1e-2, 0.1, 0.3, 1.0)
-    """Noise variances that are tried, as shares of the correction's."""
+    """Noise variances that are tried, as shares of the correction's variance."""
     min_gain: float = 0.2
     """Min gain of a corrected joint, as a share of its squared error."""
     min_gain_errors: float = 2.82
     """The same in standard errors: the 99 % point of t for ten blocks."""
     max_outputs: int = 400
-    """Max number of torques at which the correction is stored."""
+    """Max torques at which the correction is stored."""
     open_share: float = 0.01
-    """Share of the correction's variance that these torques may leave open."""
+    """Max share of the correction's variance that these torques do not explain."""
 
 
 OPTIONS = CorrectionOptions()
-REPORTED = "local_"
-"""Prefix of entries of a fit's report, one a corrected joint: the share of its squared error that is left."""
+REPORT_PREFIX = "local_"
+"""Prefix of entries of a fit's report, one for each corrected joint: the remaining share of its squared error."""
 
 
 @dataclass(frozen=True)
 class Correction:
-    """posterior: of arm and correction; errors: (n,), squared error of blocks that are left out, with the correction
-    over without it, 1 for joints that are not corrected."""
+    """A correction and its gain."""
 
     posterior: CompactPosterior
+    """Posterior of arm and correction."""
     errors: Array
+    """Squared error of held-out blocks with the correction, divided by that without, (n,); 1 for joints without
+    correction."""
 
     def report(self) -> dict[str, float]:
-        """Errors of the joints that are corrected, for the manifest."""
-        return {f"{REPORTED}{j + 1}": round(float(each), 3) for j, each in enumerate(self.errors) if each < 1}
+        """Return the errors of corrected joints, for the manifest."""
+        return {f"{REPORT_PREFIX}{j + 1}": round(float(each), 3) for j, each in enumerate(self.errors) if each < 1}
 
 
 def corrected_joints(report: Mapping[str, object]) -> list[int]:
-    """Joints that a fit's report names as corrected, from 0."""
-    return [int(key.removeprefix(REPORTED)) - 1 for key in report if key.startswith(REPORTED)]
+    """Return the corrected joints of a fit's report, from 0."""
+    return [int(key.removeprefix(REPORT_PREFIX)) - 1 for key in report if key.startswith(REPORT_PREFIX)]
 
 
 def correct(kernel: TorqueKernel, arm: CompactPosterior, samples: Samples, joints: Sequence[int] = ()) -> Correction:
-    """Return the posterior of an arm with a correction of what it leaves over of N samples.
+    """Return the posterior of an arm with a correction of its residuals of N samples.
 
-    kernel: the arm's, friction and the local one; joints: which to correct in any case, as an earlier fit did.
-    The noise of a joint that is corrected is what is left of it in blocks that are left out. No joint is corrected of a
-    recording too short to leave blocks of it out in turn.
+    kernel: the arm's, friction and the local one; joints: joints to correct in any case, as an earlier fit did. The
+    noise of a corrected joint is its residual in held-out blocks. If the recording is too short for held-out blocks, no
+    joint is corrected.
     """
     order = np.lexsort((samples.t, samples.episode))
     samples = samples.rows(
@@ -97,7 +99,7 @@ def correct(kernel: TorqueKernel, arm: CompactPosterior, samples: Samples, joint
         kept = motion[np.sort(pivots(near, 1, OPTIONS.max_outputs // int(corrected.sum()), OPTIONS.open_share).outputs)]
     outputs = (np.arange(len(kept))[:, None] * n + np.flatnonzero(corrected)).reshape(-1)
     taught = collect(Basis.build(local, own, kept, outputs), np.array(OPTIONS.noise_shares)[best] * power, motion, left)
-    assert arm.statistics is not None  # as trained
+    assert arm.statistics is not None  # a trained posterior has statistics
     posterior = CompactPosterior.build(
         kernel,
         Basis.build(kernel, params, kept, outputs),
@@ -110,21 +112,21 @@ def correct(kernel: TorqueKernel, arm: CompactPosterior, samples: Samples, joint
 
 
 def side_by_side(correction: Statistics, arm: Statistics) -> Statistics:
-    """Statistics of a correction, and of an arm that knows nothing of it."""
+    """Return the joint statistics of a correction and an arm that are independent."""
     a, b = block_diagonal([correction.a, arm.a]), np.concatenate([correction.b, arm.b])
     return Statistics(a, b, arm.samples)
 
 
 def _errors(samples: Samples, left: Array, near: Array) -> tuple[Array, Array]:
-    """Mean squared errors of B blocks that are predicted from the others: for each of the noise shares, (B, S, n), and
-    without a correction, (B, n); all the same if a block is too short.
+    """Return the mean squared errors of B blocks predicted from the others, with and without a correction.
 
+    With a correction they are (B, S, n) for S noise shares, without it (B, n). All are one if a block is too short.
     samples: in order; left: (N, n), in units of its root mean square; near: (N, N).
     """
     block = np.arange(len(samples)) * OPTIONS.blocks // len(samples)
     with_it, without = [], []
     for each in range(OPTIONS.blocks):
-        parts = guarded(samples.episode, samples.t, np.arange(len(samples)), block == each, GUARD_S)
+        parts = apply_guard(samples.episode, samples.t, np.arange(len(samples)), block == each, GUARD_S)
         if not (parts.train.any() and parts.held_out.any()):
             return np.ones((2, len(OPTIONS.noise_shares), left.shape[1])), np.ones((2, left.shape[1]))
         values, vectors = eigh(near[np.ix_(parts.train, parts.train)])

@@ -1,4 +1,4 @@
-"""Training one named estimator: hyperparameters or the arm, then the compact posterior."""
+"""Training of one named estimator: hyperparameters or the arm, then the compact posterior."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from lipcore.arm.learning import Learnt, learn
+from lipcore.arm.learning import ArmFit, learn
 from lipcore.arm.search import known_geometries
 from lipcore.data.independence import motion_dimensions
 from lipcore.data.samples import Samples
@@ -20,9 +20,9 @@ from lipcore.kernels.geometry import Geometry
 from lipcore.model.parameters import friction_coefficients
 from lipcore.model.torque_model import TorqueModel, training_range, training_torque
 from lipcore.posterior.compact import CompactPosterior
-from lipcore.posterior.compression import Compression, compressed, linear
-from lipcore.posterior.conformal import Conformal, conform
-from lipcore.posterior.misfit import Misfit, estimate, shared_rows
+from lipcore.posterior.compression import Compression, build_linear, compress_samples
+from lipcore.posterior.conformal import Conformal, fit_conformal
+from lipcore.posterior.misfit import Misfit, estimate_misfit, shared_rows
 from lipcore.posterior.statistics import collect
 from lipcore.training.correction import correct
 from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
@@ -31,16 +31,16 @@ from lipcore.vocabulary import LOCAL, RIGID, ROBOT_ESTIMATORS
 def fit_estimator(
     task: Task,
     name: str,
-    learnt: Learnt | None = None,
+    learnt: ArmFit | None = None,
     geometries: Sequence[Geometry] = (),
     corrected: Sequence[int] = (),
 ) -> TorqueModel:
     """Train one estimator on the samples of a task.
 
-    name: one of `lipcore.estimators.catalogue.ESTIMATORS`; learnt: what these samples have led to of the rigid bodies,
-    where that is known already, which tells estimators without them how unsure friction at rest is; geometries: base to
-    tip, that a search for one looks at first; corrected: joints that an earlier fit has corrected.
-    Raise ValueError as `check_estimator` does, FitCancelledError, or NotPositiveDefiniteError.
+    name: one of `lipcore.estimators.catalogue.ESTIMATORS`; learnt: rigid bodies learnt from these samples before, from
+    which estimators without them read the uncertainty of friction at rest; geometries: first starts of a search, base
+    to tip; corrected: joints that an earlier fit has corrected. Raise ValueError like `check_estimator`,
+    FitCancelledError, or NotPositiveDefiniteError.
     """
     samples, types, options = task.samples, task.joint_types, task.options
     if task.sibling is None:
@@ -59,16 +59,16 @@ def fit_estimator(
         used = samples.rows(learnt.rows)
         variance = np.exp(2 * learnt.params["noise.log_std"]) / learnt.counts
         arm = SumKernel(*(term for kind, term in estimator.terms.items() if kind != "local"))
-        compression = linear(arm, learnt.params, used, variance, options.compact_tolerance, factor, learnt.misfit)
+        compression = build_linear(arm, learnt.params, used, variance, options.compact_tolerance, factor, learnt.misfit)
         if name == LOCAL:
             if task.on_progress is not None:
                 task.on_progress(FitProgress("posterior", 0, 0, float(learnt.report["objective"]), 0.0, 0.0))
             correction = correct(estimator.kernel, compression.posterior, samples, corrected)
             compression = replace(compression, posterior=correction.posterior)
             report |= correction.report()
-        conformal = conform(compression.posterior, used, variance)
+        conformal = fit_conformal(compression.posterior, used, variance)
     else:
-        # not the noise: what rigid bodies leave of the torque is what the other term is there for
+        # without the noise: the residual of rigid bodies belongs to the other term
         params = {} if learnt is None else learnt.params
         start = {key: value for key, value in params.items() if key != "noise.log_std"}
         fewer = options if learnt is None else independent_samples(options, learnt)
@@ -108,16 +108,16 @@ def fit_estimator(
 def compact(
     task: Task, estimator: Estimator, params: Params, used: Samples, rigid: Misfit | None = None
 ) -> tuple[Compression, dict[str, float], Conformal]:
-    """The compact posterior of an estimator with a nonlinear term; for the manifest, the jitter, (N·m)², that the exact
-    one took, and how many independent samples it stands on; and what left-out blocks say of its intervals.
+    """Return the compact posterior of an estimator, manifest entries, and conformal factors.
 
-    used: samples of the task's recordings; rigid: misfit of the arm that was learnt from them. A torque counts as
-    `Misfit.of_row` says; what that is, contiguous samples tell: of friction at rest less than the arm does, since a
-    nonlinear term follows the few samples that it has there. Raise NotPositiveDefiniteError where the exact posterior
-    cannot be computed.
+    The estimator has a nonlinear term. The entries are the jitter of the exact posterior, (N·m)², and the number of
+    effective samples. used: samples of the task's recordings; rigid: misfit of the arm that was learnt from them. A
+    torque has the variance of `Misfit.of_row`, estimated from contiguous samples. They show less friction at rest than
+    the arm, because a nonlinear term follows its few samples there. Raise NotPositiveDefiniteError if the exact
+    posterior cannot be computed.
     """
     options, factor = task.options, calibrate(estimator.name).function_std_factor
-    compression, jitter = compressed(
+    compression, jitter = compress_samples(
         estimator.kernel, params, used, options.compact_tolerance, options.max_inducing_outputs, factor
     )
     posterior = compression.posterior
@@ -125,7 +125,7 @@ def compact(
     residual = contiguous.tau - posterior.mean(contiguous.motion())
     noise = posterior.noise_variance
     moved = np.stack([contiguous.dq, contiguous.ddq])
-    misfit, _ = estimate(residual, contiguous.tau, moved, contiguous.episodes(), noise)
+    misfit, _ = estimate_misfit(residual, contiguous.tau, moved, contiguous.episodes(), noise)
     misfit = misfit.with_friction(friction_coefficients(posterior, estimator).coulomb)
     misfit = misfit if rigid is None else misfit.with_rest(rigid)
     motion = used.motion()
@@ -134,11 +134,11 @@ def compact(
     counted = CompactPosterior.build(estimator.kernel, posterior.basis, statistics, noise, factor, misfit)
     independent = float((noise / variance).mean(axis=1).sum())
     stands_on = {"jitter": jitter, "independent_samples": independent}
-    return replace(compression, posterior=counted), stands_on, conform(counted, used, variance)
+    return replace(compression, posterior=counted), stands_on, fit_conformal(counted, used, variance)
 
 
-def independent_samples(options: FitOptions, learnt: Learnt) -> FitOptions:
-    """Options for hyperparameters from no more samples than the recording holds independent ones."""
+def independent_samples(options: FitOptions, learnt: ArmFit) -> FitOptions:
+    """Return options that limit the samples for hyperparameters to the recording's effective samples."""
     most = max(50, round(float(learnt.counts.mean(axis=1).sum())))
     return replace(
         options,

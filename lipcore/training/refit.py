@@ -1,4 +1,4 @@
-"""The last fit: a model whose quality was judged on rows that it had not learnt learns these rows, too."""
+"""The last fit: a model that was evaluated on held-out rows learns these rows too."""
 
 from __future__ import annotations
 
@@ -18,53 +18,55 @@ from lipcore.training.correction import corrected_joints
 from lipcore.training.fit import compact, fit_estimator
 from lipcore.vocabulary import LOCAL, RIGID
 
-WIDENED = "widened_"
-"""Prefix of entries of a fit's report, one a joint: factor on its intervals that held-out rows have proved."""
+WIDENED_PREFIX = "widened_"
+"""Prefix of entries of a fit's report, one for each joint: factor on its intervals from held-out rows."""
 
 
-def widened(model: TorqueModel, samples: Samples) -> TorqueModel:
-    """Return the model with intervals widened until they hold 95 % of the torques of samples that it has not learnt."""
-    factors = model.predict(samples.q, samples.dq, samples.ddq).interval.shortfall(samples.tau)
-    known = {joint: float(model.fit.get(f"{WIDENED}{joint + 1}", 1.0)) * each for joint, each in enumerate(factors)}
-    report = {f"{WIDENED}{joint + 1}": round(each, 3) for joint, each in known.items() if each > 1}
-    return _wider(replace(model, fit={**model.fit, **report}), factors.tolist())
+def widen_intervals(model: TorqueModel, samples: Samples) -> TorqueModel:
+    """Return the model with intervals widened to a coverage of 95 % of the torques of held-out samples."""
+    factors = model.predict(samples.q, samples.dq, samples.ddq).interval.width_factor(samples.tau)
+    known = {
+        joint: float(model.fit.get(f"{WIDENED_PREFIX}{joint + 1}", 1.0)) * each for joint, each in enumerate(factors)
+    }
+    report = {f"{WIDENED_PREFIX}{joint + 1}": round(each, 3) for joint, each in known.items() if each > 1}
+    return _widen(replace(model, fit={**model.fit, **report}), factors.tolist())
 
 
-def _wider(model: TorqueModel, factors: Sequence[float]) -> TorqueModel:
+def _widen(model: TorqueModel, factors: Sequence[float]) -> TorqueModel:
     return model if model.conformal is None else replace(model, conformal=model.conformal.widened(factors))
 
 
 def refit(model: TorqueModel, task: Task) -> TorqueModel:
-    """Return the model trained on the samples of a task, from where its own training ended.
+    """Return the model trained on the samples of a task, starting from the result of its own training.
 
-    An arm follows the geometries of the model without a search; what is corrected beside it stays so. If `auto` has
-    chosen an arm alone, it is corrected where only all rows tell that motion repeats. The other estimators keep their
-    arm and hyperparameters; their basis and posterior are made anew. `selection`, the report of the search and
-    the factors of `widened` are kept.
+    An arm starts at the geometries of the model, without a search. Its correction stays. If `auto` chose an arm alone,
+    it is corrected if only all rows together show that motion repeats. The other estimators keep their arm and
+    hyperparameters, and their basis and posterior are computed again. `selection`, the report of the search and the
+    factors of `widen_intervals` are kept.
 
-    task: of the model's robot, with its joints, torque convention and options.
-    Raise FitCancelledError, ValueError as `learn` does, or NotPositiveDefiniteError.
+    task: of the model's robot, with its joints, torque convention and options. Raise FitCancelledError, ValueError like
+    `learn`, or NotPositiveDefiniteError.
     """
     began, name = time.monotonic(), model.estimator.name
     if name in (RIGID, LOCAL):
-        assert model.arm is not None  # it is what the estimator is made of
+        assert model.arm is not None  # these estimators have an arm
         learnt = learn(task, begin=model.arm.geometries)
         searched = {key: value for key, value in model.fit.items() if key.startswith("search_")}
         learnt = replace(learnt, report={**learnt.report, **searched})
         again = fit_estimator(task, name, learnt, corrected=corrected_joints(model.fit))
         again = replace(again, selection=model.selection)
         if name == RIGID and model.selection is not None:
-            again = _corrected(again, model.selection, fit_estimator(task, LOCAL, learnt))
+            again = _choose_corrected(again, model.selection, fit_estimator(task, LOCAL, learnt))
     else:
         again = _with_posterior_of(model, task)
-    kept = {key: value for key, value in model.fit.items() if key.startswith(WIDENED)}
+    kept = {key: value for key, value in model.fit.items() if key.startswith(WIDENED_PREFIX)}
     kept["seconds"] = float(model.fit["seconds"]) + time.monotonic() - began
     again = replace(again, fit={**again.fit, **kept})
-    return _wider(again, [float(kept.get(f"{WIDENED}{joint + 1}", 1.0)) for joint in range(model.n_joints)])
+    return _widen(again, [float(kept.get(f"{WIDENED_PREFIX}{joint + 1}", 1.0)) for joint in range(model.n_joints)])
 
 
-def _corrected(arm: TorqueModel, before: Selection, local: TorqueModel) -> TorqueModel:
-    """Return an arm that `auto` has chosen before, or its corrected twin if all rows show that a correction gains."""
+def _choose_corrected(arm: TorqueModel, before: Selection, local: TorqueModel) -> TorqueModel:
+    """Return an arm that `auto` chose before, or the corrected one if all rows show a gain."""
     if not corrected_joints(local.fit):
         return arm
     reason = shortened(f"{LOCAL} replaces {RIGID}: of all rows it gains; before: {before['reason']}")
@@ -72,7 +74,7 @@ def _corrected(arm: TorqueModel, before: Selection, local: TorqueModel) -> Torqu
 
 
 def _with_posterior_of(model: TorqueModel, task: Task) -> TorqueModel:
-    """The model with a basis and a posterior of the samples of a task."""
+    """Return the model with a new basis and posterior, from the samples of a task."""
     if task.cancelled is not None and task.cancelled():
         raise FitCancelledError("the fit was cancelled")
     if task.on_progress is not None:

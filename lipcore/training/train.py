@@ -1,4 +1,4 @@
-"""Samples in, a model out: the choice of the estimator, its fit, and the pass over all samples."""
+"""Training of a model: choice of the estimator, its fit, and the pass over all samples."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lipcore.model.sibling import arm_of_sibling
 from lipcore.model.torque_model import TorqueModel
 from lipcore.robots.urdf import RigidBody
 from lipcore.training import conditioning
-from lipcore.training.auto import choose
+from lipcore.training.auto import train_auto
 from lipcore.training.fit import fit_estimator
 from lipcore.vocabulary import AUTO, TorqueConvention
 
@@ -37,14 +37,31 @@ def train(
 ) -> TorqueModel:
     """Train a model on samples of n joints.
 
-    joint_types: (n,), `revolute` or `prismatic`; estimator: one of `ESTIMATORS`, or `auto`,
-    which chooses (`lipcore.training.auto`); torque_convention: what `samples.tau` holds; on_progress, cancelled: see
-    `lipcore.estimators.hyperparameters.fit`; robot: for estimators of rigid bodies, of the joints of the samples;
-    base: for them, too, a model of another unit of the same robot, whose arm is expected (`lipcore.model.sibling`).
-    Corrupt rows are left out before anything sees them, and the fit's report names them (`lipcore.data.outliers`).
-    Raise ValueError for bad arguments, BaseMismatchError, CorruptError, FitCancelledError, or NotPositiveDefiniteError.
+    Corrupt rows are removed first, and the fit's report contains their number (`lipcore.data.outliers`).
+
+    Args:
+        samples: Samples of n joints.
+        joint_types: `revolute` or `prismatic` for each joint, (n,).
+        estimator: One of `ESTIMATORS`, or `auto`, which chooses (`lipcore.training.auto`).
+        options: Options of the fit.
+        torque_convention: Meaning of `samples.tau`.
+        on_progress: See `lipcore.estimators.hyperparameters.fit`.
+        cancelled: See `lipcore.estimators.hyperparameters.fit`.
+        robot: Rigid bodies with the joints of the samples, for estimators with an arm.
+        base: Model of another unit of the same robot; its arm is the prior (`lipcore.model.sibling`).
+
+    Returns:
+        The trained model.
+
+    Raises:
+        ValueError: An argument is invalid.
+        BaseMismatchError: The training cannot start from the base.
+        CorruptRowsError: Too many rows are corrupt.
+        FitCancelledError: The caller cancelled the training.
+        NotPositiveDefiniteError: A covariance matrix cannot be factored.
+
     """
-    corrupt = outliers.of_samples(samples)
+    corrupt = outliers.find_in_samples(samples)
     samples = samples.rows(~corrupt.rows) if corrupt.count else samples
     types, options = check_joint_types(joint_types), options or FitOptions()
     sibling = None
@@ -73,7 +90,7 @@ def train(
         sibling=sibling,
     )
     model = fit_model(task, estimator)
-    model = replace(model, fit={**model.fit, **corrupt.in_fit()})
+    model = replace(model, fit={**model.fit, **corrupt.fit_entries()})
     weights = recording_weights(samples.t, samples.episode)
     if not conditioning.should_condition(task.options, len(samples), float(weights.sum())):
         return model
@@ -81,12 +98,12 @@ def train(
 
 
 def fit_model(task: Task, estimator: str = AUTO, geometries: Sequence[Geometry] = ()) -> TorqueModel:
-    """Train as `train` does, on the chosen samples alone: where there are too many for memory, on a thinned table.
+    """Train like `train`, on the given samples alone. If all are too many for memory, they are a thinned table.
 
-    estimator: as in `train`; geometries: base to tip, that a search for one looks at first, as of an earlier version;
-    `auto` begins anew. Raise as `train` does.
+    estimator: as in `train`; geometries: first starts of a search, base to tip, for example of an earlier version;
+    `auto` ignores them. Raise like `train`.
     """
     if task.sibling is None:
         check_estimator(estimator, task.joint_types, task.robot, task.options)
     task.options.check_device(estimator)
-    return choose(task) if estimator == AUTO else fit_estimator(task, estimator, geometries=geometries)
+    return train_auto(task) if estimator == AUTO else fit_estimator(task, estimator, geometries=geometries)

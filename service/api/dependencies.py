@@ -11,10 +11,10 @@ from fastapi import Depends, Header, Query, Request
 from service.foundation.errors import invalid_request
 from service.learning.learners import Learners
 from service.models.loaded import LoadedModels
-from service.storage.rows import HEADER, MAX_PAGE, USUAL, Page
+from service.storage.rows import DEFAULT_PAGE, HEADER, MAX_PAGE, Page
 from service.storage.storage import Storage
 from service.telemetry.meters import Meters
-from service.telemetry.readiness import Readiness, Stopping
+from service.telemetry.readiness import Readiness, StopState
 from service.training.queue import JobQueue
 
 
@@ -44,15 +44,15 @@ UploadsDep = Annotated[CapacityLimiter, Depends(_turns_of("uploads"))]
 ArchivesDep = Annotated[CapacityLimiter, Depends(_turns_of("archives"))]
 MetersDep = Annotated[Meters, Depends(of_app("meters"))]
 ReadinessDep = Annotated[Readiness, Depends(of_app("readiness"))]
-StoppingDep = Annotated[Stopping, Depends(of_app("stopping"))]
+StoppingDep = Annotated[StopState, Depends(of_app("stopping"))]
 
 
 def _page(
-    limit: Annotated[int | None, Query(ge=1, description=f"Most items of this page; {USUAL} by default")] = None,
+    limit: Annotated[int | None, Query(ge=1, description=f"Most items of this page; {DEFAULT_PAGE} by default")] = None,
     cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
 ) -> Page:
     if limit is None:
-        limit = min(USUAL, MAX_PAGE)
+        limit = min(DEFAULT_PAGE, MAX_PAGE)
     if limit > MAX_PAGE:
         raise invalid_request("limit", limit, f"at most {MAX_PAGE}")
     if cursor is not None and not (cursor.isascii() and cursor.isdigit() and len(cursor) < 18):

@@ -148,7 +148,7 @@ def _methods(request: Request) -> list[str]:
 
 
 async def _storage_error(request: Request, error: Exception) -> JSONResponse:
-    answer = storage_errors.translated(error)
+    answer = storage_errors.translate_error(error)
     if answer is None and isinstance(error, FileNotFoundError) and not request.app.state.storage.files.in_place():
         answer = StorageUnavailableError("files cannot be read or written now: the home of the service is gone")
     if answer is None:

@@ -19,7 +19,7 @@ from service.api.access.scopes import READ, needs
 from service.api.route import Route
 from service.storage.disk import measure
 from service.storage.storage import Storage
-from service.telemetry.meters import Durations, Kind, Meters, MetricKind, merged
+from service.telemetry.meters import Durations, Kind, Meters, MetricKind, merge_durations
 from service.telemetry.readiness import Readiness
 
 
@@ -148,7 +148,7 @@ def _grouped(
     groups: dict[tuple[str, ...], list[Durations]] = defaultdict(list)
     for kind, durations in seen.items():
         groups[labels(kind)].append(durations)
-    return [(group, merged(groups[group])) for group in sorted(groups)]
+    return [(group, merge_durations(groups[group])) for group in sorted(groups)]
 
 
 EXAMPLE = """# HELP lipserve_requests_total Requests that were answered; 101: a stream, 499: the client went away before

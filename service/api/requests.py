@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from lipcore import extras
 from service.api.errors import ERROR_CODE
 from service.foundation.settings import Settings
-from service.telemetry.logs import KEY_ID, REQUEST_ID, asked, given_request_id, new_request_id, request_id
+from service.telemetry.logs import KEY_ID, REQUEST_ID, new_request_id, read_request_id, request_id, request_scope
 from service.telemetry.meters import Kind, Meters
 
 _OF_CALLS = "/inference.GRPCInferenceService/"
@@ -37,7 +37,7 @@ def telemetry(settings: Settings) -> TelemetryConfig:
     """
     on = settings.opentelemetry
     if on:
-        extras.check("opentelemetry", "LIPSERVE_OPENTELEMETRY is set")
+        extras.check_extra("opentelemetry", "LIPSERVE_OPENTELEMETRY is set")
     return {
         "tracing": on,
         "metrics": False,
@@ -136,9 +136,9 @@ class RequestContext:
         if scope["type"] == "lifespan":
             await self.app(scope, receive, send)
             return
-        name = given_request_id(scope["headers"]) or new_request_id()
+        name = read_request_id(scope["headers"]) or new_request_id()
         request_id.set(name)  # of this request's own task
-        asked.set(scope)
+        request_scope.set(scope)
         if self.tracing:
             trace.get_current_span().set_attribute("lipserve.request_id", name)
         method: str = scope.get("method", WEBSOCKET)

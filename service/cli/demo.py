@@ -18,7 +18,7 @@ from rich.table import Table
 
 from lipcore.data.samples import Samples
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import FAST, Stream, simulate
+from lipcore.robots.simulation import FAST_SPEED, Simulation, simulate
 from lipserve import ApiError, Client, Evaluation, Prediction
 from lipserve.asking import Reading
 from lipserve.progress import follow
@@ -83,10 +83,10 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
         robot = load_robot("panda")
         train, test = {}, {}
         # the paper's slow sinusoids, where gravity rules, and the faster variant, where inertia shows
-        for name, speed in (("slow", 1.0), ("fast", FAST)):
-            train[name] = _upload(client, robot, Stream(speed=speed), 1, Path(folder) / f"train-{name}.csv")
+        for name, speed in (("slow", 1.0), ("fast", FAST_SPEED)):
+            train[name] = _upload(client, robot, Simulation(speed=speed), 1, Path(folder) / f"train-{name}.csv")
             test[name] = _upload(
-                client, robot, Stream(speed=speed, n_sinusoids=100), 2, Path(folder) / f"test-{name}.npz"
+                client, robot, Simulation(speed=speed, n_sinusoids=100), 2, Path(folder) / f"test-{name}.npz"
             )
             console.print(f"  {name}: training stream {train[name][0]}, unseen test trajectory {test[name][0]}")
 
@@ -128,7 +128,7 @@ def run(port: int, once: bool, plot: Path | None, console: Console) -> None:
         service.stop()
 
 
-def _upload(client: Client, robot: Robot, stream: Stream, seed: int, path: Path) -> tuple[str, Samples]:
+def _upload(client: Client, robot: Robot, stream: Simulation, seed: int, path: Path) -> tuple[str, Samples]:
     samples = simulate(robot, stream, seed)
     write_recording(path, samples)
     reading = Reading(joint_names=samples.joint_names) if path.suffix == ".csv" else Reading()

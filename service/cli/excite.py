@@ -26,7 +26,7 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.profiles import Profile, names
 from lipcore.robots.library import ROBOTS, Robot, load_robot
-from lipcore.robots.simulation import FAST, Stream, sinusoids
+from lipcore.robots.simulation import FAST_SPEED, Simulation, sinusoids
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 from lipserve import ApiError, Client
@@ -120,7 +120,7 @@ def _of_urdf(profile: Profile, joints: Sequence[str], names: tuple[str, ...] | N
 
 def _check(profile: Profile, own: Sequence[str], called: Sequence[str]) -> None:
     """The model's joints are the robot's, in the same order, whatever they are called."""
-    known = profile.called(called)
+    known = profile.official_names(called)
     if len(own) != len(called) or (known is not None and known != tuple(own)):
         raise ValueError(
             f"robot {profile.name!r} has the joints {', '.join(own)}; the model has {', '.join(called)}, expected as "
@@ -265,11 +265,11 @@ def random_motion(made: Plan) -> Random:
     repeats = options.samples / samples
 
     def left(speed: float) -> Array:
-        stream = Stream(motion="full", speed=speed)
+        stream = Simulation(motion="full", speed=speed)
         draws = (sinusoids(bare, stream, t, np.random.default_rng([options.seed, k])) for k in range(COMPARED))
         return np.asarray(np.mean([made.left_by(*motion, repeats) for motion in draws], axis=0))
 
-    return Random(left(1.0), left(FAST))
+    return Random(left(1.0), left(FAST_SPEED))
 
 
 def document(made: Plan, random: Random, out: Path, plot: Path | None) -> dict[str, Any]:
@@ -317,8 +317,8 @@ def summary(made: Plan, known: str) -> str:
         ended += ", which the budget ended"
     return (
         f"{options.seconds:g} s at {options.rate:g} Hz, {made.series.harmonics} harmonics, for what {known} does not "
-        f"know; {ended}. Random: the paper's sums of 50 sinusoids, mean of {COMPARED}, at their own and at {FAST:g} "
-        f"times their frequencies. Starts and ends at rest at q = {start}."
+        f"know; {ended}. Random: the paper's sums of 50 sinusoids, mean of {COMPARED}, at their own and at "
+        f"{FAST_SPEED:g} times their frequencies. Starts and ends at rest at q = {start}."
     )
 
 

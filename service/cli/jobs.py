@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 from rich.table import Column, Table
 
-from lipcore.vocabulary import AUTO, CHOICES
+from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES
 from lipserve.address import DEFAULT_URL
 from service.cli import connecting
 from service.cli.connecting import PATIENCE, connected, dataset_of, recording_of, watch
@@ -122,9 +122,9 @@ def train(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help=f"One of {', '.join(CHOICES)}; {AUTO} by default, which compares arms and `lip-chain` "
+            help=f"One of {', '.join(ESTIMATOR_CHOICES)}; {AUTO} by default, which compares arms and `lip-chain` "
             "on held-out rows and takes the simplest unless another one is surely better.",
-            autocompletion=lambda: list(CHOICES),
+            autocompletion=lambda: list(ESTIMATOR_CHOICES),
         ),
     ] = None,
     joint_types: Annotated[

@@ -20,7 +20,7 @@ from service.cli.options import Json, group, settings_of
 from service.foundation.errors import InvalidRequestError
 from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, Database
-from service.storage.storage import HomeError, usable
+from service.storage.storage import HomeError, explain_home_errors
 
 app = group("API keys of the home LIPSERVE_HOME.")
 ERRORS = (HomeError, InvalidRequestError)
@@ -102,7 +102,7 @@ def revoke(
 @contextmanager
 def _database() -> Iterator[tuple[Database, Settings]]:
     settings = settings_of()
-    with usable(settings), closing(Database.of(settings)) as database:
+    with explain_home_errors(settings), closing(Database.of(settings)) as database:
         yield database, settings
 
 

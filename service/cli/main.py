@@ -15,7 +15,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from service import __version__
 from service.cli.consoles import echo, explain, print_error
-from service.runtime.remote import imported
+from service.runtime.remote import import_without_gc
 
 
 class Entry(NamedTuple):
@@ -47,7 +47,7 @@ class LazyGroup(TyperGroup):
         """Import a command and return it; raise KeyError for an unknown one."""
         entry = self.entries[name]
         if entry.module not in sys.modules:
-            imported(entry.module)
+            import_without_gc(entry.module)
         command = typer.main.get_command(getattr(sys.modules[entry.module], entry.app))
         command.name = name
         return command

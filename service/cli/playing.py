@@ -20,7 +20,7 @@ import numpy as np
 from lipcore.data.samples import Array
 from lipcore.online.changes.opening import OPENING, Opening
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.vocabulary import TorqueConvention
 from lipserve import StreamClient, StreamError
 from lipserve.exchange import StreamAnswer, StreamLearnt, StreamRefusal
@@ -179,7 +179,7 @@ class Motion:
         return replace(self, **columns, joint_names=tuple(joint_names)), True
 
 
-def simulated(robot: str, stream: Stream, seed: int = 0) -> Motion:
+def simulated(robot: str, stream: Simulation, seed: int = 0) -> Motion:
     """A simulated robot's stream.
 
     Raise MissingExtraError where what simulates is not installed, ValueError for other robots.

@@ -9,15 +9,15 @@ import numpy as np
 
 from lipcore.data.samples import Samples
 from lipcore.excitation import Plan
-from lipcore.extras import need
+from lipcore.extras import import_extra
 from lipserve import Prediction
 from service.foundation.text import percent
 
 
 def pyplot() -> Any:
     """Matplotlib's plotting module; raise MissingExtraError."""
-    need("matplotlib", "plot").use("agg")
-    return need("matplotlib.pyplot", "plot")
+    import_extra("matplotlib", "plot").use("agg")
+    return import_extra("matplotlib.pyplot", "plot")
 
 
 def draw_motion(path: Path, made: Plan) -> None:

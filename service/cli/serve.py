@@ -13,7 +13,7 @@ from service.api.server import sockets
 from service.api.server.connections import MAX_FRAME_BYTES, StreamProtocol, guarded
 from service.app import create_app
 from service.cli.options import alone, settings_of, start_logs
-from service.runtime.allocator import keep_little
+from service.runtime.allocator import limit_free_memory
 from service.storage.storage import HomeError, check_home
 
 app = alone()
@@ -30,7 +30,7 @@ def serve(
     """Serve models and run training jobs."""
     settings = settings_of(host=host, port=port, grpc_port=grpc_port, uds=uds)
     sockets.check_port(settings.host, settings.port)
-    keep_little()
+    limit_free_memory()
     start_logs(settings)
     check_home(settings)  # before the app opens it for good: what is wrong is said without a traceback
     served = create_app(settings)

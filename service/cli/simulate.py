@@ -11,7 +11,7 @@ import typer
 from lipcore.data.samples import Samples
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import ROBOTS, load_robot
-from lipcore.robots.simulation import FAST, Payload, Stream, simulate
+from lipcore.robots.simulation import FAST_SPEED, Payload, Simulation, simulate
 from service.cli.consoles import print_result
 from service.cli.options import (
     Along,
@@ -66,20 +66,20 @@ def described(
     payload: float,
     payload_at: float,
     dirt: float,
-) -> Stream:
+) -> Simulation:
     """What the options of a simulation ask for; `simulate` checks it."""
-    return Stream(
+    return Simulation(
         n_samples=samples,
         rate=rate,
         n_sinusoids=sinusoids,
         motion=motion,  # type: ignore[arg-type]  # simulate checks it
-        speed=FAST if fast else 1.0,
+        speed=FAST_SPEED if fast else 1.0,
         noise=noise,
         viscous=viscous,
         coulomb=coulomb,
         payload=Payload(payload, payload_at) if payload else None,
         course=course,  # type: ignore[arg-type]  # as above
-        dirt=Dirt().times(dirt) if dirt else None,
+        dirt=Dirt().scaled(dirt) if dirt else None,
     )
 
 

@@ -159,7 +159,7 @@ class Doubt:
         """Look at a second that has ended: at the answers of the first, and at what became of the torques."""
         if self._source is not None:
             self.decide(stream)
-        elif second == 1 and part.opening(1.0).misfit:
+        elif second == 1 and part.opening(1.0).is_misfit:
             share = percent(part.opening(1.0).coverage.mean())
             print_error(Explained(f"only {share} of the first second lies within the 95 % band of the model", CHECK))
 

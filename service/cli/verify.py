@@ -28,7 +28,7 @@ from service.runtime.process import SERVING_THREADS
 from service.storage.database import Database, DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
 from service.storage.database.engine import FILE
 from service.storage.files import Files, FilesUnreachableError
-from service.storage.storage import WAIT_S, HomeError, usable
+from service.storage.storage import WAIT_S, HomeError, explain_home_errors
 
 
 class Damage(NamedTuple):
@@ -205,7 +205,7 @@ ERRORS = (HomeError,)
 def verify(as_json: Json = False) -> None:
     """Read everything that the home LIPSERVE_HOME stores and report what is damaged; also while the service runs."""
     settings = settings_of()
-    with usable(settings):
+    with explain_home_errors(settings):
         findings = verify_home(settings)
     if as_json:
         print_json(findings.document())

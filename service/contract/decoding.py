@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, PlainValidator, create_model
 
 from service.foundation.errors import InvalidRequestError
-from service.foundation.json_text import each_once
+from service.foundation.json_text import has_unique_fields
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -64,7 +64,7 @@ class HotDecoder(Generic[Model]):
             checked = self._others.model_validate(msgspec.structs.asdict(value))
         except (MsgspecError, RecursionError, ValueError, InvalidRequestError):
             return None
-        return checked if each_once(body) else None
+        return checked if has_unique_fields(body) else None
 
     def request(self, decoded: Any) -> Model | None:
         """Return what was decoded as the model, null in arrays as NaN, or None if an array is empty or ragged."""

@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.estimators.options import MOST_SECONDS, FitOptions, GeometryOption, Standing
-from lipcore.vocabulary import AUTO, CHOICES, DIFFERENTIATED, ROBOT_ESTIMATORS, JointType
+from lipcore.estimators.options import MAX_SEARCH_SECONDS, FitOptions, GeometryOption, Standing
+from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, ROBOT_ESTIMATORS, TORCH_ESTIMATORS, JointType
 from service.contract.models import VERSION, HeldOutQuality, Holdout, ModelName
 from service.contract.states import JobState, PromotionOption
-from service.foundation.fields import LONGEST, MOST_NAMED
+from service.foundation.fields import MAX_NAME_CHARS, MAX_NAMES
 
 MAX_OPTIONS = {"hyperparameter_samples": 500, "posterior_samples": 1000, "max_inducing_outputs": 4000}
 """Max values of options of a fit. Its time grows with the cube of the samples, that of an answer with the outputs."""
@@ -42,10 +42,10 @@ class Options(BaseModel):
         "robot's URDF or the base, `fixed` as that has it; `auto`: calibrate where there is one, else learn",
     )
     search_seconds: float = Field(
-        _DEFAULTS.search_seconds, gt=0, le=MOST_SECONDS, description="Time limit of the search for a geometry, s"
+        _DEFAULTS.search_seconds, gt=0, le=MAX_SEARCH_SECONDS, description="Time limit of the search for a geometry, s"
     )
     device: Literal["auto", "cpu", "cuda"] = Field(
-        "auto", description=f"Only {', '.join(DIFFERENTIATED)} use a GPU: `auto` if there is one, `cuda` always"
+        "auto", description=f"Only {', '.join(TORCH_ESTIMATORS)} use a GPU: `auto` if there is one, `cuda` always"
     )
     compact_tolerance: float = Field(
         _DEFAULTS.compact_tolerance,
@@ -66,7 +66,7 @@ class Options(BaseModel):
     )
 
 
-DatasetName = Annotated[str, Field(max_length=LONGEST)]
+DatasetName = Annotated[str, Field(max_length=MAX_NAME_CHARS)]
 
 
 class JobRequest(BaseModel):
@@ -79,16 +79,16 @@ class JobRequest(BaseModel):
     )
 
     model: ModelName = Field(description="Name of the model; a new version of it is made")
-    datasets: list[DatasetName] = Field(min_length=1, max_length=MOST_NAMED, description="Ids or names of data sets")
+    datasets: list[DatasetName] = Field(min_length=1, max_length=MAX_NAMES, description="Ids or names of data sets")
     estimator: str = Field(
         AUTO,
         max_length=40,
-        description=f"One of {', '.join(CHOICES)}; `auto` compares arms and `lip-chain` on held-out rows and takes "
-        "the simplest unless another one is surely better",
+        description=f"One of {', '.join(ESTIMATOR_CHOICES)}; `auto` compares arms and `lip-chain` on held-out rows and "
+        "takes the simplest unless another one is surely better",
     )
     joint_types: list[JointType] | None = Field(
         None,
-        max_length=MOST_NAMED,
+        max_length=MAX_NAMES,
         description="One a joint; by default those of the robot that a data set was uploaded with, else revolute",
     )
     robot: str | None = Field(
@@ -123,7 +123,7 @@ class JobDraft(JobRequest):
 
     datasets: list[DatasetName] = Field(
         [],
-        max_length=MOST_NAMED,
+        max_length=MAX_NAMES,
         description="Those that are there already; without any, what depends on the data is not checked",
     )
 

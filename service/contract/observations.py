@@ -8,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema
 
-from lipcore.data.outliers import LARGEST_TORQUE
+from lipcore.data.outliers import MAX_TORQUE
 from service.foundation.errors import ServiceError
-from service.foundation.fields import MOST_NAMED, numbers, rows_of_numbers
+from service.foundation.fields import MAX_NAMES, numbers, rows_of_numbers
 
 CONTACT_THRESHOLD = (3.0, 100.0)
 """Bounds of the gate of contacts. Within three standard deviations lie the errors of an honest model, so that the gate
 would choose what is learnt; beyond a hundred nothing is gated: what would be learnt is no torque of this robot."""
-TORQUE_LIMIT = (1e-3, LARGEST_TORQUE)
+TORQUE_LIMIT = (1e-3, MAX_TORQUE)
 FORGETTING_S = (1.0, 1e9)
 """Up to thirty years: a longer memory is none that forgets."""
 FRICTION_WALK_S = (10.0, 1e9)
@@ -54,7 +54,7 @@ class LearningOptions(BaseModel):
     )
     torque_limits: list[TorqueLimit] | None = Field(
         None,
-        max_length=MOST_NAMED,
+        max_length=MAX_NAMES,
         description="Largest |tau| of each joint's actuator in N·m, to tell saturated samples; null: not known",
     )
     contact_threshold: float = Field(

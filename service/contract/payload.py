@@ -56,7 +56,7 @@ class Payload(BaseModel):
 
     @property
     def numbers(self) -> tuple[float, Triple, Triples | None]:
-        """What `Declared` knows it by."""
+        """What `DeclaredPayloads` knows it by."""
         return self.mass, self.com, self.inertia
 
 

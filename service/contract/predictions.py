@@ -20,7 +20,7 @@ from service.contract.models import AliasName, Evaluation, VersionNumber
 from service.contract.payload import Payload
 from service.contract.states import Outcome
 from service.foundation.errors import invalid_request
-from service.foundation.fields import LONGEST, each_once, rows_of_numbers
+from service.foundation.fields import MAX_NAME_CHARS, check_unique, rows_of_numbers
 
 Vectors = Annotated[
     NDArray[np.float64], PlainValidator(rows_of_numbers(), json_schema_input_type=list[float] | list[list[float]])
@@ -31,7 +31,7 @@ Vectors = Annotated[
 ComponentNames = Annotated[
     list[ComponentName],
     Field(max_length=len(COMPONENTS), json_schema_extra={"uniqueItems": True}),  # first: a long list is not looked at
-    AfterValidator(each_once),
+    AfterValidator(check_unique),
 ]
 Part = Literal["all", "held_out"]
 """Of a data set that a model is compared with."""
@@ -162,7 +162,7 @@ class EvaluateRequest(VersionChoice):
         extra="forbid", strict=True, json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "version": 1}]}
     )
 
-    dataset: str = Field(max_length=LONGEST, description="Id or name of a data set")
+    dataset: str = Field(max_length=MAX_NAME_CHARS, description="Id or name of a data set")
     part: Part = Field(
         "all",
         description="`held_out`: only what the training of the version has held out of the data set, see `holdout` of "
@@ -207,7 +207,7 @@ class TraceRequest(EvaluateRequest):
         1000, ge=1, lt=2**31, description="Rows to show; evenly chosen where there are more. At most 2000 by default"
     )
     components: Annotated[
-        list[TraceComponent], Field(max_length=4, json_schema_extra={"uniqueItems": True}), AfterValidator(each_once)
+        list[TraceComponent], Field(max_length=4, json_schema_extra={"uniqueItems": True}), AfterValidator(check_unique)
     ] = Field([], description="Also answer these parts of the torque, where the estimator offers them, as in `predict`")
 
 
@@ -263,7 +263,7 @@ class CompareRequest(BaseModel):
         json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "versions": ["production", 2]}]},
     )
 
-    dataset: str = Field(max_length=LONGEST, description="Id or name of a data set")
+    dataset: str = Field(max_length=MAX_NAME_CHARS, description="Id or name of a data set")
     versions: Annotated[list[VersionNumber | AliasName], Field(min_length=2, max_length=2)] = Field(
         description="Two versions of the model, by number or alias"
     )

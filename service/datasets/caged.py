@@ -9,13 +9,13 @@ from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
 
-from lipcore.extras import need
+from lipcore.extras import import_extra
 from lipcore.profiles import Profile
 from service.datasets.formats.opening import open_table
 from service.datasets.mapping.reading import Recording, read
 from service.datasets.options import UploadOptions
 from service.foundation.settings import Settings
-from service.storage.disk import Room, Usage
+from service.storage.disk import DiskBudget, Usage
 
 
 def warm() -> None:
@@ -24,9 +24,9 @@ def warm() -> None:
     for name in ("numpy.ma", "encodings.utf_8_sig", "dateutil.relativedelta"):
         with suppress(ImportError):
             import_module(name)
-    need("pyarrow", "ingest")
+    import_extra("pyarrow", "ingest")
     for name in ("csv", "parquet", "bags.reading", "lerobot", "joined"):
-        need(f"service.datasets.formats.{name}", "ingest")
+        import_extra(f"service.datasets.formats.{name}", "ingest")
     # Arrow looks its functions up when they are first called, for 50 ms: once here, not in each process that is forked
     arrow = import_module("service.datasets.formats.arrow")
     cells = import_module("pyarrow").array(["1", "1.5", "a"])
@@ -56,5 +56,5 @@ def read_upload(
 ) -> Recording:
     """Read an upload to columns in a folder; raise as `open_table` and `read` do. usage: of the disk, before."""
     with open_table(upload, kind, options.read, settings) as table:
-        made = read(table, folder, options, robot, settings, Room(usage))
+        made = read(table, folder, options, robot, settings, DiskBudget(usage))
     return Recording(made.staged.joint_names, made.staged.lengths, made.torque_convention, made.facts, made.noted)

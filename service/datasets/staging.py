@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.data.outliers import CorruptError, corrupt
+from lipcore.data.outliers import CorruptRowsError, find_corrupt_rows
 from lipcore.data.samples import Array
 from lipcore.preparation.plan import plan
 from lipcore.preparation.recipe import PreparationError, Recipe
 from service.foundation.errors import invalid_data
-from service.storage.disk import Disk, Room
+from service.storage.disk import Disk, DiskBudget
 
 TIME, EPISODE = "t", "episode"
 QUANTITIES = ("q", "dq", "ddq", "tau")
@@ -36,7 +36,7 @@ class Staged:
     joint_names: of joints 1..n. Whoever makes one removes its folder, see `staging`.
     """
 
-    def __init__(self, folder: Path, joint_names: tuple[str, ...], disk: Disk | Room) -> None:
+    def __init__(self, folder: Path, joint_names: tuple[str, ...], disk: Disk | DiskBudget) -> None:
         self.folder, self.joint_names, self.disk = folder, joint_names, disk
         self._rows: dict[str, int] = {}
         self._missing: NDArray[np.bool_] | None = None
@@ -80,7 +80,7 @@ class Staged:
 
     def append(self, columns: Mapping[str, Array]) -> None:
         """Write more rows (M,) of some columns; raise StorageFullError."""
-        self.disk.take(sum(values.nbytes for values in columns.values()))
+        self.disk.reserve(sum(values.nbytes for values in columns.values()))
         for name, values in columns.items():
             with (self.folder / f"{name}.f64").open("ab") as file:
                 file.write(np.ascontiguousarray(values, np.float64).data)
@@ -144,7 +144,9 @@ class Prepared:
     repeated: int
 
 
-def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: Disk | Room | None = None) -> Prepared:
+def prepare(
+    raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: Disk | DiskBudget | None = None
+) -> Prepared:
     """Prepare staged columns, NaN where a value is missing, in a folder of their own below `folder`.
 
     A few columns are in memory at a time. Raise InvalidDataError where the recording does not allow what the recipe
@@ -153,9 +155,9 @@ def prepare(raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: D
     t, episode, missing = _or_none(raw, TIME), _or_none(raw, EPISODE), raw.missing()
     numbers = np.zeros(raw.rows) if episode is None else episode
     try:
-        damaged = corrupt(t, numbers, raw.n_joints, lambda *which: raw.read(column(*which)), raw.quantities)
+        damaged = find_corrupt_rows(t, numbers, raw.n_joints, lambda *which: raw.read(column(*which)), raw.quantities)
         made = plan(t, episode, missing, raw.quantities, recipe, damaged.rows)
-    except (CorruptError, PreparationError) as error:
+    except (CorruptRowsError, PreparationError) as error:
         raise invalid_data(error.field, error.value, error.expected) from None
     if len(made) < min_samples:
         why = "trimming the filter's edges" if made.cutoff is not None else "leaving out what cannot be used"

@@ -30,9 +30,9 @@ from service.robots.store import profile_of
 from service.runtime import cage
 from service.storage import sample_file
 from service.storage.database import Database, DatasetRow, JobRow, now
-from service.storage.errors import undecided
+from service.storage.errors import is_undecided
 from service.storage.files import Files, new_id
-from service.storage.rows import Identity, Page, done, mark, newest
+from service.storage.rows import Page, RequestIdentity, find_done_row, mark_row, read_page
 from service.storage.sample_file import PartOf
 from service.storage.storage import Storage
 
@@ -42,7 +42,7 @@ MOST_NAMED = 5
 
 
 def add(
-    storage: Storage, upload: Path, kind: str, name: str, options: UploadOptions, named: Identity | None = None
+    storage: Storage, upload: Path, kind: str, name: str, options: UploadOptions, named: RequestIdentity | None = None
 ) -> Dataset:
     """Read an upload, which goes with that, check and prepare it, then store it: samples first, the row that makes them
     visible last.
@@ -51,7 +51,7 @@ def add(
     Raise InvalidDataError, InvalidRequestError, TooLargeError, StorageFullError or ConflictError.
     """
     with storage.database.session() as session:
-        if (before := done(session, DatasetRow, named)) is not None:
+        if (before := find_done_row(session, DatasetRow, named)) is not None:
             return _show(before)
     settings, disk = storage.settings, storage.disk
     profile = None if options.robot is None else profile_of(storage.database, options.robot)
@@ -67,7 +67,7 @@ def add(
         report["upload_sha256"] = sample_file.sha256(upload)
         report["joint_types"] = None if profile is None else _joint_types(profile, raw.joint_names)
         staged = prepared.staged
-        disk.take(sample_file.size(staged.rows, staged.n_joints))
+        disk.reserve(sample_file.count_bytes(staged.rows, staged.n_joints))
         dataset = new_id("ds")
         digest = storage.files.write_samples(dataset, staged.rows, staged.n_joints, partial(_array, staged))
     row = DatasetRow(
@@ -80,13 +80,13 @@ def add(
         rows=staged.rows,
         report=report,
     )
-    mark(row, named)
+    mark_row(row, named)
     try:
         with storage.database.transaction() as session:
-            if (before := done(session, DatasetRow, named)) is None:
+            if (before := find_done_row(session, DatasetRow, named)) is None:
                 session.add(row)
     except (SQLAlchemyError, ConflictError) as error:
-        if not undecided(error):
+        if not is_undecided(error):
             storage.files.delete_samples(dataset)
         raise
     if before is not None:  # the same request was faster on another connection
@@ -137,7 +137,7 @@ def page(database: Database, part: Page, upload_sha256: str | None = None) -> Da
     """List data sets, newest first; upload_sha256: only those of files with this hash."""
     of_file = () if upload_sha256 is None else (DatasetRow.report["upload_sha256"].as_string() == upload_sha256,)
     with database.session() as session:
-        rows, following = newest(session, DatasetRow, part, *of_file)
+        rows, following = read_page(session, DatasetRow, part, *of_file)
     return DatasetPage(items=[_show(row) for row in rows], next_cursor=following)
 
 

@@ -1,1 +1,1 @@
-"""What everything may import: settings, errors, names, states."""
+"""Settings, errors, environment variables and texts that every room may import."""

@@ -1,4 +1,4 @@
-"""Environment variables of LIPServe: which are known, and which this release removed."""
+"""Environment variables of LIPServe: known ones, and those that this release removed."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ from difflib import get_close_matches
 
 from service.foundation.settings import PREFIX, Settings
 
-OTHERS = frozenset(
+OTHER_VARIABLES = frozenset(
     {
-        *("URL", "API_KEY"),  # of clients
-        "PUBLISH",  # of compose.yaml
-        *("AXE", "CHROMIUM", "SCREENSHOTS", "HISTORY_S", "HISTORY_SEED", "POWER_CUTS", "POWER_SEED"),  # of tests
+        *("URL", "API_KEY"),  # read by clients
+        "PUBLISH",  # read by compose.yaml
+        *("AXE", "CHROMIUM", "SCREENSHOTS", "HISTORY_S", "HISTORY_SEED", "POWER_CUTS", "POWER_SEED"),  # read by tests
         *("FAULT_FILE", "FAULT_TARGETS", "TEST_HIDDEN"),
     }
 )
-"""Variables that are no settings of the service, without the prefix."""
-REMOVED = {
+"""Known variables that are no settings of the service, without the prefix."""
+REMOVED_VARIABLES = {
     "ANSWER_S": "a client now has 30 s to read any of its answer",
     "BODY_BYTES_PER_S": "the slowest body is now fixed at 1000 bytes/s",
     "BODY_S": "the wait for a body is now fixed at 20 s",
@@ -83,13 +83,13 @@ REMOVED = {
     "STREAM_RETENTION_S": "LIPSERVE_OBSERVATION_RETENTION_S now applies to streams, too",
     "STREAM_WRITE_S": "a client of a stream now has 10 s to read an answer",
 }
-"""What replaces a variable that this release removed, for one release; without the prefix."""
+"""The replacement of each variable that this release removed, without the prefix. The next release drops this table."""
 
 
 def check_environment(environment: Mapping[str, str]) -> list[str]:
-    """Return a warning for each variable that was removed; raise ValueError for one that is unknown.
+    """Return a warning for each removed variable; raise ValueError for an unknown one.
 
-    Kubernetes sets variables for each Service of a namespace, of which some may have our prefix: they are ignored.
+    Kubernetes sets variables for each Service of a namespace. Some may have our prefix; they are ignored.
     """
     names = {name.upper() for name in environment if name.upper().startswith(PREFIX)}
     services = [name.removesuffix("SERVICE_HOST") for name in names if name.endswith("_SERVICE_HOST")]
@@ -98,9 +98,9 @@ def check_environment(environment: Mapping[str, str]) -> list[str]:
     warnings = []
     for name in sorted(names):
         short = name.removeprefix(PREFIX)
-        if short in REMOVED:
-            warnings.append(f"{name} was removed: {REMOVED[short]}.")
-        elif short not in OTHERS and short not in known and not name.startswith(foreign):
+        if short in REMOVED_VARIABLES:
+            warnings.append(f"{name} was removed: {REMOVED_VARIABLES[short]}.")
+        elif short not in OTHER_VARIABLES and short not in known and not name.startswith(foreign):
             near = get_close_matches(short, known, 1)
             raise ValueError(f"Unknown setting {name}." + (f" Did you mean {PREFIX}{near[0]}?" if near else ""))
     return warnings

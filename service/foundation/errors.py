@@ -1,4 +1,4 @@
-"""The errors of the service, each with its status and code; and what the body of an answer says of one."""
+"""The errors of the service with their status and code, and the body of an error response."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 
 from lipcore.extras import MissingExtraError, install_line
 
-_REPR = reprlib.Repr()  # Python's own takes as long as the value is large, and fails where it is nested deep
+_REPR = reprlib.Repr()  # Python's own takes longer for large values and fails on deeply nested ones
 _REPR.maxlevel = 10
 _REPR.maxlist = _REPR.maxtuple = _REPR.maxdict = _REPR.maxset = 200
 _REPR.maxstring = _REPR.maxlong = _REPR.maxother = 1000
@@ -38,7 +38,7 @@ class ErrorResponse(BaseModel):
 
 
 class ServiceError(Exception):
-    """An error a client can act on; subclasses fix status and code."""
+    """An error that a client can act on; subclasses fix status and code."""
 
     status = 500
     code = "internal_error"
@@ -165,41 +165,41 @@ class UnreadableVersionError(ServiceError):
 
 
 def problem(field: str, value: object, expected: str) -> Problem:
-    """Describe one wrong value; long values are cut, and what is nested deep."""
+    """Return the description of one wrong value; long values and deep nesting are cut."""
     text = value if isinstance(value, str) else _REPR.repr(value)
     text = text if len(text) <= 200 else text[:200] + "…"
     return Problem(field=readable(field[:200]), value=readable(text), expected=expected)
 
 
 def readable(text: str) -> str:
-    """Escape what a terminal or a log would not show as it is: control and bidirectional characters, half ones."""
+    """Escape characters that a terminal or log does not show: control and bidirectional characters, half surrogates."""
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 def sentence(item: Problem) -> str:
-    """Say a problem in one sentence."""
+    """Write a problem as one sentence."""
     return f"{item.field} is {item.value}, expected {item.expected}"
 
 
 def invalid_request(field: str, value: object, expected: str) -> InvalidRequestError:
-    """Error for one wrong value of a request."""
+    """Return the error for one wrong value of a request."""
     item = problem(field, value, expected)
     return InvalidRequestError(sentence(item), [item])
 
 
 def invalid_data(field: str, value: object, expected: str) -> InvalidDataError:
-    """Error for one wrong thing in an uploaded data set."""
+    """Return the error for one fault in an uploaded data set."""
     item = problem(field, value, expected)
     return InvalidDataError(sentence(item), [item])
 
 
 def not_installed(error: MissingExtraError) -> NotInstalledError:
-    """Error for an extra that is not installed."""
+    """Return the error for an extra that is not installed."""
     return NotInstalledError(str(error), [problem("extra", error.extra, install_line(error.extra))])
 
 
 def not_found(kind: str, name: object) -> NotFoundError:
-    """Error for something that does not exist."""
+    """Return the error for something that does not exist."""
     return NotFoundError(f"no {kind} {str(name)[:200]!r}", [problem(kind, str(name), f"an existing {kind}")])

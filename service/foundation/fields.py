@@ -1,4 +1,4 @@
-"""What several rooms take and show: names for people, numbers in lists."""
+"""Validators and schemas of fields that several rooms share: names for people, lists of numbers, uploads."""
 
 from __future__ import annotations
 
@@ -13,29 +13,32 @@ from pydantic import AfterValidator, Field, ValidationInfo
 
 from service.foundation.errors import invalid_request
 
-LONGEST, MOST_NAMED = 200, 1000
-"""Characters of a name; and what a list of names, or of one number a joint, may hold, whatever the settings."""
+MAX_NAME_CHARS, MAX_NAMES = 200, 1000
+"""Max characters of a name; and max entries of a list of names, or of a list with one number per joint."""
 
 
-def for_people(field: str, name: str) -> str:
-    """Return a name; raise InvalidRequestError where it would not be shown as it is, or not be seen at all.
+def check_name(field: str, name: str) -> str:
+    """Return a name; raise InvalidRequestError if it is empty, too long or contains invisible characters.
 
-    Control, bidirectional and zero-width characters let one name pass for another, and break logs and terminals.
+    Control, bidirectional and zero-width characters make one name look like another, and break logs and terminals.
     """
-    if not name.strip() or len(name) > LONGEST or not name.isprintable():
-        raise invalid_request(field, name, f"1 to {LONGEST} printable characters")
+    if not name.strip() or len(name) > MAX_NAME_CHARS or not name.isprintable():
+        raise invalid_request(field, name, f"1 to {MAX_NAME_CHARS} printable characters")
     return name
 
 
 def _checked(name: str, info: ValidationInfo) -> str:
-    return for_people(info.field_name or "name", name)
+    return check_name(info.field_name or "name", name)
 
 
-NameForPeople = Annotated[str, Field(min_length=1, max_length=LONGEST), AfterValidator(_checked)]
+NameForPeople = Annotated[str, Field(min_length=1, max_length=MAX_NAME_CHARS), AfterValidator(_checked)]
 
 
 def numbers(name: str, row: list[Any], nullable: bool = False) -> list[float]:
-    """Finite numbers of a JSON list; nullable: any numbers, and null as NaN. Raise InvalidRequestError."""
+    """Return the finite numbers of a JSON list; raise InvalidRequestError.
+
+    nullable: accept any numbers, and read null as NaN.
+    """
     if set(map(type, row)) <= {int, float}:
         with suppress(OverflowError):
             values = list(map(float, row))
@@ -58,19 +61,22 @@ def numbers(name: str, row: list[Any], nullable: bool = False) -> list[float]:
 
 
 def rows_of_numbers(nullable: bool = False) -> Callable[[Any, ValidationInfo], NDArray[np.float64]]:
-    """A validator of numbers (n,) or rows of numbers (N, n), which become an array; nullable: see `numbers`."""
+    """Return a validator that turns numbers (n,) or rows of numbers (N, n) into an array.
+
+    nullable: see `numbers`.
+    """
     return lambda value, info: _to_array(info.field_name or "value", value, nullable)
 
 
-def each_once(names: list[Any]) -> list[Any]:
-    """The names of components; raise InvalidRequestError where one is there twice."""
+def check_unique(names: list[Any]) -> list[Any]:
+    """Return the names of components; raise InvalidRequestError if one is repeated."""
     if (index := first_repeat(names)) is not None:
         raise invalid_request(f"components[{index}]", names[index], "each component once")
     return names
 
 
 def first_repeat(values: Iterable[Hashable]) -> int | None:
-    """The place of the first value that came before, None where there is none; in linear time."""
+    """Return the index of the first repeated value in linear time, None if there is none."""
     seen = set()
     for index, value in enumerate(values):
         if value in seen:
@@ -80,7 +86,7 @@ def first_repeat(values: Iterable[Hashable]) -> int | None:
 
 
 def finite(values: Sequence[float] | NDArray[np.float64]) -> list[float | None]:
-    """Numbers (n,) as JSON has them: null where there is no finite one."""
+    """Return numbers (n,) for JSON, with null for each number that is not finite."""
     return [float(value) if isfinite(value) else None for value in values]
 
 
@@ -102,7 +108,7 @@ BINARY: dict[str, Any] = {"type": "string", "format": "binary"}
 
 
 def upload_body(description: str, content: dict[str, Any], file: str) -> dict[str, Any]:
-    """What the OpenAPI document says of the body of an upload: by media type, or as a form with a file of this kind."""
+    """Return the OpenAPI description of an upload's body: by media type, or a form with one file."""
     form = {"type": "object", "required": ["file"], "properties": {"file": {**BINARY, "description": file}}}
     every = {**content, "multipart/form-data": {"schema": form}}
     return {"requestBody": {"required": True, "description": description, "content": every}}

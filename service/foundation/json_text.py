@@ -1,4 +1,4 @@
-"""JSON of requests, read so that it has one meaning: no field twice, no text that is not UTF-8."""
+"""Strict reader of JSON request bodies: each field once, UTF-8 only."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 from service.foundation.errors import InvalidRequestError, invalid_request, problem, sentence
 from service.foundation.fields import first_repeat
 
-MOST_FIELDS = 1000
-"""Fields of a JSON object that are read at all."""
+MAX_FIELDS = 1000
+"""Max fields of a JSON object."""
 
 
 def read_json(body: bytes) -> Any:
-    """The value of a JSON text as RFC 8259 has it, besides NaN and Infinity, which are refused where they stand.
+    """Return the value of a JSON text (RFC 8259); NaN and Infinity are accepted here and rejected by the fields.
 
-    Raise InvalidRequestError naming the place where it is not UTF-8, no JSON, nested too deep, or names a field twice.
+    Raise InvalidRequestError if the text is not UTF-8, is not JSON, is nested too deeply or repeats a field.
     """
     try:
         return json.loads(body.decode("utf-8-sig"), object_pairs_hook=_object)
@@ -25,14 +25,13 @@ def read_json(body: bytes) -> Any:
         reason = f"not JSON at character {error.pos}: {error.msg}"
     except RecursionError:
         reason = "nested too deep"
-    except ValueError:  # Python reads no whole number of more digits
+    except ValueError:  # Python limits the digits of a whole number
         reason = "not JSON that can be read: a whole number has more than 4300 digits"
     raise invalid_request("body", reason, "JSON")
 
 
-def each_once(body: bytes) -> bool:
-    """Whether an object surely has each field once, in JSON that is known to be right: False may also mean that it is
-    not clear, and that `read_json` has to look."""
+def has_unique_fields(body: bytes) -> bool:
+    """Return True if valid JSON surely repeats no field; False means that `read_json` has to check."""
     if b"\\" in body:
         return False
     quoted = body.split(b'"')[1::2]
@@ -40,8 +39,8 @@ def each_once(body: bytes) -> bool:
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    if len(pairs) > MOST_FIELDS:
-        raise invalid_request("body", f"an object of {len(pairs)} fields", f"at most {MOST_FIELDS}")
+    if len(pairs) > MAX_FIELDS:
+        raise invalid_request("body", f"an object of {len(pairs)} fields", f"at most {MAX_FIELDS}")
     value = dict(pairs)
     if len(value) < len(pairs):
         index = first_repeat(name for name, _ in pairs)

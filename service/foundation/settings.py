@@ -1,6 +1,6 @@
 """All settings of the service: environment variables with the prefix `LIPSERVE_`.
 
-A setting is what an operator has a reason to change. All other limits are constants beside the code that uses them.
+A setting is a value that an operator has a reason to change. All other limits are constants beside their code.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ OCTAL = "octal"
 
 @dataclass(frozen=True)
 class Unit:
-    """Unit of a setting, for people."""
+    """The unit of a setting, for people."""
 
     name: str
 
@@ -51,7 +51,7 @@ FileMode = Annotated[int, BeforeValidator(_octal), Unit(OCTAL)]
 
 
 def shipped_models() -> Path:
-    """Folder of the models that come with LIPServe, in a checkout or in an installed package."""
+    """Return the folder of the models that come with LIPServe, in a checkout or in an installed package."""
     packaged = Path(__file__).resolve().parents[1] / "shipped"
     return CHECKOUT_MODELS if (CHECKOUT_MODELS / "panda-sim").is_dir() else packaged
 
@@ -61,7 +61,7 @@ def _default_home() -> Path:
 
 
 class Settings(BaseSettings):
-    """Validated settings; a wrong value stops the start with its name and what was expected."""
+    """Validated settings; a wrong value stops the start with its name and the expected value."""
 
     model_config = SettingsConfigDict(env_prefix=PREFIX, extra="forbid", frozen=True, hide_input_in_errors=True)
 
@@ -254,12 +254,12 @@ class Settings(BaseSettings):
 
     @property
     def keys_needed(self) -> bool:
-        """Whether requests need API keys."""
+        """Return whether requests need API keys."""
         return self.keys == "on" or not is_loopback(self.host)
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach `host`."""
+    """Return whether only this machine can reach `host`."""
     try:
         return ip_address(host).is_loopback
     except ValueError:
@@ -267,7 +267,7 @@ def is_loopback(host: str) -> bool:
 
 
 class Setting(NamedTuple):
-    """A setting for people. value, default: as in the environment, empty if none, without secrets."""
+    """A setting for people. Value and default are written as in the environment, without secrets; empty if not set."""
 
     variable: str
     value: str
@@ -289,7 +289,7 @@ def describe(settings: Settings) -> list[Setting]:
 
 
 def _text(value: Any, unit: str) -> str:
-    """A value as the environment has it, without the password of a URL."""
+    """Return a value as the environment has it, without the password of a URL."""
     if value is None:
         return ""
     if isinstance(value, bool):

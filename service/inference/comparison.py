@@ -1,4 +1,4 @@
-"""Comparing two versions of a model on one data set: no transport here."""
+"""Compare two versions of a model on one data set, independent of any transport."""
 
 from __future__ import annotations
 
@@ -6,22 +6,24 @@ from collections.abc import Collection
 from math import isfinite
 
 from lipcore.data import metrics
-from lipcore.data.metrics import Answer, Comparison, Difference, evaluate
+from lipcore.data.metrics import Comparison, Difference, TorqueDistribution, evaluate
 from lipcore.data.samples import Samples
 from service.contract import predictions as schema
 from service.contract.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
-from service.inference.evaluating import measured
+from service.inference.evaluating import read_dataset
 from service.models.evaluation import joint_figures
-from service.models.loaded import LoadedModels, Served
+from service.models.loaded import LoadedModels, ServedModel
 
 
 def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> schema.CompareResponse:
-    """Compare two versions; raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError. Not
-    for the event loop."""
+    """Compare two versions on a data set. Not for the event loop.
+
+    Raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError.
+    """
     first, second = versions = _versions(loaded, model, request)
-    recorded = measured(loaded, request.dataset, *versions)
+    recorded = read_dataset(loaded, request.dataset, *versions)
     answers = [_answer(each, recorded.used) for each in versions]
     compared = metrics.compare(recorded.used, *answers)
     outcome, verdict = _verdict(first.version, second.version, compared)
@@ -57,7 +59,7 @@ def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) ->
     )
 
 
-def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> tuple[Served, Served]:
+def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> tuple[ServedModel, ServedModel]:
     first, second = (
         loaded.get(model, named, None) if isinstance(named, int) else loaded.get(model, None, named)
         for named in request.versions
@@ -67,13 +69,13 @@ def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) 
     return first, second
 
 
-def _answer(served: Served, samples: Samples) -> Answer:
+def _answer(served: ServedModel, samples: Samples) -> TorqueDistribution:
     answer = served.model.predict(samples.q, samples.dq, samples.ddq)
     return answer.interval
 
 
 def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, str]:
-    """What the difference says, for programs and in words."""
+    """Return the outcome of a comparison, as a code and in words."""
     if compared.blocks < metrics.MIN_BLOCKS:
         return "cannot_tell", (
             f"These data cannot tell: they make {compared.blocks} stretches of {metrics.BLOCK_S:g} s, or episodes, and "
@@ -108,8 +110,8 @@ def _amount(difference: Difference, place: int) -> str:
     return f"{abs(difference.mean[place]):.3g} ± {difference.half_width[place]:.2g}"
 
 
-def _warnings(versions: Collection[Served], in_training: Collection[bool]) -> list[str]:
-    """What makes figures flatter one of the versions."""
+def _warnings(versions: Collection[ServedModel], in_training: Collection[bool]) -> list[str]:
+    """Return the reasons why figures favour one of the versions."""
     warnings = []
     for served, trained in zip(versions, in_training, strict=True):
         if trained:

@@ -1,4 +1,4 @@
-"""Comparing a version with a data set, or with what its training held out of it, in figures or row by row."""
+"""Evaluate a version on a data set or its held-out part, in figures or row by row."""
 
 from __future__ import annotations
 
@@ -21,48 +21,54 @@ from service.foundation.errors import DamagedDataError, invalid_request
 from service.inference.predicting import MAX_COMPONENT_BATCH, check_offered
 from service.models import registry
 from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation
-from service.models.loaded import LoadedModels, Served
+from service.models.loaded import LoadedModels, ServedModel
 from service.storage import sample_file
 from service.storage.database import DatasetRow
 from service.training import holding_out, repeating
 from service.training.holding_out import CannotHoldOutError, SetSplit
 
 MAX_TRACE_POINTS = 2000
-"""Rows of one trace of a model along a data set."""
+"""Maximum rows of one trace."""
 
 
 @dataclass(frozen=True)
-class Measured:
-    """A data set, or part of it, to compare models with. samples: how many it has; used: those that are compared,
-    evenly thinned."""
+class EvaluationData:
+    """A data set, or part of it, to evaluate versions on."""
 
     id: str
     sha256: str
     samples: int
+    """Number of samples before thinning."""
     used: Samples
+    """The evaluated samples, thinned evenly."""
 
 
-def measured(loaded: LoadedModels, dataset: str, *versions: Served) -> Measured:
-    """Read a data set for these versions; raise NotFoundError, or InvalidRequestError where it is of other joints."""
-    row = fitting(loaded, dataset, *versions)
+def read_dataset(loaded: LoadedModels, dataset: str, *versions: ServedModel) -> EvaluationData:
+    """Return the samples of a data set for these versions.
+
+    Raise NotFoundError, or InvalidRequestError if the joints differ.
+    """
+    row = find_dataset(loaded, dataset, *versions)
     used = store.samples(loaded.files, row, MAX_EVALUATION_SAMPLES)
-    return Measured(row.id, row.sha256, row.rows, used)
+    return EvaluationData(row.id, row.sha256, row.rows, used)
 
 
-def held_out(loaded: LoadedModels, dataset: str, served: Served) -> Measured:
-    """Read what the training of a version has held out of a data set; as `measured`, and where it was nothing raise
-    InvalidRequestError."""
-    row = fitting(loaded, dataset, served)
+def read_held_out(loaded: LoadedModels, dataset: str, served: ServedModel) -> EvaluationData:
+    """Return the samples of a data set that a version's training held out.
+
+    Raise as `read_dataset` does, and InvalidRequestError if nothing was held out.
+    """
+    row = find_dataset(loaded, dataset, served)
     with _splitting():
         split = _split_of(loaded, row, served)
         used = store.samples(loaded.files, row, MAX_EVALUATION_SAMPLES, split.held_out)
-    return Measured(row.id, row.sha256, split.rows, used)
+    return EvaluationData(row.id, row.sha256, split.rows, used)
 
 
-def _split_of(loaded: LoadedModels, row: DatasetRow, served: Served) -> SetSplit:
-    """How a data set was split for a version; raise CannotHoldOutError where nothing of it was held out."""
+def _split_of(loaded: LoadedModels, row: DatasetRow, served: ServedModel) -> SetSplit:
+    """Return how a version split a data set; raise CannotHoldOutError if nothing of it was held out."""
     version = registry.find(loaded.database, served.name, served.version)
-    split = holding_out.remembered(row, version.manifest["lineage"])
+    split = holding_out.find_earlier_split(row, version.manifest["lineage"])
     if split is None:
         raise CannotHoldOutError(f"version {served.version} has held nothing out of data set {row.id}")
     return split
@@ -70,16 +76,18 @@ def _split_of(loaded: LoadedModels, row: DatasetRow, served: Served) -> SetSplit
 
 @contextmanager
 def _splitting() -> Iterator[None]:
-    """Raise InvalidRequestError where there is no part that was held out."""
+    """Raise InvalidRequestError for a CannotHoldOutError."""
     try:
         yield
     except CannotHoldOutError as error:
         raise invalid_request("part", "held_out", f"all, as {error}") from None
 
 
-def fitting(loaded: LoadedModels, dataset: str, *versions: Served) -> DatasetRow:
-    """The row of a data set; raise NotFoundError, or InvalidRequestError where its joints or its torque convention are
-    not those of these versions."""
+def find_dataset(loaded: LoadedModels, dataset: str, *versions: ServedModel) -> DatasetRow:
+    """Return the row of a data set.
+
+    Raise NotFoundError, or InvalidRequestError if its joints or torque convention differ from those of these versions.
+    """
     row = store.find(loaded.database, dataset)
     for served in versions:
         known = served.model
@@ -93,7 +101,7 @@ def fitting(loaded: LoadedModels, dataset: str, *versions: Served) -> DatasetRow
 
 
 def _how_to_upload(row: DatasetRow, joint_names: Sequence[str]) -> str:
-    """What makes a data set one of these joints, where it has as many."""
+    """Return advice to upload the recording under these joint names; empty if the number of joints differs."""
     if len(row.joint_names) != len(joint_names):
         return ""
     named = next((name for name in recognise(joint_names) if profile(name).joint_names == tuple(joint_names)), None)
@@ -102,15 +110,15 @@ def _how_to_upload(row: DatasetRow, joint_names: Sequence[str]) -> str:
 
 
 def evaluate(
-    loaded: LoadedModels, model: str, request: schema.EvaluateRequest, served: Served | None = None
+    loaded: LoadedModels, model: str, request: schema.EvaluateRequest, served: ServedModel | None = None
 ) -> schema.EvaluateResponse:
-    """Compare a model with a data set or what it has held out of it; raise InvalidRequestError or NotFoundError.
+    """Evaluate a version on a data set or its held-out part; raise InvalidRequestError or NotFoundError.
 
-    Of rows held out that a version has learnt since, the figures of its judged fit are returned. served: what answers,
-    where that is found already.
+    If the version has since learnt the held-out rows, return the figures of its judged fit. `served` is the version if
+    the caller has found it.
     """
     served = served or loaded.get(model, request.version, request.alias)
-    row = fitting(loaded, request.dataset, served)
+    row = find_dataset(loaded, request.dataset, served)
     judged = _judged(loaded, row, served) if request.part == "held_out" else None
     in_training, revision = False, 0
     if judged is None:
@@ -129,18 +137,18 @@ def evaluate(
 
 
 def _compared(
-    loaded: LoadedModels, request: schema.EvaluateRequest, served: Served, in_training: bool
+    loaded: LoadedModels, request: schema.EvaluateRequest, served: ServedModel, in_training: bool
 ) -> dict[str, Any]:
-    """Fields of an `Evaluation` of a version."""
-    recorded = (measured if request.part == "all" else held_out)(loaded, request.dataset, served)
+    """Return the fields of an `Evaluation` of a version."""
+    recorded = (read_dataset if request.part == "all" else read_held_out)(loaded, request.dataset, served)
     used = recorded.used
     answer = served.model.predict(used.q, used.dq, used.ddq)
     repeats = _repeats(loaded, served, used, in_training)
     return {"samples": recorded.samples, **evaluation(used, answer.interval), **repeats}
 
 
-def _judged(loaded: LoadedModels, row: DatasetRow, served: Served) -> Evaluation | None:
-    """How the judged fit of a version predicts what was held out of a data set; None unless its lineage says so."""
+def _judged(loaded: LoadedModels, row: DatasetRow, served: ServedModel) -> Evaluation | None:
+    """Return the judged fit's evaluation of a data set's held-out part; None unless the lineage contains it."""
     if not (record := _holdout_of(loaded, served)).get("learnt"):
         return None
     holdout = HoldoutLineage.model_validate(record)
@@ -148,28 +156,28 @@ def _judged(loaded: LoadedModels, row: DatasetRow, served: Served) -> Evaluation
     return next((holdout.evaluations[name] for name in names if name in holdout.evaluations), None)
 
 
-def _in_training(loaded: LoadedModels, row: DatasetRow, part: schema.Part, served: Served) -> bool:
-    """Whether a version has learnt a data set or part of it, or what was held out of it."""
+def _in_training(loaded: LoadedModels, row: DatasetRow, part: schema.Part, served: ServedModel) -> bool:
+    """Return whether a version has learnt a data set, part of it, or its held-out part."""
     if part == "held_out" and not _holdout_of(loaded, served).get("learnt"):
         return False
     return served.has_learnt_from(row.id, row.sha256)
 
 
-def _holdout_of(loaded: LoadedModels, served: Served) -> dict[str, Any]:
-    """What the lineage of a version says of what was held out; empty if that is nothing."""
+def _holdout_of(loaded: LoadedModels, served: ServedModel) -> dict[str, Any]:
+    """Return the held-out record of a version's lineage; empty if nothing was held out."""
     version = registry.find(loaded.database, served.name, served.version)
     return version.manifest["lineage"].get("holdout") or {}
 
 
-def _repeats(loaded: LoadedModels, served: Served, used: Samples, in_training: bool) -> dict[str, Any]:
-    """How much of the samples repeats what a version was trained on, where it was not trained on these."""
+def _repeats(loaded: LoadedModels, served: ServedModel, used: Samples, in_training: bool) -> dict[str, Any]:
+    """Return how much of the samples repeats the training motion, unless the version was trained on them."""
     if in_training:
         return repeating.look([], used, served.model.joint_types)
     version = registry.find(loaded.database, served.name, served.version)
     try:
-        training = repeating.trained_on(loaded.database, loaded.files, version.manifest["lineage"])
+        training = repeating.read_training_parts(loaded.database, loaded.files, version.manifest["lineage"])
         return repeating.look(training, used, served.model.joint_types)
-    except (CannotHoldOutError, DamagedDataError) as error:  # the samples judged can be read, and figures be had
+    except (CannotHoldOutError, DamagedDataError) as error:  # the figures are valid without the training data
         return {**repeating.look([], used, ()), "warnings": [f"whether they repeat the training is not known: {error}"]}
 
 
@@ -177,14 +185,16 @@ Rows = NDArray[np.int64]
 
 
 def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> schema.TraceResponse:
-    """Follow a model along a data set or what it has held out of it. Raise InvalidRequestError, NotFoundError or
-    DamagedDataError. Not for the event loop."""
+    """Predict along a data set or its held-out part. Not for the event loop.
+
+    Raise InvalidRequestError, NotFoundError or DamagedDataError.
+    """
     if request.points > MAX_TRACE_POINTS:
         raise invalid_request("points", request.points, f"at most {MAX_TRACE_POINTS}")
     served = loaded.get(model, request.version, request.alias)
-    offered = dynamics.available(served.model.estimator)
+    offered = dynamics.available_components(served.model.estimator)
     check_offered(served.model, request.components)
-    dataset = fitting(loaded, request.dataset, served)
+    dataset = find_dataset(loaded, request.dataset, served)
     path = loaded.files.samples_file(dataset.id, dataset.sha256)
     episode, t = (sample_file.read_array(path, name) for name in ("episode", "t"))
     part = np.arange(len(t), dtype=np.int64)
@@ -221,7 +231,7 @@ def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> sch
 
 
 def _within(part: Rows, request: schema.TraceRequest, count: int) -> Rows:
-    """Rows of a part from `start` to `stop`; raise InvalidRequestError where there are none."""
+    """Return the rows of a part from `start` to `stop`; raise InvalidRequestError if there are none."""
     if request.start >= count:
         raise invalid_request("start", request.start, f"a row of the data set, 0 to {count - 1}")
     if request.stop is not None and request.stop <= request.start:
@@ -235,16 +245,16 @@ def _within(part: Rows, request: schema.TraceRequest, count: int) -> Rows:
 
 
 def _breaks(part: Rows, episode: NDArray[np.int64], rows: Rows) -> list[int]:
-    """Places in `rows` before which the part is interrupted or the episode changes."""
+    """Return the positions in `rows` before which the part is interrupted or the episode changes."""
     anew = (np.diff(part) != 1) | (np.diff(episode[part]) != 0)
     piece = np.concatenate([[0], np.cumsum(anew)])[np.searchsorted(part, rows)]
     return (np.flatnonzero(np.diff(piece)) + 1).tolist()
 
 
 def _components(
-    served: Served, samples: Samples, names: Sequence[schema.TraceComponent], batch: int
+    served: ServedModel, samples: Samples, names: Sequence[schema.TraceComponent], batch: int
 ) -> dict[schema.TraceComponent, schema.TraceComponentValues]:
-    """Parts of the torque at samples, so many at a time: they take far more memory than a torque."""
+    """Return torque components at samples, computed in batches: they need far more memory than a torque."""
     if not names:
         return {}
     mean: dict[schema.TraceComponent, list[Array]] = {name: [] for name in names}

@@ -1,4 +1,4 @@
-"""Torque queries: decoded, checked, answered and encoded."""
+"""Torque queries: decode, check, answer and encode them."""
 
 from __future__ import annotations
 
@@ -21,28 +21,30 @@ from service.contract.decoding import HotDecoder, struct_of
 from service.contract.payload import Payload
 from service.contract.predictions import PredictRequest, PredictResponse
 from service.foundation.errors import invalid_request
-from service.models.loaded import LoadedModels, Served
+from service.models.loaded import LoadedModels, ServedModel
 
 Array = NDArray[np.float64]
 MAX_BATCH, MAX_COMPONENT_BATCH = 1000, 100
-"""Queries of one prediction request, and of one that asks for components."""
+"""Maximum queries of one prediction request, and of one with components."""
 QUANTITIES = ("q", "dq", "ddq", "tau")
 FORWARD: ComponentName = "forward_dynamics"
 
 
 class Query(NamedTuple):
-    """Motions that torque is asked for, whatever has brought them: JSON, tensors or a frame.
+    """Motions of a torque query, from JSON, tensors or a frame.
 
-    values: q, dq and ddq, tau too where it is needed, (3 or 4, N, n) in SI units; single: whether this is one query
-    without an axis of queries, as its answer then is.
+    `values` contains q, dq, ddq and, if needed, tau: (3 or 4, N, n) in SI units. If `single`, the request was one query
+    without a query axis, and so is its answer.
     """
 
     values: Array
     single: bool
 
     def check(self, limits: Array, expected: Callable[[str], str] = lambda _: "a finite number") -> None:
-        """Raise InvalidRequestError where a number is not finite or a position beyond ±`limits`, (n,) rad (m).
-        expected: says what a number of q, dq, ddq or tau has to be."""
+        """Raise InvalidRequestError if a number is not finite or a position exceeds ±`limits`, (n,) rad (m).
+
+        `expected` returns what a value of q, dq, ddq or tau must be.
+        """
         if not np.isfinite(self.values).all():
             part, row, joint = np.argwhere(~np.isfinite(self.values))[0]
             number = f"{self.values[part, row, joint]:g}"
@@ -54,8 +56,10 @@ class Query(NamedTuple):
             raise invalid_request(self._name("q", row, joint), f"{self.values[0, row, joint]:g}", within)
 
     def components(self, model: TorqueModel, names: Sequence[ComponentName]) -> dict[str, Estimate]:
-        """Estimates of parts of the dynamics by name, (N, …) each; raise InvalidRequestError where inertia cannot be
-        inverted. Torque is for forward dynamics alone."""
+        """Return estimates of dynamics components by name, (N, …) each; torque is used by forward dynamics alone.
+
+        Raise InvalidRequestError if an inertia matrix cannot be inverted.
+        """
         parts = self.values if FORWARD in names else self.values[:3]
         q, dq, ddq, *tau = parts
         try:
@@ -72,8 +76,10 @@ class Query(NamedTuple):
 
 
 def check_shapes(request: Any, model: TorqueModel) -> list[Array]:
-    """The arrays q, dq, ddq and tau of a request, those left out that are None; raise InvalidRequestError where they
-    are not of the model's joints or of several shapes."""
+    """Return the arrays q, dq, ddq and tau of a request without those that are None.
+
+    Raise InvalidRequestError if their shapes differ or do not match the model's joints.
+    """
     parts = {name: values for name in QUANTITIES if (values := getattr(request, name)) is not None}
     for name, values in parts.items():
         if values.shape[-1] != model.n_joints:
@@ -85,11 +91,11 @@ def check_shapes(request: Any, model: TorqueModel) -> list[Array]:
 
 
 def check_answer(name: str, values: Array) -> None:
-    """Raise InvalidRequestError where a number of an answer, of any shape, is not finite."""
-    if isfinite(np.vdot(values, values)):  # at one query a third of what np.isfinite takes
+    """Raise InvalidRequestError if a number of an answer, of any shape, is not finite."""
+    if isfinite(np.vdot(values, values)):  # for one query this takes a third of the time of np.isfinite
         return
     wrong = np.argwhere(~np.isfinite(values))
-    if len(wrong):  # else their squares alone are beyond numbers
+    if len(wrong):  # else only their squares overflow
         place = tuple(wrong[0])
         expected = "a finite number: are dq in rad/s and ddq in rad/s²?"
         field = name + "".join(f"[{index}]" for index in place)
@@ -98,7 +104,7 @@ def check_answer(name: str, values: Array) -> None:
 
 def check_offered(model: TorqueModel, components: Sequence[ComponentName]) -> None:
     """Raise InvalidRequestError for a component that the model's estimator does not offer."""
-    offered = dynamics.available(model.estimator)
+    offered = dynamics.available_components(model.estimator)
     for index, name in enumerate(components):
         if name not in offered:
             expected = f"what a model with the estimator {model.estimator.name} offers: {', '.join(offered)}"
@@ -106,33 +112,37 @@ def check_offered(model: TorqueModel, components: Sequence[ComponentName]) -> No
 
 
 def check_count(field: str, given: Any, count: int, components: bool, noun: str = "") -> None:
-    """Raise InvalidRequestError if there are too many queries for one request. given: the value of the field."""
+    """Raise InvalidRequestError for too many queries in one request; `given` is the value of the field."""
     most, kind = (MAX_COMPONENT_BATCH, " with components") if components else (MAX_BATCH, "")
     if count > most:
         raise invalid_request(field, given, f"at most {most}{noun} in one request{kind}")
 
 
 def check_torque(given: bool, needed: bool, users: str, place: str) -> None:
-    """Raise InvalidRequestError for a torque that is missing, or given although nothing needs it.
-    users: what needs it; place: the field that asks for them."""
+    """Raise InvalidRequestError if tau is missing but needed, or given but not needed.
+
+    `users` are the components that need it, `place` the field that requests them.
+    """
     if needed and not given:
         raise invalid_request("tau", "missing", f"the torque that {users} is asked for, shaped as q")
     if given and not needed:
         raise invalid_request("tau", "given", f"no tau, or {users} among the {place}")
 
 
-def carrying(served: Served, payload: Payload | None) -> TorqueModel:
-    """What answers for a version: with this payload, or where None with what its arm carries. Raise InvalidRequestError
-    where it knows no arm that could carry one, or where no body is like that."""
+def model_with_payload(served: ServedModel, payload: Payload | None) -> TorqueModel:
+    """Return a version's model with this payload, or its default model if None.
+
+    Raise InvalidRequestError if the version has no rigid bodies or the payload is not a possible body.
+    """
     if payload is None:
-        return served.asked
+        return served.default_model
     try:
-        return served.declared.model(payload.numbers)
+        return served.declared_payloads.model(payload.numbers)
     except NoArmError:
         rigid = f"knows no rigid bodies to add it to, one of {', '.join(ROBOT_ESTIMATORS)} does"
         expected = f"no payload: a model with the estimator {served.model.estimator.name} {rigid}"
         raise invalid_request("payload", "given", expected) from None
-    except ValueError as error:  # names a field of the payload first, and last what was expected
+    except ValueError as error:  # the message starts with a payload field and ends with what was expected
         name, text = str(error).partition(" ")[0], str(error).rpartition("expected ")[2]
         raise invalid_request(f"payload.{name}", payload.model_dump(mode="json")[name], text) from error
 
@@ -143,7 +153,7 @@ _encoder = msgspec.json.Encoder()
 
 
 def one_motion(query: Any) -> Array | None:
-    """Return the motion (3, n) of a decoded query, or None if it asks for more than the torque of one motion."""
+    """Return the motion (3, n) of a decoded query; None if it requests more than the torque of one motion."""
     batch = bool(query.q) and isinstance(query.q[0], list)
     if batch or query.covariance or query.components or query.tau is not None:
         return None
@@ -154,29 +164,35 @@ def one_motion(query: Any) -> Array | None:
 
 
 def encode(answer: Struct) -> bytes:
-    """Encode a PredictResponse, what was not asked for left out; its numbers read back are the same numbers."""
+    """Encode a PredictResponse without the fields that were not requested; decoding returns the same numbers."""
     return _encoder.encode(answer)
 
 
-def at_once(served: Served, motion: Array, max_position: float, payload: Payload | None = None) -> Struct | None:
-    """Return a PredictResponse to one motion (3, n), for the event loop; None where the motion or the answer is not as
-    it should be, or what answers with a payload has to be made first."""
-    model = served.asked if payload is None else served.declared.known(payload.numbers)
+def predict_now(
+    served: ServedModel, motion: Array, max_position: float, payload: Payload | None = None
+) -> Struct | None:
+    """Return a PredictResponse to one motion (3, n), for the event loop.
+
+    Return None if the motion or the answer is invalid, or if the payload's model must be made first.
+    """
+    model = served.default_model if payload is None else served.declared_payloads.cached(payload.numbers)
     if model is None or motion.shape[1] != model.n_joints:
         return None
     if (abs(motion[0]) > served.model.position_limits(max_position)).any():
         return None
     answer = model.answer_fully(motion)
-    assert answer.tau_std is not None  # it is, unless declined
+    assert answer.tau_std is not None  # present unless the caller declines it
     tau, tau_std = answer.tau.tolist(), answer.tau_std.tolist()
     if not isfinite(sum(tau) + sum(tau_std)):
         return None
     return _answer(served, tau, tau_std, None if answer.fallback is None else answer.fallback.share.tolist())
 
 
-def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: Served | None = None) -> Struct:
+def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: ServedModel | None = None) -> Struct:
     """Return a PredictResponse to the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
-    served: what answers, where that is found already."""
+
+    `served` is the version if the caller has found it.
+    """
     served = served or loaded.get(model, request.version, request.alias)
     known = served.model
     single = request.q.ndim == 1
@@ -188,7 +204,7 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
     check_count("q", f"{count} queries", count, bool(request.components))
     query.check(served.model.position_limits(loaded.storage.settings.max_position))
 
-    known = carrying(served, request.payload)
+    known = model_with_payload(served, request.payload)
     q, dq, ddq, *_ = query.values
     answer = known.predict(q, dq, ddq, request.covariance)
     arrays = {"tau": answer.tau, "tau_std": answer.tau_std}
@@ -212,7 +228,7 @@ def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: S
 
 
 def _answer(
-    served: Served,
+    served: ServedModel,
     tau: list[Any],
     tau_std: list[Any],
     fallback: list[Any] | None = None,
@@ -229,7 +245,7 @@ def _answer(
         tau=tau,
         tau_std=tau_std,
         noise_std=served.noise_std,
-        scale=served.scales.asked,
+        scale=served.scales.default_factors,
         guaranteed=served.guaranteed,
         covariance=covariance,
         components=components,

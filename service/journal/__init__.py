@@ -1,1 +1,1 @@
-"""The log of observations, and what keeps it short."""
+"""The event log of each model, its snapshots and its retention."""

@@ -1,4 +1,4 @@
-"""What the owner of a learning model should know, with the evidence."""
+"""Alarms about a learning model, with their evidence."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from sqlalchemy.orm import Session
 
 from service.contract.learning import AlarmKind
 from service.storage.database import AlarmRow, now
-from service.storage.rows import Page, newest
+from service.storage.rows import Page, read_page
 
 
 def raise_alarm(session: Session, model: str, kind: AlarmKind, message: str, evidence: dict[str, Any]) -> AlarmRow:
-    """Add an alarm; it is visible once the session commits."""
+    """Add an alarm. It is visible once the session commits."""
     row = AlarmRow(model=model, kind=kind, at=now(), message=message, evidence=evidence)
     session.add(row)
     session.flush()
@@ -20,5 +20,5 @@ def raise_alarm(session: Session, model: str, kind: AlarmKind, message: str, evi
 
 
 def page(session: Session, model: str, part: Page) -> tuple[list[AlarmRow], str | None]:
-    """Alarms of a page, newest first, and the cursor after it."""
-    return newest(session, AlarmRow, part, AlarmRow.model == model)
+    """Return the alarms of a page, read_page first, and the cursor after the page."""
+    return read_page(session, AlarmRow, part, AlarmRow.model == model)

@@ -1,6 +1,7 @@
-"""Which batches of a stream have arrived: what is missing, whether one may have come before, room for new streams.
+"""The arrival of batches: gaps in a stream, batches that may be repeated, room for new streams.
 
-Functions that write are called inside `Database.transaction()`, as those of the log."""
+Functions that write are called inside `Database.transaction()`, like those of the log.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +16,15 @@ from service.foundation.errors import BusyError, ConflictError
 from service.storage.database import EventRow, StreamRow, now
 
 StreamKind = Literal["batches", "frames"]
-MOST_RANGES = 1000
-"""Ranges that are remembered; the lowest are given up first, being the least likely to be filled."""
-IN_USE_S = 10.0
-"""Seconds without a batch after which a stream makes room for a new one, if it was silent for longest."""
+MAX_RANGES = 1000
+"""Gaps that are stored for a stream. The lowest are dropped first: they are the least likely to be filled."""
+MIN_SILENT_S = 10.0
+"""Seconds without a batch after which a stream may be deleted to make room for a new one."""
 
 
 @dataclass(frozen=True)
 class NewBatch:
-    """A batch to be logged; its fields are those of `EventRow` and, where the stream is new, of `StreamRow`."""
+    """A batch to be logged. Its fields are those of `EventRow` and, for a new stream, of `StreamRow`."""
 
     stream_id: str
     kind: StreamKind
@@ -41,14 +42,17 @@ class NewBatch:
 
 @dataclass(frozen=True)
 class Gaps:
-    """Sequences that a stream misses: ranges [a, b], rising, between the first (lowest) and the last that are there."""
+    """The sequences that a stream lacks."""
 
     first: int
+    """Lowest sequence that has arrived."""
     last: int
+    """Highest sequence that has arrived."""
     ranges: tuple[tuple[int, int], ...] = ()
+    """Missing ranges [a, b] between `first` and `last`, in rising order."""
 
     def arrived(self, first: int, last: int) -> Gaps:
-        """The gaps once `first` to `last` are there too, in whatever order batches arrive."""
+        """Return the gaps after the sequences `first` to `last` have arrived. The order of arrival does not matter."""
         left: list[tuple[int, int]] = []
         if last + 1 < self.first:
             left.append((last + 1, self.first - 1))
@@ -59,14 +63,14 @@ class Gaps:
                 left.append((max(a, last + 1), b))
         if self.last + 1 < first:
             left.append((self.last + 1, first - 1))
-        return Gaps(min(self.first, first), max(self.last, last), tuple(left[-MOST_RANGES:]))
+        return Gaps(min(self.first, first), max(self.last, last), tuple(left[-MAX_RANGES:]))
 
-    def may_hold(self, sequence: int) -> bool:
-        """Whether a sequence may have arrived: not where it is known to be missing."""
+    def may_contain(self, sequence: int) -> bool:
+        """Return whether a sequence may have arrived. It has not if it lies in a gap."""
         return self.first <= sequence <= self.last and not any(a <= sequence <= b for a, b in self.ranges)
 
     def to_json(self) -> dict[str, Any]:
-        """As a stream's row keeps them, which has `last` in a column of its own."""
+        """Return the JSON for a stream's row, which stores `last` in its own column."""
         return {"first": self.first, "ranges": [list(pair) for pair in self.ranges]}
 
     @staticmethod
@@ -76,18 +80,18 @@ class Gaps:
 
 
 def is_forgotten(source: StreamRow, sequence: int) -> bool:
-    """Whether a batch may have arrived that is no longer kept: whether it is a repetition cannot be known then."""
+    """Return whether the batch of a sequence may have arrived and been deleted since."""
     gaps = Gaps.from_json(source.missing, source.last)
-    return source.forgotten is not None and sequence <= source.forgotten and gaps.may_hold(sequence)
+    return source.forgotten is not None and sequence <= source.forgotten and gaps.may_contain(sequence)
 
 
-def note_arrival(session: Session, model: str, batch: NewBatch, most_streams: int | None) -> StreamRow:
-    """Note in the row of a stream which sequences are there, and return it; a new row for a new stream."""
+def note_arrival(session: Session, model: str, batch: NewBatch, max_streams: int | None) -> StreamRow:
+    """Store in the row of a stream which sequences have arrived, and return the row. A new stream gets a new row."""
     source = session.get(StreamRow, (model, batch.stream_id))
     if source is None:
         _check_new(session, model, batch)
-        if most_streams is not None:
-            _make_room(session, model, most_streams, batch.received)
+        if max_streams is not None:
+            _make_room(session, model, max_streams, batch.received)
         source = StreamRow(model=model, stream_id=batch.stream_id, kind=batch.kind, offset=batch.offset)
         source.created_at = now()
         gaps = Gaps(batch.sequence, batch.last_sequence)
@@ -101,8 +105,7 @@ def note_arrival(session: Session, model: str, batch: NewBatch, most_streams: in
 
 
 def _check_new(session: Session, model: str, batch: NewBatch) -> None:
-    """Raise ConflictError where the log has later batches of a stream that was silent for so long that it is no longer
-    known."""
+    """Raise ConflictError if the row of a silent stream was deleted and the log has later batches of the stream."""
     of_stream = EventRow.model == model, EventRow.stream_id == batch.stream_id
     last = session.scalar(select(func.max(EventRow.last_sequence)).where(*of_stream))
     if last is not None and batch.sequence <= last:
@@ -113,15 +116,15 @@ def _check_new(session: Session, model: str, batch: NewBatch) -> None:
 
 
 def _make_room(session: Session, model: str, most: int, received: float) -> None:
-    """Forget the stream that was silent for longest where there are too many; raise BusyError where all are in use."""
+    """Delete the stream that was silent longest if there are too many. Raise BusyError if all are in use."""
     of_model = StreamRow.model == model
     known = session.scalar(select(func.count()).select_from(StreamRow).where(of_model)) or 0
     if known < most:
         return
     used = func.coalesce(StreamRow.received, 0.0)
-    silent = case((used > received + IN_USE_S, 0.0), else_=used)  # by a clock that was set right since
+    silent = case((used > received + MIN_SILENT_S, 0.0), else_=used)  # stamped before the clock was set back
     oldest = session.scalars(select(StreamRow).where(of_model).order_by(silent).limit(1)).one()
-    if abs((oldest.received or 0.0) - received) < IN_USE_S:
+    if abs((oldest.received or 0.0) - received) < MIN_SILENT_S:
         raise BusyError(
             f"model {model!r} has {known} sources of observations in use, the most it may have: go on with one of "
             "their stream_ids"
@@ -131,7 +134,7 @@ def _make_room(session: Session, model: str, most: int, received: float) -> None
 
 
 def check_kind(source: StreamRow | None, kind: StreamKind) -> None:
-    """Raise ConflictError where a stream carries something else: one sequence cannot count both."""
+    """Raise ConflictError if a stream carries the other kind: one sequence cannot count both."""
     if source is not None and source.kind != kind:
         name = f"stream {source.stream_id!r} of model {source.model!r}"
         raise ConflictError(f"{name} carries {source.kind}, not {kind}: use another stream_id")

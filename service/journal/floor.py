@@ -1,4 +1,4 @@
-"""The least uncertainty of a version: what its latest errors prove."""
+"""The smallest uncertainty of a version that its latest errors allow."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ from lipcore.data.samples import Array
 from lipcore.online.record import Record, error_floor
 from service.storage.database import Database, EventRow
 
-SECONDS = 2.0
-FEWEST_ROWS = 200
+WINDOW_S = 2.0
+"""Seconds before the newest batch whose batches count."""
+MIN_ROWS = 200
+"""Min rows that count: older batches are added until there are so many."""
 
 
 def error_floor_of(database: Database, model: str, version: int, through: int, n_joints: int) -> Array:
-    """Return the function variance (N·m)², (n,), that a version's errors up to event `through` prove: its std is no
-    lower.
+    """Return the lower bound (n,) of the function variance, (N·m)², that the errors up to event `through` prove.
 
-    The batches are those of the last SECONDS before the newest one came, and more until there are FEWEST_ROWS rows. Not
-    those that were undone, of a stream that did not fit from its first second on and that nobody has confirmed, that
-    wait for their owner's decision, or that came while learning was paused.
+    The batches are those of the last `WINDOW_S` before the newest batch, and older ones until there are `MIN_ROWS`
+    rows.
+
+    Batches that were undone do not count, nor do those of an unconfirmed stream that did not fit from its first second.
+    The same is true of batches that wait for a decision, or that arrived while learning was paused.
     """
     clock = func.coalesce(EventRow.clock, EventRow.received)
     query = select(clock, EventRow.record).where(
@@ -37,18 +40,18 @@ def error_floor_of(database: Database, model: str, version: int, through: int, n
     newest: float | None = None
     with database.session() as session:
         latest = query.order_by(EventRow.number.desc()).limit(500)
-        events = session.execute(latest.execution_options(yield_per=20))  # few are needed as a rule
+        events = session.execute(latest.execution_options(yield_per=20))  # most calls need only a few
         for at, record in events:
             if record is None:
                 continue
             newest = at if newest is None else newest
-            if rows >= FEWEST_ROWS and at < newest - SECONDS:
+            if rows >= MIN_ROWS and at < newest - WINDOW_S:
                 break
             records.append(record)
             rows += record["rows"]
         events.close()
     total = Record.empty(n_joints)
-    if rows:  # all of them at once, and only what the floor is made of: it is asked for twice a second
+    if rows:  # in one average and only two figures: this runs twice a second
         figures = np.array([[record["squared"], record["noise"]] for record in records])
         squared, noise = np.average(figures, axis=0, weights=[record["rows"] for record in records])
         total = replace(total, rows=rows, squared=squared, noise=noise)

@@ -1,7 +1,7 @@
 """The event log of a model, in the order of commits. The learnt state is a function of it.
 
-Functions that write are called inside `Database.transaction()`: numbers are given out under its lock, so that they are
-dense and rise in the order of commits, and an event is durable once the transaction has ended.
+Functions that write are called inside `Database.transaction()`. Its lock makes event numbers dense and rising in the
+order of commits. An event is durable once the transaction has ended.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from lipcore.vocabulary import Code
 from service.journal.arrivals import NewBatch, note_arrival
 from service.storage.database import EventRow, LearnerRow, LearningRow, StreamRow, fetch
 from service.storage.rows import Page
-from service.storage.rows import newest as newest_rows
+from service.storage.rows import read_page as newest_rows
 
 EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings", "payload"]
-UNTIMED = [Code.NON_FINITE, Code.TIME_JUMP]
-"""Codes of rows whose own time says nothing."""
-ARRAYS = tuple(field.name for field in fields(Rows))
-"""Of the safetensors archive that an event's rows are kept as."""
+UNTIMED_CODES = [Code.NON_FINITE, Code.TIME_JUMP]
+"""Codes of rows whose time is invalid."""
+ARRAY_NAMES = tuple(field.name for field in fields(Rows))
+"""Names of the arrays in the safetensors archive of an event's rows."""
 
 
 _OF_STREAM = select(EventRow).where(EventRow.model == bindparam("model"), EventRow.stream_id == bindparam("stream_id"))
@@ -46,14 +46,15 @@ _START = select(LearnerRow.start).where(
 
 @dataclass(frozen=True)
 class Memory:
-    """What events of the kind `settings` set. forgetting_s: time constant of forgetting, s, None where nothing is
-    forgotten; friction_walk_s: that of friction that drifts, s, None where it does not."""
+    """The time constants that events of the kind `settings` set."""
 
     forgetting_s: float | None = None
+    """Time constant of forgetting, s; None if nothing is forgotten."""
     friction_walk_s: float | None = None
+    """Time constant of drifting friction, s; None if friction does not drift."""
 
     def to_json(self) -> dict[str, Any]:
-        """As an event keeps it."""
+        """Return the JSON for an event."""
         walk = {} if self.friction_walk_s is None else {"friction_walk_s": self.friction_walk_s}
         return {"forgetting_s": self.forgetting_s} | walk
 
@@ -64,76 +65,82 @@ class Memory:
 
 
 def append_batch(
-    session: Session, model: str, batch: NewBatch, most_streams: int | None = None
+    session: Session, model: str, batch: NewBatch, max_streams: int | None = None
 ) -> tuple[EventRow, StreamRow]:
-    """Log a batch and what its stream still misses; return its event, which is written with the session's next flush,
-    and the row of its stream.
+    """Log a batch and update the gaps of its stream. Return the event and the stream's row.
 
-    Raise ConflictError where the stream is of another kind, where frames do not go on after the last, or where the
-    batch may have been learnt before and is no longer kept; BusyError beyond `most_streams` streams in use. That
-    no batch of this sequence is kept is checked with `find_batch` before, in the same transaction.
+    The event is written with the session's next flush. The caller has checked with `find_batch`, in the same
+    transaction, that the log has no batch of this sequence.
+
+    Raise ConflictError if the stream is of another kind, or if frames do not follow the last one. Raise it also if the
+    batch may have been learnt before and is no longer in the log. Raise BusyError beyond `max_streams` streams in use.
     """
     names = ("stream_id", "sequence", "last_sequence", "digest", "version", "revision", "report", "record")
     event = EventRow(number=newest(session, model) + 1, **{name: getattr(batch, name) for name in names})
-    source = note_arrival(session, model, batch, most_streams)
+    source = note_arrival(session, model, batch, max_streams)
     return _append(session, event, model, "batch", batch.received, batch.rows), source
 
 
 def append(
     session: Session, model: str, kind: EventKind, detail: dict[str, Any], received: float, rows: Rows | None = None
 ) -> EventRow:
-    """Log an event of another kind than a batch; return it."""
+    """Log an event of any kind but `batch`, and return it."""
     event = _append(session, EventRow(number=newest(session, model) + 1, detail=detail), model, kind, received, rows)
     session.flush()
     return event
 
 
 def find_batch(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
-    """The batch of exactly this sequence."""
+    """Return the batch with exactly this sequence."""
     return session.scalar(_of_stream(model, stream_id).where(EventRow.sequence == sequence))
 
 
-def covering(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
-    """The batch that this sequence lies in, of frames or of its own."""
+def find_covering_batch(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
+    """Return the batch that contains a sequence: its own, or that of one of its frames."""
     query = _of_stream(model, stream_id).where(EventRow.sequence <= sequence).order_by(EventRow.sequence.desc())
     event = session.scalar(query.limit(1))
     return event if event is not None and event.last_sequence is not None and sequence <= event.last_sequence else None
 
 
 @dataclass(frozen=True)
-class Past:
-    """What is kept of a stream around a sequence. source: its row, None of a new stream; same: the batch of exactly
-    this sequence; below, above: those next to it, with a gap in between or without."""
+class StreamHistory:
+    """The logged batches of a stream around a sequence."""
 
     source: StreamRow | None
+    """Row of the stream; None if the stream is new."""
     same: EventRow | None = None
+    """Batch with exactly this sequence."""
     below: EventRow | None = None
+    """Nearest batch with a lower sequence, adjacent or not."""
     above: EventRow | None = None
+    """Nearest batch with a higher sequence, adjacent or not."""
 
 
-def past(session: Session, model: str, stream_id: str, sequence: int) -> Past:
-    """Read what is kept of a stream around a sequence."""
+def read_history(session: Session, model: str, stream_id: str, sequence: int) -> StreamHistory:
+    """Read the logged batches of a stream around a sequence."""
     source = stream(session, model, stream_id)
     if source is None:
-        return Past(None)
+        return StreamHistory(None)
     place = {"model": model, "stream_id": stream_id, "sequence": sequence}
     below = session.scalar(_BEFORE, place)
-    if sequence > source.last:  # most batches are the last of their stream
-        return Past(source, None, below)
-    return Past(source, find_batch(session, model, stream_id, sequence), below, session.scalar(_AFTER, place))
+    if sequence > source.last:  # most batches are the last of their stream: skip two queries
+        return StreamHistory(source, None, below)
+    return StreamHistory(source, find_batch(session, model, stream_id, sequence), below, session.scalar(_AFTER, place))
 
 
-def derived_beside(session: Session, model: str, stream_id: str, sequence: int) -> int | None:
-    """The window of the batches right next to a sequence, see `Placement`; None if none of them was derived."""
+def find_adjacent_window(session: Session, model: str, stream_id: str, sequence: int) -> int | None:
+    """Return the derivation window of a batch adjacent to a sequence, see `Placement`; None if none was derived."""
     for other in (sequence - 1, sequence + 1):
         if (event := _derived(session, model, stream_id, other)) is not None:
             return Placement.from_json(event.report or {}).window
     return None
 
 
-def rows_beside(session: Session, model: str, stream_id: str, sequence: int, way: int, count: int) -> list[Rows]:
-    """Rows whose accelerations were derived, next after (way 1) or before (−1) a sequence, without a gap of sequences,
-    in order, at most `count`."""
+def read_adjacent_rows(session: Session, model: str, stream_id: str, sequence: int, way: int, count: int) -> list[Rows]:
+    """Return up to `count` rows with derived accelerations after (way 1) or before (way −1) a sequence, in order.
+
+    Reading stops at the first gap of sequences.
+    """
     parts: list[Rows] = []
     while count > 0:
         sequence += way
@@ -141,14 +148,14 @@ def rows_beside(session: Session, model: str, stream_id: str, sequence: int, way
         if event is None:
             break
         own = Placement.from_json(event.report or {}).own
-        part = rows_of(event).take(slice(*own))  # without those that had waited for it
+        part = rows_of(event).take(slice(*own))  # without the rows of neighbours that this batch completed
         parts.append(part.take(slice(0, count) if way > 0 else slice(max(len(part) - count, 0), None)))
         count -= len(part)
     return parts[::way]
 
 
 def _derived(session: Session, model: str, stream_id: str, sequence: int) -> EventRow | None:
-    """The batch of a sequence, if its accelerations were derived and it still teaches."""
+    """Return the batch of a sequence if its accelerations were derived and it is not undone."""
     event = find_batch(session, model, stream_id, sequence)
     if event is None or event.void or event.report is None:
         return None
@@ -156,17 +163,20 @@ def _derived(session: Session, model: str, stream_id: str, sequence: int) -> Eve
 
 
 def stream(session: Session, model: str, stream_id: str) -> StreamRow | None:
-    """What is known of a source of observations."""
+    """Return the row of a stream."""
     return session.get(StreamRow, (model, stream_id))
 
 
 def newest(session: Session, model: str) -> int:
-    """Number of the newest event, 0 where there is none."""
+    """Return the number of the newest event, 0 if the log is empty."""
     return fetch(session, _NEWEST, model=model).scalar() or 0
 
 
 def events(session: Session, model: str, after: int, limit: int, void: bool = False) -> list[EventRow]:
-    """Events above number `after` with their payload, rising, at most `limit`; void ones only where asked for."""
+    """Return up to `limit` events above number `after` in rising order, with their rows.
+
+    void: include events that were undone.
+    """
     query = select(EventRow).where(EventRow.model == model, EventRow.number > after).order_by(EventRow.number)
     if not void:
         query = query.where(EventRow.void.is_(False))
@@ -174,7 +184,7 @@ def events(session: Session, model: str, after: int, limit: int, void: bool = Fa
 
 
 def is_complete(session: Session, model: str, after: int, through: int) -> bool:
-    """Whether every event with after < number <= through is kept: without it there is no state that needs them."""
+    """Return whether the log has every event with after < number <= through."""
     span = (EventRow.model == model, EventRow.number > after, EventRow.number <= through)
     return session.scalar(select(func.count()).select_from(EventRow).where(*span)) == max(through - after, 0)
 
@@ -182,7 +192,10 @@ def is_complete(session: Session, model: str, after: int, through: int) -> bool:
 def page(
     session: Session, model: str, part: Page, stream_id: str | None = None, rejected: bool = False
 ) -> tuple[list[EventRow], str | None]:
-    """Batches of a page, newest first, and the cursor after it; rejected: only those with rows that are not learnt."""
+    """Return the batches of a page, newest first, and the cursor after it.
+
+    rejected: return only batches with rows that are not learnt.
+    """
     conditions = [EventRow.model == model, EventRow.kind == "batch"]
     if stream_id is not None:
         conditions.append(EventRow.stream_id == stream_id)
@@ -191,8 +204,8 @@ def page(
     return newest_rows(session, EventRow, part, *conditions)
 
 
-def about(session: Session, batch: EventRow, kind: Literal["replay", "unlearn"]) -> Sequence[EventRow]:
-    """Events that have learnt rows of a batch later, or have taken it out, in order, also those undone since."""
+def find_related(session: Session, batch: EventRow, kind: Literal["replay", "unlearn"]) -> Sequence[EventRow]:
+    """Return the replays or the unlearning of a batch in order, including those undone since."""
     query = select(EventRow).where(
         EventRow.model == batch.model,
         EventRow.number > batch.number,
@@ -203,13 +216,13 @@ def about(session: Session, batch: EventRow, kind: Literal["replay", "unlearn"])
 
 
 def rows_of(event: EventRow) -> Rows:
-    """The rows of a batch or a replay, which are read only now."""
-    assert event.payload is not None  # both have one for as long as they are in the log
+    """Read the rows of a batch or a replay."""
+    assert event.payload is not None  # batches and replays have one
     return decode(event.payload)
 
 
 def memory(session: Session, model: str, number: int) -> Memory:
-    """What is set after event `number`."""
+    """Return the time constants that apply after event `number`."""
     query = select(EventRow.detail).where(
         EventRow.model == model, EventRow.number <= number, EventRow.kind == "settings", EventRow.void.is_(False)
     )
@@ -218,13 +231,16 @@ def memory(session: Session, model: str, number: int) -> Memory:
 
 
 def start_of(session: Session, model: str, version: int) -> int:
-    """Number of the last event that a version contains by training."""
+    """Return the number of the last event that a version contains by training."""
     return fetch(session, _START, model=model, version=version).scalar() or 0
 
 
 def clock(session: Session, model: str, received: float) -> float:
-    """Time of a model's own clock at an arrival, Unix time, s. It goes on with arrivals, never back, and in a pause by
-    no more than the shortest time constant that is set: no clock that is wrong, or set right, makes it forget more."""
+    """Return the time of a model's own clock at an arrival, Unix time, s.
+
+    The clock advances with arrivals and never runs back. In a pause it advances by at most the shortest time constant
+    that is set. A host clock that is wrong, or is corrected, therefore cannot make the model forget more.
+    """
     latest = session.execute(_LATEST, {"model": model}).first()
     if latest is None:
         return received
@@ -236,40 +252,42 @@ def clock(session: Session, model: str, received: float) -> float:
 
 
 def learning_time(event: EventRow, time: Array | float) -> Array:
-    """Event times of an event, s, by the model's own clock: as late as they were when it arrived, and never later than
-    its arrival by more than AHEAD_S."""
+    """Return the event times of an event by the model's own clock, s.
+
+    The age of each row at its arrival stays. No time is later than the arrival by more than `AHEAD_S`.
+    """
     if event.clock is None:  # logged by an earlier release
         return np.asarray(time)
     return np.asarray(event.clock + np.minimum(time - event.received, AHEAD_S))
 
 
 def learning_rows(event: EventRow) -> Rows:
-    """The rows of a batch or a replay, which are read only now, at times of the model's own clock."""
+    """Read the rows of a batch or a replay, with times by the model's own clock."""
     rows = rows_of(event)
-    # those of a replay have times of that clock already: they are as old as their batch
+    # a replay was logged with times of that clock: its rows are as old as their batch
     return rows if event.kind == "replay" else replace(rows, time=learning_time(event, rows.time))
 
 
-def pending(session: Session, model: str, after: int) -> tuple[int, float | None]:
-    """Rows to be learnt after event `after`, and when the first of them arrived, Unix time, s; None without any."""
+def count_pending(session: Session, model: str, after: int) -> tuple[int, float | None]:
+    """Return how many rows after event `after` are to be learnt, and when the first arrived, Unix time, s, or None."""
     later = EventRow.model == model, EventRow.number > after, EventRow.learnt > 0, EventRow.void.is_(False)
     rows, arrived = session.execute(select(func.sum(EventRow.learnt), func.min(EventRow.received)).where(*later)).one()
     return int(rows or 0), arrived
 
 
 def encode(rows: Rows) -> bytes:
-    """Write rows, bit for bit."""
-    return save({name: np.ascontiguousarray(getattr(rows, name)) for name in ARRAYS})
+    """Return rows as safetensors, bit for bit."""
+    return save({name: np.ascontiguousarray(getattr(rows, name)) for name in ARRAY_NAMES})
 
 
 def decode(data: bytes) -> Rows:
-    """Read what `encode` wrote; raise ValueError where it is damaged."""
+    """Read what `encode` wrote; raise ValueError if it is damaged."""
     try:
         arrays = load(data)
     except SafetensorError as error:
         raise ValueError(f"logged rows cannot be read: {error}") from None
-    if sorted(arrays) != sorted(ARRAYS):
-        raise ValueError(f"logged rows have the arrays {', '.join(sorted(arrays))}, expected {', '.join(ARRAYS)}")
+    if sorted(arrays) != sorted(ARRAY_NAMES):
+        raise ValueError(f"logged rows have the arrays {', '.join(sorted(arrays))}, expected {', '.join(ARRAY_NAMES)}")
     return Rows(**arrays)
 
 
@@ -284,7 +302,7 @@ def _append(
     event.clock = clock(session, model, received)
     if rows is not None:
         event.payload, event.rows, event.learnt = encode(rows), len(rows), int(np.sum(rows.code == Code.LEARNT))
-        times = rows.time[np.isfinite(rows.time) & ~np.isin(rows.code, UNTIMED)]
+        times = rows.time[np.isfinite(rows.time) & ~np.isin(rows.code, UNTIMED_CODES)]
         if len(times):
             event.first, event.last = float(times.min()), float(times.max())
     session.add(event)

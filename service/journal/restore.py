@@ -1,16 +1,16 @@
-"""What a version has learnt: its newest snapshot, and the events of the log since, folded one after the other.
+"""The learnt state of a version: its newest snapshot, and the fold of the events since.
 
-The state after event k is the fold of the events up to k that are not void. To undo is to mark events void, in the
-transaction that logs it, which deletes the snapshots that contain them too; whoever holds a state that contains them
-folds the log again, from the newest snapshot that is left. So the state is a function of the log, to the last bit,
-whoever makes it, when, and in however many steps: services that share a log answer alike. (It takes the same
-arithmetic: the same release, kind of processor and number of threads.)
+The state after event k is the fold of the events up to k that are not void. To undo is to mark events void and to
+delete the snapshots that contain them, in one transaction. A process whose state contains void events folds the log
+again from the newest remaining snapshot. So the state is a function of the log, to the last bit, whichever process
+computes it, when, and in however many steps. Services that share a log return the same answers. (This requires the same
+release, kind of processor and number of threads.)
 
-It holds for as long as the log has what is needed. Where `snapshots.retain` has deleted events that a state lacks, the
-newest snapshot is continued, whoever stored it; without one, what is left of the log is learnt. A batch stays in a
-state that cannot be folded again without it.
+This is true while the log is complete. If `snapshots.retain` has deleted events that a state lacks, the newest snapshot
+of any service is used. Without a snapshot, the remaining events are learnt. If a state cannot be folded again without
+an unlearnt batch, the batch stays in the state.
 
-Pages of the log are bounded, so that what comes of one can be published, and others have their turn, in between.
+The log is read in bounded pages, so that revisions can be published and other versions advance between pages.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sqlalchemy.orm import Session, defer, undefer
 
 from lipcore.model.torque_model import TorqueModel
 from lipcore.online import transfer as state
-from lipcore.online.learner import Novel, OnlineModel
+from lipcore.online.learner import NovelRowsCallback, OnlineModel
 from service.journal import log, snapshots, undo
 from service.journal.log import Memory
 from service.storage.database import Database, EventRow, fetch
@@ -33,20 +33,23 @@ from service.storage.files import Files
 logger = logging.getLogger(__name__)
 
 PAGE_ROWS = 500
-"""Rows that are learnt in one step, unless a single batch has more: for a robot of seven joints about 15 ms with the
-learnt arm, and up to 0.4 s with an estimator of many inducing outputs."""
-PAGE_EVENTS = 200
+"""Max rows learnt in one step, unless one batch has more.
 
-_LIVE = (
+For seven joints, that takes about 15 ms with the learnt arm, and up to 0.4 s with many inducing outputs.
+"""
+PAGE_EVENTS = 200
+"""Max events of one page."""
+
+_NOT_UNDONE = (
     EventRow.model == bindparam("model"),
     EventRow.number > bindparam("after"),
     EventRow.number <= bindparam("through"),
     EventRow.void.is_(False),
 )
-_SIZES = select(EventRow.rows).where(*_LIVE).order_by(EventRow.number).limit(PAGE_EVENTS)
-_EVENTS = (  # what was answered and recorded of them is not learnt
+_SIZES = select(EventRow.rows).where(*_NOT_UNDONE).order_by(EventRow.number).limit(PAGE_EVENTS)
+_EVENTS = (  # reports and records are large and not learnt
     select(EventRow)
-    .where(*_LIVE)
+    .where(*_NOT_UNDONE)
     .order_by(EventRow.number)
     .limit(bindparam("count"))
     .options(undefer(EventRow.payload), defer(EventRow.report), defer(EventRow.record))
@@ -54,20 +57,20 @@ _EVENTS = (  # what was answered and recorded of them is not learnt
 
 
 @dataclass(frozen=True)
-class Restored:
-    """What a version has learnt after event `number`. start: the event that it contains by training.
-
-    seen: number of the event up to which undoing is taken into account; torn: whether the newest snapshot could not be
-    read, so that nothing is to be waited for where the log has gaps.
-    """
+class RestoredState:
+    """The learnt state of a version after event `number`."""
 
     model: str
     version: int
     start: int
+    """Last event that the version contains by training."""
     online: OnlineModel
     number: int
+    """Last event that `online` contains."""
     seen: int
+    """Event up to which undoing is taken into account."""
     torn: bool = False
+    """Whether the newest snapshot is unreadable. If so, gaps of the log are skipped."""
 
 
 def restore(
@@ -78,10 +81,12 @@ def restore(
     base: TorqueModel,
     at_most: int | None = None,
     pages: int | None = None,
-) -> Restored:
-    """Return what a version has learnt, after event `at_most` where given. base: the version as trained; pages: of the
-    log since its snapshot that are learnt at most."""
-    known = _begin(database, files, model, version, base, at_most)
+) -> RestoredState:
+    """Return the learnt state of a version, up to event `at_most` if given.
+
+    base: the version as trained. pages: max pages of the log that are learnt after the snapshot.
+    """
+    known = _load_base(database, files, model, version, base, at_most)
     while pages is None or pages > 0:
         following = advance(database, files, known, at_most)
         if following is known:
@@ -91,11 +96,17 @@ def restore(
 
 
 def advance(
-    database: Database, files: Files, known: Restored, at_most: int | None = None, novel: Novel | None = None
-) -> Restored:
-    """Return the state after the next page of events, the very same one where nothing is new. It is an earlier state
-    where events that this one contains have been undone, or where the log lacks events that a later snapshot contains.
-    novel: see `OnlineModel.learn`."""
+    database: Database,
+    files: Files,
+    known: RestoredState,
+    at_most: int | None = None,
+    novel: NovelRowsCallback | None = None,
+) -> RestoredState:
+    """Return the state after the next page of events; the very same object if nothing is new.
+
+    The result is an earlier state if events in this one have been undone. It is a later snapshot if the log lacks
+    events that the snapshot contains. novel: see `OnlineModel.learn`.
+    """
     model = known.model
     with database.session() as session:
         newest = log.newest(session, model)
@@ -105,43 +116,43 @@ def advance(
         begin = undo.must_fold_again(session, model, known.version, known.seen, known.number)
         events, end = _page(session, known, last)
         if not begin and not known.torn and not log.is_complete(session, model, known.number, end):
-            row = snapshots.latest(session, model, known.version, at_most)
+            row = snapshots.find_latest(session, model, known.version, at_most)
             begin = row is not None and row.number > known.number
     if begin:
-        return _begin(database, files, model, known.version, known.online.base, at_most)
-    online = _learn(known.online, events, novel)
+        return _load_base(database, files, model, known.version, known.online.base, at_most)
+    online = _fold_events(known.online, events, novel)
     return replace(known, online=online, number=end, seen=newest)
 
 
-def _begin(
+def _load_base(
     database: Database, files: Files, model: str, version: int, base: TorqueModel, at_most: int | None
-) -> Restored:
-    """The newest snapshot that can be read, up to a number where given, or the version as trained."""
+) -> RestoredState:
+    """Load the newest readable snapshot, up to event `at_most` if given, else start from the version as trained."""
     limit, torn = at_most, False
     with database.session() as session:
         start, seen = log.start_of(session, model, version), log.newest(session, model)
-        while (row := snapshots.latest(session, model, version, limit)) is not None:
+        while (row := snapshots.find_latest(session, model, version, limit)) is not None:
             try:
                 online = state.load(base, snapshots.read(files, row))
-                return Restored(model, version, start, online, row.number, seen, torn)
+                return RestoredState(model, version, start, online, row.number, seen, torn)
             except (ValueError, OSError) as error:
                 logger.error("snapshot %s of version %d of model %r cannot be used: %s", row.id, version, model, error)
                 limit, torn = row.number - 1, True
-        online = _remembering(OnlineModel.start(base), log.memory(session, model, start))
-    return Restored(model, version, start, online, start, seen, torn)
+        online = _with_memory(OnlineModel.start(base), log.memory(session, model, start))
+    return RestoredState(model, version, start, online, start, seen, torn)
 
 
-def _page(session: Session, known: Restored, last: int) -> tuple[Sequence[EventRow], int]:
-    """The events to learn next, up to number `last` at most, and the number that they lead to."""
+def _page(session: Session, known: RestoredState, last: int) -> tuple[Sequence[EventRow], int]:
+    """Return the events to learn next, up to number `last`, and the number of the state that results."""
     part = {"model": known.model, "after": known.number, "through": last}
     sizes = list(fetch(session, _SIZES, **part).scalars())
-    count = _count(sizes)
+    count = _count_page(sizes)
     events = session.scalars(_EVENTS, {**part, "count": count}).all()
     return events, last if count == len(sizes) < PAGE_EVENTS else events[-1].number
 
 
-def _count(sizes: Iterable[int]) -> int:
-    """How many events of so many rows each make the next page."""
+def _count_page(sizes: Iterable[int]) -> int:
+    """Return how many of the next events, with these numbers of rows, make a page."""
     count, total = 0, 0
     for rows in sizes:
         if count and total + rows > PAGE_ROWS:
@@ -150,7 +161,7 @@ def _count(sizes: Iterable[int]) -> int:
     return count
 
 
-def _learn(online: OnlineModel, events: Sequence[EventRow], novel: Novel | None) -> OnlineModel:
+def _fold_events(online: OnlineModel, events: Sequence[EventRow], novel: NovelRowsCallback | None) -> OnlineModel:
     """Fold the events of a page, one after the other."""
     rows = {event.number: log.learning_rows(event) for event in events if event.payload is not None}
     teaches = any(len(each.learnt) for each in rows.values())
@@ -163,10 +174,10 @@ def _learn(online: OnlineModel, events: Sequence[EventRow], novel: Novel | None)
         elif event.kind == "change":
             online = online.change(float(log.learning_time(event, (event.detail or {})["t"])))
         elif event.kind == "settings":
-            online = _remembering(online, Memory.from_json(event.detail or {}))
+            online = _with_memory(online, Memory.from_json(event.detail or {}))
     return online.symmetrised() if teaches else online
 
 
-def _remembering(online: OnlineModel, memory: Memory) -> OnlineModel:
-    """What has been learnt, remembered otherwise from here on."""
+def _with_memory(online: OnlineModel, memory: Memory) -> OnlineModel:
+    """Return the model with these time constants for all later events."""
     return online.with_forgetting(memory.forgetting_s).with_walk(memory.friction_walk_s)

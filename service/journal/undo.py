@@ -1,6 +1,6 @@
-"""The one way to undo: events become void, snapshots that contain them are deleted, and the log is folded again.
+"""The one way to undo: mark events void, delete the snapshots that contain them, fold the log again.
 
-Functions that write are called inside `Database.transaction()`, as those of `log`.
+Functions that write are called inside `Database.transaction()`, like those of `log`.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ logger = logging.getLogger(__name__)
 
 
 def unlearn(session: Session, model: str, event: EventRow, received: float) -> EventRow:
-    """Mark a batch and its replays void, and delete the snapshots that contain them; return the event that says so.
+    """Mark a batch and its replays void and delete the snapshots that contain them; return the new event.
 
-    Snapshots stay where the log is too short to fold it again without the batch, which then stays in them.
+    Snapshots stay if the log is too short to fold it again without the batch. The batch then stays in them.
     """
     storing = select(SnapshotRow.version).where(SnapshotRow.model == model, SnapshotRow.number >= event.number)
     serving = select(ServingRow.version).where(ServingRow.model == model)
@@ -32,14 +32,16 @@ def unlearn(session: Session, model: str, event: EventRow, received: float) -> E
         else:
             name = f"batch {event.sequence} of stream {event.stream_id!r}"
             logger.error("%s stays in what model %r has learnt: the log lacks what is before it", name, model)
-    numbers = [event.number, *(each.number for each in log.about(session, event, "replay"))]
+    numbers = [event.number, *(each.number for each in log.find_related(session, event, "replay"))]
     session.execute(update(EventRow).where(EventRow.model == model, EventRow.number.in_(numbers)).values(void=True))
     return log.append(session, model, "unlearn", {"event": event.number}, received)
 
 
 def rollback(session: Session, model: str, to: int, received: float) -> EventRow:
-    """Mark void what was learnt and set after event `to`, for every version, and delete the snapshots that contain it;
-    return the event that says so. What was unlearnt stays unlearnt."""
+    """Mark the events after `to` void and delete the snapshots that contain them; return the new event.
+
+    These are batches, replays, changes and settings, for every version. Unlearnt batches stay unlearnt.
+    """
     made = ("batch", "replay", "change", "settings")
     later = (EventRow.model == model, EventRow.number > to)
     session.execute(update(EventRow).where(*later, EventRow.kind.in_(made), EventRow.void.is_(False)).values(void=True))
@@ -52,8 +54,12 @@ def rollback(session: Session, model: str, to: int, received: float) -> EventRow
 
 
 def must_fold_again(session: Session, model: str, version: int, seen: int, through: int) -> bool:
-    """Whether what a version has learnt up to event `through` contains what has been undone since event `seen`, and can
-    be made without. What it contains by training stays."""
+    """Return whether a state up to event `through` must be folded again after undoing since event `seen`.
+
+    It must if it contains events that have been undone since and can be made without them.
+
+    Events that the version contains by training stay.
+    """
     later = (EventRow.model == model, EventRow.number > seen, EventRow.kind.in_(("unlearn", "rollback")))
     start = log.start_of(session, model, version)
     for kind, detail in session.execute(select(EventRow.kind, EventRow.detail).where(*later)).all():
@@ -66,8 +72,10 @@ def must_fold_again(session: Session, model: str, version: int, seen: int, throu
 
 
 def can_fold_again(session: Session, model: str, version: int, first: int) -> bool:
-    """Whether what a version has learnt can be made again without events from `first` on: whether the log has all
-    events since the newest snapshot before that, or since the version was trained."""
+    """Return whether the state of a version can be made again without the events from `first` on.
+
+    That needs all events since the newest snapshot before `first`, or since the training.
+    """
     before = (SnapshotRow.model == model, SnapshotRow.version == version, SnapshotRow.number < first)
     base = session.scalar(select(func.max(SnapshotRow.number)).where(*before))
     base = log.start_of(session, model, version) if base is None else base

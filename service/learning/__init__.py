@@ -1,1 +1,1 @@
-"""Learning while serving: a durable log of observations, and what follows it."""
+"""Learning while serving: the ingest of observations, the learner process, control and the live feed."""

@@ -1,4 +1,4 @@
-"""Metrics of models that learn: computed when they are asked for, and kept nowhere."""
+"""Metrics of the models that learn. They are computed at each scrape and not stored."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def _quality(figure: str, meaning: str) -> MetricKind:
     return MetricKind("gauge", f"lipserve_quality_{figure}", meaning, ("model", "joint", "window"))
 
 
-class Learning(Collector):
-    """The figures of all models of one service that learn. Not for the event loop."""
+class LearningCollector(Collector):
+    """The metrics of all models of one service that learn. Not for the event loop."""
 
     nmse = _quality(
         "nmse", "Mean squared error / variance of the measured torque; every row is predicted before it is learnt"
@@ -61,21 +61,23 @@ class Learning(Collector):
         self._learners = learners
 
     def describe(self) -> list[Metric]:
-        """Nothing: what there is depends on the models."""
+        """Return nothing: the metrics depend on the models."""
         return []
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric with a sample for each model."""
-        families = {name: kind.family() for name, kind in vars(Learning).items() if isinstance(kind, MetricKind)}
-        for model, monitor in self._learners.watched().items():
+        families = {
+            name: kind.family() for name, kind in vars(LearningCollector).items() if isinstance(kind, MetricKind)
+        }
+        for model, monitor in self._learners.load_monitors().items():
             _add_quality(families, model, monitor)
             for outcome in CODES:
                 families["rows"].add_metric([model, outcome], monitor.counts[outcome])
             if (served := self._learners.loaded.peek(model)) is None:
                 continue
-            for joint, factor in zip(served.model.joint_names, served.scales.asked, strict=True):
+            for joint, factor in zip(served.model.joint_names, served.scales.default_factors, strict=True):
                 families["scale"].add_metric([model, joint], factor)
-            known = served.loads.masses()
+            known = served.payloads.masses()
             families["streams"].add_metric([model], len(monitor.streams.all()))
             families["carrying"].add_metric([model], sum(mass is not None for mass in known.values()))
             families["revision"].add_metric([model, str(served.version)], served.revision)
@@ -91,7 +93,7 @@ class Learning(Collector):
 def _add_quality(families: Mapping[str, Any], model: str, monitor: Monitor) -> None:
     now = time.time()
     for window in monitor.windows:
-        figures = status.window(window, now)
+        figures = status.summarise_window(window, now)
         for name in ("nmse", "coverage", "nlpd"):
             for joint, value in zip(monitor.joint_names, getattr(figures, name), strict=True):
                 if value is not None:

@@ -1,4 +1,4 @@
-"""What a model's owner decides and has to know: options of learning, holds after a change, alarms."""
+"""The owner's settings of a model that learns: options, pauses and the payload of all streams."""
 
 from __future__ import annotations
 
@@ -15,18 +15,20 @@ from service.journal import log
 from service.storage import audit
 from service.storage.database import Database, LearningRow, ModelRow, fetch
 
-_SET = select(LearningRow.options, LearningRow.held).where(LearningRow.model == bindparam("model"))
+_SETTINGS = select(LearningRow.options, LearningRow.held).where(LearningRow.model == bindparam("model"))
 
 
-def options(session: Session, model: str) -> LearningOptions:
-    """What is set for a model, the defaults where nothing is."""
-    row = fetch(session, _SET, model=model).first()
+def read_options(session: Session, model: str) -> LearningOptions:
+    """Return the learning options of a model, the defaults if none are set."""
+    row = fetch(session, _SETTINGS, model=model).first()
     return LearningOptions() if row is None else LearningOptions(**row.options)
 
 
 def set_options(database: Database, model: str, chosen: LearningOptions, n_joints: int, received: float) -> None:
-    """Set how a model learns from now on; a new time constant is an event of its log. Raise NotFoundError for a model
-    that does not exist, InvalidRequestError where `torque_limits` is not of its joints."""
+    """Set how a model learns from now on. A new time constant becomes an event of the log.
+
+    Raise NotFoundError for an unknown model, and InvalidRequestError if `torque_limits` does not match its joints.
+    """
     limits = chosen.torque_limits
     if limits is not None and len(limits) != n_joints:
         raise invalid_request(
@@ -41,31 +43,31 @@ def set_options(database: Database, model: str, chosen: LearningOptions, n_joint
             log.append(session, model, "settings", memory.to_json(), received)
 
 
-def hold(session: Session, model: str, detail: dict[str, Any]) -> None:
-    """Let a model hold still: observations are answered and logged, but not learnt. detail: why."""
+def pause(session: Session, model: str, detail: dict[str, Any]) -> None:
+    """Pause learning: observations are answered and logged, but not learnt. detail: the reason."""
     _row(session, model).held = detail
 
 
-def release(session: Session, model: str) -> None:
-    """Let a model learn again; nothing happens where it does."""
+def resume(session: Session, model: str) -> None:
+    """Resume learning if it is paused."""
     row = session.get(LearningRow, model)
     if row is not None:
         row.held = None
 
 
-def held(session: Session, model: str) -> dict[str, Any] | None:
-    """Why a model holds still; None where it learns."""
-    row = fetch(session, _SET, model=model).first()
+def read_pause(session: Session, model: str) -> dict[str, Any] | None:
+    """Return why learning is paused; None if it is not."""
+    row = fetch(session, _SETTINGS, model=model).first()
     return None if row is None else row.held
 
 
-def declare(session: Session, model: str, payload: dict[str, Any]) -> None:
-    """Keep what was declared of the payload of all streams, see `lipcore.online.stream.PayloadRecord`."""
+def store_payload(session: Session, model: str, payload: dict[str, Any]) -> None:
+    """Store the payload declared for all streams, see `lipcore.online.stream.PayloadRecord`."""
     _row(session, model).payload = payload
 
 
 def _row(session: Session, model: str) -> LearningRow:
-    """The row of a model, a new one with the defaults where there is none."""
+    """Return the row of a model, a new one with the defaults if there is none."""
     row = session.get(LearningRow, model)
     if row is None:
         if session.scalar(select(ModelRow).where(ModelRow.name == model)) is None:

@@ -1,4 +1,4 @@
-"""Aliases of versions: listed, moved and taken back, so that no query fails or waits for it."""
+"""List, move, remove and roll back the aliases of versions. No query fails or waits while an alias moves."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from service.storage.database import AliasMoveRow, AliasRow, ServingRow, Version
 
 
 def page(loaded: LoadedModels, model: str) -> AliasList:
-    """Every alias of a model, `serving` first; raise NotFoundError."""
-    # nothing is listed here that does not answer yet; and other services move and remove aliases meanwhile
+    """Return every alias of a model, `serving` first; raise NotFoundError."""
+    # `moving`: an alias is listed only once queries follow it. `moment`: other services move and remove aliases too
     with loaded.moving, loaded.database.moment() as session:
         _check_model(session, model)
-        serving = [] if registry.answering(session, model) is None else [SERVING]
+        serving = [] if registry.serving_version(session, model) is None else [SERVING]
         return AliasList(items=[_show(loaded, session, model, name) for name in (*serving, *names(session, model))])
 
 
 def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> Alias:
-    """Point an alias, a new one too, to a version.
+    """Point an alias, existing or new, to a version.
 
-    The version is in memory and warm before the alias moves: queries follow by one assignment, those in flight keep
-    what answered them. Raise InvalidRequestError where not exactly one of version and alias is named, NotFoundError,
-    ConflictError beyond MAX_ALIASES and for a version of another robot, UnreadableVersionError. Not for the event
+    The version is loaded and warm before the alias moves. Queries follow by one assignment; queries in flight keep
+    their version. Raise InvalidRequestError unless exactly one of version and alias is given, NotFoundError,
+    UnreadableVersionError, and ConflictError beyond MAX_ALIASES or for a version of another robot. Not for the event
     loop.
     """
     if (request.version is None) == (request.alias is None):
@@ -38,10 +38,10 @@ def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> 
 
 
 def rollback(loaded: LoadedModels, model: str, alias: str) -> Alias:
-    """Take the last move of an alias back, its removal too, and the next time the one before it.
+    """Undo the last move of an alias, removals included. A second call undoes the move before it.
 
-    Raise NotFoundError where there never was such an alias, ConflictError where it has pointed to nothing before, or to
-    a version that has been deleted; UnreadableVersionError. Not for the event loop.
+    Raise NotFoundError if the alias never existed, UnreadableVersionError, and ConflictError if the alias pointed to
+    nothing before or to a deleted version. Not for the event loop.
     """
     with loaded.database.session() as session:
         move = _last(session, model, alias)
@@ -51,7 +51,7 @@ def rollback(loaded: LoadedModels, model: str, alias: str) -> Alias:
 
 
 def remove(loaded: LoadedModels, model: str, alias: str) -> None:
-    """Remove an alias; raise NotFoundError, or ConflictError for `serving`. A rollback brings it back."""
+    """Remove an alias; raise NotFoundError, or ConflictError for `serving`. A rollback restores it."""
     with loaded.moving:
         with loaded.database.transaction() as session:
             _check_model(session, model)
@@ -64,7 +64,7 @@ def remove(loaded: LoadedModels, model: str, alias: str) -> None:
 
 
 def _move(loaded: LoadedModels, model: str, alias: str, version: int, taken_back: AliasMoveRow | None = None) -> Alias:
-    """Move an alias to a version that is in memory; taken_back: the move that has to be the last one still."""
+    """Move an alias to a version that is loaded. If `taken_back` is given, it must still be the alias's last move."""
     number = None if taken_back is None else taken_back.seq
     with loaded.moving:
         with loaded.database.transaction() as session:
@@ -91,8 +91,10 @@ def _move(loaded: LoadedModels, model: str, alias: str, version: int, taken_back
 
 
 def point(session: Session, model: str, alias: str, version: int | None, takes_back: int | None = None) -> None:
-    """Point an alias to a version, or to none, and note the move; nothing happens where it points there already. Not
-    for the alias `serving`, see `registry.serve`. takes_back: see `registry.note`."""
+    """Point an alias to a version, or to none, and record the move; do nothing if it points there already.
+
+    Not for the alias `serving`, see `registry.serve`. takes_back: see `registry.note`.
+    """
     row = session.get(AliasRow, (model, alias))
     before = None if row is None else row.version
     if before == version:
@@ -107,13 +109,13 @@ def point(session: Session, model: str, alias: str, version: int | None, takes_b
 
 
 def _history(session: Session, model: str, alias: str, count: int) -> list[AliasMoveRow]:
-    """The last moves of an alias, newest first, at most `count`."""
+    """Return the last moves of an alias, newest first, at most `count`."""
     query = select(AliasMoveRow).where(AliasMoveRow.model == model, AliasMoveRow.alias == alias)
     return list(session.scalars(query.order_by(AliasMoveRow.seq.desc()).limit(count)))
 
 
 def standing(session: Session, model: str, alias: str) -> AliasMoveRow | None:
-    """The move that a rollback takes back: the newest that neither took one back nor was taken back itself."""
+    """Return the move that a rollback undoes: the newest that is neither a rollback nor rolled back."""
     of_alias = (AliasMoveRow.model == model, AliasMoveRow.alias == alias)
     undone = select(AliasMoveRow.takes_back).where(*of_alias, AliasMoveRow.takes_back.is_not(None))
     query = select(AliasMoveRow).where(*of_alias, AliasMoveRow.takes_back.is_(None), AliasMoveRow.seq.not_in(undone))
@@ -131,7 +133,7 @@ def _last(session: Session, model: str, alias: str) -> AliasMoveRow:
 
 
 def _before(session: Session, move: AliasMoveRow) -> int:
-    """The version that an alias pointed to before a move."""
+    """Return the version that an alias pointed to before a move."""
     name = f"the alias {move.alias!r} of model {move.model!r}"
     if move.before is None:
         raise ConflictError(f"{name} has pointed to nothing before version {move.version}: it can be moved or removed")
@@ -146,7 +148,7 @@ def _check_model(session: Session, model: str) -> None:
 
 
 def names(session: Session, model: str) -> list[str]:
-    """The aliases of a model but for `serving`, in order."""
+    """Return the aliases of a model except `serving`, in alphabetical order."""
     return list(session.scalars(select(AliasRow.alias).where(AliasRow.model == model).order_by(AliasRow.alias)))
 
 

@@ -1,5 +1,6 @@
-"""A version for use elsewhere: an archive with its files, their checksums and what made them, as C, or its arm as a
-URDF. What reads an archive: `archive_reading`.
+"""Export a version: as an archive with checksums and origin, as C source, or its arm as a URDF.
+
+Archives are read by `archive_reading`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from lipcore.export.c_writer import Origin, c_files
+from lipcore.export.c_writer import ModelOrigin, c_files
 from lipcore.export.urdf_writer import urdf_of_parameters
 from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, TENSORS, ModelFormatError
@@ -28,8 +29,11 @@ MEDIA_TYPE = "application/x-tar"
 
 
 @dataclass(frozen=True)
-class Exported:
-    """An archive that is ready to be sent. size: bytes; name: of the file."""
+class ArchiveFile:
+    """An archive that is ready to be sent.
+
+    `name` is the file name, `size` the length in bytes, `pieces` the content.
+    """
 
     name: str
     size: int
@@ -38,24 +42,25 @@ class Exported:
 
 def export(
     loaded: LoadedModels, model: str, version: int | None, alias: str | None, learnt: bool, as_c: bool = False
-) -> Exported:
-    """Archive a version, the one that serves where none is named. Not for the event loop.
+) -> ArchiveFile:
+    """Archive a version, or the serving version if none is named. Not for the event loop.
 
-    learnt: with what it has learnt online, else as trained; as_c: as source and header of `lipcore.export.c_writer`.
-    Nothing is sent before all of it has been checked. Raise NotFoundError, InvalidRequestError for both a version and
-    an alias and for what is not written as C, UnreadableVersionError for damaged files, StorageFullError.
+    If `learnt`, include what the version has learnt online; else export it as trained. If `as_c`, write the C source
+    and header of `lipcore.export.c_writer`. Everything is checked before the first byte is sent. Raise NotFoundError,
+    InvalidRequestError for both a version and an alias or for an estimator without C export, UnreadableVersionError for
+    damaged files, StorageFullError.
     """
     row = _find(loaded, model, version, alias)
     try:
         files, revision = _files(loaded, row, learnt)
         decoded = persistence.decode(files) if as_c else None
     except ModelFormatError as error:
-        registry.find(loaded.database, row.model, row.version)  # it may have been deleted meanwhile
+        registry.find(loaded.database, row.model, row.version)  # raises if the version was deleted meanwhile
         message = f"version {row.version} of model {row.model!r} cannot be exported: {error}"
         raise UnreadableVersionError(message) from error
     suffix = f"-r{revision}" if revision else ""
     if decoded is not None:
-        origin = Origin(row.model, row.version, revision, persistence.sha256(files[TENSORS]))
+        origin = ModelOrigin(row.model, row.version, revision, persistence.sha256(files[TENSORS]))
         try:
             written = c_files(decoded, origin)
         except ValueError as error:
@@ -63,7 +68,7 @@ def export(
             message = f"version {row.version} of model {row.model!r} cannot be written as C: {error}"
             raise InvalidRequestError(message, [item]) from error
         file = _packed(loaded, {name: text.encode() for name, text in written.items()})
-        return Exported(f"{row.model}-v{row.version}{suffix}-c.tar", file.tell(), _pieces(file))
+        return ArchiveFile(f"{row.model}-v{row.version}{suffix}-c.tar", file.tell(), _pieces(file))
     about = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
@@ -78,19 +83,21 @@ def export(
     files = {EXPORT: _json(about), **files}
     sums = _json({name: persistence.sha256(content) for name, content in files.items()})
     file = _packed(loaded, {CHECKSUMS: sums, **files})
-    return Exported(f"{row.model}-v{row.version}{suffix}.tar", file.tell(), _pieces(file))
+    return ArchiveFile(f"{row.model}-v{row.version}{suffix}.tar", file.tell(), _pieces(file))
 
 
 def _find(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> VersionRow:
-    """The version of a number or of an alias, the one that serves where both are None; raise NotFoundError, and
-    InvalidRequestError for both."""
+    """Return a version by number or alias, the serving version if both are None.
+
+    Raise NotFoundError, or InvalidRequestError if both are given.
+    """
     if version is not None and alias is not None:
         raise invalid_request("version or alias", "both", "one of the two at most")
-    return registry.find(loaded.database, model, loaded.meant(model, version, alias)[0])
+    return registry.find(loaded.database, model, loaded.resolve_version(model, version, alias)[0])
 
 
 def _files(loaded: LoadedModels, row: VersionRow, learnt: bool) -> tuple[dict[str, bytes], int]:
-    """The files of a version by name, checked, and the revision that they are of: 0 as trained."""
+    """Return the checked files of a version by name, and their revision: 0 as trained."""
     files = loaded.files.read_version(row.folder, lambda folder: _checked(folder, row))
     if not learnt:
         return files, 0
@@ -99,7 +106,7 @@ def _files(loaded: LoadedModels, row: VersionRow, learnt: bool) -> tuple[dict[st
     known = loaded.learnt.consolidated(row.model, row.version, base)
     if known is None:
         return files, 0
-    # of an earlier life too, where the version was imported with online updates
+    # a version imported with online updates keeps the record of its earlier ones
     before = {} if (earlier := row.manifest["lineage"].get("learnt")) is None else {"before": earlier}
     learnt_since = {"model": row.model, "version": row.version, "revision": known.revision, **before}
     _, files = persistence.encode(known.model, {**row.manifest["lineage"], "learnt": learnt_since})
@@ -109,14 +116,14 @@ def _files(loaded: LoadedModels, row: VersionRow, learnt: bool) -> tuple[dict[st
 def _checked(folder: Path, row: VersionRow) -> dict[str, bytes]:
     files = persistence.read_files(folder)
     if row.checksums is not None:
-        persistence.check(files, row.checksums)
+        persistence.check_checksums(files, row.checksums)
     return files
 
 
 def _packed(loaded: LoadedModels, files: Mapping[str, bytes]) -> IO[bytes]:
-    """The archive on disk, in a file without a name, for a client that may be slow."""
+    """Write the archive to an unnamed file on disk, as the client may read slowly."""
     loaded.storage.disk.require(sum(map(len, files.values())))
-    file = tempfile.TemporaryFile(dir=loaded.files.uploads)  # noqa: SIM115 - closed by who reads it
+    file = tempfile.TemporaryFile(dir=loaded.files.uploads)  # noqa: SIM115 - `_pieces` closes it
     try:
         for name, content in files.items():
             info = tarfile.TarInfo(name)
@@ -130,7 +137,7 @@ def _packed(loaded: LoadedModels, files: Mapping[str, bytes]) -> IO[bytes]:
 
 
 def _pieces(file: IO[bytes]) -> Iterator[bytes]:
-    """What a file holds, which is closed at its end, and where it is given up."""
+    """Yield the content of a file; close the file at its end, or if the reader stops early."""
     with file:
         file.seek(0)
         while piece := file.read(1 << 20):
@@ -165,8 +172,10 @@ URDF_EXAMPLE = """<?xml version="1.0"?>
 
 
 def write_urdf(loaded: LoadedModels, model: str, version: int | None, alias: str | None) -> tuple[str, str]:
-    """The name of a file and the URDF that belongs in it, of the version that serves where none is named. Raise
-    NotFoundError, InvalidRequestError for both a version and an alias, and for a version without an arm."""
+    """Return a file name and the URDF of a version, of the serving version if none is named.
+
+    Raise NotFoundError, or InvalidRequestError for both a version and an alias or for a version without an arm.
+    """
     row = _find(loaded, model, version, alias)
     name, manifest = f"{row.model}-v{row.version}", row.manifest
     try:

@@ -1,4 +1,4 @@
-"""A version from an archive, which may come from a stranger: everything is checked before anything is kept of it."""
+"""Import a version from an archive of unknown origin: everything is checked before anything is stored."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from service.models.lineage import held_out_figures
 from service.models.loaded import LoadedModels
 from service.runtime import cage
 from service.storage.database import now
-from service.storage.errors import undecided
+from service.storage.errors import is_undecided
 from service.storage.files import new_id
 
 logger = logging.getLogger(__name__)
 
 
 def add(loaded: LoadedModels, upload: Path, name: str | None, promotion: PromotionOption | None = None) -> Version:
-    """Make a new version of what an archive holds; return it. Not for the event loop.
+    """Import an archive as a new version and return it. Not for the event loop.
 
-    name: of the model, that of the archive by default; promotion: whether it answers, as the settings say where None.
-    If asked, it answers only where it is the model's first one, and the figures in its lineage say that it may. Raise
-    InvalidDataError naming the member that is wrong and what is wrong with it, ConflictError for a model of another
-    robot.
+    `name` is the model's name; the default is the name in the archive. `promotion` decides whether the version serves;
+    the default is the setting. With the option `ask`, the version serves only if it is the model's first and passes the
+    acceptance rules by the figures in its lineage. Raise InvalidDataError naming the damaged member, ConflictError for
+    a model of another robot.
     """
     settings = loaded.storage.settings
     cage.run("service.models.archive_reading:try_out", type(None), upload, settings, settings=settings, field="archive")
@@ -57,12 +57,12 @@ def add(loaded: LoadedModels, upload: Path, name: str | None, promotion: Promoti
     loaded.storage.disk.require(sum(map(len, files.values())))
     folder = new_id("mv")
     with loaded.files.new_version(folder) as target:
-        persistence.write(target, files)
+        persistence.write_folder(target, files)
     try:
         version, serves = _publish(loaded, model, folder, manifest, promotion or settings.promotion)
     except BaseException as error:
-        if not undecided(error):
-            with suppress(OSError):  # what cannot be deleted now is swept
+        if not is_undecided(error):
+            with suppress(OSError):  # the sweep deletes what remains
                 loaded.files.delete_version(folder)
         raise
     if serves:
@@ -74,12 +74,12 @@ def add(loaded: LoadedModels, upload: Path, name: str | None, promotion: Promoti
 def _publish(
     loaded: LoadedModels, model: str, folder: str, manifest: dict[str, Any], option: PromotionOption
 ) -> tuple[int, bool]:
-    """Add the version; return its number, and whether it answers where none is named."""
+    """Add the version; return its number and whether it serves."""
     with loaded.database.transaction() as session:
         registry.check_robot(session, model, RobotKind.of_manifest(manifest))
         first = not registry.has_model(session, model)
         other = Acceptance(unknown=("it was imported beside other versions",))
-        judged = Promotion.of(_accepted(manifest) if first else other, registry.answering(session, model), option)
+        judged = Promotion.of(_accepted(manifest) if first else other, registry.serving_version(session, model), option)
         version = registry.publish(
             session, model, folder, manifest, None, candidate=not judged.answers, promotion=judged
         )
@@ -95,7 +95,7 @@ def _accepted(manifest: Mapping[str, Any]) -> Acceptance:
 
 
 def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
-    """The manifest of files that make a model which answers; what can be computed of it is computed anew."""
+    """Return the manifest of a model that passes all checks, with every computable entry computed again."""
     limits = limits_of(settings)
     try:
         manifest = read_manifest_bytes(files[MANIFEST], limits)
@@ -119,7 +119,7 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
         raise invalid_model(ModelFormatError(str(error))) from None
     except ValidationError as error:
         raise invalid_member(f"{MANIFEST}: lineage", error) from None
-    except (ValueError, ArithmeticError) as error:  # parameters that no fit has
+    except (ValueError, ArithmeticError) as error:  # parameters that no fit can produce
         raise invalid_data(TENSORS, str(error), "parameters that are finite numbers") from None
     return manifest
 

@@ -1,4 +1,4 @@
-"""The lineage of an imported version: the type and range of each field that the service reads or shows."""
+"""The lineage of an imported version: type and range of each field that the service reads or shows."""
 
 from __future__ import annotations
 
@@ -6,25 +6,25 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lipcore.files.entries import LARGEST
+from lipcore.files.entries import MAX_VALUE
 from service.contract.models import HoldoutLineage
 
 Count = Annotated[int, Field(ge=0, lt=2**63)]
-Size = Annotated[float, Field(ge=0, le=LARGEST)]
-"""A deviation, a duration or anything else that is not below zero."""
+Size = Annotated[float, Field(ge=0, le=MAX_VALUE)]
+"""A number that is not negative, such as a standard deviation or a duration."""
 Share = Annotated[float, Field(ge=0, le=1)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Plain = bool | int | Finite
 
 
 class Strict(BaseModel):
-    """Values are of their types already."""
+    """Model whose values already have the right type."""
 
     model_config = ConfigDict(extra="allow", strict=True)
 
 
 class Figures(Strict):
-    """How well a version answered for samples, per joint: see `service.models.lineage.figures`."""
+    """Quality of predictions per joint, see `service.models.lineage.figures`."""
 
     samples: Count | None = None
     of: Count | None = None
@@ -39,11 +39,11 @@ class Figures(Strict):
 
 
 class HeldOut(HoldoutLineage, Figures):
-    """The same of what was held out."""
+    """Quality of predictions on held-out rows."""
 
 
 class ProcessFields(Strict):
-    """What a training took."""
+    """Resources that a training used."""
 
     __pydantic_extra__: dict[str, Plain]
 
@@ -52,7 +52,7 @@ class ProcessFields(Strict):
 
 
 class LineageDataset(BaseModel):
-    """A data set as a lineage names it."""
+    """A data set in a lineage."""
 
     model_config = ConfigDict(strict=True)
 
@@ -63,7 +63,7 @@ class LineageDataset(BaseModel):
 
 
 class Lineage(BaseModel):
-    """What the service reads or shows of a lineage; whatever else there is goes with it unread."""
+    """Fields of a lineage that the service reads or shows; other fields are kept unread."""
 
     model_config = ConfigDict(strict=True)
 

@@ -1,8 +1,8 @@
-"""Reading the archive of a version, which may come from a stranger.
+"""Read the archive of a version, which may come from an untrusted source.
 
-An archive is a tar file of a few plain files, by exact name and of limited size. Of `tarfile` only what makes and reads
-a single header is used: the rest follows links, sparse files, extended headers and numbers of any size, of which an
-archive of a model has none, and which have been the way in for many an attack.
+An archive is a tar file of a few plain files with exact names and limited sizes. Of `tarfile` only the functions for a
+single header are used. The rest follows links, sparse files, extended headers and numbers of any size. Model archives
+contain none of these, and many attacks use them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from service.foundation.settings import Settings
 
 EXPORT, CHECKSUMS = "export.json", "checksums.json"
 SIGNATURE = "signature.json"
-"""In archives that earlier builds have signed; it is ignored."""
+"""Present in archives that earlier releases signed; ignored."""
 FORMAT, FORMAT_VERSION = "lipserve-archive", 1
 BLOCK = 512
 _KINDS = {
@@ -39,18 +39,19 @@ _KINDS = {
 }
 
 
-SMALL = 64 * 1024
-"""Most bytes of the members that only describe the others."""
-MANIFEST_BYTES = 1024 * 1024
+MAX_JSON_BYTES = 64 * 1024
+"""Maximum size of the members that only describe other members, bytes."""
+MAX_MANIFEST_BYTES = 1024 * 1024
 MAX_ARCHIVE_BYTES, MAX_URDF_BYTES = 128 * 1024 * 1024, 2 * 1024 * 1024
-"""Largest archive of a version, and largest URDF in it or uploaded."""
+"""Maximum size of a version's archive, and of a URDF in it or uploaded, bytes."""
 MAX_TORQUES = 10_000
-"""Torques, samples times joints, that an imported version may stand on. Reading it takes memory that grows with the
-square: 0.8 GB here."""
+"""Maximum torques (samples times joints) that the posterior of an imported version may be conditioned on. Reading needs
+memory that grows with the square: 0.8 GB at this limit.
+"""
 
 
-class About(BaseModel):
-    """What `export.json` says: where an archive comes from."""
+class ArchiveOrigin(BaseModel):
+    """Content of `export.json`: the origin of an archive."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
@@ -66,7 +67,10 @@ class About(BaseModel):
 
 
 class ArchiveError(ValueError):
-    """The file is no archive that can be taken. member: where that is; given, expected: what is wrong there."""
+    """The file is not a valid archive.
+
+    `member` is the damaged member, `given` what is wrong there, `expected` what is required.
+    """
 
     def __init__(self, member: str, given: str, expected: str) -> None:
         super().__init__(f"{member} is {given}, expected {expected}")
@@ -74,8 +78,10 @@ class ArchiveError(ValueError):
 
 
 def members(path: Path, limits: Mapping[str, int]) -> dict[str, bytes]:
-    """The members of an archive by name. limits: most bytes of each. Raise ArchiveError for anything but plain files
-    with these names, each once, complete and within its limit."""
+    """Return the members of an archive by name; `limits` gives the maximum bytes of each.
+
+    Raise ArchiveError unless all members are plain files with these names, each once, complete and within its limit.
+    """
     files: dict[str, bytes] = {}
     length = path.stat().st_size
     with path.open("rb") as file:
@@ -102,12 +108,12 @@ def members(path: Path, limits: Mapping[str, int]) -> dict[str, bytes]:
 
 
 def padding(count: int) -> int:
-    """Bytes that follow so many in a tar file."""
+    """Return the number of padding bytes after `count` bytes in a tar file."""
     return -count % BLOCK
 
 
 def _header(header: bytes) -> tuple[str, int]:
-    """Name and size of a plain file; raise ArchiveError."""
+    """Return the name and size of a plain file; raise ArchiveError."""
     try:
         info = tarfile.TarInfo.frombuf(header, "ascii", "backslashreplace")
     except tarfile.HeaderError as error:
@@ -115,20 +121,22 @@ def _header(header: bytes) -> tuple[str, int]:
     name = ascii(info.name)[1:-1]
     if info.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or info.linkname:
         raise ArchiveError(name, _KINDS.get(info.type, f"of the kind {info.type!r}"), "a plain file")
-    size = header[124:136].strip(b" \0")  # which TarInfo takes in other forms too, and below zero
+    size = header[124:136].strip(b" \0")  # TarInfo also accepts other forms and negative sizes
     if not size.isdigit():
         raise ArchiveError(name, f"of the size {header[124:136]!r}", "an octal number of bytes")
     return name, info.size
 
 
-def read(upload: Path, settings: Settings) -> tuple[About, dict[str, bytes]]:
-    """Where an archive comes from, and the files of its model by name, which have their checksums; raise
-    InvalidDataError naming the member that is wrong and what is wrong with it."""
+def read(upload: Path, settings: Settings) -> tuple[ArchiveOrigin, dict[str, bytes]]:
+    """Return the origin of an archive and the files of its model by name, checksums verified.
+
+    Raise InvalidDataError naming the damaged member.
+    """
     limits = {
-        EXPORT: SMALL,
-        CHECKSUMS: SMALL,
-        SIGNATURE: SMALL,
-        MANIFEST: MANIFEST_BYTES,
+        EXPORT: MAX_JSON_BYTES,
+        CHECKSUMS: MAX_JSON_BYTES,
+        SIGNATURE: MAX_JSON_BYTES,
+        MANIFEST: MAX_MANIFEST_BYTES,
         TENSORS: MAX_ARCHIVE_BYTES,
         ROBOT: MAX_URDF_BYTES,
     }
@@ -148,26 +156,28 @@ def read(upload: Path, settings: Settings) -> tuple[About, dict[str, bytes]]:
         if persistence.sha256(content) != sums[name]:
             raise invalid_data(name, "not what its sha256 in checksums.json says", "an undamaged file")
     try:
-        return About.model_validate(_json(EXPORT, files.pop(EXPORT))), files
+        return ArchiveOrigin.model_validate(_json(EXPORT, files.pop(EXPORT))), files
     except ValidationError as error:
         raise invalid_member(EXPORT, error) from None
 
 
 def limits_of(settings: Settings) -> Limits:
-    """How large a model may be that is imported."""
+    """Return the size limits of an imported model."""
     return Limits(
         joints=settings.max_joints,
         inducing_samples=MAX_OPTIONS["posterior_samples"],
         inducing_torques=MAX_TORQUES,
         inducing_outputs=MAX_OPTIONS["max_inducing_outputs"],
-        manifest_bytes=MANIFEST_BYTES,
+        manifest_bytes=MAX_MANIFEST_BYTES,
         robot_bytes=MAX_URDF_BYTES,
     )
 
 
 def try_out(upload: Path, settings: Settings) -> None:
-    """Read an archive and all that its model is made of; raise InvalidDataError. For a process that may come to harm:
-    it keeps nothing, and who has called it reads what has been read well."""
+    """Read an archive and parse its model, store nothing; raise InvalidDataError.
+
+    For a caged process: the caller reads the archive again once this has succeeded.
+    """
     _, files = read(upload, settings)
     try:
         persistence.parse(files, limits_of(settings))
@@ -176,13 +186,13 @@ def try_out(upload: Path, settings: Settings) -> None:
 
 
 def invalid_model(error: ModelFormatError) -> InvalidDataError:
-    """Error for files that make no model."""
+    """Return the error for files that are not a valid model."""
     return InvalidDataError(f"{error.file}: {error}", [problem(error.file, str(error), "a valid model")])
 
 
 def _json(member: str, content: bytes) -> Any:
     try:
-        value = strict_json.read(content, SMALL)
+        value = strict_json.read(content, MAX_JSON_BYTES)
         strict_json.check_texts("", value)
     except strict_json.StrictJsonError as error:
         item = problem(member, str(error), "JSON as an export writes it")
@@ -191,7 +201,7 @@ def _json(member: str, content: bytes) -> Any:
 
 
 def invalid_member(member: str, error: ValidationError) -> InvalidDataError:
-    """Error for what a member says."""
+    """Return the error for invalid content of a member."""
     first = error.errors()[0]
     where = ".".join([member, *map(str, first["loc"])])
     return invalid_data(where, first.get("input"), first["msg"].removeprefix("Input should be "))

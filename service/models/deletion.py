@@ -1,4 +1,4 @@
-"""Deleting versions and models: rows first, files after, and nobody goes on answering from either."""
+"""Delete versions and models: first their rows, then their files. Nothing answers from either afterwards."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ from service.storage.files import Files
 logger = logging.getLogger(__name__)
 
 MAX_REFRESHED = 10
-"""Versions of a model kept of those that automatic refreshes made and nothing needs."""
+"""Maximum unused versions kept of those that automatic refreshes of a model made."""
 OF_MODEL = (AliasMoveRow, AliasRow, ServingRow, LearnerRow, LearningRow, StreamRow, EventRow, AlarmRow, SnapshotRow)
-"""Tables of what belongs to a model, beside its versions. Jobs and data sets keep their history."""
+"""Tables with rows that belong to a model, besides its versions. Jobs and data sets keep their history."""
 
 
 def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
-    """Delete a version for good; its number is not given again. Not for the event loop.
+    """Delete a version permanently; its number is not used again. Not for the event loop.
 
-    Raise NotFoundError; ConflictError, naming the reason, while an alias points to it, it serves, it is the only
-    one, it is compared with the one that serves, or a job trains it anew or starts from it.
+    Raise NotFoundError. Raise ConflictError, naming the reason, if an alias points to the version, if it serves or if
+    it is the model's only one. Raise it too while a job refreshes the version or starts from it.
     """
     with loaded.moving:
         with loaded.database.transaction() as session:
@@ -65,11 +65,13 @@ def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
 
 
 def delete_refreshed(loaded: LoadedModels, model: str) -> None:
-    """Delete the versions that automatic refreshes have made, but the newest MAX_REFRESHED, those that
-    something needs and the one that a rollback of `serving` returns to. Not for the event loop."""
+    """Delete the versions made by automatic refreshes that nothing needs. Not for the event loop.
+
+    Kept are the newest MAX_REFRESHED, every version in use and the one that a rollback of `serving` returns to.
+    """
     with loaded.database.session() as session:
         trigger = JobRow.request["refresh"]["trigger"].as_string()
-        by_itself = (VersionRow.model == model, trigger != "asked")  # of what is no refresh it is NULL
+        by_itself = (VersionRow.model == model, trigger != "asked")  # NULL for jobs other than refreshes
         made = select(VersionRow.version).join(JobRow, JobRow.id == VersionRow.job).where(*by_itself)
         older = list(session.scalars(made.order_by(VersionRow.version.desc()).offset(MAX_REFRESHED)))
         move = aliases.standing(session, model, registry.SERVING)
@@ -82,8 +84,8 @@ def delete_refreshed(loaded: LoadedModels, model: str) -> None:
 def delete_model(loaded: LoadedModels, model: str) -> None:
     """Delete a model with its versions, aliases, log, streams, snapshots and alarms. Not for the event loop.
 
-    A model that is trained later under the same name goes on with the numbers of versions. Raise NotFoundError, or
-    ConflictError while a job of the model, or one that starts from a version of it, waits or runs.
+    A later model of the same name continues the version numbers. Raise NotFoundError, or ConflictError while a job of
+    the model, or a job that starts from one of its versions, waits or runs.
     """
     with loaded.moving:
         with loaded.database.transaction() as session:
@@ -110,12 +112,12 @@ def delete_model(loaded: LoadedModels, model: str) -> None:
 
 
 def _check_unused(session: Session, model: str, version: int) -> None:
-    """Raise ConflictError, naming the reason, where a version is needed."""
+    """Raise ConflictError, naming the reason, if a version is in use."""
     name = f"version {version} of model {model!r}"
     aliases = select(AliasRow.alias).where(AliasRow.model == model, AliasRow.version == version)
     if pointing := list(session.scalars(aliases.order_by(AliasRow.alias))):
         raise ConflictError(f"{name} has the alias {', '.join(map(repr, pointing))}: move or remove it first")
-    if registry.answering(session, model) == version:
+    if registry.serving_version(session, model) == version:
         raise ConflictError(f"{name} serves: let another version serve first, or delete the model")
     if session.scalar(select(func.count()).select_from(VersionRow).where(VersionRow.model == model)) == 1:
         raise ConflictError(f"{name} is its only one: delete the model")
@@ -131,7 +133,7 @@ def _active_jobs(session: Session) -> list[JobRow]:
 
 
 def _note_deletion(session: Session, row: ModelRow, versions: Collection[int]) -> None:
-    """Remember which numbers were given."""
+    """Record the highest version number used."""
     deleted = session.get(DeletedModelRow, row.name)
     if deleted is None:
         deleted = DeletedModelRow(name=row.name)
@@ -140,7 +142,7 @@ def _note_deletion(session: Session, row: ModelRow, versions: Collection[int]) -
 
 
 def _remove_files(files: Files, folders: Collection[str], snapshots: Collection[str]) -> None:
-    """Remove files that no row names any more; what cannot be removed now is at the next start."""
+    """Remove files that no row refers to any more; files that cannot be removed now are removed at the next start."""
     for delete_file, names in ((files.delete_version, folders), (files.delete_snapshot, snapshots)):
         for name in names:
             try:

@@ -1,4 +1,4 @@
-"""Figures of how well torques were predicted: of an evaluation, and of the judged fit in a version's lineage."""
+"""Figures of prediction quality: of an evaluation, and of the judged fit in a version's lineage."""
 
 from __future__ import annotations
 
@@ -9,28 +9,28 @@ import numpy as np
 
 from lipcore.data import metrics
 from lipcore.data.coverage import CoverageInterval, coverage_interval
-from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Answer, Metrics
+from lipcore.data.metrics import LEVELS, RELIABILITY_LEVELS, Metrics, TorqueDistribution
 from lipcore.data.samples import Array, Samples
 from service.contract.models import Interval, Reliability, Stretches
 from service.foundation.fields import finite
 
 MAX_EVALUATION_SAMPLES = 5000
-"""Samples of one evaluation; more are thinned evenly."""
+"""Maximum samples of one evaluation; more are thinned evenly."""
 
 
 def stretches(samples: Samples, mean: Array) -> Stretches:
-    """Mean squared error of each stretch / variance of the measured torque over all samples; mean: (N, n) N·m.
+    """Return the normalised mean squared error of each stretch; mean: (N, n) N·m.
 
-    The variance is that of all samples: a joint that rests for a while has a variance near zero then, and any error
-    would look enormous.
+    The variance is that of the measured torque over all samples. While a joint rests, the variance of the stretch alone
+    is near zero and any error would look enormous.
     """
     episodes = samples.episodes()
-    by_episode = 5 <= len(episodes) <= 200  # fewer make no box plot, more are a few samples long
+    by_episode = 5 <= len(episodes) <= 200  # fewer make no box plot; more have only a few samples each
     if not by_episode:
         edges = np.linspace(0, len(samples), min(10, len(samples)) + 1).astype(np.int64).tolist()
         episodes = [slice(first, last) for first, last in pairwise(edges)]
     squared = (samples.tau - mean) ** 2
-    varies = np.ptp(samples.tau, axis=0) > 0  # rounding gives a constant column a variance above zero
+    varies = np.ptp(samples.tau, axis=0) > 0  # not `variance > 0`: rounding gives a constant column a positive variance
     variance = samples.tau.var(axis=0)
     means = np.array([squared[each].mean(axis=0) for each in episodes])
     return Stretches(
@@ -43,14 +43,14 @@ def stretches(samples: Samples, mean: Array) -> Stretches:
     )
 
 
-def evaluation(samples: Samples, answer: Answer) -> dict[str, Any]:
-    """Return the fields of `Evaluation` that say how well an answer predicts samples."""
+def evaluation(samples: Samples, answer: TorqueDistribution) -> dict[str, Any]:
+    """Return the fields of `Evaluation` for an answer (mean and deviations) at samples."""
     found = metrics.evaluate(samples.tau, *answer)
     return {
         "samples_used": len(samples),
         "level": found.level,
         **joint_figures(found),
-        **known(coverage_interval(samples, answer)),
+        **coverage_fields(coverage_interval(samples, answer)),
         "coverages": [
             Interval(level=each, coverage=coverage.tolist(), interval_width=width.tolist())
             for each, coverage, width in zip(LEVELS, found.coverages, found.widths, strict=True)
@@ -61,13 +61,13 @@ def evaluation(samples: Samples, answer: Answer) -> dict[str, Any]:
 
 
 def joint_figures(metrics: Metrics) -> dict[str, Any]:
-    """Figures of each joint, nmse null where its torque does not vary."""
+    """Return the figures of each joint; nmse is null if the joint's torque is constant."""
     per_joint = {name: getattr(metrics, name).tolist() for name in ("rmse", "coverage", "nlpd")}
     return {"nmse": finite(metrics.nmse), **per_joint, "interval_width": metrics.width.tolist()}
 
 
-def known(interval: CoverageInterval) -> dict[str, list[float]]:
-    """How far coverages are known, as the API and lineages name it."""
+def coverage_fields(interval: CoverageInterval) -> dict[str, list[float]]:
+    """Return the confidence interval of coverages under the names of the API and of lineages."""
     return {
         "independent": interval.independent.tolist(),
         "coverage_low": interval.low.tolist(),

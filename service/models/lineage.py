@@ -1,4 +1,4 @@
-"""What made a version: the software, so that it can be made again, and how well it fits what it was made from."""
+"""The lineage of a version: software, data sets and quality of fit."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ import scipy
 
 from lipcore.data import metrics
 from lipcore.data.coverage import coverage_interval
-from lipcore.data.metrics import Answer
+from lipcore.data.metrics import TorqueDistribution
 from lipcore.data.samples import Samples
 from lipcore.files.manifest import FORMAT_VERSION
 from lipcore.model.acceptance import HeldOutFigures
 from lipcore.model.torque_model import TorqueModel
 from service import __version__
 from service.foundation.fields import finite
-from service.models.evaluation import known
+from service.models.evaluation import coverage_fields
 from service.storage.database import DatasetRow
 
-MOST_SAMPLES = 500
-"""Samples that training metrics are computed on."""
+MAX_METRIC_SAMPLES = 500
+"""Maximum samples that training metrics are computed on."""
 
 
 def software() -> dict[str, str | int]:
-    """Versions of what computes here, for a version's lineage: cheap after the first call of a process.
+    """Return the software versions for a version's lineage; cheap after the first call in a process.
 
-    model_format: of the files that this release writes; git_commit: only in a checkout, with the suffix `-dirty` where
-    it was changed since.
+    `model_format` is the format of model files that this release writes. `git_commit` is present only in a checkout,
+    with the suffix `-dirty` if files were changed since.
     """
     versions: dict[str, str | int] = {
         "lipserve": __version__,
@@ -46,8 +46,8 @@ def software() -> dict[str, str | int]:
     return versions if commit is None else {**versions, "git_commit": commit}
 
 
-def named(rows: Sequence[DatasetRow]) -> list[dict[str, Any]]:
-    """Data sets that were trained on as a lineage names them, with how they were prepared where that is known."""
+def describe_datasets(rows: Sequence[DatasetRow]) -> list[dict[str, Any]]:
+    """Return the training data sets as a lineage lists them, with their preparation if it is recorded."""
     prepared = ("source", "recipe", "steps")
     return [
         {
@@ -62,7 +62,7 @@ def named(rows: Sequence[DatasetRow]) -> list[dict[str, Any]]:
 
 
 def learnt_from(lineage: dict[str, Any]) -> frozenset[str]:
-    """Ids and hashes of the data sets that a version has learnt from, be it from part of them."""
+    """Return the ids and hashes of the data sets that a version has learnt from, wholly or in part."""
     holdout = lineage.get("holdout") or {}
     left_out = set() if holdout.get("learnt") else {each["id"] for each in holdout.get("datasets", []) if each["whole"]}
     learnt = [each for each in lineage.get("datasets", []) if each["id"] not in left_out]
@@ -70,21 +70,26 @@ def learnt_from(lineage: dict[str, Any]) -> frozenset[str]:
 
 
 def figures(model: TorqueModel, samples: Samples, most: int, of: int) -> dict[str, Any]:
-    """How well a model answers for samples, thinned evenly to at most so many of them; `of`: how many they stand for.
-    Per joint: nmse (None where the torque did not vary), rmse in N·m, coverage of the 95 % interval with the confidence
-    interval from so many `independent` errors, the width of the former in N·m, and nlpd in nats."""
+    """Return how well a model predicts samples, thinned evenly to at most `most`.
+
+    `of` is the number of rows that the samples represent. Per joint: nmse (None if the torque is constant), rmse in
+    N·m, nlpd in nats, coverage of the 95 % interval and the interval's width in N·m. The confidence interval of the
+    coverage counts `independent` errors.
+    """
     count = min(len(samples), most)
     used = samples.rows(np.linspace(0, len(samples) - 1, count).round().astype(np.int64))
     answer = answer_of(model, used)
     compared = metrics.evaluate(used.tau, *answer)
     per_joint = {name: finite(getattr(compared, name)) for name in ("nmse", "rmse", "coverage", "nlpd")}
     width = {"interval_width": compared.width.tolist()}
-    return {"samples": len(used), "of": of, **per_joint, **width, **known(coverage_interval(used, answer))}
+    return {"samples": len(used), "of": of, **per_joint, **width, **coverage_fields(coverage_interval(used, answer))}
 
 
 def held_out_figures(joint_names: tuple[str, ...], holdout: Mapping[str, Any]) -> HeldOutFigures:
-    """Figures of a fit on what was held out, as a lineage has them; raise KeyError, TypeError or ValueError where there
-    are none, or others."""
+    """Return the held-out figures of a fit from a lineage.
+
+    Raise KeyError, TypeError or ValueError if they are missing or malformed.
+    """
     found = {
         each.name: np.array(holdout[each.name], np.float64)
         for each in fields(HeldOutFigures)
@@ -95,17 +100,19 @@ def held_out_figures(joint_names: tuple[str, ...], holdout: Mapping[str, Any]) -
     return HeldOutFigures(joint_names, **found)
 
 
-def answer_of(model: TorqueModel, samples: Samples) -> Answer:
-    """What a model predicts of samples, not by its compiled form: a process that trains and never serves would wait for
-    that."""
+def answer_of(model: TorqueModel, samples: Samples) -> TorqueDistribution:
+    """Return a model's predictions at samples, without its compiled form.
+
+    Compilation pays off only in a process that serves.
+    """
     answer = model.posterior.predict(samples.motion())
-    return Answer(answer.mean, answer.std, model.noise_std, model.scale)
+    return TorqueDistribution(answer.mean, answer.std, model.noise_std, model.scale)
 
 
 @cache
 def git_commit(checkout: Path) -> str | None:
-    """The commit that a folder is a checkout of; None where it is none, or git cannot tell."""
-    if not (checkout / ".git").exists():  # an installed package may lie within somebody else's checkout
+    """Return the git commit of a checkout; None if the folder is not a checkout or git fails."""
+    if not (checkout / ".git").exists():  # an installed package may lie inside another project's checkout
         return None
     command = ["git", "--no-optional-locks", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
     try:  # a checkout on a slow disk loses its commit, not its training

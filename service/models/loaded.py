@@ -1,4 +1,4 @@
-"""Model versions in memory: what hot routes answer from, without a lock and without the database."""
+"""Model versions in memory. Hot routes read them without a lock and without the database."""
 
 from __future__ import annotations
 
@@ -20,35 +20,38 @@ from service.contract.states import PartState
 from service.foundation.errors import NotFoundError, UnreadableVersionError
 from service.models import registry
 from service.models.lineage import learnt_from
-from service.models.loads import Loads
+from service.models.loads import StreamPayloads
 from service.models.registry import SERVING, Serving
 from service.models.scales import Scales
-from service.models.served import Alias, Key, LearntStates, Served, Waiting
+from service.models.served import Alias, Key, LearntStates, RevisionWaiters, ServedModel
 from service.storage.database import VersionRow
 from service.storage.storage import Storage
 
 logger = logging.getLogger(__name__)
 
-__all__ = ["LoadedModels", "Served"]
+__all__ = ["LoadedModels", "ServedModel"]
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """What is in memory, which version of each model answers, and where all aliases point; replaced as a whole."""
+    """Versions in memory, the serving version of each model, and all other aliases; replaced as a whole."""
 
-    served: Mapping[Key, Served] = field(default_factory=dict)
+    served: Mapping[Key, ServedModel] = field(default_factory=dict)
     serving: Mapping[str, Serving] = field(default_factory=dict)
     aliases: Mapping[Alias, int] = field(default_factory=dict)
 
     def pointed(self, model: str, alias: str | None) -> int | None:
-        """The version that an alias points to, or that serves where it is None; None where that is not known."""
+        """Return the version of an alias, the serving version if `alias` is None.
+
+        Return None if this snapshot does not contain it.
+        """
         if alias is None or alias == SERVING:
             serving = self.serving.get(model)
             return None if serving is None else serving.version
         return self.aliases.get((model, alias))
 
     def without(self, gone: set[Key], model: str | None) -> Snapshot:
-        """The same without some versions and, where given, without a model's pointers."""
+        """Return a copy without some versions and, if `model` is given, without that model's aliases."""
         return Snapshot(
             {key: each for key, each in self.served.items() if key not in gone},
             {name: each for name, each in self.serving.items() if name != model},
@@ -57,15 +60,11 @@ class Snapshot:
 
 
 class LoadedModels:
-    """Cache of loaded versions; safe to share between threads. The least recently used are dropped beyond `capacity`, a
-    setting.
+    """Cache of loaded versions; safe to share between threads.
 
-    A version becomes the one that answers once it is in memory and warm, by one assignment: queries in flight keep
-    theirs, and none waits. So does a revision of it. An alias moves in the same way.
-
-    learnt: knows what versions have learnt. moving: held while an alias is moved or a version deleted, in the database
-    and then here, one at a time. waiting: who waits for a model to answer otherwise. when_deleted: called with the name
-    of a model that is gone.
+    Beyond `capacity`, a setting, the least recently used versions are dropped. A version starts to answer once it is in
+    memory and warm, by one assignment. Queries in flight keep theirs, and none waits. Revisions and aliases change in
+    the same way.
     """
 
     def __init__(self, storage: Storage, learnt: LearntStates, capacity: int | None = None) -> None:
@@ -73,26 +72,31 @@ class LoadedModels:
         self.database, self.files = storage.database, storage.files
         self.capacity = storage.settings.max_loaded_models if capacity is None else capacity
         self.when_deleted: list[Callable[[str], None]] = []
+        """Functions called with the name of a deleted model."""
         self._lagging: set[str] = set()
         self._wake: Callable[[str], None] = self._lagging.add
         self._revisions: dict[Key, tuple[int, Revision]] = {}
-        self._held: WeakValueDictionary[Key, Served] = WeakValueDictionary()  # by streams too, after they are dropped
+        self._held: WeakValueDictionary[Key, ServedModel] = WeakValueDictionary()  # streams keep dropped versions
         self._revising = threading.Lock()
         self._snapshot = Snapshot(aliases=registry.pointers(storage.database))
         self._deleted: set[Key] = set()
         self._lock = threading.Lock()
         self.moving = threading.Lock()
-        self.waiting = Waiting()
+        """Lock for one change at a time: an alias is moved or a version deleted, first in the database, then here."""
+        self.waiters = RevisionWaiters()
+        """Queries that wait for a revision."""
         self._loading: dict[Key, threading.Lock] = {}
         self._clock = itertools.count()
         self._used: dict[Key, int] = {}
         self._unreadable: dict[Key, str] = {}
         self._scales: dict[Key, Scales] = {}
-        self._loads: dict[Key, Loads] = {}
+        self._payloads: dict[Key, StreamPayloads] = {}
 
-    def hot(self, model: str, version: int | None, alias: str | None = None) -> Served | None:
-        """Return a version, or the one that an alias points to, if it is in memory; never waits. With neither, as with
-        the alias `serving`, it is the one that serves."""
+    def hot(self, model: str, version: int | None, alias: str | None = None) -> ServedModel | None:
+        """Return a version, or the version of an alias, if it is in memory; never waits.
+
+        Without a version and an alias, or with the alias `serving`, return the serving version.
+        """
         snapshot = self._snapshot
         if version is None:
             version = snapshot.pointed(model, alias)
@@ -104,35 +108,37 @@ class LoadedModels:
             self._used[key] = next(self._clock)
         return served
 
-    def peek(self, model: str) -> Served | None:
-        """Return the version that serves if it is in memory; never waits. Asking does not count as using it."""
+    def peek(self, model: str) -> ServedModel | None:
+        """Return the serving version if it is in memory; never waits. The call does not count as use."""
         snapshot = self._snapshot
         serving = snapshot.serving.get(model)
         return None if serving is None else snapshot.served.get((model, serving.version))
 
     def newest(self, model: str, alias: str | None = None) -> int | None:
-        """Return the version that answers where an alias is named, or none, in memory or dropped since; never waits."""
+        """Return the number of the version of an alias, or of the serving version, even if dropped; never waits."""
         return self._snapshot.pointed(model, alias)
 
     def is_deleted(self, model: str, version: int) -> bool:
-        """Whether a version has been deleted since the service started; never waits."""
+        """Return whether a version was deleted since the service started; never waits."""
         return (model, version) in self._deleted
 
-    def get(self, model: str, version: int | None, alias: str | None = None) -> Served:
-        """Return a version, or the one that an alias points to, loaded if need be. Not for the event loop. With neither
-        it is the one that serves. Raise NotFoundError or UnreadableVersionError."""
+    def get(self, model: str, version: int | None, alias: str | None = None) -> ServedModel:
+        """Return a version, or the version of an alias; load it if necessary. Not for the event loop.
+
+        Without both, return the serving version. Raise NotFoundError or UnreadableVersionError.
+        """
         served = self.hot(model, version, alias)
         while served is None:
-            number, serving = self.meant(model, version, alias)
+            number, serving = self.resolve_version(model, version, alias)
             try:
                 served = self._load(registry.find(self.database, model, number), serving)
             except NotFoundError:
-                if self.meant(model, version, alias)[0] == number:
-                    raise  # else the alias has moved on, and the version before was deleted
+                if self.resolve_version(model, version, alias)[0] == number:
+                    raise  # else the alias has moved, and its earlier version was deleted
         return served
 
-    def meant(self, model: str, version: int | None, alias: str | None) -> tuple[int | None, Serving | None]:
-        """The number of the version that is meant, and what serves where that is it; raise NotFoundError."""
+    def resolve_version(self, model: str, version: int | None, alias: str | None) -> tuple[int | None, Serving | None]:
+        """Return the number of a version, and its `Serving` record if it serves; raise NotFoundError."""
         if version is not None:
             return version, None
         if alias is None or alias == SERVING:
@@ -144,32 +150,35 @@ class LoadedModels:
         return number, None
 
     def point(self, model: str, alias: str, version: int | None) -> None:
-        """Let an alias point to a version from now on, or to none; `moving` is held, and the database says so."""
+        """Point an alias to a version, or to none. The caller holds `moving` and has changed the database."""
         with self._lock:
             aliases = {**self._snapshot.aliases}
             aliases.pop((model, alias), None)
             if version is not None:
                 aliases[model, alias] = version
             self._snapshot = replace(self._snapshot, aliases=aliases)
-        self.waiting.wake(model)
+        self.waiters.wake(model)
 
     def aliases(self) -> Mapping[Alias, int]:
-        """Where every alias points that has been given, but for those that serve."""
+        """Return the version of every alias except `serving`."""
         return self._snapshot.aliases
 
     def repoint(self, aliases: Mapping[Alias, int], models: Collection[str] | None) -> None:
-        """Let the aliases of these models, of all where None, be these; `moving` is held, and the database says so."""
+        """Replace the aliases of these models, of all models if None.
+
+        The caller holds `moving` and has changed the database.
+        """
         with self._lock:
             kept = {} if models is None else {k: v for k, v in self._snapshot.aliases.items() if k[0] not in models}
             self._snapshot = replace(self._snapshot, aliases=kept | dict(aliases))
         for model in {model for model, _ in aliases}:
-            self.waiting.wake(model)
+            self.waiters.wake(model)
 
     def forget(self, model: str, versions: Collection[int], entirely: bool = False) -> None:
-        """Answer no more with these versions, which have been deleted; `moving` is held.
+        """Stop answering with deleted versions; the caller holds `moving`.
 
-        entirely: the model has been deleted with them. Queries in flight keep theirs. To be called before their files
-        go: who finds them gone has to know why.
+        `entirely`: the model was deleted too. Queries in flight keep their version. Call this before the files are
+        removed, so that a reader that finds no file finds the reason here.
         """
         gone = {(model, version) for version in versions}
         with self._revising, self._lock:
@@ -181,22 +190,21 @@ class LoadedModels:
                 self._used.pop(key, None)
                 self._unreadable.pop(key, None)
                 self._scales.pop(key, None)
-                self._loads.pop(key, None)
-        self.waiting.wake(model)
+                self._payloads.pop(key, None)
+        self.waiters.wake(model)
         if entirely:
             for deleted in self.when_deleted:
                 deleted(model)
 
     def announce(self, models: Collection[str]) -> None:
-        """Answer for these models with the versions that now serve. Not for the event loop."""
-        known = self._snapshot.serving  # a model without an answer yet is loaded when it is asked
+        """Load the versions of these models that now serve. Not for the event loop."""
+        known = self._snapshot.serving  # other models are loaded by their first query
         for model, serving in registry.serving(self.database, [each for each in models if each in known]).items():
             if serving.change > known[model].change:
                 self.adopt(model)
 
     def changed(self, model: str) -> None:
-        """Answer with what a job has changed of a model: the version that serves, and where its aliases point. Not for
-        the event loop."""
+        """Follow a job's changes to a model: its serving version and its aliases. Not for the event loop."""
         with self.moving:
             self.repoint(registry.pointers(self.database, [model]), [model])
         self.adopt(model)
@@ -207,62 +215,68 @@ class LoadedModels:
             self._adopt(model, serving)
 
     def _adopt(self, model: str, serving: Serving) -> bool:
-        """Load a version that serves; return whether it could be."""
+        """Load a version that serves; return whether that succeeded."""
         try:
             self._load(registry.find(self.database, model, serving.version), serving)
             return True
-        except (UnreadableVersionError, OSError) as error:  # who asks is told; the version before goes on answering
+        except (UnreadableVersionError, OSError) as error:  # the earlier version keeps answering
             logger.error("%s", error)
-        except NotFoundError:  # another one serves by now, and this one has been deleted: who did that adopts it
+        except NotFoundError:  # deleted after another version started to serve, which that change loads
             logger.info("version %d of model %s was deleted before it answered", serving.version, model)
         return False
 
     def held(self) -> dict[Key, int | None]:
-        """Versions that anyone here may answer with, and their revisions: those in memory, of streams too, and those
-        that serve, which may have been dropped (None)."""
+        """Return the versions in use here and their revisions: in memory, used by streams, or serving.
+
+        The revision is None for a serving version that was dropped from memory.
+        """
         snapshot = self._snapshot
         revisions: dict[Key, int | None] = {(model, each.version): None for model, each in snapshot.serving.items()}
         streamed = [each for ref in self._held.valuerefs() if (each := ref()) is not None]
         return revisions | {(each.name, each.version): each.revision for each in (*streamed, *snapshot.served.values())}
 
     def versions(self) -> Collection[Key]:
-        """Versions that are in memory; asking does not count as using them."""
+        """Return the versions in memory; the call does not count as use."""
         return self._snapshot.served.keys()
 
     def look(self, lasting: object = None) -> tuple[PartState, str]:
-        """Whether the versions that serve can be read, for readiness."""
-        lost, models = registry.lost(self.database, self.files, self.versions(), self.unreadable())
+        """Return whether the serving versions can be read, for readiness."""
+        lost, models = registry.count_unreadable(self.database, self.files, self.versions(), self.unreadable())
         if not lost:
             return "ok", f"{models} can be read"
         state: PartState = "failed" if lost == models else "warning"
         return state, f"{lost} of {models} cannot be read: `lipserve verify` names them"
 
     def unreadable(self) -> dict[Key, str]:
-        """Versions that could not be read when they were last asked for, and why."""
+        """Return the versions that failed to load at their last use, and why."""
         return dict(self._unreadable)
 
     def learn_from(self, wake: Callable[[str], None]) -> None:
-        """Have a learner woken, by the name of the model, whenever a version is loaded without all that its log holds.
-        It is woken for those that have been loaded so already."""
+        """Register the learner: `wake` is called with a model's name when a version is loaded that lags behind its log.
+
+        It is called at once for the versions already loaded like that.
+        """
         self._wake = wake
         while self._lagging:
             wake(self._lagging.pop())
 
     def wake(self, model: str) -> None:
-        """Have the learner look at a model: its log, or the roles of its versions, may have changed."""
+        """Wake the learner of a model, as its log or the roles of its versions may have changed."""
         self._wake(model)
 
     def revise(self, name: str, version: int, revision: int, learnt: Revision) -> bool:
-        """Answer with what a version has learnt, from now on or once it is loaded; return whether that changed answers.
-        Nothing is done where a revision as high is known. Not for the event loop; it computes next to nothing."""
+        """Apply a revision to a version, now or once it is loaded; return whether answers changed.
+
+        Ignore it if an equal or higher revision is present. Not for the event loop; it computes next to nothing.
+        """
         key = (name, version)
-        with self._revising:  # one at a time, so that the highest is the last
+        with self._revising:  # one at a time, so that the highest revision wins
             if key in self._deleted:
                 return False
             known = self._revisions.pop(key, None)
             if known is not None and known[0] >= revision:
                 revision, learnt = known
-            self._revisions[key] = (revision, learnt)  # the last that came is the last to go
+            self._revisions[key] = (revision, learnt)  # moves to the end: the oldest is dropped first
             while len(self._revisions) > 2 * self.capacity:
                 del self._revisions[next(iter(self._revisions))]
             known_version = self._snapshot.served.get(key) or self._held.get(key)
@@ -272,21 +286,21 @@ class LoadedModels:
             return self._publish(served) is served
 
     def scales(self, model: str) -> dict[int, Scales]:
-        """The widths of the intervals of a model's versions, of those that have been in memory."""
+        """Return the width factors of a model's versions, of those that were ever in memory."""
         with self._lock:
             return {version: scales for (name, version), scales in self._scales.items() if name == model}
 
-    def served(self, model: str) -> dict[int, Served]:
-        """A model's versions that are in memory."""
+    def served(self, model: str) -> dict[int, ServedModel]:
+        """Return a model's versions that are in memory."""
         return {version: each for (name, version), each in self._snapshot.served.items() if name == model}
 
     def preload(self) -> int:
-        """Load the versions that serve of the models that changed last, as many as fit; return how many."""
-        gc.freeze()  # what was imported, unexamined: looking through it takes 0.3 s
+        """Load the serving versions of the most recently changed models, as many as fit; return how many."""
+        gc.freeze()  # keeps imported modules out of collections, which would take 0.3 s longer each
         recent = registry.serving(self.database, registry.recent(self.database, self.capacity))
         return sum(self._adopt(model, serving) for model, serving in recent.items())
 
-    def _load(self, row: VersionRow, serving: Serving | None = None) -> Served:
+    def _load(self, row: VersionRow, serving: Serving | None = None) -> ServedModel:
         key = (row.model, row.version)
         with self._lock:
             loading = self._loading.setdefault(key, threading.Lock())
@@ -303,31 +317,31 @@ class LoadedModels:
             if (learnt := self._revisions.get(key)) is not None:  # published while this was loaded
                 self.revise(*key, *learnt)
                 served = self._snapshot.served.get(key, served)
-            # keeps the version out of collections, which would stop every answer for as long as they look through it.
-            # What is dropped later is freed all the same: a model is in no cycle. Nothing else is frozen but a few
-            # hundred objects of requests under way
+            # keeps the version out of later collections, which would stop all answers while they scan it. A version
+            # that is dropped later is freed all the same, as a model is in no reference cycle. Besides it, only a few
+            # hundred objects of current requests are frozen
             gc.collect()
             gc.freeze()
             with self._lock:
                 self._loading.pop(key, None)
         return served
 
-    def _make(self, row: VersionRow) -> Served:
+    def _make(self, row: VersionRow) -> ServedModel:
         base = self._read(row)
         base.warm_up()
         scales = self._scales_of(row, base.scale)
         with self._lock:
-            loads = self._loads.setdefault((row.model, row.version), Loads())
-        served = Served(row.model, row.version, base, base, learnt_from(row.manifest["lineage"]), scales, loads)
-        if served.carrier is not None and loads.fresh:
+            payloads = self._payloads.setdefault((row.model, row.version), StreamPayloads())
+        served = ServedModel(row.model, row.version, base, base, learnt_from(row.manifest["lineage"]), scales, payloads)
+        if served.carrier is not None and payloads.fresh:
             served.carrier.warm_up()
-            loads.take(self.learnt.carried(row.model, row.version, served.carrier))
+            payloads.replace(self.learnt.payloads(row.model, row.version, served.carrier))
         if (published := self._revisions.get((row.model, row.version))) is not None:
             revision, learnt = published
             return replace(served, model=_warm(learnt.apply(base)), revision=revision)
         try:
             known = self.learnt.find(row.model, row.version, base)
-        except Exception:  # whoever asks is answered all the same, by the version as trained, and told its revision
+        except Exception:  # queries are answered by the version as trained; the reply states its revision
             logger.exception("what version %d of model %r has learnt is not known", row.version, row.model)
             return served
         if known is None:
@@ -337,12 +351,12 @@ class LoadedModels:
         return replace(served, model=_warm(known.model), revision=known.revision)
 
     def _scales_of(self, row: VersionRow, own: Array) -> Scales:
-        """The widths that a version's streams had come to when it was last in memory, or the service last ran."""
+        """Return the version's width factors as of its last use, or as of the last run of the service."""
         key = (row.model, row.version)
         if (known := self._scales.get(key)) is not None:
             return known
         scales = Scales(own)
-        scales.take(self.learnt.factors(*key))
+        scales.replace(self.learnt.factors(*key))
         with self._lock:
             return self._scales.setdefault(key, scales)
 
@@ -354,13 +368,16 @@ class LoadedModels:
             message = f"version {row.version} of model {row.model!r} cannot be loaded: {error}"
             raise UnreadableVersionError(message) from error
 
-    def _publish(self, served: Served, serving: Serving | None = None) -> Served:
-        """Answer with a version from now on, and with this one of its model where told; return what answers."""
+    def _publish(self, served: ServedModel, serving: Serving | None = None) -> ServedModel:
+        """Answer with a version from now on and return the version that answers.
+
+        If `serving` is given, the version also serves its model.
+        """
         key = (served.name, served.version)
         with self._lock:
-            if key in self._deleted:  # while it was loaded: who asked before is answered, nobody after
+            if key in self._deleted:  # deleted while it was loaded: only requests made before get it
                 return served
-            if key not in self._used:  # a revision of one that is known is no use of it
+            if key not in self._used:  # a new revision of a loaded version does not count as use
                 self._used[key] = next(self._clock)
             entries, pointers = dict(self._snapshot.served), dict(self._snapshot.serving)
             current = entries.get(key)
@@ -375,11 +392,11 @@ class LoadedModels:
                 del entries[oldest]
                 self._used.pop(oldest, None)
             self._snapshot = replace(self._snapshot, served=entries, serving=pointers)
-        self.waiting.wake(served.name)
+        self.waiters.wake(served.name)
         return current
 
 
 def _warm(model: TorqueModel) -> TorqueModel:
-    """The model after an answer, which brings its arrays into memory."""
+    """Return the model after one prediction, which loads its arrays into memory."""
     model.answer(np.zeros((3, model.n_joints)))
     return model

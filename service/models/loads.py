@@ -1,4 +1,4 @@
-"""What answers where an arm carries something: a model for each stream that does."""
+"""Models with the payload that each stream carries."""
 
 from __future__ import annotations
 
@@ -10,52 +10,59 @@ from service.models.scales import RECENT_S
 
 
 @dataclass(frozen=True)
-class Carried:
-    """Of a stream: what answers with its payload, None where it carries nothing; mass: mean and standard deviation, kg;
-    received: Unix time of its last batch, s."""
+class StreamPayload:
+    """The payload of a stream."""
 
     model: TorqueModel | None
+    """Model with this payload; None if the stream has no payload."""
     mass: tuple[float, float] | None
+    """Mean and standard deviation, kg; None if the stream has no payload."""
     received: float
+    """Unix time of the stream's last observation batch, s."""
 
 
-class Loads:
-    """What a version answers with for each stream; any thread may read while one replaces it.
+class StreamPayloads:
+    """Payload models of a version's streams; any thread may read while one thread replaces them.
 
-    One of these belongs to a version for as long as the service runs, as its `Scales` do. asked: what questions that
-    belong to no stream are answered with, None where that is the version as it is: the payload that was declared for
-    all, or that of the only stream of late. fresh: whether none has been taken yet.
+    A version keeps one instance as long as the service runs, as it does its `Scales`.
     """
 
     def __init__(self) -> None:
-        self._streams: Mapping[str, Carried] = {}
-        self._default: Carried | None = None
-        self.asked: TorqueModel | None = None
+        self._streams: Mapping[str, StreamPayload] = {}
+        self._default: StreamPayload | None = None
+        self.default_model: TorqueModel | None = None
+        """Model for queries without a stream: with the payload declared for all, or that of the only recent stream.
+        None means the version without payload.
+        """
         self.fresh = True
+        """Whether `replace` was never called."""
 
-    def of(self, stream_id: str | None) -> TorqueModel | None:
-        """What answers a stream, None for the version as it is; of no stream as of questions."""
+    def model_for(self, stream_id: str | None) -> TorqueModel | None:
+        """Return the model of a stream, the default model if `stream_id` is None.
+
+        None means the version without payload.
+        """
         if stream_id is None:
-            return self.asked
+            return self.default_model
         known = self._streams.get(stream_id, self._default)
         return None if known is None else known.model
 
     def mass(self, stream_id: str | None) -> tuple[float, float] | None:
-        """Mass that a stream carries, mean and standard deviation, kg; None where it carries nothing."""
+        """Return the payload mass of a stream, mean and standard deviation in kg; None if it has no payload."""
         known = self._default if stream_id is None else self._streams.get(stream_id, self._default)
         return None if known is None else known.mass
 
     def masses(self) -> dict[str, tuple[float, float] | None]:
-        """Mass that each stream carries, as `mass` has it, of all streams that are known."""
+        """Return the payload mass of every stream that has reported one, as `mass` does."""
         return {name: each.mass for name, each in self._streams.items()}
 
-    def take(self, streams: Mapping[str, Carried]) -> None:
-        """Answer with these from now on; the default is that of an empty name."""
+    def replace(self, streams: Mapping[str, StreamPayload]) -> None:
+        """Replace the payloads of all streams; the empty name is the default for other streams."""
         self._default = streams.get("")
         known = {name: each for name, each in streams.items() if name}
         latest = max((each.received for each in known.values()), default=0.0)
         recent = [each for each in known.values() if each.received >= latest - RECENT_S]
         default = None if self._default is None else self._default.model
-        self.asked = recent[0].model if len(recent) == 1 else default
+        self.default_model = recent[0].model if len(recent) == 1 else default
         self.fresh = False
         self._streams = known

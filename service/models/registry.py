@@ -1,4 +1,4 @@
-"""Named models and their versions: publishing, finding, listing, and which of them answers."""
+"""Models and their versions: publish, find and list them, and set which version serves."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ from service.storage.database import (
     now,
 )
 from service.storage.files import Files, new_id
-from service.storage.rows import Page, newest
+from service.storage.rows import Page, read_page
 
 logger = logging.getLogger(__name__)
 
 SHIPPED = "panda-sim"
 SERVING = "serving"
-"""The alias that every model has: the version that answers where none is named."""
+"""The alias of every model for its serving version."""
 MAX_ALIASES = 100
-"""Aliases of one model, `serving` aside."""
+"""Maximum aliases of one model, besides `serving`."""
 
 
 _VERSION = select(VersionRow.version).where(
@@ -49,18 +49,18 @@ _VERSION = select(VersionRow.version).where(
 
 
 class Serving(NamedTuple):
-    """Which version of a model answers where none is named. change: higher for what was decided later."""
+    """The serving version of a model; a later change has a higher `change`."""
 
     version: int
     change: int
 
 
 PROMOTION = "promotion"
-"""What a version's row has beside its manifest: the file was written before it was known."""
+"""Entry of a version's row that its manifest file lacks, because the file is written first."""
 
 
 def manifest_on_disk(row: VersionRow) -> dict[str, Any]:
-    """The manifest of a version as its file has it."""
+    """Return the manifest of a version as its file contains it."""
     return {name: value for name, value in row.manifest.items() if name != PROMOTION}
 
 
@@ -74,10 +74,10 @@ def publish(
     start: int | None = None,
     promotion: Promotion | None = None,
 ) -> int:
-    """Add a version whose files are complete; it is visible once the session commits. Return its number.
+    """Add a version whose files are complete; return its number. It is visible once the session commits.
 
-    It answers from then on, unless it is a candidate. start: number of the last event of the model that it contains by
-    training, the newest where None; promotion: why it answers, or does not.
+    It serves from then on, unless it is a candidate. `start` is the number of the model's last event that the training
+    includes; the default is the newest event. `promotion` records why the version serves or not.
     """
     row = _row(session, model)
     row.last_version = version = row.last_version + 1
@@ -102,14 +102,17 @@ def publish(
 
 
 def _origin(manifest: dict[str, Any], job: str | None) -> dict[str, Any]:
-    """What the audit log says of a new version: of an imported one also where it comes from."""
+    """Return the audit log's entry for a new version, with its source if it was imported."""
     imported = manifest["lineage"].get("imported", []) if job is None else []
     source = {name: imported[-1].get(name) for name in ("model", "version")} if imported else {}
     return {"estimator": manifest["estimator"], "job": job, **({"imported": source} if source else {})}
 
 
 def _row(session: Session, model: str) -> ModelRow:
-    """The row of a model, a new one where there is none: no number of one that was deleted is given again."""
+    """Return the row of a model, a new one if there is none.
+
+    A new row continues the version numbers of a deleted model.
+    """
     row = session.scalar(select(ModelRow).where(ModelRow.name == model))
     if row is None:
         deleted = session.get(DeletedModelRow, model)
@@ -120,7 +123,7 @@ def _row(session: Session, model: str) -> ModelRow:
 
 
 def check_robot(session: Session, model: str, kind: RobotKind) -> None:
-    """Raise ConflictError where a model's first version is of another robot than one that is to answer for it."""
+    """Raise ConflictError if the model's first version belongs to another robot."""
     query = select(VersionRow).where(VersionRow.model == model).order_by(VersionRow.version).limit(1)
     first = session.scalar(query)
     found = None if first is None else RobotKind.of_manifest(first.manifest).difference(kind)
@@ -132,20 +135,22 @@ def check_robot(session: Session, model: str, kind: RobotKind) -> None:
         )
 
 
-def answering(session: Session, model: str) -> int | None:
-    """The version that answers where none is named, None where there is none."""
+def serving_version(session: Session, model: str) -> int | None:
+    """Return the number of the serving version, None if none serves."""
     chosen = session.get(ServingRow, model)
     return None if chosen is None else chosen.version
 
 
 def has_model(session: Session, model: str) -> bool:
-    """Whether there is a model of this name."""
+    """Return whether a model of this name exists."""
     return session.scalar(select(ModelRow.name).where(ModelRow.name == model)) is not None
 
 
 def missing(session: Session, model: str, version: int | None) -> NotFoundError | NoServingVersionError:
-    """The error for a version that there is not: of its model, where that is none either. version: None for the one
-    that serves."""
+    """Return the error for a missing version, or for its model if that is missing too.
+
+    `version` is None for the serving version.
+    """
     if not has_model(session, model):
         return not_found("model", model)
     if version is not None:
@@ -158,15 +163,15 @@ def missing(session: Session, model: str, version: int | None) -> NotFoundError 
 
 
 def exists(session: Session, model: str, version: int) -> bool:
-    """Whether there is such a version."""
+    """Return whether a version exists."""
     return fetch(session, _VERSION, model=model, version=version).scalar() is not None
 
 
 def serve(session: Session, model: str, version: int, takes_back: int | None = None) -> int:
-    """Let a version answer where none is named, once the session commits, and learn; return the number of the change.
+    """Let a version serve and learn once the session commits; return the number of the change.
 
-    The version before neither answers nor learns any more. takes_back: see `note`. Raise NotFoundError where
-    there is no such version.
+    The earlier version stops serving and learning. takes_back: see `note`. Raise NotFoundError if the version does not
+    exist.
     """
     session.flush()
     if not exists(session, model, version):
@@ -192,7 +197,7 @@ def serve(session: Session, model: str, version: int, takes_back: int | None = N
 def note(
     session: Session, model: str, alias: str, before: int | None, version: int | None, takes_back: int | None = None
 ) -> None:
-    """Write a move of an alias down. takes_back: number of the move that this one takes back."""
+    """Record a move of an alias; `takes_back` is the number of the move that this one undoes."""
     audit.note(session, model, "alias moved", version, alias, before, version)
     move = AliasMoveRow(model=model, alias=alias, before=before, version=version, takes_back=takes_back, at=now())
     session.add(move)
@@ -200,7 +205,7 @@ def note(
 
 
 def pointers(database: Database, models: Collection[str] | None = None) -> dict[tuple[str, str], int]:
-    """The version of every alias of these models, of all where None, by (model, alias), but for those that serve."""
+    """Return the version of each alias by (model, alias), of all models if None, except the alias `serving`."""
     query = select(AliasRow.model, AliasRow.alias, AliasRow.version)
     if models is not None:
         query = query.where(AliasRow.model.in_(models))
@@ -209,17 +214,17 @@ def pointers(database: Database, models: Collection[str] | None = None) -> dict[
 
 
 def serving(database: Database, models: Collection[str]) -> dict[str, Serving]:
-    """Which version of each of these models answers; those that have none are left out."""
+    """Return the serving version of each of these models; models without one are missing."""
     query = select(ServingRow.model, ServingRow.version, ServingRow.change).where(ServingRow.model.in_(models))
     with database.session() as session:
         return {model: Serving(version, change) for model, version, change in session.execute(query)}
 
 
 def install_shipped(database: Database, files: Files) -> None:
-    """Register the model that comes with LIPServe; where an upgrade brings another one, as a new version.
+    """Register the model that comes with LIPServe; after an upgrade that brings another one, as a new version.
 
-    Not if the user has made a version of that name since, which goes on answering, or has deleted the model or its
-    newest version.
+    Do nothing if the user has trained or imported a version under that name, or has deleted the model or its newest
+    version.
     """
     source = shipped_models() / SHIPPED
     with database.session() as session:
@@ -229,7 +234,7 @@ def install_shipped(database: Database, files: Files) -> None:
     with files.new_version(folder) as target:
         manifest = lipcore.copy_model(source, target)
     with database.transaction() as session:
-        if _is_missing(session, source):  # no other service has started at the same time
+        if _is_missing(session, source):  # another service that starts at the same time may have registered it
             version = publish(session, SHIPPED, folder, manifest, None)
     if version is None:
         files.delete_version(folder)
@@ -238,7 +243,7 @@ def install_shipped(database: Database, files: Files) -> None:
 
 
 def _is_missing(session: Session, source: Path) -> bool:
-    """Whether the shipped model is to be registered."""
+    """Return whether the shipped model must be registered."""
     query = select(VersionRow).where(VersionRow.model == SHIPPED).order_by(VersionRow.version.desc())
     known = list(session.scalars(query))
     row = session.scalar(select(ModelRow).where(ModelRow.name == SHIPPED))
@@ -254,17 +259,17 @@ def _is_missing(session: Session, source: Path) -> bool:
 
 
 def find(database: Database, model: str, version: int | None) -> VersionRow:
-    """Return a version, the one that answers where None; raise NotFoundError or NoServingVersionError."""
+    """Return a version, the serving version if None; raise NotFoundError or NoServingVersionError."""
     with database.session() as session:
-        number = answering(session, model) if version is None else version
+        number = serving_version(session, model) if version is None else version
         row = None if number is None else session.get(VersionRow, (model, number))
         if row is None:
             raise missing(session, model, version)
     return row
 
 
-def named(database: Database, text: str) -> VersionRow:
-    """The version that a text of the pattern `schema.VERSION` names; raise NotFoundError or NoServingVersionError."""
+def find_named(database: Database, text: str) -> VersionRow:
+    """Return the version for a text of the pattern `schema.VERSION`; raise NotFoundError or NoServingVersionError."""
     name, _, alias = text.partition("@")
     model, _, number = name.partition(":")
     if alias in ("", SERVING):
@@ -276,7 +281,7 @@ def named(database: Database, text: str) -> VersionRow:
 
 
 def no_alias(database: Database, model: str, alias: str) -> NotFoundError:
-    """The error for an alias that there is not: of its model, where that is none either."""
+    """Return the error for a missing alias: names the model if that is missing too."""
     with database.session() as session:
         return not_found("alias", alias) if has_model(session, model) else not_found("model", model)
 
@@ -308,7 +313,7 @@ def show_version(database: Database, model: str, version: int) -> Version:
 def page(database: Database, part: Page) -> ModelPage:
     """List models, newest first."""
     with database.session() as session:
-        rows, following = newest(session, ModelRow, part)
+        rows, following = read_page(session, ModelRow, part)
         return ModelPage(items=[_show(session, row) for row in rows], next_cursor=following)
 
 
@@ -321,7 +326,7 @@ def _show(session: Session, row: ModelRow) -> Model:
         name=row.name,
         created_at=row.created_at,
         latest_version=versions[-1].version,
-        serving_version=answering(session, row.name),
+        serving_version=serving_version(session, row.name),
         aliases={each.alias: each.version for each in aliases},
         versions=[
             VersionSummary(
@@ -337,8 +342,10 @@ def _show(session: Session, row: ModelRow) -> Model:
 
 
 def quality(manifest: Mapping[str, Any]) -> HeldOutQuality | None:
-    """How well a version predicts what its training held out, as its manifest has it; None where that was nothing, or
-    is not as this release writes it: an import shows figures and does not read them."""
+    """Return the held-out figures of a version's manifest; None if missing or in another form.
+
+    Imports keep figures that this release cannot read.
+    """
     try:
         return HeldOutQuality.model_validate(manifest["lineage"]["holdout"])
     except (KeyError, TypeError, ValidationError):
@@ -346,16 +353,19 @@ def quality(manifest: Mapping[str, Any]) -> HeldOutQuality | None:
 
 
 def rows_of(session: Session, keys: Collection[tuple[str, int]]) -> dict[tuple[str, int], VersionRow]:
-    """Versions by model and number; those that are gone are left out."""
+    """Return versions by model and number; deleted ones are missing."""
     query = select(VersionRow).where(tuple_(VersionRow.model, VersionRow.version).in_(keys))
     return {(row.model, row.version): row for row in session.scalars(query)}
 
 
-def lost(
+def count_unreadable(
     database: Database, files: Files, held: Collection[tuple[str, int]], damaged: Collection[tuple[str, int]]
 ) -> tuple[int, int]:
-    """How many models have a version that serves and cannot be read, and how many have one that serves. held: versions
-    in memory, which answer whatever their files are; damaged: those whose files could not be read."""
+    """Return how many models have a serving version that cannot be read, and how many have a serving version.
+
+    `held` are versions in memory, which answer even without files; `damaged` are versions whose files could not be
+    read.
+    """
     with database.session() as session:
         names = list(session.scalars(select(ModelRow.name)))
         rows = session.execute(select(VersionRow.model, VersionRow.version, VersionRow.folder))

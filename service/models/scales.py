@@ -1,4 +1,4 @@
-"""Factors on the widths of a version's intervals, as the measurements that its streams bring have made them."""
+"""Factors on the interval widths of a version, adapted to the measurements of its streams."""
 
 from __future__ import annotations
 
@@ -9,49 +9,55 @@ from lipcore.data.samples import Array
 from lipcore.online.adaptive import widest
 
 RECENT_S = 60.0
-"""Streams that taught within so long of the newest one are asked about, s."""
+"""Queries without a stream use the streams whose last batch is at most this much older than the newest, s."""
 
 
 @dataclass(frozen=True)
 class Factor:
-    """Of a stream: values (n,) for its own answers, and `others` (n,), of what was not kept out of it; received: when
-    the batch came that made them, Unix time, s. doubted: whether the stream did not fit from its first second on, and
-    nobody has confirmed it: no others are answered with its factors."""
+    """Width factors of one stream."""
 
     values: Array
+    """Factors of the stream's own answers, (n,)."""
     others: Array
+    """Factors of answers to others, (n,), from accepted observations only."""
     received: float
+    """Unix time of the batch that they come from, s."""
     doubted: bool = False
+    """Whether the stream disagreed with the version from its first second on and nobody has confirmed it. Its factors
+    then apply to its own answers only.
+    """
 
 
 class Scales:
-    """The factors that a version answers with now; any thread may read while one replaces them.
+    """Current width factors of a version; any thread may read while one thread replaces them.
 
-    One of these belongs to a version for as long as the service runs, whatever it learns: all of its revisions have it.
-    own: (n,), what the training has proved, which holds until streams say otherwise.
+    A version keeps one instance as long as the service runs; all of its revisions share it. `own` (n,) are the factors
+    from the training, used until streams have their own.
     """
 
     def __init__(self, own: Array) -> None:
         self._own = own
         self._streams: Mapping[str, Factor] = {}
         self._widest = own
-        self.asked: list[float] = own.tolist()
+        self.default_factors: list[float] = own.tolist()
+        """Factors of the default model, per joint."""
 
     def of(self, stream_id: str | None) -> Array:
-        """Those of a stream, (n,), the version's own where it has taught nothing; of no stream those of questions,
-        `asked`.
+        """Return the factors of a stream, (n,): the version's own if it has sent no observations.
 
-        A question of HTTP belongs to no stream: it has the largest of those of the recent streams and its own."""
+        A query without a stream gets `default_factors`, the largest of the version's own and those of the recent
+        streams.
+        """
         if stream_id is None:
             return self._widest
         known = self._streams.get(stream_id)
         return self._own if known is None else known.values
 
-    def take(self, streams: Mapping[str, Factor]) -> None:
-        """Answer with these from now on."""
+    def replace(self, streams: Mapping[str, Factor]) -> None:
+        """Replace the factors of all streams."""
         trusted = [each for each in streams.values() if not each.doubted]
         latest = max((each.received for each in trusted), default=0.0)
         recent = [each.others for each in trusted if each.received >= latest - RECENT_S]
         self._widest = widest(recent, self._own)
-        self.asked = self._widest.tolist()
+        self.default_factors = self._widest.tolist()
         self._streams = streams

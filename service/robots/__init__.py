@@ -1,1 +1,1 @@
-"""Uploaded URDFs and the robots that are known by name."""
+"""Uploaded URDFs and built-in robot profiles."""

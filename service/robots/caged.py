@@ -1,4 +1,4 @@
-"""Reading a URDF where it can do no harm: `service.runtime.cage` calls this in a process of its own."""
+"""Read a URDF in a separate process, where it can do no harm; called by `service.runtime.cage`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from service.foundation.errors import InvalidDataError, problem
 
 
 def warm() -> None:
-    """Import what reads a URDF; raise MissingExtraError where it is not installed."""
+    """Import the URDF reader; raise MissingExtraError if it is not installed."""
     pinocchio()
 
 
 def read_urdf(urdf: str) -> Description:
-    """What a URDF describes; raise InvalidDataError saying what is wrong with it."""
+    """Return the description of a URDF; raise InvalidDataError naming the error in it."""
     try:
         described = describe(urdf)
         read_limits(urdf, described.joint_names)
@@ -25,5 +25,5 @@ def read_urdf(urdf: str) -> Description:
 
 
 def invalid_urdf(message: str) -> InvalidDataError:
-    """Error for a URDF that cannot be used."""
+    """Return the error for an unusable URDF."""
     return InvalidDataError(message, [problem("urdf", message, "a URDF of an arm with a fixed base")])

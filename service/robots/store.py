@@ -1,4 +1,4 @@
-"""Robots known by name and uploaded: storing and finding them, and fitting them to the joints of data."""
+"""Robot profiles and uploaded URDFs: store and find them, and match them to the joints of data."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from service.foundation.errors import (
     invalid_request,
     not_found,
 )
-from service.foundation.fields import LONGEST, for_people
+from service.foundation.fields import MAX_NAME_CHARS, check_name
 from service.foundation.settings import Settings
 from service.robots.caged import invalid_urdf
 from service.runtime import cage
 from service.storage.database import Database, JobRow, RobotRow, now
 from service.storage.files import new_id
-from service.storage.rows import Page, newest
+from service.storage.rows import Page, read_page
 
 
 def add(database: Database, content: bytes, name: str | None, settings: Settings) -> Robot:
-    """Check a URDF and store it; raise InvalidDataError saying what is wrong with it."""
+    """Check a URDF and store it; raise InvalidDataError naming the error in it."""
     try:
         urdf = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -43,7 +43,7 @@ def add(database: Database, content: bytes, name: str | None, settings: Settings
     described = cage.run("service.robots.caged:read_urdf", Description, urdf, settings=settings, field="urdf")
     row = RobotRow(
         id=new_id("urdf"),
-        name=name or for_people("robot name", described.name[:LONGEST] or "unnamed"),
+        name=name or check_name("robot name", described.name[:MAX_NAME_CHARS] or "unnamed"),
         created_at=now(),
         sha256=hashlib.sha256(urdf.encode()).hexdigest(),
         joints=[{"name": joint.name, "type": MOVABLE[joint.kind]} for joint in described.joints],
@@ -66,17 +66,17 @@ def show(database: Database, robot: str) -> Robot:
 def page(database: Database, part: Page) -> RobotPage:
     """List uploaded robots, newest first."""
     with database.session() as session:
-        rows, following = newest(session, RobotRow, part)
+        rows, following = read_page(session, RobotRow, part)
     return RobotPage(items=[_show(row) for row in rows], next_cursor=following)
 
 
 def list_profiles() -> list[RobotProfile]:
-    """Every robot that is known by name."""
+    """Return all built-in robot profiles."""
     return [_show_profile(profile) for profile in profiles.profiles()]
 
 
 def show_profile(database: Database, robot: str) -> RobotProfile:
-    """The profile of a robot by its name or the id of its uploaded URDF; raise NotFoundError."""
+    """Return the profile of a robot by its name or the id of its uploaded URDF; raise NotFoundError."""
     try:
         profile = profile_of(database, robot)
     except InvalidRequestError:
@@ -97,14 +97,14 @@ def delete(database: Database, robot: str) -> None:
 
 
 def resolve(database: Database, robot: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:
-    """The rigid bodies of a profile or an uploaded URDF for data with these joints.
+    """Return the rigid bodies of a profile or an uploaded URDF, matched to these joints.
 
-    Raise UnknownRobotError, JointMismatchError, UrdfError, or MissingExtraError where profiles are missing.
+    Raise UnknownRobotError, JointMismatchError, UrdfError, or MissingExtraError if profiles are not installed.
     """
     if robot in ROBOTS:
         return _of_profile(robot, joint_names, joint_types)
     if robot in profiles.names():
-        raise UrdfError(profiles.profile(robot).why_no_urdf())
+        raise UrdfError(profiles.profile(robot).explain_missing_urdf())
     row = _find(database, robot)
     if row is None:
         raise UnknownRobotError(
@@ -114,7 +114,7 @@ def resolve(database: Database, robot: str, joint_names: Sequence[str], joint_ty
 
 
 def profile_of(database: Database, robot: str) -> Profile:
-    """The profile of a robot known by name or of an uploaded URDF; raise InvalidRequestError naming what there is."""
+    """Return the profile of a built-in robot or of an uploaded URDF; raise InvalidRequestError listing all robots."""
     known = profiles.names()
     if robot in known:
         return profiles.profile(robot)
@@ -123,17 +123,17 @@ def profile_of(database: Database, robot: str) -> Profile:
         raise invalid_request("robot", robot, f"one of {', '.join(known)}, or the id of an uploaded URDF")
     try:
         return profiles.from_urdf(row.urdf, row.name)
-    except UrdfError as error:  # an earlier release has taken it
+    except UrdfError as error:  # an earlier release accepted it
         raise invalid_urdf(f"robot {robot} cannot be used any more: {error}") from None
 
 
 def _of_profile(robot: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:
-    urdf = profile_urdf(robot)  # where it is missing, says how to install it
-    called = profiles.profile(robot).called(joint_names)
-    if called is None or (called == ROBOTS[robot].free and all(map(is_number, joint_names))):
+    urdf = profile_urdf(robot)  # if it is missing, the error tells how to install it
+    official_names = profiles.profile(robot).official_names(joint_names)
+    if official_names is None or (official_names == ROBOTS[robot].free and all(map(is_number, joint_names))):
         return RigidBody.from_profile(robot, joint_names, joint_types)
-    # data of some of its joints, or under the names of another driver: the others are locked
-    return replace(RigidBody.from_urdf(urdf, joint_names, joint_types, called, robot), matched="name")
+    # the data have fewer joints, or another driver's joint names: the remaining joints are locked
+    return replace(RigidBody.from_urdf(urdf, joint_names, joint_types, official_names, robot), matched="name")
 
 
 def _find(database: Database, robot: str) -> RobotRow | None:
@@ -149,11 +149,11 @@ _NUMBERS = {
     **{"lower": "lower", "upper": "upper", "max_speed": "speed", "max_acceleration": "acceleration"},
     **{"max_torque": "torque", "torque_constant": "torque_constants"},
 }
-"""Fields of a profile by those that the API shows them as."""
+"""Profile attribute for each numeric field of the API."""
 
 
 def _show_profile(profile: Profile) -> RobotProfile:
-    """A profile as the API shows it: what is infinite or not known is null."""
+    """Return a profile as the API shows it; infinite and unknown values are null."""
     joints = [
         ProfileJoint(
             name=name,
@@ -166,7 +166,7 @@ def _show_profile(profile: Profile) -> RobotProfile:
     ]
     same = {each: getattr(profile, each) for each in ("name", "title", "effort", "effort_note", "source")}
     available = profile.urdf is not None
-    note = None if available else profile.why_no_urdf()
+    note = None if available else profile.explain_missing_urdf()
     return RobotProfile(joints=joints, urdf_available=available, urdf_note=note, **same)
 
 

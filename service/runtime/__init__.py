@@ -1,1 +1,1 @@
-"""Work that is divided among processes, of this host or of a cluster."""
+"""Processes and cluster workers that share the work of the service."""

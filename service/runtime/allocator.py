@@ -1,9 +1,9 @@
-"""How the C library of a long-lived process keeps the memory that it is given back.
+"""Memory that the C library of a long-lived process keeps after it is freed.
 
-glibc gives each thread that allocates a heap of its own, up to eight for each CPU, and raises the size from which on it
-asks the system for a block by itself with every block that is freed. A service has dozens of threads: what one of them
-frees, no other one uses, and what lies below a block still in use goes back to nobody until it is asked for. Memory
-grows over thousands of requests and versions, though nothing is held (`python -m benchmarks soak` plots it).
+glibc gives each allocating thread a heap of its own, up to eight per CPU. With every freed block it raises the size
+from which it requests a block directly from the system. A service has dozens of threads: memory that one thread freed
+is unusable for the others. Memory below a used block never returns to the system. The process grows over thousands of
+requests and versions without a leak (`python -m benchmarks soak` plots it).
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from collections.abc import Mapping
 from enum import IntEnum
 
 HEAPS = 1
-"""What one thread frees serves all others. With two, more is left free in between, and no query is answered sooner:
-Python's threads take turns anyway."""
-BLOCK = 1024 * 1024
-"""Bytes from which on a block is the system's own, and goes back to it at once; and of free memory that is kept."""
+"""One heap, so that all threads reuse freed memory. With two, more memory stays free in between, and no query is
+faster: Python's threads take turns anyway."""
+BLOCK_BYTES = 1024 * 1024
+"""Bytes from which a block is requested from the system and returned to it at once; also the max kept free memory."""
 
 
 class Mallopt(IntEnum):
@@ -30,25 +30,29 @@ class Mallopt(IntEnum):
     ARENA_MAX = -8
 
 
-def keep_little(environment: Mapping[str, str] = os.environ) -> bool:
-    """Have this process keep few heaps and little free memory, as long as it lives; return whether it does.
+def limit_free_memory(environment: Mapping[str, str] = os.environ) -> bool:
+    """Limit the heaps and the free memory of this process for its lifetime; return whether it does.
 
-    To be called before it starts threads. Nothing is done where the environment has settings of its own, or the C
-    library is another one.
+    Call it before any thread starts. It does nothing if the environment has settings of its own, or the C library is
+    not glibc.
     """
     if any(name.startswith(("MALLOC_", "GLIBC_TUNABLES")) for name in environment):
         return False
     library = ctypes.CDLL(None)
     if not hasattr(library, "gnu_get_libc_version"):
         return False
-    settings = ((Mallopt.ARENA_MAX, HEAPS), (Mallopt.MMAP_THRESHOLD, BLOCK), (Mallopt.TRIM_THRESHOLD, BLOCK))
+    settings = (
+        (Mallopt.ARENA_MAX, HEAPS),
+        (Mallopt.MMAP_THRESHOLD, BLOCK_BYTES),
+        (Mallopt.TRIM_THRESHOLD, BLOCK_BYTES),
+    )
     taken = [library.mallopt(parameter, value) for parameter, value in settings]
     threading.Thread(target=_give_back_often, name="give-back", daemon=True).start()
     return all(taken)
 
 
 def give_back() -> None:
-    """Give the system all memory that this process has free, wherever it lies; nothing with a library but glibc."""
+    """Return all free memory of this process to the system; do nothing without glibc."""
     library = ctypes.CDLL(None)
     if hasattr(library, "malloc_trim"):
         library.malloc_trim(0)
@@ -56,5 +60,5 @@ def give_back() -> None:
 
 def _give_back_often() -> None:
     while True:
-        time.sleep(60.0)  # it takes a heap's lock for a millisecond
+        time.sleep(60.0)  # it locks a heap for a millisecond
         give_back()

@@ -1,9 +1,8 @@
-"""Functions that read strangers' files, called in a process that can do nothing else: see `confinement`.
+"""Calls of functions that read untrusted files, each in a confined process: see `confinement`.
 
-A process that has imported the readers waits for calls, and is forked ahead of each: see `reader_process`. What goes
-there are names, paths and plain values; what comes back is data of a type that the caller names, checked against it.
-Nothing is unpickled. A process that crashes, hangs or takes too much costs its own call an answer of 422 or 413, and
-nobody else anything.
+A process that has imported the readers waits for calls and forks a process ahead of each: see `reader_process`. It
+receives names, paths and plain values; it returns data of a type that the caller names, and they are checked. Nothing
+is unpickled. A process that crashes, hangs or exceeds a limit fails only its own call, with 422 or 413.
 """
 
 from __future__ import annotations
@@ -25,40 +24,40 @@ import msgspec
 from lipcore.extras import MissingExtraError
 from service.foundation.errors import NotReadyError, ServiceError, TooLargeError, invalid_data, problem, readable
 from service.foundation.settings import Settings
-from service.runtime.confinement import OPEN_FILES
+from service.runtime.confinement import MAX_OPEN_FILES
 from service.runtime.progress import LOOK_S, Progress
 from service.runtime.reader_messages import (
     ERRORS,
-    OUTPUT_BYTES,
+    MAX_OUTPUT_BYTES,
     Answer,
     Call,
     Failure,
     Outcome,
-    plain,
+    from_plain,
     receive,
     send,
-    typed,
+    to_plain,
 )
 
 logger = logging.getLogger(__name__)
 T = TypeVar("T")
 
 IMPORT_S = 120.0
-"""Longest wait in s for a process that is yet to be started, to import a reader or to answer, on a busy machine."""
+"""Max wait for a process to start, import a reader or answer, s, on a busy machine."""
 ENVIRONMENT = {
     "LANG": "C.UTF-8",
-    "OPENBLAS_NUM_THREADS": "1",  # a thread that runs when a process is forked is not in the fork
+    "OPENBLAS_NUM_THREADS": "1",  # a running thread is not copied by a fork
     "OMP_NUM_THREADS": "1",
-    "MALLOC_ARENA_MAX": "2",  # each takes address space, used or not
+    "MALLOC_ARENA_MAX": "2",  # each uses address space, even if empty
     "ARROW_DEFAULT_MEMORY_POOL": "system",
 }
 CPU_SHARE = 0.5
-"""Processor time that reading one upload may take, in shares of its time."""
+"""Max processor time of one upload's reader, as a share of its max time."""
 _making = threading.Lock()
 
 
 class UnexpectedReaderError(RuntimeError):
-    """A reader failed with an error that it should not have, which the log shows."""
+    """A reader failed with an unexpected error; the log shows it."""
 
 
 def run(
@@ -69,21 +68,26 @@ def run(
     folder: Path | None = None,
     field: str = "file",
 ) -> T:
-    """Call `module:function` in a confined process; return what it does, of the type `returns`. Not for the event loop.
+    """Call `module:function` in a confined process; return its result as the type `returns`. Not for the event loop.
 
-    function: its module is imported before the process is forked, and what that has to do first is done by a function
-    `warm` of it; arguments: plain values, data classes of such, paths, small arrays, settings (of which what readers
-    need goes); folder: may be written, paths among the arguments be read; field: what errors call the file. Raise what
-    the function raises of `ERRORS`, MissingExtraError and OSError; InvalidDataError where it reached a limit or
-    crashed, TooLargeError where that is one of size; UnexpectedReaderError for any other error of the function.
+    - function: its module is imported before the fork; the module's function `warm`, if any, is called then.
+    - returns: the type that the result is checked against.
+    - arguments: plain values, data classes of them, paths, small arrays, and settings. Of settings, only those for
+      readers are sent.
+    - settings: contain the limits.
+    - folder: the function may write here. It may read paths among the arguments.
+    - field: name of the file in errors.
+
+    Raise the function's error if it is one of `ERRORS`, MissingExtraError or OSError. Raise InvalidDataError if it
+    crashed or reached a limit, TooLargeError if that is a limit of size, UnexpectedReaderError for any other error.
     """
     limits = settings.parser_memory_bytes, cpu_s(settings), settings.parser_s, settings.max_unpacked_bytes
     paths = [os.fspath(each) for each in arguments if isinstance(each, Path)]
     write = [] if folder is None else [os.fspath(folder)]
-    encoded = msgspec.Raw(msgspec.msgpack.encode(arguments, enc_hook=plain))
+    encoded = msgspec.Raw(msgspec.msgpack.encode(arguments, enc_hook=to_plain))
     outcome = _ask(Call(function, encoded, paths, write, *limits))
     if outcome.output:
-        shown = readable(outcome.output.decode(errors="backslashreplace"))[:OUTPUT_BYTES]
+        shown = readable(outcome.output.decode(errors="backslashreplace"))[:MAX_OUTPUT_BYTES]
         logger.warning("a reader of an upload wrote", extra={"fields": {"reader": function, "output": shown}})
     if outcome.late:
         raise _beyond("time", field, settings)
@@ -101,9 +105,12 @@ def run(
 
 
 def _decoder(kind: type[T]) -> msgspec.msgpack.Decoder[T]:
-    """Made by one thread at a time: two that are the first to use a type of msgspec at once can end the process."""
+    """Return a decoder, made by one thread at a time.
+
+    Two threads that first use a msgspec type at the same time can crash the process.
+    """
     with _making:
-        return msgspec.msgpack.Decoder(kind, dec_hook=typed)
+        return msgspec.msgpack.Decoder(kind, dec_hook=from_plain)
 
 
 def _ask(call: Call) -> Outcome:
@@ -116,15 +123,17 @@ def _ask(call: Call) -> Outcome:
                 connection.settimeout(call.wall_s + IMPORT_S)
                 send(connection, data)
                 return _decoder(Outcome).decode(receive(connection))
-        # the process that waits for calls had just ended, or hangs, or none can be started
+        # the waiting process had just ended, hangs, or cannot start
         except (EOFError, OSError) as error:
             failed = error
     raise NotReadyError(f"uploads cannot be read now: no process can be started for it ({failed!r})")
 
 
 def _hand_over(call: Call, connection: socket.socket, process: Any) -> None:
-    """Name the function of a call and wait until a process has it; raise TimeoutError where the one that waits for
-    calls hangs, once that has been ended."""
+    """Send the name of a call's function and wait until a process accepts the call.
+
+    Raise TimeoutError if the waiting process hangs; it is killed first.
+    """
     progress = Progress(lambda: [process.pid], call.wall_s, IMPORT_S)
     connection.settimeout(LOOK_S)
     send(connection, call.function.encode())
@@ -141,17 +150,17 @@ def _hand_over(call: Call, connection: socket.socket, process: Any) -> None:
 
 
 def cpu_s(settings: Settings) -> int:
-    """Processor time in s that reading one upload may take."""
+    """Return the max processor time for reading one upload, s."""
     return max(1, round(CPU_SHARE * settings.parser_s))
 
 
 def _beyond(limit: str, field: str, settings: Settings) -> ServiceError:
-    """The error of a file that takes more than a limit."""
+    """Return the error of a file that exceeds a limit."""
     of = {
         "memory": ("memory", f"{settings.parser_memory_bytes} bytes", "LIPSERVE_PARSER_MEMORY_BYTES"),
         "processor": ("processor time", f"{cpu_s(settings)} s", "LIPSERVE_PARSER_S"),
         "time": ("time", f"{settings.parser_s:g} s", "LIPSERVE_PARSER_S"),
-        "files": ("open files", f"{OPEN_FILES}", None),
+        "files": ("open files", f"{MAX_OPEN_FILES}", None),
         "size": ("space", f"{settings.max_unpacked_bytes} bytes", "LIPSERVE_MAX_UNPACKED_BYTES"),
     }
     what, most, setting = of[limit]
@@ -183,7 +192,7 @@ def _ending(status: int) -> str:
 
 
 class _Spawner:
-    """The process of this one that waits for calls; started when it is needed."""
+    """The child process that waits for calls; started on the first call."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -192,7 +201,7 @@ class _Spawner:
         self._owner = 0
 
     def connect(self) -> tuple[socket.socket, Any]:
-        """A connection for one call, and the process that it goes to; raise OSError where none can be started."""
+        """Return a connection for one call and the process that receives it; raise OSError if none can start."""
         ours, theirs = socket.socketpair()
         with theirs, self._lock:
             control = self._control if self._owner == os.getpid() else None  # a forked process starts its own
@@ -200,12 +209,12 @@ class _Spawner:
                 if control is None:
                     raise ConnectionError
                 socket.send_fds(control, [b"c"], [theirs.fileno()])
-            except ConnectionError:  # it has ended, as it does when nobody calls
+            except ConnectionError:  # it ended, as it does after a time without calls
                 socket.send_fds(self._start(), [b"c"], [theirs.fileno()])
             return ours, self._process
 
     def end(self, process: Any) -> None:
-        """End a process, and start another one for the next call."""
+        """Kill a process; the next call starts another one."""
         with self._lock:
             if process is self._process and self._control is not None:
                 process.kill()
@@ -221,7 +230,7 @@ class _Spawner:
 
 
 def start(control: socket.socket) -> Any:
-    """Start a process that serves the calls of a socket, with no descriptor and no variable but what it needs."""
+    """Start a process that serves the calls of a socket, with only the descriptors and variables that it needs."""
     path = json.dumps([os.path.abspath(each) for each in sys.path])
     code = (
         "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from service.runtime import reader_process as process"
@@ -233,7 +242,7 @@ def start(control: socket.socket) -> Any:
         env=ENVIRONMENT
         | {name: os.environ[name] for name in ("LD_LIBRARY_PATH", "NUMBA_CACHE_DIR", "TZ") if name in os.environ},
         cwd="/",
-        start_new_session=True,  # Ctrl-C is not for it
+        start_new_session=True,  # Ctrl-C must not reach it
     )
 
 

@@ -1,4 +1,4 @@
-"""The connection of a service to the scheduler of its cluster; a thread makes it again whenever it is lost."""
+"""The connection of a service to the scheduler of its cluster; a thread restores it after each loss."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from service.runtime.executors import ClusterUnavailableError, connect
 logger = logging.getLogger(__name__)
 
 LOOK_S = 2.0
-"""Seconds between two looks at the scheduler."""
+"""Seconds between two checks of the scheduler."""
 JOB, GPU = "JOB", "GPU"
-"""Tags of workers that take jobs, and of those that have a GPU."""
+"""Tags of workers that run jobs, and of those that have a GPU."""
 
 
 def needs_gpu(request: dict[str, Any]) -> bool:
-    """Whether a job, by its request, has to run on a worker with a GPU."""
+    """Return whether a job needs a worker with a GPU, from its request."""
     return bool(request.get("options", {}).get("device") == "cuda")
 
 
 class Cluster:
-    """A cluster as one service sees it. All but `close` return at once, whatever the scheduler does.
+    """The cluster of one service. All methods but `close` return at once, even if the scheduler does not answer.
 
-    problem: why it cannot be used now, None while it can; jobs, gpus: how many jobs its workers take at a time, and
-    how many of these with a GPU, as they were counted last.
+    problem: why the cluster cannot be used now, None if it can. jobs, gpus: number of jobs that its workers run at a
+    time, and of those with a GPU, at the last count.
     """
 
     def __init__(self, address: str) -> None:
@@ -42,35 +42,35 @@ class Cluster:
         self._thread.start()
 
     def submit(self, key: str, gpu: bool, function: Callable[..., Any], *given: Any) -> Any:
-        """Have a worker that takes jobs call a function, even where this service is no more: a future of the cluster.
+        """Call a function on a worker that runs jobs; return a future of the cluster.
 
-        Raise ClusterUnavailableError.
+        The call continues if this service ends. Raise ClusterUnavailableError.
         """
         client = self._client
         if self.problem is not None or client is None:
             raise ClusterUnavailableError(self.problem or "not connected")
         import distributed  # noqa: PLC0415 - an extra
 
-        keep: Any = distributed.fire_and_forget  # its module is typed in part
+        keep: Any = distributed.fire_and_forget  # its module is only partly typed
         resources = {JOB: 1, GPU: 1} if gpu else {JOB: 1}
         try:
             future = client.submit(function, *given, key=key, resources=resources, pure=False)
             keep(future)
-        except Exception as error:  # it was lost just now, which has many forms
+        except Exception as error:  # a connection that was just lost raises many kinds of errors
             raise ClusterUnavailableError(f"the scheduler {self.address} cannot be used: {error}") from None
         return future
 
     def knows(self, future: Any) -> bool:
-        """Whether the scheduler still has the call in hand."""
+        """Return whether the scheduler still has the call."""
         return future.client is self._client and not future.done()
 
     def drop(self, future: Any) -> None:
-        """Take a call back that nobody needs any more, if it has not begun."""
+        """Withdraw a call that is no longer needed, if it has not started."""
         if self.knows(future):  # in a thread: it waits for the scheduler
             threading.Thread(target=_cancel, args=(future,), daemon=True).start()
 
     def close(self) -> None:
-        """Leave the cluster; what was submitted goes on."""
+        """Leave the cluster; submitted calls continue."""
         self._closing.set()
         self._thread.join()
         self._leave()
@@ -101,7 +101,7 @@ class Cluster:
         self.gpus = sum(bool(each.get(GPU)) for each in takes)
 
     def _reach(self) -> None:
-        """Raise an error where nobody listens: a client would try for long, and log it."""
+        """Raise an error if nothing listens at the address: a client would retry for long, and log it."""
         parts = urlsplit(self.address)
         try:
             socket.create_connection((parts.hostname or "", parts.port or 8786), LOOK_S).close()
@@ -113,10 +113,10 @@ class Cluster:
     def _leave(self) -> None:
         client, self._client = self._client, None
         if client is not None:
-            with suppress(Exception):  # it may be gone
+            with suppress(Exception):  # the connection may be closed already
                 client.close(timeout=1.0)
 
 
 def _cancel(future: Any) -> None:
-    with suppress(Exception):  # then a worker finds that there is nothing to do
+    with suppress(Exception):  # a worker then finds that there is nothing to do
         future.cancel(force=True)

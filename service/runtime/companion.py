@@ -1,6 +1,6 @@
-"""A process beside the service: given work, listened to, and started again when it dies or hangs.
+"""A process beside the service: it receives work, sends messages, and is restarted if it ends or hangs.
 
-Nothing here imports numerics: the process takes its place on the machine before it does, see `compute.process`.
+Nothing here imports numerics: the process sets its options before it does, see `service.runtime.process`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any
 
 from service.foundation.settings import Settings
-from service.runtime.process import Place, call, start_process
+from service.runtime.process import ProcessOptions, call, start_process
 from service.runtime.progress import LOOK_S, Progress
 
 logger = logging.getLogger(__name__)
@@ -26,39 +26,42 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class CompanionOptions:
-    """When the process is started again, and when it is replaced."""
+    """Times of restart and replacement."""
 
     pause_s: float = 0.5
-    """Seconds until a process that died is started again: each time twice as long."""
+    """Seconds until an ended process is restarted; doubled each time."""
     max_pause_s: float = 30.0
-    """Max of these seconds; a process that lived for so long begins again at `pause_s`."""
+    """Max of these seconds. A process that lived this long starts again at `pause_s`."""
     quiet_s: float = 45.0
-    """Seconds in which the process neither ends a step nor computes, after which it is replaced."""
+    """Seconds without a finished step and without computation, after which the process is replaced."""
     step_s: float = 900.0
-    """Seconds of one step after which the process is replaced."""
+    """Max seconds of one step, after which the process is replaced."""
 
 
 COMPANION = CompanionOptions()
 
 
 BEAT, BEAT_S = "beat", 1.0
-"""What the process says after a step, and how often it says so at most, s."""
+"""Message of the process after a step, and the min seconds between two of them."""
 Work = dict[Hashable, list[Any]]
-"""What is to be done, by what it is about, in order."""
+"""Items of work by subject, in order."""
 
 
 class Companion:
-    """A process that is started when it gets work for the first time, and ends with the service.
+    """A process that starts with its first work and ends with the service.
 
-    name: for people; place: on the machine; run: module and function that the process runs, with the settings and a
-    connection over which it is given `Work`, None at the end; on_message: called in a thread of its own, with one
-    message after the other, in the order in which they were sent; at_start: what each process is told of first.
+    - name: for people.
+    - place: share of the machine.
+    - run: module and function that the process runs, with the settings and a connection. It receives `Work`, and None
+      at the end.
+    - on_message: called with each message in order, in a thread of its own.
+    - at_start: returns the subjects of the first work of each new process.
     """
 
     def __init__(
         self,
         name: str,
-        place: Place,
+        place: ProcessOptions,
         settings: Settings,
         run: tuple[str, str],
         on_message: Callable[[Any], None],
@@ -76,24 +79,26 @@ class Companion:
 
     @property
     def pid(self) -> int | None:
-        """Id of the process, None while there is none."""
+        """Id of the process, None if there is none."""
         process = self._process
         return None if process is None or not process.is_alive() else process.pid
 
     @property
     def silent_s(self) -> float:
-        """Seconds for which the process has not got on; 0 while it does, or there is none."""
+        """Seconds without progress of the process; 0 if it makes progress, or there is none."""
         progress = self._progress
         return 0.0 if progress is None else progress.silent_s
 
     @property
-    def needed(self) -> bool:
-        """Whether there should be a process: it has got work, and the service is not closing."""
+    def is_needed(self) -> bool:
+        """Return whether there should be a process: it has received work, and the service is not closing."""
         return bool(self._threads) and not self._closing
 
     def give(self, about: Hashable, *items: Any, most: int | None = None) -> int:
-        """Give the process work. Never waits for it. Of what it has not taken yet at most the last `most` items are
-        kept; return how many were dropped."""
+        """Queue work for the process without waiting; return the number of dropped items.
+
+        most: max items that wait; the oldest are dropped.
+        """
         with self._changed:
             if self._closing:
                 return 0
@@ -109,7 +114,7 @@ class Companion:
             return dropped
 
     def close(self) -> None:
-        """Let the process end; end it where that takes too long."""
+        """End the process; kill it after 5 s."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()
@@ -129,7 +134,7 @@ class Companion:
             began = time.monotonic()
             try:
                 connection, self._process = self._start()
-            except Exception:  # no memory, too many processes: another time there may be
+            except Exception:  # no memory or too many processes: a retry may succeed
                 logger.exception("the %s process cannot be started: tried again", self.name)
                 pause = self._rest(pause)
                 continue
@@ -138,7 +143,7 @@ class Companion:
                 for each in self._at_start():
                     self._work.setdefault(each, [])
                 self._changed.notify_all()
-                if self._closing:  # while it was started: the sender has gone already
+                if self._closing:  # closed during the start: the sender has ended already
                     self._process.kill()
             self._listen(connection, self._process)
             self._process.join()
@@ -152,7 +157,7 @@ class Companion:
             pause = self._rest(pause)
 
     def _rest(self, pause: float) -> float:
-        """Wait before the next start; return how long to wait before the one after that."""
+        """Wait before the next start; return the wait before the one after that."""
         with self._changed:
             self._changed.wait_for(lambda: self._closing, pause)
         return min(2 * pause, COMPANION.max_pause_s)
@@ -163,7 +168,7 @@ class Companion:
         arguments = self.place, self._run, self.settings, theirs
         process = context.Process(target=_begin, args=arguments, daemon=True, name=f"lipserve-{self.name}")
         process.start()
-        theirs.close()  # the process has its own: with this one open, its end would go unnoticed
+        theirs.close()  # the process has its own copy: an open copy here would hide its end
         return ours, process
 
     def _listen(self, connection: Connection, process: BaseProcess) -> None:
@@ -186,26 +191,28 @@ class Companion:
                 continue
             try:
                 self.on_message(message)
-            except Exception:  # the next one may be right
+            except Exception:  # the next one may be valid
                 logger.exception("a message of the %s process was not taken: %s", self.name, message)
 
     def _send(self) -> None:
-        """Hand over work: in a thread, because the process may be busy and the pipe full."""
+        """Send work, in a thread: the process may be busy and the pipe full."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._closing or (self._connection is not None and self._work))
                 connection, closing = self._connection, self._closing
                 work, self._work = self._work, {}
             if connection is not None:
-                with suppress(OSError):  # it has died
+                with suppress(OSError):  # the process has ended
                     connection.send(None if closing else work)
             if closing:
                 return
 
 
-def received(connection: Connection, seconds: float) -> Work | None:
-    """The work that the service gives its companion within so many seconds, None where it is time to end; for the
-    process. Raise EOFError where the service is gone."""
+def receive_work(connection: Connection, seconds: float) -> Work | None:
+    """Return the work that arrives within `seconds`, None if the process has to end. Called in the process.
+
+    Raise EOFError if the service is gone.
+    """
     work: Work = {}
     while connection.poll(seconds):
         given = connection.recv()
@@ -217,8 +224,8 @@ def received(connection: Connection, seconds: float) -> Work | None:
     return work
 
 
-def _begin(place: Place, run: tuple[str, str], settings: Settings, connection: Connection) -> None:
+def _begin(place: ProcessOptions, run: tuple[str, str], settings: Settings, connection: Connection) -> None:
     start_process(place)
-    # a signal to all processes of the service ends the parent in order, which then lets this one end
+    # a signal to all processes ends the parent in order, which then ends this one
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    call(*run, settings, connection)  # numerics, see above
+    call(*run, settings, connection)  # imports numerics, see the module's docstring

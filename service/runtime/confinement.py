@@ -1,9 +1,8 @@
-"""What a process that reads a stranger's file is left with: so much memory, time and disk, the files that it is given,
-no network, no other process. Each is what the kernel keeps to, whatever code the file may bring to run.
+"""Confinement of a process that reads an untrusted file: limited memory, time and disk, only the given files, no
+network, no other processes. The kernel enforces all of it, whatever code the file may run.
 
-Limits of resources are POSIX. On Linux capabilities are given up, Landlock keeps the process from files
-(https://docs.kernel.org/userspace-api/landlock.html), and a seccomp filter from system calls that no parser makes. All
-are irrevocable.
+The resource limits are POSIX. On Linux the process also drops its capabilities. Landlock restricts its files
+(https://docs.kernel.org/userspace-api/landlock.html), and a seccomp filter the system calls. All are irrevocable.
 """
 
 from __future__ import annotations
@@ -25,13 +24,16 @@ from pathlib import Path
 from typing import Any
 
 LINUX = sys.platform == "linux"
-OPEN_FILES = 256
+MAX_OPEN_FILES = 256
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """memory: bytes of address space beyond what the process has now; cpu_s: of processor time; file: bytes of the
-    largest file that it may write."""
+    """Resource limits of one call.
+
+    memory: bytes of address space beyond the current size of the process. cpu_s: processor time, s. file: max bytes of
+    a file that it writes.
+    """
 
     memory: int
     cpu_s: int
@@ -40,21 +42,23 @@ class Bounds:
 
 @cache
 def protections() -> dict[str, bool]:
-    """What this platform has, by name; a process is confined by all of it. Nothing is changed by asking."""
+    """Return the protections of this platform by name; a process is confined by all that are True."""
     return {
-        "memory": LINUX,  # macOS takes the limit, and does not keep to it
+        "memory": LINUX,  # macOS accepts the limit but does not enforce it
         "processor": True,
         "landlock": LINUX and _landlock_version() > 0,
         "seccomp": _architecture() is not None and _has_filters(),
     }
 
 
-def renounce() -> None:
-    """Give up for good what no call needs: rights, the network, other processes. This one has one thread, and ends with
-    the one that has forked it. Raise OSError where anything that `protections` names cannot be had."""
+def drop_privileges() -> None:
+    """Give up rights, network and other processes for good, which no call needs; end with the parent.
+
+    The process must have one thread. Raise OSError if a protection that `protections` names cannot be applied.
+    """
     if LINUX:
         _call("prctl", Prctl.SET_PDEATHSIG, 9, 0, 0, 0)
-        with suppress(OSError):  # a sandbox of its own may have closed it
+        with suppress(OSError):  # another sandbox may forbid it
             Path("/proc/self/oom_score_adj").write_text("1000")
         _drop_capabilities()
         _call("prctl", Prctl.SET_NO_NEW_PRIVS, 1, 0, 0, 0)
@@ -63,9 +67,10 @@ def renounce() -> None:
 
 
 def confine(bounds: Bounds, read: Iterable[Path], write: Iterable[Path]) -> None:
-    """Give up what a call does not need, either: all resources and files but some.
+    """Give up all resources and files that a call does not need.
 
-    read, write: files and folders that it keeps; it can read its own modules, too. Raise OSError as `renounce` does.
+    read, write: files and folders that it keeps; it can always read its own modules. Raise OSError as `drop_privileges`
+    does.
     """
     has = protections()
     _limit(bounds, has["memory"])
@@ -77,7 +82,7 @@ def _limit(bounds: Bounds, memory: bool) -> None:
     limits = {
         resource.RLIMIT_CPU: bounds.cpu_s,
         resource.RLIMIT_FSIZE: bounds.file,
-        resource.RLIMIT_NOFILE: OPEN_FILES,
+        resource.RLIMIT_NOFILE: MAX_OPEN_FILES,
         resource.RLIMIT_CORE: 0,
     }
     if memory:
@@ -86,7 +91,7 @@ def _limit(bounds: Bounds, memory: bool) -> None:
     for kind, most in limits.items():
         hard = resource.getrlimit(kind)[1]
         soft = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        # a process that passes over the signal of its processor time is ended a second later
+        # a process that ignores the signal of its processor time is killed a second later
         spare = 1 if kind == resource.RLIMIT_CPU else 0
         resource.setrlimit(kind, (soft, soft + spare if hard == resource.RLIM_INFINITY else min(soft + spare, hard)))
 
@@ -101,7 +106,7 @@ class Prctl(IntEnum):
 
 
 class Landlock(IntEnum):
-    """System calls of Landlock, numbered alike on all machines."""
+    """System calls of Landlock, with the same numbers on all machines."""
 
     CREATE_RULESET = 444
     ADD_RULE = 445
@@ -125,12 +130,12 @@ def _drop_capabilities() -> None:
 def _landlock_version() -> int:
     try:
         return _call("syscall", Landlock.CREATE_RULESET, None, ctypes.c_size_t(0), 1)
-    except OSError:  # an older kernel, or one that was started without it
+    except OSError:  # an older kernel, or Landlock is switched off
         return 0
 
 
 class Rights(IntFlag):
-    """Landlock's rights on files that are given: none to links, pipes, sockets or devices."""
+    """Landlock's rights on given files: none on links, pipes, sockets or devices."""
 
     WRITE_FILE = 1 << 1
     READ_FILE = 1 << 2
@@ -142,7 +147,7 @@ class Rights(IntFlag):
     TRUNCATE = 1 << 14
     READ = READ_FILE | READ_DIR
     FILE = WRITE_FILE | READ_FILE | TRUNCATE
-    """Rights that a file has, and not its folder."""
+    """Rights on a file, as opposed to a folder."""
     WRITE = READ | FILE | REMOVE_DIR | REMOVE_FILE | MAKE_DIR | MAKE_FILE
 
 
@@ -152,11 +157,11 @@ class _Rule(ctypes.Structure):
 
 
 def _keep_files(read: Iterable[Path], write: Iterable[Path]) -> None:
-    """Keep some files and folders; all else, TCP and processes outside are out of reach."""
+    """Allow some files and folders; forbid all others, TCP and signals to other processes."""
     version = _landlock_version()
-    rights_since = {1: 13, 2: 14, 3: 15, 5: 16}  # how many there are from a version on
+    rights_since = {1: 13, 2: 14, 3: 15, 5: 16}  # number of rights by the version that added them
     handled = (1 << max(count for since, count in rights_since.items() if since <= version)) - 1
-    # files; TCP, from version 4 on: to bind and connect; abstract sockets and signals, from version 6 on
+    # files; TCP bind and connect, from version 4; abstract sockets and signals, from version 6
     attributes = (ctypes.c_uint64 * 3)(handled, 3, 3)
     size = ctypes.c_size_t(8 * (3 if version >= 6 else 2 if version >= 4 else 1))
     rules = _call("syscall", Landlock.CREATE_RULESET, attributes, size, 0)
@@ -173,7 +178,10 @@ def _keep_files(read: Iterable[Path], write: Iterable[Path]) -> None:
 
 @cache
 def own_files() -> list[Path]:
-    """Modules, and the libraries and tables that they open. Not what else lies beside a package, as a home may."""
+    """Return our modules, and the libraries and tables that they open.
+
+    Other files beside a package are left out; a home may lie there.
+    """
     modules = [Path(str(import_module(name).__file__)).parent for name in ("lipcore", "lipserve", "service")]
     python = [Path(each) for name, each in sysconfig.get_paths().items() if name in ("stdlib", "platstdlib")]
     packages = [Path(each) for name, each in sysconfig.get_paths().items() if name in ("purelib", "platlib")]
@@ -181,8 +189,8 @@ def own_files() -> list[Path]:
 
 
 _ARCHITECTURES = {"x86_64": (0xC000003E, 0), "aarch64": (0xC00000B7, 1)}
-"""By the name of a machine: what a filter sees of it, and the place of its numbers in the tables below."""
-FORBIDDEN = {
+"""By machine: its number in a filter, and its column in the tables below."""
+FORBIDDEN_CALLS = {
     **{"socket": (41, 198), "socketpair": (53, 199)},
     **{"execve": (59, 221), "execveat": (322, 281), "fork": (57, None), "vfork": (58, None)},
     **{"ptrace": (101, 117), "process_vm_readv": (310, 270), "process_vm_writev": (311, 271)},
@@ -196,10 +204,10 @@ FORBIDDEN = {
     **{"unshare": (272, 97), "setns": (308, 268), "bpf": (321, 280), "userfaultfd": (323, 282)},
     **{"perf_event_open": (298, 241), "io_uring_setup": (425, 425), "io_uring_enter": (426, 426)},
 }
-"""Numbers of system calls (x86_64, aarch64): the network, other programs and processes, what outlives a process, and
-parts of the kernel that have been the way in for many an attack."""
-OF_ITSELF = {"kill": (62, 129), "tgkill": (234, 131), "rt_tgsigqueueinfo": (297, 240), "prlimit64": (302, 261)}
-"""Those that a process may do to itself: their first argument is a process."""
+"""Numbers of forbidden system calls (x86_64, aarch64): network, other programs and processes, objects that outlive a
+process, and kernel parts that were exploited often."""
+SELF_ONLY_CALLS = {"kill": (62, 129), "tgkill": (234, 131), "rt_tgsigqueueinfo": (297, 240), "prlimit64": (302, 261)}
+"""System calls that a process may apply only to itself: their first argument is a process."""
 Instruction = tuple[int, int, int, int]
 
 
@@ -214,15 +222,15 @@ class Code(IntEnum):
 
 
 class Action(IntEnum):
-    """Answers of a filter."""
+    """Results of a filter."""
 
     ALLOW = 0x7FFF0000
     KILL = 0x80000000
     ERROR = 0x50000
 
 
-class At(IntEnum):
-    """Where the number of a call, the machine and the lower half of the first argument lie."""
+class CallOffset(IntEnum):
+    """Offsets of the call's number, the machine, and the lower half of the first argument."""
 
     NUMBER = 0
     MACHINE = 4
@@ -247,37 +255,37 @@ def _has_filters() -> bool:
 
 def _filter_calls() -> None:
     machine, place = _ARCHITECTURES[platform.machine()]
-    made = (_Instruction * len(program := calls(machine, place, os.getpid())))(
+    made = (_Instruction * len(program := build_filter(machine, place, os.getpid())))(
         *(_Instruction(*each) for each in program)
     )
     _call("prctl", Prctl.SET_SECCOMP, 2, ctypes.byref(_Program(len(made), made)), 0, 0)
 
 
-def calls(machine: int, place: int, pid: int) -> Sequence[Instruction]:
-    """The filter's program: (code, steps over where true, where false, constant) each."""
+def build_filter(machine: int, place: int, pid: int) -> Sequence[Instruction]:
+    """Return the filter's program: (code, steps to skip if true, if false, constant) each."""
     refuse, allow = (Code.RETURN, 0, 0, Action.ERROR | EPERM), (Code.RETURN, 0, 0, Action.ALLOW)
     program = [
-        (Code.LOAD, 0, 0, At.MACHINE),
+        (Code.LOAD, 0, 0, CallOffset.MACHINE),
         (Code.EQUAL, 1, 0, machine),
         (Code.RETURN, 0, 0, Action.KILL),
-        (Code.LOAD, 0, 0, At.NUMBER),
-        (Code.AT_LEAST, 0, 1, 0x40000000),  # the calls of x32, which are the same once more
+        (Code.LOAD, 0, 0, CallOffset.NUMBER),
+        (Code.AT_LEAST, 0, 1, 0x40000000),  # the calls of x32, a second set of the same calls
         refuse,
-        (Code.EQUAL, 0, 1, 435),  # clone3: its flags cannot be seen; without it the C library takes `clone`
+        (Code.EQUAL, 0, 1, 435),  # clone3: a filter cannot see its flags; without it the C library uses `clone`
         (Code.RETURN, 0, 0, Action.ERROR | ENOSYS),
     ]
-    for numbers in FORBIDDEN.values():
+    for numbers in FORBIDDEN_CALLS.values():
         if (number := numbers[place]) is not None:
             program += [(Code.EQUAL, 0, 1, number), refuse]
-    # clone makes threads, not processes
+    # clone may make threads, not processes
     program += [
         (Code.EQUAL, 0, 4, (56, 220)[place]),
-        (Code.LOAD, 0, 0, At.FIRST),
+        (Code.LOAD, 0, 0, CallOffset.FIRST),
         (Code.ANY_BIT, 0, 1, 0x10000),
         allow,
         refuse,
     ]
-    for numbers in OF_ITSELF.values():
-        program += [(Code.EQUAL, 0, 5, numbers[place]), (Code.LOAD, 0, 0, At.FIRST)]
+    for numbers in SELF_ONLY_CALLS.values():
+        program += [(Code.EQUAL, 0, 5, numbers[place]), (Code.LOAD, 0, 0, CallOffset.FIRST)]
         program += [(Code.EQUAL, 1, 0, pid), (Code.EQUAL, 0, 1, 0), allow, refuse]
     return [*program, allow]

@@ -1,4 +1,4 @@
-"""What may be open only so many times at once, such as streams and followers."""
+"""A limit on what is open at once, such as streams and followers."""
 
 from __future__ import annotations
 
@@ -9,8 +9,11 @@ from typing import ClassVar
 from service.foundation.errors import BusyError
 
 
-class Counted:
-    """Counts what is open. too_many: the message beyond the most, with a place for the number; headers: go with it."""
+class OpenCounter:
+    """Counts open things of one kind.
+
+    too_many: message of the error beyond the limit, with a place for the number. headers: sent with the error.
+    """
 
     too_many: ClassVar[str]
     headers: ClassVar[dict[str, str]] = {}
@@ -19,8 +22,8 @@ class Counted:
         self.open = 0
 
     @contextmanager
-    def one_more(self, most: int) -> Iterator[None]:
-        """Count one while it lasts; raise BusyError beyond `most`."""
+    def count_one(self, most: int) -> Iterator[None]:
+        """Count one for the duration of the block; raise BusyError beyond `most`."""
         if self.open >= most:
             raise BusyError(self.too_many.format(self.open), headers=self.headers)
         self.open += 1

@@ -1,12 +1,11 @@
-"""Executors for shards of work: this process, processes of this host, or workers of a Dask cluster; and sums over
-shards that do not depend on who computes which.
+"""Executors of shards: this process, processes of this host, or workers of a Dask cluster; and reproducible sums.
 
-Work that is given to them has to be a function of a module, with plain data. On a cluster it runs on another host,
-whose settings are its own: see `placed`.
+A shard's work is a function of a module with plain data. On a cluster it runs on another host, which has settings of
+its own: see `choose_settings`.
 
-Shard k's result is added to those before it as a binary counter counts: two neighbours make a pair, two pairs a four.
-Floating-point sums depend on their order, and this one is given by the number of shards alone. No more results are kept
-than the counter has digits, and those that are ahead of their turn.
+Results are added like the digits of a binary counter: two neighbours make a pair, two pairs a four. A floating-point
+sum depends on its order, and here only the number of shards sets the order. Memory contains one result per digit of the
+counter, and the results that wait for their turn.
 """
 
 from __future__ import annotations
@@ -24,10 +23,10 @@ from multiprocessing.process import BaseProcess
 from typing import Any, ParamSpec, Protocol, Self, TypeVar
 
 from lipcore.estimators.hyperparameters import FitCancelledError
-from lipcore.extras import need
+from lipcore.extras import import_extra
 from service.foundation.settings import Settings
 from service.runtime import remote
-from service.runtime.process import Place, start_process
+from service.runtime.process import ProcessOptions, start_process
 from service.runtime.progress import HEARTBEAT_S, LOOK_S, Progress
 from service.telemetry import logs
 
@@ -35,21 +34,22 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 SHARD, GPU_SHARD = "SHARD", "GPU_SHARD"
-"""Tags of workers that take shards. A job holds its worker's GPU while it lasts, and asks for shards on GPUs
-meanwhile: these have a tag of their own, or they would wait for their job's end."""
+"""Tags of workers that compute shards. A job occupies its worker's GPU and meanwhile submits shards on GPUs. These have
+a tag of their own; otherwise they would wait for the end of their job."""
 
 
 class ClusterUnavailableError(RuntimeError):
-    """The scheduler of the cluster cannot be reached: another time it may be."""
+    """The scheduler of the cluster cannot be reached now; retry later."""
 
 
 @contextmanager
 def shard_executor(settings: Settings, gpu: bool = False) -> Iterator[Executor]:
-    """An executor for the shards of one pass; what still waits or runs at the end is given up.
+    """Yield an executor for the shards of one pass; cancel unfinished shards at the end.
 
-    gpu: the shards need one: workers of a cluster that have one, else this process. A shard whose worker was lost ends
-    with an error that `lost` knows; it can be submitted again at once, to the same executor.
-    Raise ClusterUnavailableError.
+    gpu: the shards need a GPU. They run on workers of a cluster that have one, or in this process.
+
+    A shard whose worker was lost ends with an error that `is_worker_lost` recognises. Submit it again to the same
+    executor. Raise ClusterUnavailableError.
     """
     if settings.cluster is not None:
         with _workers(settings.cluster, {SHARD: 1, GPU_SHARD: 1} if gpu else {SHARD: 1}) as executor:
@@ -62,8 +62,8 @@ def shard_executor(settings: Settings, gpu: bool = False) -> Iterator[Executor]:
         local.shutdown(wait=False, cancel_futures=True)
 
 
-def lost(error: BaseException | None) -> bool:
-    """Whether a shard has not failed, but its worker is gone."""
+def is_worker_lost(error: BaseException | None) -> bool:
+    """Return whether an error means that the worker is gone, not that the shard failed."""
     if isinstance(error, BrokenProcessPool | CancelledError):
         return True
     # by name: its module is an extra
@@ -71,10 +71,10 @@ def lost(error: BaseException | None) -> bool:
 
 
 class Inline(Executor):
-    """Does everything at once, in the thread that submits."""
+    """Runs every call at once, in the submitting thread."""
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Call the function; return a future that has ended."""
+        """Call the function; return a finished future."""
         future: Future[T] = Future()
         try:
             future.set_result(fn(*args, **kwargs))
@@ -84,8 +84,7 @@ class Inline(Executor):
 
 
 class Processes(Executor):
-    """Processes of this host in the place of this one: as nice, on the same CPUs. A pool that broke is replaced, one
-    that hangs is broken."""
+    """Processes of this host with the priority and CPUs of this one. Broken pools are replaced, hung ones killed."""
 
     def __init__(self, settings: Settings) -> None:
         self._new = partial(
@@ -93,15 +92,15 @@ class Processes(Executor):
             settings.statistics_workers,
             mp_context=multiprocessing.get_context("spawn"),
             initializer=start_process,
-            # niceness, policy and CPUs are inherited; threads are told before numerics are imported
-            initargs=(Place(settings.training_threads, log=logs.current()),),
+            # niceness, policy and CPUs are inherited; threads must be set before numerics are imported
+            initargs=(ProcessOptions(settings.training_threads, log=logs.current_options()),),
         )
         self._pool = self._new()
         self._progress = Progress(lambda: [each.pid for each in self._processes() if each.pid], HEARTBEAT_S, inf)
         self._looked = time.monotonic()
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Hand a call to the next free process."""
+        """Submit a call to the next free process."""
         try:
             future = self._pool.submit(fn, *args, **kwargs)
         except BrokenProcessPool:
@@ -113,8 +112,7 @@ class Processes(Executor):
         return future
 
     def look(self) -> None:
-        """End all processes where none of them has got on for HEARTBEAT_S while work waits: one that others wait
-        for hangs. To be asked often."""
+        """Kill all processes if none makes progress for HEARTBEAT_S while work waits. Call it often."""
         if time.monotonic() - self._looked < LOOK_S / 4:
             return
         self._looked = time.monotonic()
@@ -129,7 +127,7 @@ class Processes(Executor):
         return list((self._pool._processes or {}).values())
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Give up what waits; without `wait` the processes are ended, whatever they do."""
+        """Cancel waiting calls; without `wait`, kill the processes."""
         processes = self._processes()
         self._pool.shutdown(wait=wait, cancel_futures=cancel_futures)
         if not wait:
@@ -138,26 +136,26 @@ class Processes(Executor):
 
 
 class Workers(Executor):
-    """Workers of a cluster, by its own executor."""
+    """Workers of a cluster, through its own executor."""
 
     def __init__(self, executor: Any) -> None:
         self._executor = executor
 
     def submit(self, fn: Callable[P, T], /, *args: P.args, **kwargs: P.kwargs) -> Future[T]:
-        """Hand a call to a worker; raise ClusterUnavailableError where the scheduler is gone."""
+        """Submit a call to a worker; raise ClusterUnavailableError if the scheduler is gone."""
         packed = remote.pack(fn, *args, **kwargs)
         try:
             future: Future[T] = self._executor.submit(remote.call, packed)
-        except Exception as error:  # a client that has given up says so in many ways
+        except Exception as error:  # a closed client raises many kinds of errors
             raise ClusterUnavailableError(f"the scheduler of the cluster is gone: {error}") from None
         return future
 
 
 def connect(address: str, name: str = "lipserve") -> Any:
-    """A client of a cluster's scheduler. Raise ClusterUnavailableError, MissingExtraError."""
-    distributed = need("distributed", "cluster", "LIPSERVE_CLUSTER is set")
+    """Return a client of a cluster's scheduler. Raise ClusterUnavailableError, MissingExtraError."""
+    distributed = import_extra("distributed", "cluster", "LIPSERVE_CLUSTER is set")
     new: Any = distributed.Client
-    logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it has set another one
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # its import has set another level
     try:
         return new(address, timeout=10.0, set_as_default=False, direct_to_workers=True, name=name)
     except (OSError, TimeoutError, ValueError) as error:
@@ -178,14 +176,14 @@ def _workers(address: str, resources: dict[str, int]) -> Iterator[Executor]:
 _placed: Settings | None = None
 
 
-def place(settings: Settings) -> None:
-    """Say that this process is a worker of a cluster, with settings of its own."""
+def set_worker_settings(settings: Settings) -> None:
+    """Make this process a worker of a cluster, with settings of its own."""
     global _placed  # noqa: PLW0603 - a worker is a process
     _placed = settings
 
 
-def placed(sent: Settings | None) -> Settings:
-    """Settings that a shard works with: its worker's own on a cluster (home, database, files), else those sent."""
+def choose_settings(sent: Settings | None) -> Settings:
+    """Return the settings for a shard: those of the cluster worker (home, database, files), or those that were sent."""
     if _placed is not None:
         return _placed
     if sent is None:
@@ -193,25 +191,24 @@ def placed(sent: Settings | None) -> Settings:
     return sent
 
 
-def sent(settings: Settings) -> Settings | None:
-    """Settings to send with a shard: none to a cluster, whose workers have their own; secrets stay where they are."""
+def settings_to_send(settings: Settings) -> Settings | None:
+    """Return the settings to send with a shard; None for a cluster, whose workers have their own. Secrets stay here."""
     return None if settings.cluster is not None else settings
 
 
 logger = logging.getLogger(__name__)
 
 POLL_S = 0.1
-"""Seconds between two looks at whether to stop."""
-AHEAD = 32
-"""Shards that are in work, or wait for their turn to be added: so many workers have something to do, and so many
-results are in memory at most."""
+"""Seconds between two checks for cancellation."""
+MAX_SHARDS_AHEAD = 32
+"""Max shards in work or waiting to be added: it bounds both the busy workers and the results in memory."""
 
 
 class Addable(Protocol):
-    """What a shard comes to."""
+    """The result of a shard."""
 
     def __add__(self, other: Self, /) -> Self:
-        """The sum of two; it may be another one in another order."""
+        """Return the sum of two results; it may depend on their order."""
         ...
 
 
@@ -220,21 +217,21 @@ Sum = TypeVar("Sum", bound=Addable)
 
 
 class ShardFailedError(RuntimeError):
-    """A shard could not be computed: its workers were lost again and again."""
+    """A shard could not be computed: its workers were lost repeatedly."""
 
 
 class Tree(list[tuple[int, Any]]):
-    """Sums of 2^k neighbours each, the larger ones first: (k, sum). Results are added in the order of their shards."""
+    """Sums of 2^k neighbours each as (k, sum), larger ones first. Results are added in the order of their shards."""
 
     def add(self, result: Any) -> None:
-        """Take the next shard's result."""
+        """Add the next shard's result."""
         level = 0
         while self and self[-1][0] == level:
             result, level = self.pop()[1] + result, level + 1
         self.append((level, result))
 
     def sum(self) -> Any:
-        """The sum of all; raise ValueError where there is none."""
+        """Return the sum of all results; raise ValueError if there are none."""
         if not self:
             raise ValueError("no shards: expected at least one")
         total = self[-1][1]
@@ -243,7 +240,7 @@ class Tree(list[tuple[int, Any]]):
         return total
 
 
-def summed(
+def sum_shards(
     executor: Executor,
     work: Callable[[Shard], Sum],
     shards: Sequence[Shard],
@@ -251,11 +248,14 @@ def summed(
     attempts: int = 3,
     done: Callable[[int], None] | None = None,
 ) -> Sum:
-    """Sum of what `work` makes of each shard: the same to the last bit, whoever computes which shard when.
+    """Return the sum of `work` over all shards: the same to the last bit, on any workers and in any timing.
 
-    work: a function at the top of a module, of plain data; cancelled: asked often while this waits; attempts: how often
-    a shard is computed whose worker is lost; done: told how many are added.
-    Raise FitCancelledError when `cancelled` says so, ShardFailedError, or what `work` raises.
+    - work: a function at the top of a module, of plain data.
+    - cancelled: called often during the wait.
+    - attempts: max times that a shard is computed if its worker is lost.
+    - done: called with the number of added shards.
+
+    Raise FitCancelledError if `cancelled` returns True, ShardFailedError, or any error of `work`.
     """
     running: dict[Future[Sum], int] = {}
     tries, again, results, tree = [0] * len(shards), list[int](), dict[int, Sum](), Tree()
@@ -264,8 +264,8 @@ def summed(
         while added < len(shards):
             if cancelled():
                 raise FitCancelledError("cancelled while the samples were summed up")
-            more = again or (begun < len(shards) and begun < added + AHEAD)
-            if more:  # one at a time: an executor may do it at once
+            more = again or (begun < len(shards) and begun < added + MAX_SHARDS_AHEAD)
+            if more:  # one at a time: an executor may run it at once
                 number = again.pop(0) if again else begun
                 begun = max(begun, number + 1)
                 if tries[number] == attempts:
@@ -279,7 +279,7 @@ def summed(
                 number, error = running.pop(future), _error(future)
                 if error is None:
                     results[number] = future.result()
-                elif lost(error):
+                elif is_worker_lost(error):
                     logger.warning("shard %d of %d is computed again: %s", number + 1, len(shards), _reason(error))
                     again.append(number)
                 else:

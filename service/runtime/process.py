@@ -1,8 +1,8 @@
-"""A training process's place on the machine: it gives way to serving.
+"""The threads, priority and CPUs of training processes, which yield to serving.
 
-Nothing here imports numerics. A process takes its place before it does: BLAS and OpenMP start their threads when they
-are imported, as many as the environment then says, and on Linux a thread has the priority that its starter had then.
-What is set later reaches none of those that run already.
+Nothing here imports numerics. A process sets these options before it imports them: BLAS and OpenMP start their threads
+on import, as many as the environment then allows. On Linux a thread inherits the priority of its starter. Later changes
+do not reach running threads.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Literal
 
 from service.foundation.settings import Settings
-from service.runtime.remote import imported
+from service.runtime.remote import import_without_gc
 from service.telemetry import logs
 from service.telemetry.logs import LogOptions
 
@@ -36,41 +36,46 @@ THREAD_VARIABLES = (
     "NUMBA_NUM_THREADS",
 )
 SERVING_THREADS = 1
-"""Threads of BLAS for one prediction: a prediction is too short to be shared, and others want the cores."""
+"""BLAS threads of one prediction: a prediction is too short to share, and other work needs the cores."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """What a process may take of the machine: threads of each numerical library, priority, CPUs (None: all); log: how
-    it says what happens, None: as Python does of itself.
-
-    policy: of scheduling, Linux only; "idle" runs where nothing else wants to, "other" is the usual one. On two CPUs
-    neither it nor more niceness kept training out of serving's way as well as leaving one CPU to serving did.
-    """
+class ProcessOptions:
+    """The share of the machine that a process uses, and its log."""
 
     threads: int
+    """Threads of each numerical library."""
     niceness: int = 0
     policy: Literal["other", "idle"] = "other"
+    """Scheduling policy, Linux only: "idle" runs if nothing else needs the CPU, "other" is the usual one.
+
+    On two CPUs neither "idle" nor more niceness kept training out of serving's way as well as a CPU reserved for
+    serving.
+    """
     cpus: frozenset[int] | None = None
+    """CPUs it may use, None for all."""
     log: LogOptions | None = None
+    """Its log options, None for Python's default."""
 
 
-def training_place(settings: Settings) -> Place:
-    """The place of training processes."""
+def training_process_options(settings: Settings) -> ProcessOptions:
+    """Return the options of training processes."""
     cpus = None
     if hasattr(os, "sched_getaffinity"):  # Linux
         cpus = training_cpus(os.sched_getaffinity(0), settings.training_cpus)
-    return Place(settings.training_threads, settings.training_niceness, settings.training_policy, cpus, logs.current())
+    return ProcessOptions(
+        settings.training_threads, settings.training_niceness, settings.training_policy, cpus, logs.current_options()
+    )
 
 
 def training_cpus(available: set[int], most: int | None) -> frozenset[int]:
-    """CPUs for training: `most` of those available, all but one where None; the first ones are left to serving."""
+    """Return the last `most` of the available CPUs for training; all but the first if None."""
     count = max(1, len(available) - 1 if most is None else min(most, len(available)))
     return frozenset(sorted(available)[-count:])
 
 
-def start_process(place: Place) -> None:
-    """Prepare a process of a pool: its place, Ctrl-C left to its parent, and an end with the parent."""
+def start_process(place: ProcessOptions) -> None:
+    """Prepare a process of a pool: set its options, ignore Ctrl-C, and end it with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent ends its processes
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(place.threads)))
     os.nice(place.niceness)
@@ -89,7 +94,7 @@ def start_process(place: Place) -> None:
 
 def call(module: str, function: str, *given: Any) -> None:
     """Call a function in a process that may not have imported its module yet."""
-    getattr(imported(module), function)(*given)
+    getattr(import_without_gc(module), function)(*given)
 
 
 def _end_with(parent: BaseProcess) -> None:
@@ -97,65 +102,65 @@ def _end_with(parent: BaseProcess) -> None:
     os._exit(1)
 
 
-REAPING_S = 0.5
-"""Longest wait for what the system says of a process that has ended, s."""
+MAX_EXIT_WAIT_S = 0.5
+"""Max wait for the exit code of an ended process, s."""
 
 
 class Slot:
-    """An executor of one process. To be used by one thread."""
+    """An executor of one process. Use it from one thread."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: ProcessOptions) -> None:
         self.place = place
         self._pool = self._new_pool()
         self._process: BaseProcess | None = None
 
     def start(self, function: Callable[..., None], *given: Any) -> Future[None]:
-        """Call a function of a module in the process, started where there is none.
+        """Call a function of a module in the process; start the process if there is none.
 
-        The future's error is BrokenProcessPool where the process ends before the function does. Raise OSError where no
-        process can be started.
+        The future's error is BrokenProcessPool if the process ends before the function. Raise OSError if no process can
+        start.
         """
         named = function.__module__, function.__qualname__
         try:
             future = self._pool.submit(call, *named, *given)
-        except BrokenProcessPool:  # it has died while it had nothing to do
+        except BrokenProcessPool:  # it died while it was idle
             self._renew()
             future = self._pool.submit(call, *named, *given)
-        except OSError:  # a pool does not try again
+        except OSError:  # a pool does not retry
             self._renew()
             raise
         self._process = next(iter(_processes(self._pool)), None)
         return future
 
     def kill(self) -> None:
-        """End the process at once, whatever it does; the next function has a fresh one."""
+        """Kill the process at once; the next function gets a new one."""
         for process in _processes(self._pool):
             process.kill()
         self._renew()
 
     def close(self) -> None:
-        """End the process at once, and wait for its end."""
+        """Kill the process at once, and wait for its end."""
         for process in _processes(self._pool):
             process.kill()
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def ending(self) -> str:
-        """How the last process has ended, in words."""
+        """Return in words how the last process ended."""
         code = None if self._process is None else self._exit_code(self._process)
         if code is None:
             return "ended"
         if code == -signal.SIGKILL:
             return "was killed (SIGKILL, as by a system without memory)"
-        with suppress(ValueError):  # a number that is no signal's
+        with suppress(ValueError):  # not the number of a signal
             return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         return f"ended with exit code {code}"
 
     @staticmethod
     def _exit_code(process: BaseProcess) -> int | None:
-        process.join(REAPING_S)
-        end = time.monotonic() + REAPING_S
+        process.join(MAX_EXIT_WAIT_S)
+        end = time.monotonic() + MAX_EXIT_WAIT_S
         while (code := process.exitcode) is None and time.monotonic() < end:
-            time.sleep(REAPING_S / 100)  # the pool's thread has asked the system for it, and is about to tell
+            time.sleep(MAX_EXIT_WAIT_S / 100)  # the pool's thread has read it and is about to store it
         return code
 
     def _renew(self) -> None:

@@ -1,8 +1,8 @@
-"""Whether a process gets on. That it is there says nothing: one that is suspended, or waits for ever, is there too.
+"""Progress of a process. A suspended or deadlocked process still exists, so existence proves nothing.
 
-It gets on while it takes steps, of which it tells, or while its main thread computes: a step may take minutes, as when
-kernels are compiled. CPU time is the system's own figure, so that no thread of the process has to report it, which a
-long call of compiled code would silence. Nothing here imports numerics.
+A process makes progress if it reports steps, or if its main thread computes: a step may take minutes, such as the
+compilation of kernels. The operating system counts CPU time, so no thread of the process has to report it. A long call
+of compiled code would block such a thread. Nothing here imports numerics.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 HEARTBEAT_S = 60.0
-"""Seconds without progress after which a process that computes is killed: such a step takes seconds."""
+"""Seconds without progress after which a computing process is killed: such a step takes seconds."""
 LOOK_S = 1.0
-"""Seconds between two looks; more than twice as many count as so many: who looks may have stood still as well."""
+"""Seconds between two checks. A longer gap counts as at most twice this time: the checking process may have stopped."""
 TICK_S = 0.01
-"""CPU time that is progress, s: the system counts in such ticks. Waiting in vain takes far less."""
+"""CPU time that counts as progress, s: one tick of the system. An idle wait takes far less."""
 
 
 def main_thread_s(pid: int) -> float | None:
-    """CPU time of a process's main thread, s; None where the system does not tell (Linux does), or it has ended."""
+    """Return the CPU time of a process's main thread, s; None if the process ended or the system is not Linux."""
     try:
         fields = Path(f"/proc/{pid}/task/{pid}/stat").read_text().rpartition(")")[2].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
@@ -30,11 +30,13 @@ def main_thread_s(pid: int) -> float | None:
 
 
 class Progress:
-    """Watches one process, or several that share work. To be used by one thread; `silent_s` may be read by any.
+    """Watches one process, or several that share work. Use it from one thread; any thread may read `silent_s`.
 
-    pids: which they are now; quiet_s: longest time without a step and without CPU time; step_s: longest that a step may
-    take, however busy they are: the only limit where the system does not tell of CPU time.
-    silent_s: seconds for which they have not got on.
+    - pids: returns the current ids of the processes.
+    - quiet_s: max time without a step and without CPU time, s.
+    - step_s: max time of one step, s, even if they compute. It is the only limit if the system reports no CPU time.
+    - spent: returns the CPU time of a process, s.
+    - silent_s: time without progress, s.
     """
 
     def __init__(
@@ -51,11 +53,11 @@ class Progress:
         self._known: dict[int, float] = {}
 
     def step(self) -> None:
-        """Take note of a step."""
+        """Record a step."""
         self.silent_s = self._stepless_s = 0.0
 
     def look(self) -> str | None:
-        """Say why they have to be taken for hung, in words, None while they get on; to be asked every LOOK_S."""
+        """Return why the processes are considered hung, None if they make progress. Call it every LOOK_S."""
         now = self._clock()
         passed, self._looked = min(now - self._looked, 2 * LOOK_S), now
         spent = {pid: each for pid in self._pids() if (each := self._spent(pid)) is not None}

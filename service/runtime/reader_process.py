@@ -1,5 +1,7 @@
-"""The process that `cage` calls: it waits for calls, and is forked ahead of each, first into one that will watch, then
-into the one that is confined and will call the function."""
+"""The process that `cage` calls. It forks ahead of each call: first a watching process, which forks the confined one.
+
+The confined process calls the function.
+"""
 
 from __future__ import annotations
 
@@ -23,32 +25,31 @@ import msgspec
 
 from lipcore.extras import MissingExtraError
 from service.foundation.errors import ServiceError
-from service.runtime.confinement import Bounds, confine, own_files, protections, renounce
+from service.runtime.confinement import Bounds, confine, drop_privileges, own_files, protections
 from service.runtime.reader_messages import (
-    ANSWER_BYTES,
     ERRORS,
-    OUTPUT_BYTES,
+    MAX_ANSWER_BYTES,
+    MAX_OUTPUT_BYTES,
     Answer,
     Call,
     Failure,
     Outcome,
-    complete,
-    plain,
+    from_plain,
+    prepend_length,
     receive,
     send,
-    typed,
-    with_length,
+    to_plain,
+    unpack_complete,
 )
-from service.runtime.remote import imported
+from service.runtime.remote import import_without_gc
 
 _LIMITS = {EFBIG: "size", EMFILE: "files"}
 
 
 def serve(descriptor: int) -> None:
-    """Hand each call that comes to a process that was forked for it, until the other end is closed or nothing comes for
-    long."""
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # nobody waits for those that watch
-    protections(), own_files()  # to know them takes a while
+    """Pass each call to a process forked for it, until the other end closes or no call arrives for 600 s."""
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no process waits for the watching ones
+    protections(), own_files()  # cached before the fork, as they take a while
     known = set[str]()
     with socket.socket(fileno=descriptor) as control, suppress(TimeoutError):
         control.settimeout(600.0)  # then it ends; the next call starts another process
@@ -57,8 +58,8 @@ def serve(descriptor: int) -> None:
             with socket.socket(fileno=descriptors[0]) as connection, suppress(EOFError, ConnectionError):
                 if (function := receive(connection).decode()) not in known:
                     known.add(function)
-                    with suppress(Exception):  # the one that calls it says what cannot be imported
-                        getattr(imported(function.partition(":")[0]), "warm", bool)()
+                    with suppress(Exception):  # the confined process reports a failed import
+                        getattr(import_without_gc(function.partition(":")[0]), "warm", bool)()
                         _resolved(function)
                     ready.close()
                     ready = _ahead(control)
@@ -68,7 +69,7 @@ def serve(descriptor: int) -> None:
 
 
 def _ahead(control: socket.socket) -> socket.socket:
-    """Fork the process that will watch over the next call; return where it waits for the connection of that."""
+    """Fork the watching process of the next call; return the socket on which it waits for the call's connection."""
     ours, theirs = socket.socketpair()
     with theirs:
         if os.fork() == 0:
@@ -80,15 +81,15 @@ def _ahead(control: socket.socket) -> socket.socket:
 
 @cache
 def _resolved(function: str) -> tuple[Callable[..., Any], msgspec.msgpack.Decoder[Any]]:
-    """`module:function`, and what decodes its arguments."""
+    """Return the function of `module:function`, and the decoder of its arguments."""
     module, _, name = function.partition(":")
-    resolved = getattr(imported(module), name)
+    resolved = getattr(import_without_gc(module), name)
     kinds = [kind for what, kind in get_type_hints(resolved).items() if what != "return"]
-    return resolved, msgspec.msgpack.Decoder(tuple[*kinds], dec_hook=typed)  # type: ignore[valid-type]
+    return resolved, msgspec.msgpack.Decoder(tuple[*kinds], dec_hook=from_plain)  # type: ignore[valid-type]
 
 
 def _alone(function: Callable[..., None], *arguments: Any) -> NoReturn:
-    """Call a function in a forked process, and end that."""
+    """Call a function in a forked process, then end the process."""
     code = 1
     try:
         function(*arguments)
@@ -100,7 +101,7 @@ def _alone(function: Callable[..., None], *arguments: Any) -> NoReturn:
 
 
 def _watch(calls: socket.socket) -> None:
-    """Fork the process that will be confined; give it the call that comes, and see to its end."""
+    """Fork the confined process, pass the next call to it, and wait for its end."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     (given, given_end), (answer, answer_end), (output, output_end) = os.pipe(), os.pipe(), os.pipe()
     pid = os.fork()
@@ -108,9 +109,9 @@ def _watch(calls: socket.socket) -> None:
         _alone(_confined, given, answer_end, output_end, os.getppid())
     for each in (given, answer_end, output_end):
         os.close(each)
-    for descriptor in socket.recv_fds(calls, 1, 1)[1]:  # none where there will be no call
+    for descriptor in socket.recv_fds(calls, 1, 1)[1]:  # empty if there will be no call
         with socket.socket(fileno=descriptor) as connection, suppress(EOFError, ConnectionError):
-            connection.sendall(b"c")  # it has the call
+            connection.sendall(b"c")  # confirms that it has the call
             data = receive(connection)
             with suppress(BrokenPipeError), os.fdopen(given_end, "wb") as file:
                 file.write(data)
@@ -118,16 +119,16 @@ def _watch(calls: socket.socket) -> None:
 
 
 def _see_to(pid: int, answer: int, output: int, connection: socket.socket, wall_s: float) -> None:
-    """Send what becomes of a process once it has answered, or has ended, or has to."""
+    """Send the outcome of a process after its answer or its end; kill it if its time is over."""
     until = time.monotonic() + wall_s
     content, written, in_time = _collected(answer, output, connection, until)
     if content is not None:
-        os.kill(pid, signal.SIGKILL)  # it has nothing left to do, and would take milliseconds to end
+        os.kill(pid, signal.SIGKILL)  # it is done, and its own exit would take milliseconds
         send(connection, msgspec.msgpack.encode(Outcome(0, False, written, content)))
         os.waitpid(pid, 0)
         return
     ended = 0
-    while in_time and not ended and time.monotonic() < until:  # it may close both and go on
+    while in_time and not ended and time.monotonic() < until:  # it may close both and keep running
         ended, status = os.waitpid(pid, os.WNOHANG)
         time.sleep(0 if ended else 0.0005)
     if not ended:
@@ -137,12 +138,14 @@ def _see_to(pid: int, answer: int, output: int, connection: socket.socket, wall_
 
 
 def _collected(answer: int, output: int, connection: socket.socket, until: float) -> tuple[bytes | None, bytes, bool]:
-    """The answer that comes of a descriptor, None where it ends before, and what comes of another one until then, up to
-    so many bytes of each; and whether that did not take too long, and somebody still waits for it."""
-    most = {answer: ANSWER_BYTES, output: OUTPUT_BYTES}
+    """Return the complete answer, the output so far, and whether the call is still in time and its caller connected.
+
+    The answer is None if the process ends first. MAX_ANSWER_BYTES and MAX_OUTPUT_BYTES limit both.
+    """
+    most = {answer: MAX_ANSWER_BYTES, output: MAX_OUTPUT_BYTES}
     kept = {each: bytearray() for each in most}
     poll = select.poll()
-    poll.register(connection, 0)  # only whether the other end is closed
+    poll.register(connection, 0)  # reports only that the other end is closed
     for each in most:
         poll.register(each, select.POLLIN)
     opened, in_time, content = set(most), True, None
@@ -155,24 +158,24 @@ def _collected(answer: int, output: int, connection: socket.socket, until: float
                 poll.unregister(each)
                 opened.discard(each)
         in_time = time.monotonic() < until and connection.fileno() not in ready
-        content = complete(kept[answer])
+        content = unpack_complete(kept[answer])
     os.set_blocking(output, False)
-    with suppress(BlockingIOError):  # what was written before the answer
-        kept[output] += os.read(output, OUTPUT_BYTES - len(kept[output]))
+    with suppress(BlockingIOError):  # output written before the answer
+        kept[output] += os.read(output, MAX_OUTPUT_BYTES - len(kept[output]))
     return content, bytes(kept[output]), in_time
 
 
 def _confined(given: int, answer: int, output: int, parent: int) -> None:
-    """Wait for a call, call its function with what is left to it, and send what comes of it."""
+    """Wait for a call, confine the process, call the function, and send the answer."""
     os.setsid()
     os.dup2(output, 1)
     os.dup2(output, 2)
     for low, high in pairwise([2, *sorted((given, answer)), resource.getrlimit(resource.RLIMIT_NOFILE)[0]]):
         os.closerange(low + 1, high)
     faulthandler.enable()
-    os.nice(5)  # a control loop goes before an upload
-    renounce()
-    if os.getppid() != parent:  # it has ended before this one could ask to end with it
+    os.nice(5)  # control loops have priority over uploads
+    drop_privileges()
+    if os.getppid() != parent:  # the parent ended before this process could ask to end with it
         return
     with os.fdopen(given, "rb") as file:
         data = file.read()
@@ -184,16 +187,16 @@ def _confined(given: int, answer: int, output: int, parent: int) -> None:
     confine(Bounds(call.memory, call.cpu_s, call.file), map(Path, call.read), map(Path, call.write))
     try:
         function, decoder = _resolved(call.function)
-        value = msgspec.msgpack.encode(function(*decoder.decode(call.arguments)), enc_hook=plain)
+        value = msgspec.msgpack.encode(function(*decoder.decode(call.arguments)), enc_hook=to_plain)
         sent = Answer(value=msgspec.Raw(value))
     except Exception as error:
         sent = Answer(failure=_failure(error))
     with os.fdopen(answer, "wb") as file:
-        file.write(with_length(msgspec.msgpack.encode(sent)))
+        file.write(prepend_length(msgspec.msgpack.encode(sent)))
 
 
 def _failure(error: Exception) -> Failure:
-    """What is sent of an error. A limit that was reached may be its cause, whatever a reader made of that."""
+    """Return the failure to send. A reached limit may be the cause of an error, whatever the reader made of it."""
     each: BaseException | None = error
     while each is not None:
         if isinstance(each, MemoryError):

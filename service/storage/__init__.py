@@ -1,1 +1,1 @@
-"""What is kept: database, files, the home folder."""
+"""The database, the files and the home folder of the service."""

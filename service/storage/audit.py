@@ -1,7 +1,7 @@
-"""The audit log: who changed what of which model, when, by which route or job, and from what to what.
+"""The audit log: who changed which model, when, by which route or job, and the values before and after.
 
-A line is written in the transaction of the change, so that there is none without the other, and never changed. It is
-deleted once it is older than `LIPSERVE_AUDIT_RETENTION_S`.
+A line is written in the transaction of its change, so that neither exists without the other. It is never changed. It is
+deleted when it is older than `LIPSERVE_AUDIT_RETENTION_S`.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from sqlalchemy.orm import Session
 from service.contract.audit import Change
 from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, AuditRow, Database, JobRow, now
-from service.storage.rows import Page, newest
-from service.telemetry.logs import KEY_ID, asked, job_id, request_id
+from service.storage.rows import Page, read_page
+from service.telemetry.logs import KEY_ID, job_id, request_id, request_scope
 
 logger = logging.getLogger(__name__)
 
 SERVICE = "service"
-"""Stands for a route where nobody asked: a version that comes with LIPServe, or that has proved better."""
+"""Replaces the route if no request made the change: a version shipped with LIPServe, or an automatic promotion."""
 
 
 def note(
@@ -38,12 +38,12 @@ def note(
     before: Any = None,
     after: Any = None,
 ) -> None:
-    """Add a line to the transaction of a change. before, after: JSON of what was, and of what is from then on.
+    """Add a line to the transaction of a change. before, after: JSON values.
 
-    Who and by what is known from the request that is answered, or the job that runs.
+    The author comes from the current request or job.
     """
     key, what, request = None, SERVICE, request_id.get()
-    scope, job = asked.get(), job_id.get()
+    scope, job = request_scope.get(), job_id.get()
     if job is not None:
         row = session.scalar(select(JobRow).where(JobRow.id == job))
         what = f"job {job}"
@@ -67,8 +67,10 @@ def page(
     since: datetime | None = None,
     until: datetime | None = None,
 ) -> tuple[list[AuditRow], str | None]:
-    """Lines of a page, newest first, and the cursor after it; of a model, a key or a kind of change where given, from a
-    moment on and before another."""
+    """Return the lines of a page, newest first, and the next cursor.
+
+    Lines are filtered by model, key and kind of change if given, from `since` and before `until`.
+    """
     given = ((AuditRow.model, model), (AuditRow.key, key), (AuditRow.change, change))
     conditions = [column == value for column, value in given if value is not None]
     if since is not None:
@@ -76,16 +78,16 @@ def page(
     if until is not None:
         conditions.append(AuditRow.at < _text(until))
     with database.session() as session:
-        return newest(session, AuditRow, part, *conditions)
+        return read_page(session, AuditRow, part, *conditions)
 
 
 def _text(moment: datetime) -> str:
-    """A moment as lines have it: texts of one form are in the order of time."""
+    """Return a time in the format of the lines, whose text order is the order of time."""
     return moment.astimezone(UTC).isoformat(timespec="milliseconds")
 
 
 def clean(database: Database, settings: Settings) -> int:
-    """Delete lines that are older than the setting says; return how many."""
+    """Delete lines older than the retention setting; return their number."""
     oldest = datetime.now(UTC) - timedelta(seconds=settings.audit_retention_s)
     too_old = AuditRow.at < _text(oldest)
     with database.session() as session:
@@ -97,8 +99,8 @@ def clean(database: Database, settings: Settings) -> int:
 
 
 @asynccontextmanager
-async def cleaned(database: Database, settings: Settings) -> AsyncIterator[None]:
-    """Delete what is too old, now and then, while the context lasts."""
+async def clean_hourly(database: Database, settings: Settings) -> AsyncIterator[None]:
+    """Delete old lines every hour during the block."""
     task = asyncio.create_task(_clean(database, settings))
     try:
         yield
@@ -109,7 +111,7 @@ async def cleaned(database: Database, settings: Settings) -> AsyncIterator[None]
 
 async def _clean(database: Database, settings: Settings) -> None:
     while True:
-        await asyncio.sleep(3600.0)  # first: a host that starts with a wrong clock has it set right by then
+        await asyncio.sleep(3600.0)  # wait first: a host that starts with a wrong clock has corrected it by then
         try:
             await to_thread.run_sync(clean, database, settings)
         except Exception as error:

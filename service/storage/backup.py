@@ -1,9 +1,9 @@
-"""A copy of a home in one file, as of one moment, made beside the service that writes to it; and a home made of one.
+"""Backup of a home in one file, as of one moment, beside the service that writes to it; and its restore.
 
-The database decides what there is: a file is complete before its row is committed, and deleted only after the row. So
-while nobody can commit, every row has its file. Most files are copied before that, without any lock; then writers wait
-for the milliseconds in which the few that came meanwhile are opened and the database's state is pinned, which is copied
-afterwards by SQLite's online backup. What is deleted after that moment is still open here.
+Rows decide which files exist: a file is complete before its row is committed, and deleted only after the row. So while
+no transaction can commit, every row has its file. Most files are copied before that, without any lock. Then writers
+wait for milliseconds: the few new files are opened, and a read transaction pins the database's state. SQLite's online
+backup copies that state afterwards. Files that are deleted after this moment are still open here.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from tempfile import TemporaryDirectory
 from typing import IO, Any
 from urllib.parse import quote
 
-from lipcore.files.durable import sync
+from lipcore.files.durable import sync_folder
 from service import __version__
 from service.storage.database import now
 from service.storage.database.engine import FILE, PATIENCE_S
 from service.storage.files.local import remove, write_durably
-from service.storage.storage import HomeError, hold_home
+from service.storage.storage import HomeError, lock_home
 
 FORMAT, FORMAT_VERSION = "lipserve-backup", 1
 MANIFEST = "backup.json"
-"""The last member: what belongs to the moment, with the size and sha256 of each file."""
-MOST_ROUNDS = 20
+"""The last member of the archive: data about the moment, and size and sha256 of each file."""
+MAX_ROUNDS = 20
 LOCK = ".lock"
 _NAMES = re.compile(
     rf"{re.escape(FILE)}|{re.escape(MANIFEST)}|(datasets|learning)/[a-z]+_\w{{1,36}}\.safetensors"
@@ -45,19 +45,21 @@ _KINDS = {
     "versions": "SELECT 'versions/' || folder FROM versions",
     "snapshots": "SELECT 'learning/' || id || '.safetensors' FROM snapshots",
 }
-"""Files and folders that rows name; the same columns in every release."""
+"""Queries of the files and folders that rows name; the columns are the same in every release."""
 
 
 class BackupError(ValueError):
-    """A file is no backup, or is damaged; or the home that is copied is."""
+    """A file is no backup or is damaged, or the home to copy is damaged."""
 
 
 @dataclass(frozen=True)
 class Backup:
-    """What a backup holds. at: its moment, ISO 8601 in UTC; size: bytes of its files; the others count rows."""
+    """Content of a backup; fields without a note count rows."""
 
     at: str
+    """Its moment, ISO 8601 in UTC."""
     size: int
+    """Bytes of its files."""
     datasets: int
     versions: int
     snapshots: int
@@ -65,10 +67,10 @@ class Backup:
 
 
 def backup(home: Path, file: Path) -> Backup:
-    """Copy a home into a new file, durably, whole or not at all; what that holds is what was committed at one moment.
+    """Copy a home into a new file, durably and whole or not at all, with the commits up to one moment.
 
-    Raise FileNotFoundError where the home has no database, FileExistsError where the file is there, BackupError where
-    a file of the home is missing, and what SQLite and the disks raise.
+    Raise FileNotFoundError if the home has no database, FileExistsError if the file exists, BackupError if a file of
+    the home is missing. Errors of SQLite and the disks are raised too.
     """
     if not (home / FILE).is_file():
         raise FileNotFoundError(f"home is {str(home)!r}, expected a folder with the database of a service")
@@ -76,7 +78,7 @@ def backup(home: Path, file: Path) -> Backup:
         raise FileExistsError(f"file is {str(file)!r}, expected a new one: there is one of that name")
     draft = file.with_name(f"{file.name}.draft")
     draft.unlink(missing_ok=True)
-    draft.touch(0o600)  # the database has hashes of keys in it
+    draft.touch(0o600)  # the database contains hashes of keys
     try:
         return write_durably(file, lambda opened: _write(home, opened, file.parent), draft)
     finally:
@@ -90,18 +92,18 @@ def _write(home: Path, opened: IO[bytes], folder: Path) -> Backup:
         TemporaryDirectory(prefix=".backup-", dir=folder) as scratch,
     ):
         sums = dict[str, dict[str, Any]]()
-        for _ in range(MOST_ROUNDS):  # the first copies nearly all, the next what came meanwhile
+        for _ in range(MAX_ROUNDS):  # the first round copies nearly all files, the next ones the new files
             pending = [key for key in _named(reader) if not _has(sums, key)]
             for key in pending:
                 with _files(home, [key], missing_ok=True) as files:
                     _add(tar, files, sums)
-            if len(pending) <= 50:  # the rest, while writers wait
+            if len(pending) <= 50:  # the rest is copied while writers wait
                 break
         with ExitStack() as held:
             with closing(_connected(home / FILE)) as lock:
                 lock.execute("BEGIN IMMEDIATE")  # from here on nothing is committed, so nothing is deleted either
                 reader.execute("BEGIN")
-                keys, at = _named(reader), now()  # the reader stays with what it sees now
+                keys, at = _named(reader), now()  # the reader stays at this state
                 held.callback(reader.rollback)
                 files = held.enter_context(_files(home, [key for key in keys if not _has(sums, key)]))
             _add(tar, files, sums)
@@ -127,13 +129,13 @@ def _named(reader: sqlite3.Connection) -> set[str]:
 
 
 def _counts(reader: sqlite3.Connection) -> dict[str, int]:
-    """How many rows there are, by the fields of `Backup`."""
+    """Return the number of rows, by the fields of `Backup`."""
     queries = {**_KINDS, "observations": "SELECT number FROM events WHERE kind = 'batch'"}
     return {kind: sum(1 for _ in reader.execute(query)) for kind, query in queries.items()}
 
 
 def _key(name: str) -> str:
-    """What a row names of a file: itself, or the folder of a version."""
+    """Return the name of a file in rows: its own, or the folder of a version."""
     return "/".join(name.split("/")[:2])
 
 
@@ -143,7 +145,7 @@ def _has(sums: Iterable[str], key: str) -> bool:
 
 @contextmanager
 def _files(home: Path, keys: Iterable[str], missing_ok: bool = False) -> Iterator[dict[str, IO[bytes]]]:
-    """The files of keys, open by name; of those that are gone none, or BackupError."""
+    """Yield the open files of keys by name; raise BackupError for a missing one, or leave it out if `missing_ok`."""
     with ExitStack() as opened:
         files = dict[str, IO[bytes]]()
         for key in keys:
@@ -161,18 +163,18 @@ def _files(home: Path, keys: Iterable[str], missing_ok: bool = False) -> Iterato
 def _add(
     tar: tarfile.TarFile, files: dict[str, IO[bytes]], sums: dict[str, dict[str, Any]], size: int | None = None
 ) -> None:
-    """Write files to the archive, and note size and sha256 of each."""
+    """Write files to the archive, and add size and sha256 of each to `sums`."""
     for name, file in files.items():
         info = tarfile.TarInfo(name)
         info.size = os.fstat(file.fileno()).st_size if size is None else size
         info.mode = 0o600
-        read = _Hashed(file)
+        read = _HashingReader(file)
         tar.addfile(info, read)
         sums[name] = {"size": info.size, "sha256": read.digest.hexdigest()}
 
 
-class _Hashed:
-    """A file that hashes what is read of it."""
+class _HashingReader:
+    """A file that hashes the bytes read from it."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self.file, self.digest = file, hashlib.sha256()
@@ -184,13 +186,12 @@ class _Hashed:
 
 
 def restore(home: Path, file: Path) -> Backup:
-    """Make a home of a backup. Nothing is left of it where that fails; the database comes last, so that a service which
-    starts on a home that was being restored when the power went finds none of it.
+    """Create a home from a backup. A failed restore leaves nothing.
 
-    Raise HomeError unless the home is empty, or is not there yet, and no service uses it; BackupError for a file that
-    is no backup or is damaged.
+    The database is written last, so that after a power cut a service finds no database in a partly restored home. Raise
+    HomeError unless the home is empty or missing, and unused; BackupError if the file is no backup or is damaged.
     """
-    with file.open("rb") as opened, hold_home(home):
+    with file.open("rb") as opened, lock_home(home):
         if any(path.name != LOCK for path in home.iterdir()):
             raise HomeError(f"home is {str(home)!r}, expected an empty folder: nothing is restored over what is there")
         try:
@@ -229,9 +230,9 @@ def _restored(home: Path, opened: IO[bytes]) -> Backup:
         raise BackupError(f"the file is damaged: {', '.join(lacking) + ' is missing' if lacking else faults[0]}")
     for folder in {(home / name).parent for name in sums} | {home / "versions", home}:
         if folder.is_dir():
-            sync(folder)
+            sync_folder(folder)
     draft.rename(home / FILE)
-    sync(home)
+    sync_folder(home)
     return Backup(about["at"], sum(each["size"] for each in about["files"].values()), **counts)
 
 
@@ -248,7 +249,7 @@ def _extract(content: IO[bytes], path: Path) -> str:
 
 
 def _check(about: Any, sums: dict[str, dict[str, Any]]) -> None:
-    """Raise BackupError unless everything that the manifest names has come as it was."""
+    """Raise BackupError unless all files of the manifest are there and unchanged."""
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise BackupError(f"the file is no backup, or is cut off: it has no {MANIFEST} at its end")
     if about.get("format_version") != FORMAT_VERSION:

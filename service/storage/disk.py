@@ -1,4 +1,4 @@
-"""How much of a disk the service may take: by a quota of its home, and by space that it leaves free."""
+"""Limits of disk space: a quota of the home, and space that stays free on its disk."""
 
 from __future__ import annotations
 
@@ -14,22 +14,26 @@ from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings
 
 MEASURE_S = 10.0
-"""Seconds after which the home is measured again: the database and other processes write to it too."""
-AGAIN_S = 1.0
-"""Seconds after which a home that seems full is measured again: something may have been deleted."""
+"""Seconds between two measurements of the home: the database and other processes write to it too."""
+RECHECK_S = 1.0
+"""Seconds after which a home that seems full is measured again, as files may have been deleted."""
 
 
 @dataclass(frozen=True)
 class Usage:
-    """Bytes: used by the home, free on its disk for this user; the limits of both. quota: None where there is none."""
+    """Used and free space, and its limits, in bytes."""
 
     used: int
+    """Bytes of the home."""
     free: int
+    """Bytes free on its disk for this user."""
     quota: int | None
+    """Max bytes of the home, None if not limited."""
     floor: int
+    """Bytes that stay free on the disk."""
 
     def shortage(self, size: int = 0) -> str | None:
-        """Say why `size` more bytes find no room, None where they do."""
+        """Return why there is no space for `size` more bytes, None if there is."""
         if self.free - size < self.floor:
             return (
                 f"the disk of the service has {_amount(self.free)} free, of which {_amount(self.floor)} stay so "
@@ -40,23 +44,23 @@ class Usage:
         return None
 
 
-class Room:
-    """What was free of a disk, for a process that cannot look itself."""
+class DiskBudget:
+    """The free space of a disk at one moment, for a process that cannot measure it."""
 
     def __init__(self, usage: Usage) -> None:
         self._usage, self._taken = usage, 0
 
-    def take(self, size: int) -> None:
-        """Count bytes that are written right after this; raise StorageFullError."""
+    def reserve(self, size: int) -> None:
+        """Count bytes that are written next; raise StorageFullError."""
         self._taken += size
         if (reason := self._usage.shortage(self._taken)) is not None:
             raise _full(reason)
 
 
 class Disk:
-    """The disk that the home lies on; safe from several threads. Each process that writes has one of its own.
+    """The disk of the home; safe from several threads. Each writing process has one of its own.
 
-    What is written between two measurements is known from those who ask before they write.
+    Between two measurements, writes are counted by `reserve`.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -65,20 +69,23 @@ class Disk:
         self._used, self._measured = 0, -float("inf")
 
     def require(self, size: int = 0) -> None:
-        """Make sure that there is room for `size` bytes; raise StorageFullError. Not for the event loop."""
+        """Check that there is space for `size` bytes; raise StorageFullError. Not for the event loop."""
         if self.usage().shortage(size) is None:
             return
-        reason = self.usage(AGAIN_S).shortage(size)
+        reason = self.usage(RECHECK_S).shortage(size)
         if reason is not None:
             raise _full(reason)
 
-    def take(self, size: int) -> None:
-        """Make sure of room for `size` bytes that are written right after this; raise as `require`."""
+    def reserve(self, size: int) -> None:
+        """Check that there is space for `size` bytes that are written next, and count them; raise as `require`."""
         self.require(size)
-        self._used += size  # where another thread adds at the same time, the next measurement puts it right
+        self._used += size  # a lost update of another thread is corrected by the next measurement
 
     def usage(self, age: float = MEASURE_S) -> Usage:
-        """What is used and free; the home is measured where that was done `age` s ago. Not for the event loop."""
+        """Return used and free space. Not for the event loop.
+
+        The home is measured again if the last measurement is at least `age` old, s.
+        """
         if time.monotonic() - self._measured >= age and self._lock.acquire(blocking=self._measured < 0):
             try:
                 self._used, self._measured = measure(self.home), time.monotonic()
@@ -92,7 +99,7 @@ def _full(reason: str) -> StorageFullError:
 
 
 def measure(folder: Path) -> int:
-    """Bytes of all files below a folder, links not followed; what vanishes meanwhile does not count."""
+    """Return the bytes of all files below a folder, without links and files that vanish meanwhile."""
     total, folders = 0, [os.fspath(folder)]
     while folders:
         with suppress(FileNotFoundError, NotADirectoryError), os.scandir(folders.pop()) as entries:
@@ -106,7 +113,7 @@ def measure(folder: Path) -> int:
 
 
 def _amount(size: int) -> str:
-    """Bytes for people."""
+    """Format bytes for people."""
     amount, units = float(size), ["bytes", "KiB", "MiB", "GiB", "TiB"]
     while amount >= 1024 and len(units) > 1:
         amount, units = amount / 1024, units[1:]

@@ -1,8 +1,8 @@
-"""What failing storage means to a client: errors of the database and of the operating system as those of the service.
+"""Errors of the database and the operating system, translated into errors of the service.
 
-Nothing was stored where one of these comes: files are written whole or not at all, rows in transactions. Only where a
-commit is interrupted, as the connection to a database server is lost or a disk cannot sync, nobody knows (`undecided`):
-sent again, a batch is known by its number, and what has an idempotency key by that.
+After such an error nothing was stored: files are written whole or not at all, rows in transactions. The exception is an
+interrupted commit, after a lost connection or a failed sync of the disk (`is_undecided`). A repeated batch is
+recognised by its sequence number, other requests by their idempotency key.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from service.foundation.errors import ServiceError, StorageFullError, StorageUnavailableError
 
-FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Of the operating system: the disk, a quota or the largest file allowed is used up."""
-UNAVAILABLE = frozenset(
+FULL_ERRNOS = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
+"""Errors of the operating system: the disk, a quota or the max file size is used up."""
+UNAVAILABLE_ERRNOS = frozenset(
     getattr(errno, name)
     for name in ("EROFS", "EIO", "EACCES", "EPERM", "EMFILE", "ENFILE", "ENODEV", "ENXIO", "ESTALE", "ENOTCONN")
     if hasattr(errno, name)
@@ -28,26 +28,26 @@ _LOST = "the database server cannot be reached now: try again"
 _NO_SPACE = "nothing was stored: the disk of the database is full. Delete data sets or versions"
 
 
-def translated(error: BaseException) -> ServiceError | None:
-    """The error that a client is answered with; None where `error` says nothing of the storage."""
+def translate_error(error: BaseException) -> ServiceError | None:
+    """Return the error for the client; None if `error` is not about storage."""
     if isinstance(error, (StorageFullError, StorageUnavailableError)):
         return error
     if isinstance(error, PoolTimeoutError):
         return StorageUnavailableError("too many requests wait for the database: try again", headers=RETRY_AFTER)
     if isinstance(error, DBAPIError):
         return _of_database(error)
-    if isinstance(error, OSError) and error.errno in FULL:
+    if isinstance(error, OSError) and error.errno in FULL_ERRNOS:
         return StorageFullError(f"nothing was stored: {error.strerror}. Delete data sets or versions")
-    if isinstance(error, OSError) and error.errno in UNAVAILABLE:
+    if isinstance(error, OSError) and error.errno in UNAVAILABLE_ERRNOS:
         return StorageUnavailableError(f"files cannot be read or written now: {error.strerror}", headers=RETRY_AFTER)
     return None
 
 
-def undecided(error: BaseException) -> bool:
-    """Whether what a transaction was to store may be stored all the same, so that its files have to stay.
+def is_undecided(error: BaseException) -> bool:
+    """Return whether a failed transaction may be stored all the same, so that its files must be kept.
 
-    A commit that could not be synced is in SQLite's log, whole, and is found there by the next start unless another one
-    has taken its place.
+    A commit that could not be synced is complete in SQLite's log. The next start finds it there, unless another commit
+    replaced it.
     """
     if not isinstance(error, DBAPIError):
         return False
@@ -70,13 +70,13 @@ def _of_database(error: DBAPIError) -> ServiceError | None:
 
 
 def _code(error: DBAPIError) -> int | None:
-    """SQLite's primary code; the rest of an extended one says where it came up."""
+    """Return SQLite's primary code, without the place of the error that an extended code adds."""
     code: int | None = getattr(error.orig, "sqlite_errorcode", None)
     return None if code is None else code & 0xFF
 
 
 def _of_postgresql(error: DBAPIError, state: str | None) -> ServiceError | None:
-    """By SQLSTATE, which there is none of where the server could not be asked. What it says names hosts and users."""
+    """Return the error for an SQLSTATE, None without connection. PostgreSQL's own text contains hosts and users."""
     if state is None:
         lost = error.connection_invalidated or isinstance(error, OperationalError)
         return StorageUnavailableError(_LOST, headers=RETRY_AFTER) if lost else None
@@ -85,7 +85,7 @@ def _of_postgresql(error: DBAPIError, state: str | None) -> ServiceError | None:
         return StorageUnavailableError(_LOCKED, headers=RETRY_AFTER)
     if state == "53100":
         return StorageFullError(_NO_SPACE)
-    # connection broken or refused, the server stops or starts, idle for too long, too many
+    # connection broken or refused, server stops or starts, idle for too long, too many
     if state.startswith(("08", "57P", "25P03", "53300")):
         return StorageUnavailableError(_LOST, headers=RETRY_AFTER)
     # read-only, no access, no such database, out of memory and the like, its disk, its own faults

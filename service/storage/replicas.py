@@ -1,6 +1,6 @@
-"""Services that share a database: each gives signs of life, and takes over jobs of those that no longer do.
+"""Services that share a database: each sends heartbeats, and takes over jobs of services whose heartbeats stop.
 
-Their age is told by the database's clock. A service alone gives no signs, and all jobs are its own.
+The database's clock dates the heartbeats. A single service sends none and owns all jobs.
 """
 
 from __future__ import annotations
@@ -26,24 +26,26 @@ from service.storage.files.local import write_durably
 logger = logging.getLogger(__name__)
 
 RECONCILE_S = 30.0
-"""Seconds between two searches for jobs that nobody has, of a service alone: only a fault leaves some."""
+"""Seconds between two searches of a single service for jobs without an owner: only a fault leaves some."""
 _SECONDS = cast(func.extract("epoch", func.clock_timestamp()), Float)
 
 
 class Replicas:
-    """A service among those that share its database; a thread gives its signs of life until it is closed.
+    """A service among those that share its database; a thread sends its heartbeats until it is closed.
 
-    id: of this service, the same again after a restart on the same home, so that it knows its own jobs; beat_s: seconds
-    between two signs of life; reconcile_s: between two searches for jobs that nobody has.
+    - id: of this service. It stays the same after a restart on the same home, so that the service finds its own jobs.
+    - beat_s: time between two heartbeats, s.
+    - reconcile_s: time between two searches for jobs without an owner, s.
     """
 
     def __init__(self, settings: Settings, database: Database) -> None:
         self.settings, self.database = settings, database
-        self.beat_s = settings.replica_lost_s / 10  # so many are missing before it counts as lost
-        self.id = identity(settings.home) if database.shared else "alone"
+        self.beat_s = settings.replica_lost_s / 10  # ten missing heartbeats count as lost
+        self.id = load_replica_id(settings.home) if database.shared else "alone"
         self.reconcile_s = self.beat_s if database.shared else RECONCILE_S
         self._started = now()
-        self._since, self._last = float("inf"), -float("inf")  # monotonic, s: no sign was missed since; the last one
+        # monotonic, s: start of unbroken heartbeats; the last one
+        self._since, self._last = float("inf"), -float("inf")
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         if database.shared:
@@ -52,7 +54,7 @@ class Replicas:
             self._thread.start()
 
     def close(self) -> None:
-        """Give no more signs; others need not wait to know it."""
+        """Stop the heartbeats and delete the service's row, so that the others need not wait."""
         self._closing.set()
         if self._thread is None:
             return
@@ -61,42 +63,46 @@ class Replicas:
             with self.database.session() as session:
                 session.execute(delete(ReplicaRow).where(ReplicaRow.id == self.id))
                 session.commit()
-        except Exception:  # as after a kill: others wait for the time
+        except Exception:  # as after a kill: the others wait until it counts as lost
             logger.warning("the service could not take its leave of the others", exc_info=True)
 
     def others(self, session: Session) -> list[str]:
-        """Ids of the other services that live, as far as is known."""
-        return sorted(alive(session, self.settings.replica_lost_s) - {self.id})
+        """Return the ids of the other live services."""
+        return sorted(read_live_ids(session, self.settings.replica_lost_s) - {self.id})
 
-    def mine(self, owner: str | None) -> bool:
-        """Whether a job with this owner is this service's; one that nobody has is not, where there may be others."""
+    def is_mine(self, owner: str | None) -> bool:
+        """Return whether this service owns the jobs of an owner.
+
+        Without an owner, a job belongs to a single service, but to none of several.
+        """
         return not self.database.shared or owner == self.id
 
-    def free(self, session: Session) -> set[str | None]:
-        """Owners whose jobs are to be had: of this service and nobody's, and those that live no more.
+    def list_claimable_owners(self, session: Session) -> set[str | None]:
+        """Return the owners whose jobs this service may claim: itself, None, and services that are lost.
 
-        While signs of this service could not be given for a time, nobody counts as lost: theirs could not be either.
+        After a gap in this service's own heartbeats no service counts as lost for a time: the others may have had the
+        same gap.
         """
         owners = set(session.scalars(select(JobRow.owner).where(JobRow.state.in_(ACTIVE)).distinct()))
         if time.monotonic() - self._since < self.settings.replica_lost_s:
             return owners & {None, self.id}
-        return owners - (alive(session, self.settings.replica_lost_s) - {self.id})
+        return owners - (read_live_ids(session, self.settings.replica_lost_s) - {self.id})
 
-    def take(self, job: str, before: str | None) -> bool:
-        """Make a job this service's own, if it still has the owner `before`: of several that try, one succeeds."""
+    def claim(self, job: str, before: str | None) -> bool:
+        """Become the owner of a job if its owner is still `before`: of several services, one succeeds."""
         if not self.database.shared:
             return True
         owner = JobRow.owner.is_(None) if before is None else JobRow.owner == before
         ours = or_(owner, JobRow.owner == self.id)
         return self._change(update(JobRow).where(JobRow.id == job, JobRow.state.in_(ACTIVE), ours), self.id)
 
-    def leave(self) -> None:
-        """Let others have the jobs of this service."""
+    def release_jobs(self) -> None:
+        """Release the jobs of this service for others."""
         if self.database.shared:
             self._change(update(JobRow).where(JobRow.owner == self.id, JobRow.state.in_(ACTIVE)), None)
 
     def _change(self, statement: Any, owner: str | None) -> bool:
-        with self.database.session() as session:  # a single statement: it needs no lock of all writers
+        with self.database.session() as session:  # a single statement, which needs no lock of all writers
             changed = session.execute(statement.values(owner=owner).returning(JobRow.id)).all()
             session.commit()
         return bool(changed)
@@ -122,13 +128,13 @@ class Replicas:
         self._last = clock
 
 
-def alive(session: Session, lost_s: float) -> set[str]:
-    """Ids of the services that gave a sign of life within so many seconds."""
+def read_live_ids(session: Session, lost_s: float) -> set[str]:
+    """Return the ids of services with a heartbeat in the last `lost_s` seconds."""
     return set(session.scalars(select(ReplicaRow.id).where(ReplicaRow.seen_at > _SECONDS - lost_s)))
 
 
-def identity(home: Path) -> str:
-    """The id of the service on a home, which it keeps. Only the process that holds the home may ask."""
+def load_replica_id(home: Path) -> str:
+    """Return the lasting id of the service on a home. Call it only in the process that has the home's lock."""
     path = home / "replica"
     try:
         known = path.read_text().strip()

@@ -1,7 +1,7 @@
-"""What routes make of rows: pages of lists, {items, next_cursor}; and requests that may be sent again, done once.
+"""Pages of rows for lists {items, next_cursor}, and idempotent requests.
 
-A client names a request by the header `Idempotency-Key`. Key and digest of the request are columns of the row that it
-makes: they are as durable as what was done, and go with it when it is deleted.
+A client names a request with the header `Idempotency-Key`. Key and digest of the request are columns of the row that
+the request creates. So they are as durable as the row, and are deleted with it.
 """
 
 from __future__ import annotations
@@ -18,25 +18,26 @@ from sqlalchemy.orm import Session
 
 from service.foundation.errors import ConflictError, problem
 from service.storage.database import AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow
-from service.telemetry.logs import KEY_ID, asked
+from service.telemetry.logs import KEY_ID, request_scope
 
 MAX_PAGE = 100
-"""Items of one page of a list, at most."""
-USUAL = 50
+"""Max items of one page of a list."""
+DEFAULT_PAGE = 50
+"""Items of a page, if the client names no number."""
 Row = TypeVar("Row", AlarmRow, AuditRow, DatasetRow, EventRow, JobRow, ModelRow, RobotRow)
 
 
 class Page(BaseModel):
-    """Which part of a list: items after `after`, at most `limit`, newest first where `after` is None."""
+    """A part of a list: at most `limit` items after `after`, newest first; from the newest if `after` is None."""
 
     after: int | None
     limit: int
 
 
-def newest(
+def read_page(
     session: Session, table: type[Row], page: Page, *conditions: ColumnElement[bool]
 ) -> tuple[list[Row], str | None]:
-    """Return the rows of a page that meet all conditions, newest first, and the cursor after it, None on the last."""
+    """Return the rows of a page that meet all conditions, newest first, and the next cursor, None on the last page."""
     query = select(table).where(*conditions).order_by(table.seq.desc()).limit(page.limit + 1)
     if page.after is not None:
         query = query.where(table.seq < page.after)
@@ -50,31 +51,35 @@ Made = TypeVar("Made", DatasetRow, JobRow)
 
 
 @dataclass(frozen=True)
-class Identity:
-    """A request as its client names it, and the digest of what it says. stored: the name as the database has it."""
+class RequestIdentity:
+    """The key of a request, and the digest of its content. stored: the key as the database has it."""
 
     key: str
     stored: str
     digest: str
 
 
-def identity(key: str | None, *content: Any, file: Path | None = None) -> Identity | None:
-    """The identity of the request that is being answered; None where it has no key. content: JSON of what it asks;
-    file: what it brings. Each API key has names of its own."""
+def identify_request(key: str | None, *content: Any, file: Path | None = None) -> RequestIdentity | None:
+    """Return the identity of the current request, None without a key. Each API key has keys of its own.
+
+    content: JSON of the request. file: the uploaded file.
+    """
     if key is None:
         return None
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
     if file is not None:
         with file.open("rb") as opened:
             digest.update(hashlib.file_digest(opened, "sha256").digest())
-    client = (asked.get() or {}).get(KEY_ID)
+    client = (request_scope.get() or {}).get(KEY_ID)
     stored = key if client is None else hashlib.sha256(f"{client} {key}".encode()).hexdigest()
-    return Identity(key, stored, digest.hexdigest())
+    return RequestIdentity(key, stored, digest.hexdigest())
 
 
-def done(session: Session, table: type[Made], named: Identity | None) -> Made | None:
-    """The row that a request has made before; None where it has not. Raise ConflictError where another request has the
-    key. Inside a transaction nobody else can make one meanwhile."""
+def find_done_row(session: Session, table: type[Made], named: RequestIdentity | None) -> Made | None:
+    """Return the row that the same request created before, None if there is none.
+
+    Raise ConflictError if another request used the key. Inside a transaction no other request can create the row.
+    """
     if named is None:
         return None
     row = session.scalar(select(table).where(table.idempotency_key == named.stored))
@@ -86,7 +91,7 @@ def done(session: Session, table: type[Made], named: Identity | None) -> Made | 
     return row
 
 
-def mark(row: DatasetRow | JobRow, named: Identity | None) -> None:
-    """Write the identity of the request into the row that it makes."""
+def mark_row(row: DatasetRow | JobRow, named: RequestIdentity | None) -> None:
+    """Write the identity of the request into the row that it creates."""
     if named is not None:
         row.idempotency_key, row.request_digest = named.stored, named.digest

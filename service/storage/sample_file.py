@@ -1,6 +1,6 @@
-"""The file of a data set's samples: safetensors, written array by array, as a long recording is larger than memory is.
+"""The file of a data set's samples: safetensors, written array by array, as a recording may be as large as memory.
 
-The library that reads it here (and everybody else's) writes only what it is given whole.
+The safetensors library, used here for reading, can only write arrays that are all in memory.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from numpy.typing import NDArray
 from safetensors import safe_open
 
 ARRAYS = ("t", "episode", "q", "dq", "ddq", "tau")
-ROWS = 1 << 14
-"""Rows that chosen ones are read out of at a time."""
+CHUNK_ROWS = 1 << 14
+"""Max rows that are read at a time to select some of them."""
 _HEADER = 8
-"""Bytes that say how long the header is; and to whose multiples it is filled up, so that numbers are aligned."""
+"""Bytes of the header's length; the header is padded to a multiple of it, so that numbers are aligned."""
 
 ArrayOf = Callable[[str], NDArray[Any]]
-"""Gives one of ARRAYS by name: t (N,), episode (N,) integers, the others (N, n)."""
+"""Returns one of ARRAYS by name: t (N,), episode (N,) integers, the others (N, n)."""
 PartOf = Callable[[NDArray[np.int64], NDArray[np.float64]], NDArray[np.bool_]]
-"""Chooses samples by their episodes and times: each (N,)."""
+"""Selects samples (N,) by their episodes (N,) and times (N,)."""
 
 
-def size(rows: int, n_joints: int) -> int:
-    """Bytes of the numbers of so many samples."""
+def count_bytes(rows: int, n_joints: int) -> int:
+    """Return the bytes of the numbers of `rows` samples."""
     return 8 * rows * (2 + 4 * n_joints)
 
 
 def write(file: IO[bytes], rows: int, n_joints: int, array: ArrayOf) -> str:
-    """Write samples, asking for each array when it is its turn; return the sha256 of the file."""
+    """Write samples, reading each array from `array` in its turn; return the sha256 of the file."""
     header, offset = dict[str, Any](), 0
     for name in ARRAYS:
         shape = _shape(name, rows, n_joints)
@@ -60,34 +60,34 @@ def write(file: IO[bytes], rows: int, n_joints: int, array: ArrayOf) -> str:
 
 
 def sha256(path: Path) -> str:
-    """Hash of a file, read block by block."""
+    """Return the hash of a file, read block by block."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read(path: Path, rows: NDArray[np.int64] | None = None) -> dict[str, NDArray[Any]]:
-    """Arrays by name; of some rows only, where these are wanted: then no more than one array is in memory at a time."""
+    """Return the arrays by name, of all rows or some. For some rows at most one whole array is in memory at a time."""
     return {name: read_array(path, name) if rows is None else read_array(path, name)[rows] for name in ARRAYS}
 
 
 def read_array(path: Path, name: str) -> NDArray[Any]:
-    """One array by name."""
+    """Return one array by name."""
     with safe_open(path, framework="numpy") as file:
         values: NDArray[Any] = file.get_tensor(name)
     return values
 
 
-def rows_of(path: Path) -> int:
-    """How many samples a file has, by its header."""
+def count_rows(path: Path) -> int:
+    """Return the number of samples of a file, from its header."""
     with safe_open(path, framework="numpy") as file:
         count: int = file.get_slice("t").get_shape()[0]
     return count
 
 
 class Reader:
-    """A file that is open for its rows, part by part; it outlives the file's name. Safe from several threads.
+    """An open file whose rows are read in parts, even after the file is deleted. Safe from several threads.
 
-    Nothing is mapped into memory: of a file as large as memory is, only what was asked for is there.
+    Nothing is mapped into memory: only the requested rows are there, however large the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -105,7 +105,7 @@ class Reader:
             os.close(self._file)
 
     def array(self, name: str, first: int = 0, last: int | None = None) -> NDArray[Any]:
-        """Rows `first` to `last`, exclusive, of one array; raise ValueError where the file ends before them."""
+        """Return rows `first` to `last`, exclusive, of one array; raise ValueError if the file ends before them."""
         count, size = (self.rows if last is None else last) - first, 8 * self._width[name]
         out = np.empty((count, *self._shape[name]), "<i8" if name == "episode" else "<f8")
         view, at = out.data.cast("B") if out.size else memoryview(b""), 0
@@ -117,12 +117,12 @@ class Reader:
         return out
 
     def take(self, index: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-        """Arrays by name of chosen rows, (K,) and rising: never much more than these is in memory."""
+        """Return the arrays by name at chosen rows (K,) in rising order, with little more than these in memory."""
         parts: dict[str, list[NDArray[Any]]] = {name: [] for name in ARRAYS}
         at = 0
         while at < len(index):
             first = int(index[at])
-            to = int(np.searchsorted(index, first + ROWS))
+            to = int(np.searchsorted(index, first + CHUNK_ROWS))
             last = int(index[to - 1]) + 1
             for name in ARRAYS:
                 parts[name].append(self.array(name, first, last)[index[at:to] - first])

@@ -1,5 +1,7 @@
-"""What a service keeps things in: a database, a store of files, a disk, a home folder; how these are. The home belongs
-to one running service at a time, and has to be whole before one starts on it."""
+"""The storage of a service: database, file store, disk and home folder, with their readiness.
+
+The home belongs to one running service at a time, and is checked before a service starts on it.
+"""
 
 from __future__ import annotations
 
@@ -22,15 +24,15 @@ from service.storage.database.engine import FILE, Database
 from service.storage.database.migrations import DatabaseVersionError
 from service.storage.disk import Disk
 from service.storage.files import Files, FilesUnreachableError
-from service.telemetry.readiness import Lasting, Look
+from service.telemetry.readiness import FaultAge, Probe
 
 WAIT_S = 10.0
-"""Longest wait in s of a request for another writer of the database; then it gets a 503."""
+"""Max wait of a request for another writer of the database, s; then it is answered 503."""
 
 
 @dataclass(frozen=True)
 class Storage:
-    """The storage of a running service, and the limits of what is put there."""
+    """The storage of a running service, and its limits."""
 
     settings: Settings
     database: Database
@@ -39,29 +41,29 @@ class Storage:
 
     @classmethod
     def open(cls, settings: Settings) -> Storage:
-        """Open, or make, what the settings name."""
+        """Open, or create, the storage that the settings name."""
         return cls(settings, Database.of(settings, WAIT_S), Files.of(settings), Disk(settings))
 
-    def looks(self) -> dict[str, Look]:
-        """How readiness looks at each part, by its name."""
-        parts = {"database": look_database, "home": look_home} | ({"files": look_files} if self.files.shared else {})
+    def probes(self) -> dict[str, Probe]:
+        """Return the readiness probes of all parts, by name."""
+        parts = {"database": probe_database, "home": probe_home} | ({"files": probe_files} if self.files.shared else {})
         return {name: partial(look, self) for name, look in parts.items()}
 
 
 WRITE_S = 2.0
-"""Longest wait in s for another writer of the database: commits take milliseconds."""
+"""Max wait of a probe for another writer of the database, s: commits take milliseconds."""
 
 
-def look_database(storage: Storage, _: Lasting) -> tuple[PartState, str]:
-    """Whether the database answers, and can be written in time."""
+def probe_database(storage: Storage, _: FaultAge) -> tuple[PartState, str]:
+    """Check that the database can be read, and written in time."""
     with storage.database.session() as session:
         session.execute(text("SELECT 1"))
     storage.database.adapter.check(WRITE_S)
     return "ok", "can be read and written"
 
 
-def look_home(storage: Storage, _: Lasting) -> tuple[PartState, str]:
-    """Whether the home can be written, and has room."""
+def probe_home(storage: Storage, _: FaultAge) -> tuple[PartState, str]:
+    """Check that the home can be written, and has space."""
     path = storage.files.upload()
     try:
         path.write_bytes(bytes(4096))
@@ -71,8 +73,8 @@ def look_home(storage: Storage, _: Lasting) -> tuple[PartState, str]:
     return ("ok", "can be written") if shortage is None else ("failed", shortage)
 
 
-def look_files(storage: Storage, _: Lasting) -> tuple[PartState, str]:
-    """Whether the shared store answers: without it, what is in memory and what has a copy here still does."""
+def probe_files(storage: Storage, _: FaultAge) -> tuple[PartState, str]:
+    """Check that the shared store answers: without it, models in memory and files with a local copy still work."""
     try:
         storage.files.check()
     except OSError as error:
@@ -81,18 +83,18 @@ def look_files(storage: Storage, _: Lasting) -> tuple[PartState, str]:
 
 
 class HomeError(RuntimeError):
-    """No service can start on the home; the message says why and what would help."""
+    """No service can start on the home; the message contains the reason and the remedy."""
 
 
 class HomeInUseError(HomeError):
-    """Another service works on the same home."""
+    """Another service uses the same home."""
 
 
-def hold_home(home: Path) -> ExitStack:
-    """Hold the home for this process; the locks end with the process, however it ends. Raise HomeError.
+def lock_home(home: Path) -> ExitStack:
+    """Lock the home for this process; return the locks, which end with the process. Raise HomeError.
 
-    The folder itself is locked: a file in it could be deleted, and made again by a second service. The file is locked
-    too, because NFS and others lock no folders.
+    The folder itself is locked: a file in it could be deleted, and created again by a second service. A file is locked
+    too, because NFS and others cannot lock folders.
     """
     with ExitStack() as held:
         try:
@@ -113,12 +115,12 @@ def hold_home(home: Path) -> ExitStack:
 
 
 def check_home(settings: Settings) -> None:
-    """See that a service can start: the home is nobody else's and can be written, its database is whole and up to date.
+    """Check that a service can start: the home is unused and writable, its database undamaged and up to date.
 
-    Takes about 0.3 s for each GB of the database. Raise HomeError.
+    Takes about 0.3 s per GB of the database. Raise HomeError.
     """
     home = settings.home
-    with hold_home(home), usable(settings):
+    with lock_home(home), explain_home_errors(settings):
         try:
             files = Files.of(settings)
             files.upload().unlink()
@@ -133,8 +135,8 @@ def check_home(settings: Settings) -> None:
 
 
 @contextmanager
-def usable(settings: Settings) -> Iterator[None]:
-    """Raise HomeError, which says what would help, for what keeps a block from using the database or shared files."""
+def explain_home_errors(settings: Settings) -> Iterator[None]:
+    """Raise HomeError with advice if the block cannot use the database or shared files."""
     try:
         yield
     except (DatabaseVersionError, MissingExtraError) as error:
@@ -146,10 +148,10 @@ def usable(settings: Settings) -> Iterator[None]:
 
 
 def _damage(settings: Settings) -> str | None:
-    """What is wrong with the database, None where it is whole."""
+    """Return the first fault of the database, None if there is none."""
     database = Database.of(settings, WAIT_S)
     try:
-        with database.transaction():  # a database that can only be read is of no use either
+        with database.transaction():  # a read-only database is useless too
             pass
         return next(iter(database.adapter.damage()), None)
     finally:
@@ -168,7 +170,7 @@ def _unusable_files(settings: Settings, error: OSError) -> str:
 
 
 def _unusable_database(settings: Settings, damage: str) -> str:
-    damage = " ".join(damage.split())  # SQLite's comes in several lines
+    damage = " ".join(damage.split())  # SQLite's text has several lines
     if settings.database_url is not None:
         return f"the database of LIPSERVE_DATABASE_URL cannot be used: {damage}"
     path = settings.home / FILE

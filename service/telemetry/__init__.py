@@ -1,1 +1,1 @@
-"""What any room may report to: logs, meters, readiness."""
+"""Logs, meters and readiness, for every room that reports."""

@@ -1,4 +1,4 @@
-"""Which request or job the code that runs belongs to, for logs and for what is stored."""
+"""Log format, and the request or job that the running code belongs to."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from dataclasses import dataclass
 from typing import Any, Literal, TextIO
 
 request_id: ContextVar[str | None] = ContextVar("request_id", default=None)
-"""Id of the request that is answered, None outside of one."""
-asked: ContextVar[MutableMapping[str, Any] | None] = ContextVar("asked", default=None)
-"""ASGI scope of the request that is answered, None outside of one."""
+"""Id of the current request, None outside of one."""
+request_scope: ContextVar[MutableMapping[str, Any] | None] = ContextVar("request_scope", default=None)
+"""ASGI scope of the current request, None outside of one."""
 job_id: ContextVar[str | None] = ContextVar("job_id", default=None)
-"""Id of the job that is worked on, None outside of one."""
+"""Id of the current job, None outside of one."""
 
 REQUEST_ID = b"x-request-id"
-"""Header that names a request: taken from who asks, and in every answer."""
-LONGEST_ID = 64
+"""Header with the id of a request: read from the client, and sent with every response."""
+MAX_ID_CHARS = 64
 KEY_ID = "lipserve.key_id"
-"""Key of the id of the API key in the ASGI scope of a request that came with one."""
+"""Key of the API key's id in the ASGI scope of a request."""
 
 _SEPARATORS = str.maketrans("", "", "._-")
 _prefix = secrets.token_hex(6)
@@ -32,51 +32,54 @@ _numbers = itertools.count(1)
 
 
 def new_request_id() -> str:
-    """Return an id that no other request of this or of another process has: a counter costs less than randomness."""
+    """Return an id that is unique among all processes; a counter costs less than randomness."""
     return f"{_prefix}-{next(_numbers):x}"
 
 
-def given_request_id(headers: Iterable[tuple[bytes, bytes]]) -> str | None:
-    """The id that a request brings, None where it brings none that can be taken: letters, digits and `._-`, up to 64.
+def read_request_id(headers: Iterable[tuple[bytes, bytes]]) -> str | None:
+    """Return the id that a request brings: up to 64 letters, digits and `._-`. Return None if it brings no such id.
 
-    Whatever else a header may hold would go into logs and into answers.
+    Any other content of the header would get into logs and responses.
     """
     for name, value in headers:
         if name == REQUEST_ID:
             text = value.decode("latin-1")
             plain = text.translate(_SEPARATORS)
-            return text if len(text) <= LONGEST_ID and plain.isascii() and plain.isalnum() else None
+            return text if len(text) <= MAX_ID_CHARS and plain.isascii() and plain.isalnum() else None
     return None
 
 
 Event = MutableMapping[str, Any]
 
-LOGGED_BEFORE = ("Exception in ASGI application", '%s - "WebSocket %s"', "connection open", "connection closed")
-"""Begin what uvicorn logs of requests, which the outermost middleware has logged: with their ids, without queries."""
+REQUEST_LOG_PREFIXES = ("Exception in ASGI application", '%s - "WebSocket %s"', "connection open", "connection closed")
+"""Beginnings of uvicorn's log lines about requests, which our outermost middleware logs with ids and without queries.
+"""
 _CONTROL = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160))} | {
     code: f"\\u{code:04x}" for code in (0x2028, 0x2029, *range(0x200E, 0x2010), *range(0x202A, 0x202F))
 }
-"""What must not stand in a line: control characters, ends of lines, and marks that turn the direction of text."""
+"""Escapes of characters that must not stand in a line: control characters, line ends, marks of text direction."""
 
 
 @dataclass(frozen=True)
 class LogOptions:
-    """level: lowest that is logged; form: `console` for people, or `json`."""
+    """Options of the log."""
 
     level: str = "info"
+    """Lowest level that is logged."""
     form: Literal["console", "json"] = "console"
+    """`console` for people, or `json`."""
 
 
 _current: LogOptions | None = None
 
 
-def current() -> LogOptions | None:
-    """How this process logs, to be handed to those that it starts; None where it has not been told."""
+def current_options() -> LogOptions | None:
+    """Return the log options of this process, for its child processes; None if it is not configured."""
     return _current
 
 
 def configure(options: LogOptions | None) -> None:
-    """Log in one form from now on, in this process; None leaves everything as it is."""
+    """Configure the log of this process; None changes nothing."""
     global _current  # noqa: PLW0603 - Python's logging is one for the process
     if options is None or options == _current:
         return
@@ -85,7 +88,7 @@ def configure(options: LogOptions | None) -> None:
     handler.setFormatter(_formatter(options.form))
     root, level = logging.getLogger(), options.level.upper()
     root.handlers[:] = [handler]
-    # libraries are not heard below info: what WebSockets say at debug is the headers, and with them the keys
+    # no debug lines of libraries: those of WebSockets contain headers, and with them the keys
     of_libraries = max(logging.getLevelName(level), logging.INFO)
     root.setLevel(of_libraries)
     for name in ("service", "lipcore"):
@@ -94,20 +97,20 @@ def configure(options: LogOptions | None) -> None:
         logger = logging.getLogger(name)
         logger.handlers.clear()
         logger.propagate = True
-        logger.setLevel(of_libraries)  # uvicorn takes a logger without a level of its own for one that traces
-    logging.getLogger("alembic").setLevel(max(of_libraries, logging.WARNING))  # it tells of its own parts at info
+        logger.setLevel(of_libraries)  # uvicorn traces to a logger without a level of its own
+    logging.getLogger("alembic").setLevel(max(of_libraries, logging.WARNING))  # at info it logs its own parts
     failures = logging.getLogger("uvicorn.error")
-    if not any(isinstance(each, _LoggedBefore) for each in failures.filters):
-        failures.addFilter(_LoggedBefore())
+    if not any(isinstance(each, _RequestLogFilter) for each in failures.filters):
+        failures.addFilter(_RequestLogFilter())
     logging.captureWarnings(True)
 
 
-class _LoggedBefore(logging.Filter):
-    """Drops what uvicorn says of requests."""
+class _RequestLogFilter(logging.Filter):
+    """Drops uvicorn's lines about requests."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a record is news."""
-        return not str(record.msg).startswith(LOGGED_BEFORE)
+        """Return whether a record is logged."""
+        return not str(record.msg).startswith(REQUEST_LOG_PREFIXES)
 
 
 def _formatter(form: str) -> logging.Formatter:
@@ -133,7 +136,7 @@ def _formatter(form: str) -> logging.Formatter:
 
 
 def _show_failure(out: TextIO, failure: Any) -> None:
-    """Write a traceback, in which what clients have sent may stand."""
+    """Write a traceback, which may contain text from clients."""
     lines = "".join(traceback.format_exception(*failure)).splitlines()
     out.write("\n" + "\n".join(line.translate(_CONTROL) for line in lines))
 
@@ -144,7 +147,7 @@ def _add_fields(_: Any, __: str, event: Event) -> Event:
 
 
 def _add_ids(_: Any, __: str, event: Event) -> Event:
-    """Say which request or job, and which process where it is not the service's own."""
+    """Add the ids of request, job and trace, and the process if it is not the main one."""
     for name, value in (("request_id", request_id.get()), ("job", job_id.get())):
         if value is not None:
             event[name] = value
@@ -159,7 +162,7 @@ def _add_ids(_: Any, __: str, event: Event) -> Event:
 
 
 def _make_printable(_: Any, __: str, event: Event) -> Event:
-    """Escape what could end a line or turn a terminal, in texts that clients have chosen."""
+    """Escape characters that could end a line or control a terminal, in texts from clients."""
     for name, value in event.items():
         if isinstance(value, str) and not value.isprintable():
             event[name] = value.strip().translate(_CONTROL)

@@ -1,7 +1,8 @@
-"""Figures that are counted while requests are answered, and what a metric is.
+"""Counters of requests and streams, and the declaration of metrics.
 
-Plain numbers, changed by the event loop alone, not prometheus-client's own counters: their labels and locks cost 3 µs a
-request and more, these a few tenths. A metric's description makes its families and its line in the documentation.
+The counters are plain numbers, changed only by the event loop. The labels and locks of prometheus-client's own counters
+cost over 3 µs a request; these cost a few tenths. A metric's declaration makes its families and its line in the
+documentation.
 """
 
 from __future__ import annotations
@@ -14,50 +15,50 @@ from typing import Any, Literal, NamedTuple
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-BOUNDS = (
+BUCKET_BOUNDS_S = (
     *(0.000_05, 0.000_1, 0.000_25, 0.000_5, 0.001, 0.002, 0.005, 0.01, 0.025),
     *(0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0),
 )
 """Upper bounds of durations, s: from a frame of a stream to a large upload."""
 METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "DELETE", "PATCH", "OPTIONS", "WEBSOCKET"})
 OTHER = "other"
-"""Stands for methods that there are not, and for models beyond those that are told apart."""
+"""Label of unknown methods, and of models beyond `MAX_MODELS`."""
 MAX_MODELS = 200
-"""Models that metrics of requests and streams tell apart; the others are counted together."""
+"""Max models with labels of their own in metrics of requests and streams; the others are counted together."""
 
 
 class Durations:
-    """How long something took, each time it happened, as a histogram. bounds: upper ones of its buckets, s."""
+    """A histogram of durations. bounds: upper bounds of its buckets, s."""
 
     __slots__ = ("bounds", "counts", "total")
 
-    def __init__(self, bounds: tuple[float, ...] = BOUNDS) -> None:
+    def __init__(self, bounds: tuple[float, ...] = BUCKET_BOUNDS_S) -> None:
         self.bounds, self.counts = bounds, [0] * (len(bounds) + 1)
         self.total = 0.0
 
     def add(self, seconds: float) -> None:
-        """Count one more."""
+        """Count one duration."""
         self.counts[bisect_left(self.bounds, seconds)] += 1
         self.total += seconds
 
 
 class Kind(NamedTuple):
-    """What requests are told apart by. model: empty where there is none; code: of the error, empty where there is none.
-
-    status: of the answer; 499 where the client went away before there was one.
-    """
+    """The labels of a request's metrics."""
 
     method: str
     route: str
     model: str
+    """Name of the model; empty if there is none."""
     status: int
+    """Status of the response; 499 if the client disconnected before it."""
     code: str
+    """Code of the error; empty if there is none."""
 
 
 class RequestMeter:
-    """Requests that were answered, by kind, and how many are being answered.
+    """Answered requests by kind, and the number of requests in progress.
 
-    A kind is known by the plain tuple of its fields: `find` is the slow way, for one that is not known yet.
+    `known` maps the plain tuple of a kind's fields to its durations. `find` is the slow way, for a new kind.
     """
 
     def __init__(self, most_models: int) -> None:
@@ -68,13 +69,16 @@ class RequestMeter:
         self._most_models = most_models
 
     def find(self, kind: Kind, exists: bool) -> Durations:
-        """Durations of a kind; what clients can make up at will is not told apart. exists: whether the model does."""
+        """Return the durations of a kind; labels that clients can invent are replaced.
+
+        exists: whether the model exists.
+        """
         method = kind.method if kind.method in METHODS else OTHER
         kind = kind._replace(method=method, model=self.label(kind.model) if exists else "")
         return self.known.setdefault(kind, Durations())
 
     def label(self, model: str) -> str:
-        """What stands for an existing model: its name, or OTHER where there are too many."""
+        """Return the label of an existing model: its name, or OTHER if there are too many models."""
         if not model or model in self._models:
             return model
         if len(self._models) >= self._most_models:
@@ -86,8 +90,8 @@ class RequestMeter:
 class StreamMeter:
     """Frames of the streams of one model.
 
-    durations: from a frame's arrival until its answer was ready, s; refused: by code; late: answers after their
-    deadline.
+    durations: from a frame's arrival until its answer is ready, s. refused: number of frames by error code. late:
+    number of answers after their deadline.
     """
 
     __slots__ = ("durations", "late", "refused")
@@ -103,18 +107,18 @@ class StreamMeter:
 
 
 class Meters:
-    """All that one service counts since it started. most_models: how many models are told apart."""
+    """All counters of one service since its start. most_models: max models with labels of their own."""
 
     def __init__(self, most_models: int = MAX_MODELS) -> None:
         self.requests = RequestMeter(most_models)
         self._streams: dict[str, StreamMeter] = {}
 
     def stream(self, model: str) -> StreamMeter:
-        """The meter of an existing model's streams."""
+        """Return the meter of an existing model's streams."""
         return self._streams.setdefault(self.requests.label(model), StreamMeter())
 
     def streams(self) -> Mapping[str, StreamMeter]:
-        """Meters of streams by model, as they are now."""
+        """Return a copy of the meters of streams by model."""
         return dict(self._streams)
 
 
@@ -127,26 +131,28 @@ _FAMILIES: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class MetricKind:
-    """A metric of /metrics. name: as in queries, a counter's with `_total`; meaning: in words, with its unit."""
+    """A metric of /metrics."""
 
     kind: Literal["counter", "gauge", "histogram"]
     name: str
+    """Name in queries; a counter's ends with `_total`."""
     meaning: str
+    """Meaning in words, with the unit."""
     labels: tuple[str, ...] = ()
 
     def family(self) -> Any:
-        """An empty family, to which samples are added."""
+        """Return an empty family, to which samples are added."""
         return _FAMILIES[self.kind](self.name, self.meaning, labels=self.labels)
 
     def of(self, samples: Iterable[tuple[Sequence[str], float]]) -> Metric:
-        """The family of these samples, each the values of its labels and a number."""
+        """Return the family of these samples; each has the values of its labels and a number."""
         family: Metric = self.family()
         for labels, value in samples:
-            family.add_metric(labels, value)  # type: ignore[attr-defined]  # of every kind that `family` makes
+            family.add_metric(labels, value)  # type: ignore[attr-defined]  # all families of `family` have it
         return family
 
     def spread(self, samples: Iterable[tuple[Sequence[str], Durations]]) -> Metric:
-        """The family of these histograms, each the values of its labels and durations."""
+        """Return the family of these histograms; each has the values of its labels and its durations."""
         family: Metric = self.family()
         for labels, durations in samples:
             buckets = list(_buckets(durations))
@@ -154,13 +160,13 @@ class MetricKind:
         return family
 
 
-def kinds(collector: type[Collector]) -> list[MetricKind]:
-    """The metrics that a collector declares."""
+def list_metrics(collector: type[Collector]) -> list[MetricKind]:
+    """Return the metrics that a collector declares."""
     return [each for each in vars(collector).values() if isinstance(each, MetricKind)]
 
 
-def merged(parts: Iterable[Durations]) -> Durations:
-    """All durations of several meters together."""
+def merge_durations(parts: Iterable[Durations]) -> Durations:
+    """Return the sum of the durations of several meters."""
     total = Durations()
     for part in parts:
         total.counts = [ours + theirs for ours, theirs in zip(total.counts, part.counts, strict=True)]
@@ -169,7 +175,7 @@ def merged(parts: Iterable[Durations]) -> Durations:
 
 
 def _buckets(durations: Durations) -> Iterator[tuple[str, float]]:
-    """Upper bounds and how many lie below them, as Prometheus has histograms."""
+    """Yield upper bounds and cumulative counts, as Prometheus defines histograms."""
     below = 0
     for bound, count in zip((*map(str, durations.bounds), "+Inf"), durations.counts, strict=True):
         below += count

@@ -1,4 +1,4 @@
-"""Whether the service can do what it is for: each part is checked, and named; whether it is about to stop."""
+"""Readiness of the service: the state of each part, and whether the service is stopping."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from typing import Protocol
 from service.contract.states import PartState
 
 
-class Stopping:
-    """begun: the service was told to stop, and says so, though it may still answer.
+class StopState:
+    """Stages of a stop.
 
-    closing: set when it takes no more connections: who would answer for long, as with events, ends now.
+    begun: the stop was requested; the service reports it and may still answer. closing: set when new connections are
+    refused; long responses, such as events, end now.
     """
 
     def __init__(self) -> None:
@@ -24,25 +25,25 @@ class Stopping:
         self.closing = asyncio.Event()
 
 
-KEPT_S = 1.0
-"""Seconds for which a report holds: however many ask, a part is looked at once in this time."""
+MAX_REPORT_AGE_S = 1.0
+"""Seconds for which a report is reused: each part is checked at most once in this time."""
 
 
-class Lasting(Protocol):
-    """For how many seconds something has been wrong whenever it was looked at; None where it is not wrong now."""
+class FaultAge(Protocol):
+    """Returns the seconds since a fault was first seen without a break; None if the fault is gone."""
 
     def __call__(self, wrong: bool, what: str = "") -> float | None:
-        """wrong: whether it is so now; what: it is, where a part asks for several things."""
+        """Report whether the part is faulty now. what: name of the fault, if a part has several."""
         ...
 
 
-Look = Callable[[Lasting], tuple[PartState, str]]
-"""Looks at one part and says in words how it is; may raise whatever the part raises."""
+Probe = Callable[[FaultAge], tuple[PartState, str]]
+"""Checks one part and describes its state in words; may raise any error of the part."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """One part: warning where some clients may notice, failed where the service should get no requests."""
+    """The state of one part: `warning` if some clients may notice, `failed` if the service should get no requests."""
 
     name: str
     state: PartState
@@ -50,39 +51,41 @@ class Check:
 
 
 class Readiness:
-    """Looks at the parts of a service, at most once every KEPT_S; safe from several threads, not for the event loop.
+    """Checks the parts of a service at most once every MAX_REPORT_AGE_S.
 
-    looks: of each part, by its name; clock: seconds that only rise.
+    Safe from several threads, but not for the event loop.
+
+    probes: by name of their part. clock: monotonic, s.
     """
 
     def __init__(
-        self, looks: Mapping[str, Look], stopping: Stopping, clock: Callable[[], float] = time.monotonic
+        self, probes: Mapping[str, Probe], stopping: StopState, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self.looks, self._stopping = looks, stopping
+        self.probes, self._stopping = probes, stopping
         self._clock, self._lock = clock, threading.Lock()
         self._report, self._until = tuple[Check, ...](), -float("inf")
         self._wrong_since: dict[tuple[str, str], float] = {}
 
     def report(self) -> tuple[Check, ...]:
-        """How all parts are, just now or within the last KEPT_S; never raises."""
+        """Return the state of all parts, at most MAX_REPORT_AGE_S old; never raise."""
         with self._lock:
             if self._clock() >= self._until:
-                self._report = tuple(self._check(name, look) for name, look in self.looks.items())
-                self._until = self._clock() + KEPT_S
+                self._report = tuple(self._check(name, look) for name, look in self.probes.items())
+                self._until = self._clock() + MAX_REPORT_AGE_S
             if self._stopping.begun:
                 return Check("stopping", "failed", "the service is stopping"), *self._report
             return self._report
 
     def forget(self) -> None:
-        """Look again when asked next."""
+        """Check all parts again at the next report."""
         with self._lock:
             self._until = -float("inf")
 
-    def _check(self, name: str, look: Look) -> Check:
+    def _check(self, name: str, look: Probe) -> Check:
         try:
             return Check(name, *look(partial(self._lasting, name)))
-        except Exception as error:  # whatever it is, the part does not work
-            reason = getattr(error, "strerror", None) or error  # without paths: whoever reads this needs no key
+        except Exception as error:  # a part that raises any error does not work
+            reason = getattr(error, "strerror", None) or error  # without paths: readers of this need no key
             return Check(name, "failed", f"{type(error).__name__}: {reason}")
 
     def _lasting(self, part: str, wrong: bool, what: str = "") -> float | None:

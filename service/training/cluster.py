@@ -1,8 +1,8 @@
-"""The queue of training jobs where a Dask cluster runs them.
+"""Job queue for a Dask cluster that runs the training.
 
-The rows of the jobs say all that counts. For each job of this service that waits the scheduler has a ticket: a call of
-`hosting.host`, which some worker makes once it is free. Tickets may be lost or come twice; a job is done by whoever
-changes its row first. The service watches the row, and sees to it that a waiting job has a ticket.
+The rows of the jobs are the only source of truth. For each waiting job of this service the scheduler has a ticket: a
+call of `hosting.host`, which a free worker makes. Tickets may be lost or arrive twice; the worker that changes the row
+first runs the job. The service watches the row and submits another ticket if one is lost.
 """
 
 from __future__ import annotations
@@ -15,25 +15,27 @@ from service import __version__
 from service.contract.states import QUEUED
 from service.runtime import remote
 from service.runtime.cluster import Cluster, needs_gpu
-from service.runtime.executors import ClusterUnavailableError, lost
+from service.runtime.executors import ClusterUnavailableError, is_worker_lost
 from service.runtime.process import Slot
 from service.storage.database import JobRow
 from service.training import lifecycle
-from service.training.lifecycle import Ended, Hand
+from service.training.lifecycle import JobEnd, WatchedJob
 from service.training.queue import JobQueue
 
 logger = logging.getLogger(__name__)
 
-AGAIN_S = 1.0
-"""Seconds after which a job whose ticket was lost gets another one."""
+RETRY_S = 1.0
+"""Delay before a job whose ticket was lost gets another one, s."""
 
 HOST = "service.training.hosting:host"
-"""What a worker does with a job; by name, since its module would be imported here and by the scheduler."""
+"""Function that a worker calls for a job, as a name: the service and the scheduler must not import its module."""
 
 
 class ClusterQueue(JobQueue):
-    """Has workers of a cluster run jobs, and goes on with jobs of services that are gone; a job outlives its service.
-    Which service owns a job says who watches it; the one that dies is followed by another."""
+    """Queue whose jobs run on workers of a cluster and outlive their service.
+
+    The owner of a job is the service that watches it. If that service stops, another one takes its jobs over.
+    """
 
     def _places(self) -> list[Slot]:
         assert self.settings.cluster is not None
@@ -41,28 +43,28 @@ class ClusterQueue(JobQueue):
         return []
 
     def recover(self) -> list[str]:
-        """Go on with the jobs of an earlier run of this service; none has to be queued again."""
+        """Resume watching the jobs of an earlier run; none has to be queued again."""
         self._inbox.put(self._look_around)
         return []
 
     def close(self) -> None:
-        """Leave the jobs to other services, or to the next start: workers go on with those that run."""
+        """Leave the jobs to other services or to the next start; workers continue those that run."""
         super().close()
         self._away.close()
 
     def _hand_back(self) -> None:
-        self.replicas.leave()
+        self.replicas.release_jobs()
 
     def _look_around(self) -> None:
         self._reconciled = -float("inf")
 
     def _see_to(self, row: JobRow, ours: bool) -> None:
-        """Watch a job that runs on some worker."""
-        self._hands.append(Hand(row.id, None, None, time.monotonic(), away=True))
+        """Watch a job that runs on a worker."""
+        self._watched_jobs.append(WatchedJob(row.id, None, None, time.monotonic(), away=True))
 
     def _hand_out(self) -> None:
         clock = time.monotonic()
-        known = {hand.job for hand in self._hands} | self._settling
+        known = {watched.job for watched in self._watched_jobs} | self._settling
         for job in [job for job, at in self._waiting.items() if at <= clock and job not in known]:
             if self._closing.is_set() or self._away.problem is not None:
                 return
@@ -74,11 +76,14 @@ class ClusterQueue(JobQueue):
                 except ClusterUnavailableError as error:
                     logger.warning("%s waits: %s", job, error)
                     return
-                self._hands.append(Hand(job, None, future, clock, away=True))
+                self._watched_jobs.append(WatchedJob(job, None, future, clock, away=True))
             del self._waiting[job]
 
     def _announce(self, job: str) -> bool | None:
-        """Make a waiting job this service's and say what it waits for: with a GPU? None where it does not."""
+        """Take ownership of a waiting job; return whether it needs a GPU.
+
+        Return None if it no longer waits for this service.
+        """
         with self.database.transaction() as session:
             row = lifecycle.row_of(session, job)
             if row is None or row.state != QUEUED or row.owner not in (None, self.replicas.id):
@@ -92,19 +97,19 @@ class ClusterQueue(JobQueue):
 
     def _look(self) -> None:
         super()._look()
-        for hand in list(self._hands):
-            if hand.future is None or self._away.knows(hand.future):
+        for watched in list(self._watched_jobs):
+            if watched.future is None or self._away.knows(watched.future):
                 continue
-            future, hand.future = hand.future, None
-            if hand.ran is not None:  # its row says how it is
+            future, watched.future = watched.future, None
+            if watched.ran is not None:  # its row has the state
                 continue
-            self._hands.remove(hand)
-            error = future.exception(timeout=AGAIN_S) if future.status == "error" else None
-            if error is None or lost(error):
-                self._wait(hand.job, time.monotonic() + AGAIN_S)
+            self._watched_jobs.remove(watched)
+            error = future.exception(timeout=RETRY_S) if future.status == "error" else None
+            if error is None or is_worker_lost(error):
+                self._wait(watched.job, time.monotonic() + RETRY_S)
             else:
-                self._pass_on(Ended(hand.job, "refused", f"a worker could not begin with it: {error}"))
+                self._pass_on(JobEnd(watched.job, "refused", f"a worker could not begin with it: {error}"))
 
-    def _end(self, hand: Hand) -> None:
-        if hand.future is not None and hand.ran is None:  # a worker that has begun sees it in the row
-            self._away.drop(hand.future)
+    def _end(self, watched: WatchedJob) -> None:
+        if watched.future is not None and watched.ran is None:  # a worker that has begun reads its row
+            self._away.drop(watched.future)

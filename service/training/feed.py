@@ -1,4 +1,4 @@
-"""Jobs as they change, for any number of readers: the database is read once for all of them."""
+"""Publish changes of jobs to any number of followers, with one database query for all of them."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from typing import ClassVar
 from anyio import to_thread
 from sqlalchemy import select
 
-from service.runtime.counted import Counted
+from service.runtime.counted import OpenCounter
 from service.storage.database import Database, JobRow
 
 logger = logging.getLogger(__name__)
 
 LOOK_S = 0.4
-"""Seconds between two looks at the jobs that somebody follows."""
+"""Interval between two reads of the followed jobs, s."""
 MAX_FOLLOWERS = 100
-"""Streams of jobs' events at a time; more are answered 429."""
+"""Maximum event streams of jobs at a time; further requests are answered 429."""
 
 
-class Feed(Counted):
-    """Followers of jobs. It belongs to the event loop."""
+class JobEventStream(OpenCounter):
+    """Followers of jobs; belongs to the event loop."""
 
     too_many = "events of jobs are followed {} times, the most there may be: close one, or try again later"
     headers: ClassVar = {"Retry-After": "5"}
@@ -37,13 +37,13 @@ class Feed(Counted):
         self._reader: asyncio.Task[None] | None = None
 
     async def follow(self, row: JobRow, closing: asyncio.Event) -> AsyncIterator[JobRow]:
-        """The row as it is, and again whenever it has changed, until the service closes; the caller knows its end."""
+        """Yield the row, then again after each change, until the service closes. The caller detects the job's end."""
         changed = asyncio.Event()
         if row.id in self._rows:  # it may have changed since `row` was read
             changed.set()
         self._followers.setdefault(row.id, []).append(changed)
         if self._reader is None or self._reader.done():
-            # in a context of its own, not that of the request that happens to be the first
+            # in its own context, not that of the first request
             self._reader = asyncio.get_running_loop().create_task(self._read(closing), context=Context())
         try:
             yield row
@@ -62,7 +62,7 @@ class Feed(Counted):
         while self._followers and not closing.is_set():
             try:
                 rows = await to_thread.run_sync(self._look, list(self._followers))
-            except Exception:  # of the database: the next look may find it well again
+            except Exception:  # a database error: the next read may succeed
                 logger.exception("jobs that are followed could not be read")
                 rows = []
             for row in rows:
@@ -85,5 +85,5 @@ class Feed(Counted):
 
 
 def _mark(row: JobRow) -> tuple[object, ...]:
-    """What differs after a change."""
+    """Return the columns that identify a change."""
     return row.state, row.heartbeat_at, row.finished_at, row.progress, row.history

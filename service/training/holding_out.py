@@ -1,8 +1,8 @@
-"""Holding part of the data sets out of the fit that is judged, and finding the same samples again by a lineage.
+"""Hold part of the data sets out of the judged fit, and find the same samples again from a lineage.
 
-A refresh holds out what its version held out, where it still learns from that data set. The figures of both are then
-those of their judged fits on the same samples, which neither fit has learnt. Which of both serves is decided on the
-newest logged rows (`service.training.refreshed`).
+A refresh holds out what its version held out, if it still learns from that data set. The figures of both versions then
+belong to judged fits on the same samples, which neither fit has learnt. Which version serves is decided on the newest
+logged rows (`service.training.refreshed`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.data.splits import GUARD_S, Kind, Mask, Numbers, Parts, Split, SplitError, choose, split
+from lipcore.data.splits import GUARD_S, Kind, Mask, Numbers, Split, SplitError, SplitRows, choose_stretches, split
 from service.contract.models import HeldOutSet, Holdout, HoldoutLineage
 from service.foundation.errors import invalid_request
 from service.foundation.fields import first_repeat
@@ -22,40 +22,44 @@ from service.storage.database import DatasetRow
 
 
 class CannotHoldOutError(ValueError):
-    """A data set cannot be split as asked for."""
+    """A data set cannot be split as requested."""
 
     code = "cannot_hold_out"
 
 
 @dataclass(frozen=True)
 class SetSplit:
-    """How one data set is split. entire: nothing of it is learnt from; guard: in `unit`; stretches: rows to hold out
-    in order of episode and time, None where `asked` alone says which; known: rows held out and guarded where it was
-    split before."""
+    """How one data set is split into a learnt and a held-out part."""
 
     dataset: str
     asked: Holdout
     entire: bool
+    """Whether the whole data set is held out."""
     guard: float
+    """Gap between the two parts, in `unit`."""
     unit: Literal["s", "rows"]
     stretches: list[list[int]] | None = None
+    """Rows to hold out, in order of episode and time; None if `asked` determines them."""
     known: tuple[int, int] | None = None
+    """Numbers of held-out and guarded rows of an earlier split, which the new split must reproduce."""
 
     @property
     def rows(self) -> int:
-        """Rows held out; of a data set that was split before."""
+        """Number of held-out rows of an earlier split."""
         assert self.known is not None
         return self.known[0]
 
-    def parts(self, episode: Numbers, t: Array) -> Parts:
-        """Split rows by their episodes and times, (N,) each; raise CannotHoldOutError, also where another split comes
-        out than before."""
+    def parts(self, episode: Numbers, t: Array) -> SplitRows:
+        """Split rows by their episodes and times, (N,) each.
+
+        Raise CannotHoldOutError, also if the result differs from the earlier split.
+        """
         if self.entire:
-            parts = Parts(np.zeros(len(t), dtype=bool), np.ones(len(t), dtype=bool))
+            parts = SplitRows(np.zeros(len(t), dtype=bool), np.ones(len(t), dtype=bool))
         else:
             match self.asked.kind:
                 case "auto" | "stretches":
-                    kind: Kind = "last"  # unless rows are named
+                    kind: Kind = "last"  # unused if `stretches` are given
                 case kind:
                     pass
             how = Split(kind, self.asked.share, self.asked.blocks, self.guard, self.asked.seed)
@@ -70,29 +74,31 @@ class SetSplit:
         return parts
 
     def held_out(self, episode: Numbers, t: Array) -> Mask:
-        """Rows that are held out, see `parts`."""
+        """Return the mask of held-out rows, see `parts`."""
         return self.parts(episode, t).held_out
 
 
 class RowTimes(NamedTuple):
-    """When the rows of a data set are from: their episodes and times, (N,) each."""
+    """Episodes and times of a data set's rows, (N,) each."""
 
     episode: Numbers
     t: Array
 
 
 @dataclass(frozen=True)
-class Divided:
-    """Data sets in two, by the rows of each, (N,): which are learnt from and which held out, None for all and for none
-    of them; lineage: how to find them again, None where nothing is held out."""
+class DatasetSplits:
+    """Masks over the rows of each data set, (N,): learnt and held-out rows."""
 
     train: list[Mask | None]
+    """Learnt rows of each data set; None means all."""
     held_out: list[Mask | None]
+    """Held-out rows of each data set; None means none."""
     lineage: HoldoutLineage | None
+    """Record of the split; None if nothing is held out."""
 
 
 def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
-    """Raise InvalidRequestError where reports tell already that the data sets cannot be split as asked for."""
+    """Raise InvalidRequestError if the reports already show that the data sets cannot be split as requested."""
     _check_stretches(rows, asked)
     if (index := first_repeat(row.sha256 for row in rows)) is not None:
         expected = "other samples than those of the data sets before it"
@@ -114,7 +120,7 @@ def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
 
 
 def _check_stretches(rows: Sequence[DatasetRow], asked: Holdout) -> None:
-    """Raise InvalidRequestError where stretches are not rows of the data sets, in order and apart."""
+    """Raise InvalidRequestError unless stretches are rows of the data sets, in order and disjoint."""
     if (asked.stretches is None) != (asked.kind != "stretches"):
         raise invalid_request("holdout.stretches", asked.stretches, "rows, where `kind` is stretches, and only there")
     known = {row.id: row.rows for row in rows}
@@ -133,12 +139,12 @@ def hold_out(
     clocks: Sequence[RowTimes],
     asked: Holdout,
     unrepeated: Callable[[int], list[list[int]] | None],
-) -> Divided:
-    """Divide data sets for the first time; raise CannotHoldOutError.
+) -> DatasetSplits:
+    """Split data sets for the first time; raise CannotHoldOutError.
 
-    unrepeated: what to hold out of the data set at a place where `auto` is asked for; None: its last part.
-    Each is split on its own, but those of one episode stand for an episode where whole ones are held out. What it does
-    to a data set does not depend on the order of the others.
+    `unrepeated` returns the rows to hold out of the data set at an index if the kind is `auto`; None means its last
+    part. Each data set is split on its own. If whole episodes are held out, a data set of one episode counts as an
+    episode. The result for a data set does not depend on the order of the others.
     """
     single = {row.id for row, clock in zip(rows, clocks, strict=True) if len(np.unique(clock.episode)) < 2}
     if asked.kind != "episodes" or len(rows) == 1:
@@ -149,31 +155,30 @@ def hold_out(
         if asked.stretches is not None:
             if row.id in asked.stretches:
                 splits[row.id] = _first(row, asked, False, asked.stretches[row.id])
-        elif row.id in entire or row.id not in single:  # else the one episode that it has is learnt from
+        elif row.id in entire or row.id not in single:  # else its only episode is learnt
             splits[row.id] = _first(row, asked, row.id in entire, unrepeated(place) if asked.kind == "auto" else None)
     return _divide(rows, clocks, splits)
 
 
-def hold_out_again(rows: Sequence[DatasetRow], clocks: Sequence[RowTimes], lineage: dict[str, Any]) -> Divided:
-    """Divide data sets of a version as they were for it, by its lineage; raise CannotHoldOutError."""
-    splits = {row.id: split for row in rows if (split := remembered(row, lineage)) is not None}
+def hold_out_again(rows: Sequence[DatasetRow], clocks: Sequence[RowTimes], lineage: dict[str, Any]) -> DatasetSplits:
+    """Split a version's data sets as its lineage records; raise CannotHoldOutError."""
+    splits = {row.id: split for row in rows if (split := find_earlier_split(row, lineage)) is not None}
     return _divide(rows, clocks, splits)
 
 
-def remembered(row: DatasetRow, lineage: dict[str, Any]) -> SetSplit | None:
-    """How a version's data set was split, or the same samples uploaded another time; None where nothing of it was held
-    out."""
+def find_earlier_split(row: DatasetRow, lineage: dict[str, Any]) -> SetSplit | None:
+    """Return how a version split a data set, or the same samples uploaded again; None if it held out nothing."""
     if (record := lineage.get("holdout")) is None:
         return None
     holdout = HoldoutLineage.model_validate(record)
-    for each in sorted(holdout.datasets, key=lambda one: one.id != row.id):  # itself first
+    for each in sorted(holdout.datasets, key=lambda one: one.id != row.id):  # prefer the data set itself over a copy
         if row.id == each.id or row.sha256 == each.sha256:
             counts = (each.rows, each.guarded)
             return SetSplit(row.id, holdout.split, each.whole, each.guard, each.guard_unit, each.stretches, counts)
     return None
 
 
-def _divide(rows: Sequence[DatasetRow], clocks: Sequence[RowTimes], splits: dict[str, SetSplit]) -> Divided:
+def _divide(rows: Sequence[DatasetRow], clocks: Sequence[RowTimes], splits: dict[str, SetSplit]) -> DatasetSplits:
     train: list[Mask | None] = []
     held: list[Mask | None] = []
     sets: list[HeldOutSet] = []
@@ -199,27 +204,27 @@ def _divide(rows: Sequence[DatasetRow], clocks: Sequence[RowTimes], splits: dict
             )
         )
     if not sets:
-        return Divided(train, held, None)
+        return DatasetSplits(train, held, None)
     asked = next(iter(splits.values())).asked
     total = {name: sum(getattr(each, name) for each in sets) for name in ("rows", "guarded")}
-    return Divided(train, held, HoldoutLineage(split=asked, datasets=sets, **total))
+    return DatasetSplits(train, held, HoldoutLineage(split=asked, datasets=sets, **total))
 
 
 def _first(row: DatasetRow, asked: Holdout, entire: bool, stretches: list[list[int]] | None) -> SetSplit:
-    """How a data set is split that was not split before."""
+    """Return the first split of a data set."""
     if not _is_timed(row):
-        return SetSplit(row.id, asked, entire, 25.0, "rows", stretches)  # samples: the rate is not known
+        return SetSplit(row.id, asked, entire, 25.0, "rows", stretches)  # a guard of 25 rows, as the rate is unknown
     guard = asked.guard_s
-    if guard is None:  # one period of the low-pass that it was prepared with, if it was
+    if guard is None:  # one period of the low-pass filter of the preparation, if there was one
         cutoff = row.report["recipe"]["cutoff_hz"]
         guard = GUARD_S if cutoff is None else 1.0 / float(cutoff)
     return SetSplit(row.id, asked, entire, guard, "s", stretches)
 
 
 def _entire(rows: Sequence[DatasetRow], asked: Holdout) -> set[str]:
-    """Ids of those data sets of one episode that are held out as a whole."""
+    """Return the ids of the single-episode data sets that are held out as a whole."""
     ordered = sorted(rows, key=lambda row: row.sha256)
-    chosen = choose(np.array([row.rows for row in ordered]), asked.share, asked.seed)
+    chosen = choose_stretches(np.array([row.rows for row in ordered]), asked.share, asked.seed)
     return {row.id for row, held in zip(ordered, chosen, strict=True) if held}
 
 

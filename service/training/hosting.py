@@ -1,8 +1,8 @@
-"""A worker of a Dask cluster: it joins, joins again after the scheduler was away, runs jobs, and leaves in order.
+"""A worker of a Dask cluster: join, rejoin after the scheduler was away, run jobs, and leave in order.
 
-For each job it runs a training process, and ends that where it has to be: a thread of the worker could not be ended; a
-process can, and ends with its worker. The rules are those of one machine, see `lifecycle`. The outcome is written to
-the job's row: nothing of it travels. Needs the extra `cluster`.
+A job runs in a training process, which the worker kills if it must end; a thread could not be killed. The process also
+ends with its worker. The rules are those of a single machine, see `lifecycle`. The outcome is written to the job's row
+and not sent over the cluster. Needs the extra `cluster`.
 """
 
 from __future__ import annotations
@@ -31,32 +31,35 @@ from service.foundation.errors import ServiceError
 from service.foundation.settings import Settings
 from service.runtime import executors
 from service.runtime.cluster import GPU, JOB, needs_gpu
-from service.runtime.executors import GPU_SHARD, SHARD, placed
-from service.runtime.process import Slot, training_place
+from service.runtime.executors import GPU_SHARD, SHARD, choose_settings
+from service.runtime.process import Slot, training_process_options
 from service.storage.database import Database, JobRow
 from service.storage.files import Files
 from service.training import lifecycle, worker
-from service.training.lifecycle import Ended, Facts, Hand, Settler
+from service.training.lifecycle import JobEnd, JobStatus, Settler, WatchedJob
 
 T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 WATCH_S = 0.2
-"""Seconds between two looks at the job's row."""
+"""Interval between two reads of the job's row, s."""
 _one = threading.Lock()
 _stopping = threading.Event()
 
 
 class VersionsDifferError(RuntimeError):
-    """The service and the worker are of different versions."""
+    """The service and the worker have different versions."""
 
 
 def host(version: str, job: str) -> None:
-    """Run a job on this worker, and then whatever else waits that it can run. version: of the service that asks. Work
-    that others wait for is not left lying: the cluster gives tickets to workers before these are free."""
+    """Run a job on this worker, then further waiting jobs that it can run.
+
+    `version` is that of the calling service. The loop is necessary as the cluster assigns tickets to workers before
+    they are free.
+    """
     if version != __version__:
         raise VersionsDifferError(f"the worker has version {__version__}, the service {version}: start them alike")
-    with _one:  # a worker that has lost its scheduler and joined again may still be at work
+    with _one:  # a worker that lost its scheduler and rejoined may still run a job
         following: str | None = job
         while following is not None and not _stopping.is_set():
             hosting = _host()
@@ -65,13 +68,13 @@ def host(version: str, job: str) -> None:
 
 @cache
 def _host() -> Host:
-    """The host of this worker, whose training process stays for the next job: its start takes seconds."""
-    settings = placed(None)
+    """Return the host of this worker. Its training process stays for the next job, as a start takes seconds."""
+    settings = choose_settings(None)
     return Host(settings, Database.of(settings), worker.run)
 
 
 def stop(timeout_s: float) -> None:
-    """End what runs and wait for that, for so many seconds at most: its job waits for another worker."""
+    """Stop the running job and wait at most `timeout_s`; the job waits for another worker."""
     _stopping.set()
     if _one.acquire(timeout=timeout_s):
         _host().close()
@@ -79,83 +82,83 @@ def stop(timeout_s: float) -> None:
 
 
 def has_gpu() -> bool:
-    """Whether this worker has one, as it was told."""
+    """Return whether this worker was started with a GPU."""
     from distributed import get_worker  # noqa: PLC0415 - an extra
 
     return bool(get_worker().state.total_resources.get("GPU"))
 
 
 class Host:
-    """Runs one job after the other in a training process. function: what the process does with a job."""
+    """Runs one job after another in a training process, which calls `function` with each."""
 
     def __init__(self, settings: Settings, database: Database, function: Callable[[Settings, str], None]) -> None:
         self.settings, self.database, self.function = settings, database, function
         self.files = Files.of(settings)
         self.settler = Settler(database, self.files)
-        place = training_place(settings)
-        if settings.training_cpus is None:  # nothing is served here that a CPU is to be left to
+        place = training_process_options(settings)
+        if settings.training_cpus is None:  # a worker serves no queries, so no CPU is reserved
             place = replace(place, cpus=None)
         self.slot = Slot(place)
 
     def close(self) -> None:
-        """End the process, and the talk with the database."""
+        """Stop the process and close the database."""
         self.slot.close()
         self.database.close()
 
     def next(self) -> str | None:
-        """The job that has waited longest of those that this worker can run; None where there is none."""
+        """Return the longest-waiting job that this worker can run; None if there is none."""
         gpu = has_gpu()
         return self._patiently(lambda: self._oldest(gpu))
 
     def run(self, job: str) -> bool:
-        """Run a job to its end, if it waits or whoever ran it is gone; return whether there may be more to do."""
+        """Run a job to its end if it waits or its process is gone; return whether to look for another job."""
         row = self._patiently(lambda: self._row(job))
         if row is not None and row.state == RUNNING:
             if self._lives(row):
                 return True
             message = "the worker that ran it is gone"
-            self._settle(Ended(job, "ended", message, row.attempts))
+            self._settle(JobEnd(job, "ended", message, row.attempts))
             row = self._patiently(lambda: self._row(job))
         if row is None or row.state != QUEUED:
             return True
         try:
             future = self.slot.start(self.function, self.settings, job)
         except OSError as error:
-            self._settle(Ended(job, "ended", f"a training process could not be started: {error}"))
+            self._settle(JobEnd(job, "ended", f"a training process could not be started: {error}"))
             return False
-        return self._watch(Hand(job, self.slot, future, time.monotonic()), future, row.attempts + 1)
+        return self._watch(WatchedJob(job, self.slot, future, time.monotonic()), future, row.attempts + 1)
 
-    def _watch(self, hand: Hand, future: Future[None], attempt: int) -> bool:
+    def _watch(self, watched: WatchedJob, future: Future[None], attempt: int) -> bool:
         while not wait([future], WATCH_S).done:
             if _stopping.is_set():
                 self.slot.kill()
-                self._patiently(lambda: self._hand_back(hand.job, attempt))
+                self._patiently(lambda: self._hand_back(watched.job, attempt))
                 return False
             try:
-                row = self._row(hand.job)
-            except Exception:  # without it the process cannot go on either, but it may come back
-                logger.warning("the row of %s could not be read", hand.job, exc_info=True)
+                row = self._row(watched.job)
+            except Exception:  # the process needs the database too, but it may become available again
+                logger.warning("the row of %s could not be read", watched.job, exc_info=True)
                 continue
             clock = time.monotonic()
-            if row is None or row.attempts > attempt or (hand.ran is not None and row.state == QUEUED):
-                self.slot.kill()  # it is given to another one
+            if row is None or row.attempts > attempt or (watched.ran is not None and row.state == QUEUED):
+                self.slot.kill()  # another attempt has the job
                 return True
             if row.attempts == attempt:
-                hand.see(Facts(row.state, row.heartbeat_at, row.cancel_requested), clock)
-            if (ended := hand.judge(self.settings, clock)) is not None:
+                watched.see(JobStatus(row.state, row.heartbeat_at, row.cancel_requested), clock)
+            if (end := watched.judge(self.settings, clock)) is not None:
                 self.slot.kill()
-                self._settle(Ended(hand.job, ended.why, ended.message, attempt))
-                return ended.why != "not_started"
+                self._settle(JobEnd(watched.job, end.why, end.message, attempt))
+                return end.why != "not_started"
         error = future.exception()
-        if error is None:  # written by the process, or not its to write
+        if error is None:  # the process wrote the outcome, or another attempt has the job
             return True
         ending = f"the training process {self.slot.ending()}" if isinstance(error, BrokenProcessPool) else str(error)
-        self._settle(Ended(hand.job, "ended", ending, attempt))
-        return hand.ran is not None
+        self._settle(JobEnd(watched.job, "ended", ending, attempt))
+        return watched.ran is not None
 
     def _lives(self, row: JobRow) -> bool:
-        """Whether signs of life come from wherever a job runs; one that has ended meanwhile needs none."""
-        end = time.monotonic() + 3.0  # a sign of life comes each half second
+        """Return whether a running job still sends heartbeats, or has ended meanwhile."""
+        end = time.monotonic() + 3.0  # heartbeats arrive every half second
         while time.monotonic() < end and not _stopping.wait(WATCH_S):
             seen = self._patiently(lambda: self._row(row.id))
             if seen is None or seen.state not in ACTIVE or seen.heartbeat_at != row.heartbeat_at:
@@ -180,11 +183,11 @@ class Host:
             lifecycle.hand_back(row, "its worker was stopped while it ran")
         lifecycle.remove_leftovers(self.database, self.files, job)
 
-    def _settle(self, ended: Ended) -> None:
-        self._patiently(lambda: self.settler.settle(ended))
+    def _settle(self, end: JobEnd) -> None:
+        self._patiently(lambda: self.settler.settle(end))
 
     def _patiently(self, ask: Callable[[], T]) -> T | None:
-        """Ask the database until it answers, or the worker is to stop: then once more only."""
+        """Retry a database call until it succeeds; once the worker stops, give up after one more try."""
         while True:
             try:
                 return ask()
@@ -195,15 +198,15 @@ class Host:
 
 
 WRITE_S = 10.0
-"""Longest wait in s for the database when a worker starts."""
+"""Maximum wait for the database when a worker starts, s."""
 
 
 class CannotJoinError(RuntimeError):
-    """A worker lacks what it needs; the message says what."""
+    """A worker lacks a requirement, which the message names."""
 
 
 def check_storage(settings: Settings) -> None:
-    """See that the database and the files can be used, before anything is asked of a worker. Raise CannotJoinError."""
+    """Check that the database and the files can be used before the worker joins; raise CannotJoinError."""
     try:
         settings.home.mkdir(parents=True, exist_ok=True)
         database = Database.of(settings, WRITE_S)
@@ -217,20 +220,23 @@ def check_storage(settings: Settings) -> None:
 
 
 def join(settings: Settings, gpus: int = 0, name: str | None = None) -> None:
-    """Be a worker until SIGTERM or SIGINT. gpus: that it has; name: in the cluster, its address where None."""
+    """Run as a worker until SIGTERM or SIGINT.
+
+    `gpus` is the number of its GPUs, `name` its name in the cluster; the default is its address.
+    """
     assert settings.cluster is not None
-    executors.place(settings)
+    executors.set_worker_settings(settings)
     resources: dict[str, float] = {JOB: 1, SHARD: 1, **({GPU: gpus, GPU_SHARD: gpus} if gpus else {})}
     asyncio.run(_work(settings, settings.cluster, resources, name))
 
 
 class _Worker(distributed.Worker):
-    async def close(self, *given: Any, **options: Any) -> Any:  # threads of jobs see to their end themselves
+    async def close(self, *given: Any, **options: Any) -> Any:  # job threads end on their own
         return await super().close(*given, **{**options, "executor_wait": False})
 
 
 async def _work(settings: Settings, scheduler: str, resources: dict[str, float], name: str | None) -> None:
-    """Be a worker until told to stop; what runs goes on while the scheduler is away."""
+    """Run as a worker until stopped; running jobs continue while the scheduler is away."""
     stopped = asyncio.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(number, stopped.set)
@@ -239,7 +245,7 @@ async def _work(settings: Settings, scheduler: str, resources: dict[str, float],
         joined = asyncio.create_task(_be_member(settings, scheduler, resources, name))
         await asyncio.wait({joined, stopping}, return_when=asyncio.FIRST_COMPLETED)
         if stopped.is_set():
-            await asyncio.to_thread(stop, 10.0)  # its job is handed back
+            await asyncio.to_thread(stop, 10.0)  # the job waits for another worker
             joined.cancel()
             with suppress(asyncio.CancelledError):
                 await joined
@@ -253,21 +259,21 @@ async def _work(settings: Settings, scheduler: str, resources: dict[str, float],
 
 async def _be_member(settings: Settings, scheduler: str, resources: dict[str, float], name: str | None) -> None:
     """Be a member of the cluster until the scheduler is gone or this is cancelled."""
-    logging.getLogger("distributed").setLevel(logging.WARNING)  # importing it has set another one
+    logging.getLogger("distributed").setLevel(logging.WARNING)  # its import set another level
     options = {"distributed.worker.profile.enabled": False, "distributed.worker.daemon": False}
     with dask.config.set(options):
         member = _Worker(
             scheduler,
-            nthreads=2,  # one waits for the process of a job, one computes a shard
+            nthreads=2,  # one thread waits for a job's process, one computes shards
             resources=resources,
             name=name,
-            memory_limit=0,  # results are few; a container's limit is the one that counts
+            memory_limit=0,  # results are small, and the container has its own limit
             local_directory=str(settings.home / "dask"),
         )
         try:
             await member
             logger.info("worker %s has joined %s with %s", member.name, scheduler, resources)
-            finished: Any = member.finished  # its module is typed in part
+            finished: Any = member.finished  # its module is only partly typed
             await finished()
         finally:
             await member.close(timeout=2)

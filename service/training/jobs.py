@@ -1,5 +1,7 @@
-"""Making, finding, cancelling and repeating jobs; and refreshes, which train the version that serves anew, on its data
-sets and on what was observed since."""
+"""Create, find, cancel and repeat training jobs and refreshes.
+
+A refresh retrains the serving version on its data sets and on the observations since.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ from lipcore.estimators.base import BaseMismatchError, RobotKind, check_base
 from lipcore.estimators.catalogue import UnknownEstimatorError, check_estimator
 from lipcore.estimators.options import FitOptions
 from lipcore.robots.library import ROBOTS
-from lipcore.vocabulary import AUTO, CHOICES, DIFFERENTIATED, ROBOT_ESTIMATORS
+from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES, ROBOT_ESTIMATORS, TORCH_ESTIMATORS
 from service.contract.jobs import MAX_OPTIONS, Job, JobDraft, JobPage, JobRequest
 from service.contract.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING
 from service.datasets import store
@@ -36,26 +38,32 @@ from service.models.loaded import LoadedModels
 from service.robots import store as robots
 from service.storage.database import Database, DatasetRow, JobRow, RobotRow, VersionRow, now
 from service.storage.files import new_id
-from service.storage.rows import Identity, Page, done, mark, newest
-from service.telemetry.logs import KEY_ID, asked, request_id
+from service.storage.rows import Page, RequestIdentity, find_done_row, mark_row, read_page
+from service.telemetry.logs import KEY_ID, request_id, request_scope
 from service.training import holding_out, lifecycle, refresh_data
 from service.training.queue import JobQueue
 
 MAX_DATASETS = 100
-"""Data sets of one training job."""
+"""Maximum data sets of one training job."""
 MAX_QUEUED = 100
-"""Jobs that may wait; more are answered 429."""
+"""Maximum waiting jobs; further requests are answered 429."""
 
 
-def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, named: Identity | None = None) -> Job:
-    """Check a request, store it as a queued job and hand it to the queue. retry_of: the job that it repeats; named: the
-    request, which is not done again where it was before."""
+def create(
+    queue: JobQueue, request: JobRequest, retry_of: str | None = None, named: RequestIdentity | None = None
+) -> Job:
+    """Check a request, store it as a queued job and submit it to the queue.
+
+    `retry_of` is the job that it repeats; `named` identifies the request, which runs only once.
+    """
     if (before := done_before(queue.database, named)) is not None:
         return before
     rows, joint_types, base = _checked(queue, request)
-    queue.storage.disk.require()  # for the version that will be made
+    queue.storage.disk.require()  # room for the new version
     with queue.database.transaction() as session:
-        if (row := done(session, JobRow, named)) is not None:  # the same request was faster on another connection
+        if (
+            row := find_done_row(session, JobRow, named)
+        ) is not None:  # the same request arrived first on another connection
             return represent(row)
         ids = [row.id for row in rows]
         content = {**request.model_dump(mode="json"), "joint_types": joint_types, "datasets": ids}
@@ -76,15 +84,15 @@ def create(queue: JobQueue, request: JobRequest, retry_of: str | None = None, na
 
 
 def check(queue: JobQueue, draft: JobDraft) -> None:
-    """Check what a job would be queued with; raise what `create` would, as far as the data sets there allow."""
+    """Check the options of a job as `create` does, as far as possible without data sets; raise as `create` does."""
     if draft.datasets:
         _checked(queue, draft)
         return
     _check_options(draft)
     if draft.base is not None:
-        registry.named(queue.database, draft.base)
-    if draft.estimator not in CHOICES:
-        raise invalid_request("estimator", draft.estimator, f"one of {', '.join(CHOICES)}")
+        registry.find_named(queue.database, draft.base)
+    if draft.estimator not in ESTIMATOR_CHOICES:
+        raise invalid_request("estimator", draft.estimator, f"one of {', '.join(ESTIMATOR_CHOICES)}")
     if queue.settings.cluster is None:
         _check_extra(draft)
     if draft.robot is not None and draft.estimator not in (AUTO, *ROBOT_ESTIMATORS):
@@ -94,7 +102,7 @@ def check(queue: JobQueue, draft: JobDraft) -> None:
 
 
 def _checked(queue: JobQueue, request: JobRequest) -> tuple[list[DatasetRow], list[str], VersionRow | None]:
-    """The data sets of a request, the types of their joints, and the version to start from."""
+    """Return the data sets of a request, their joint types and the version to start from."""
     _check_options(request)
     if len(request.datasets) > MAX_DATASETS:
         raise invalid_request("datasets", len(request.datasets), f"at most {MAX_DATASETS}")
@@ -105,20 +113,20 @@ def _checked(queue: JobQueue, request: JobRequest) -> tuple[list[DatasetRow], li
         registry.check_robot(session, request.model, kind)
     if request.holdout is not None:
         holding_out.check(rows, request.holdout, MIN_SAMPLES)
-    if queue.settings.cluster is None:  # else its workers have what it takes, or say so
+    if queue.settings.cluster is None:  # else the workers check it
         _check_extra(request)
     if request.base is None:
         _check_estimator(queue.database, request, rows[0].joint_names, joint_types)
         return rows, joint_types, None
-    base = registry.named(queue.database, request.base)
+    base = registry.find_named(queue.database, request.base)
     _check_base(base, request, rows[0], joint_types)
     return rows, joint_types, base
 
 
-def done_before(database: Database, named: Identity | None) -> Job | None:
-    """The job that a request has made before, as it is now; None where it has not. Raise ConflictError."""
+def done_before(database: Database, named: RequestIdentity | None) -> Job | None:
+    """Return the job that this request has made before, None if there is none; raise ConflictError."""
     with database.session() as session:
-        row = done(session, JobRow, named)
+        row = find_done_row(session, JobRow, named)
     return None if row is None else represent(row)
 
 
@@ -127,9 +135,9 @@ def add(
     model: str,
     request: dict[str, Any],
     retry_of: str | None = None,
-    named: Identity | None = None,
+    named: RequestIdentity | None = None,
 ) -> JobRow:
-    """Add a queued job, to be handed to the queue once the session has committed; raise BusyError for a full queue."""
+    """Add a queued job; raise BusyError if the queue is full. Submit it once the session has committed."""
     waiting = session.scalar(select(func.count()).select_from(JobRow).where(JobRow.state == QUEUED)) or 0
     if waiting >= MAX_QUEUED:
         raise BusyError(
@@ -147,35 +155,35 @@ def add(
         history=[],
         retry_of=retry_of,
         request_id=request_id.get(),
-        key=(asked.get() or {}).get(KEY_ID),
+        key=(request_scope.get() or {}).get(KEY_ID),
     )
-    mark(job, named)
+    mark_row(job, named)
     lifecycle.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat {retry_of}")
     session.add(job)
     return job
 
 
 def _seconds_to_wait(session: Session) -> int:
-    """When the first of the jobs that run may end and another one leave the queue, s: a guess where none can tell."""
+    """Estimate when the first running job ends and a place in the queue becomes free, s; 30 s if unknown."""
     left = [row.get("remaining_s") for row in session.scalars(select(JobRow.progress).where(JobRow.state == RUNNING))]
     known = [seconds for seconds in left if seconds is not None]
     return math.ceil(min(max(min(known), 1.0), 3600)) if known else 30
 
 
 def show(queue: JobQueue, loaded: LoadedModels, job: str) -> Job:
-    """Return one job; raise NotFoundError. Who sees it succeed is answered by its version from then on."""
+    """Return one job; raise NotFoundError. If it has succeeded, its version answers from then on."""
     row = find(queue.database, job)
     if row.version is not None:
         loaded.announce([row.model])
-    return represented(queue.database, [row])[0]
+    return represent_all(queue.database, [row])[0]
 
 
 def page(queue: JobQueue, loaded: LoadedModels, part: Page) -> JobPage:
-    """List jobs, newest first. Who sees one succeed is answered by its version from then on."""
+    """List jobs, newest first. Versions of jobs listed as succeeded answer from then on."""
     with queue.database.session() as session:
-        rows, following = newest(session, JobRow, part)
+        rows, following = read_page(session, JobRow, part)
     loaded.announce({row.model for row in rows if row.version is not None})
-    return JobPage(items=represented(queue.database, rows), next_cursor=following)
+    return JobPage(items=represent_all(queue.database, rows), next_cursor=following)
 
 
 def find(database: Database, job: str) -> JobRow:
@@ -191,9 +199,11 @@ def _existing(row: JobRow | None, job: str) -> JobRow:
 
 
 def cancel(queue: JobQueue, job: str) -> Job:
-    """Cancel a job: at once while it waits; while it runs within `JobLimits.cancel_s`, with or without its consent.
-    Raise NotFoundError, ConflictError where it has ended."""
-    queue.stop(job)  # before anything is written, for which its process may hold the lock
+    """Cancel a job: at once if it waits; within `JobLimits.cancel_s` if it runs.
+
+    Raise NotFoundError, ConflictError if it has ended.
+    """
+    queue.stop(job)  # before the transaction, as the job's process may hold the lock
     with queue.database.transaction() as session:
         row = _existing(lifecycle.row_of(session, job), job)
         if row.state not in ACTIVE:
@@ -224,7 +234,7 @@ def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
 
 
 def _check_estimator(database: Database, request: JobRequest, joint_names: list[str], joint_types: list[str]) -> None:
-    """Check what the training process will, so that what it refuses is refused here."""
+    """Run the checks of the training process, so that invalid requests are rejected early."""
     try:
         robot = None
         if request.robot is not None:
@@ -239,9 +249,9 @@ def _check_estimator(database: Database, request: JobRequest, joint_names: list[
 
 
 def _check_extra(request: JobRequest) -> None:
-    """Raise MissingExtraError where the training process would."""
-    if request.estimator in DIFFERENTIATED:
-        extras.check("train")
+    """Raise MissingExtraError if the training process would."""
+    if request.estimator in TORCH_ESTIMATORS:
+        extras.check_extra("train")
 
 
 def _check_base(base: VersionRow, request: JobRequest, data: DatasetRow, joint_types: list[str]) -> None:
@@ -269,13 +279,13 @@ def _check_options(request: JobRequest) -> None:
 
 
 def represent(row: JobRow) -> Job:
-    """A job as the API shows it: columns of its row, and what its request says."""
+    """Return a job as the API shows it, from the columns of its row and its request."""
     fields = {name: getattr(row, name, row.request.get(name)) for name in Job.model_fields}
     return Job.model_validate(fields)
 
 
-def represented(database: Database, rows: Sequence[JobRow]) -> list[Job]:
-    """Jobs as the API shows them, each with the quality of the version that it made."""
+def represent_all(database: Database, rows: Sequence[JobRow]) -> list[Job]:
+    """Return jobs as the API shows them, with the quality of the versions that they made."""
     made = {(row.model, row.version) for row in rows if row.version is not None}
     with database.session() as session:
         versions = registry.rows_of(session, made) if made else {}
@@ -295,17 +305,17 @@ def refresh(
     model: str,
     trigger: Trigger = "asked",
     retry_of: str | None = None,
-    named: Identity | None = None,
+    named: RequestIdentity | None = None,
 ) -> Job:
-    """Queue a refresh of the version that serves; return its job. Not for the event loop.
+    """Queue a refresh of the serving version and return its job. Not for the event loop.
 
-    retry_of: the job that it repeats; named: the request, where its client has named it.
-    Raise NotFoundError, BusyError for a full queue, ConflictError where a refresh of the model is under way or there is
-    nothing to train on.
+    `retry_of` is the job that it repeats; `named` identifies the request if the client named it. Raise NotFoundError,
+    BusyError if the queue is full, ConflictError if a refresh of the model is queued or runs, or if there are no data
+    to train on.
     """
     version = registry.find(queue.database, model, None)
     with queue.database.transaction() as session:
-        if (before := done(session, JobRow, named)) is not None:
+        if (before := find_done_row(session, JobRow, named)) is not None:
             return represent(before)
         job = add_refresh(session, version, trigger, retry_of, named)
     queue.submit(job.id)
@@ -317,7 +327,7 @@ def add_refresh(
     version: VersionRow,
     trigger: Trigger,
     retry_of: str | None = None,
-    named: Identity | None = None,
+    named: RequestIdentity | None = None,
 ) -> JobRow:
     """Add the job of a refresh; raise ConflictError or BusyError."""
     model, manifest = version.model, version.manifest
@@ -333,7 +343,7 @@ def add_refresh(
         raise ConflictError(_nothing(version, rows, left_out, MIN_SAMPLES))
     made_by = None if version.job is None else session.scalar(select(JobRow).where(JobRow.id == version.job))
     options = manifest["options"]
-    if manifest["estimator"] not in DIFFERENTIATED:  # earlier releases trained every estimator on a GPU
+    if manifest["estimator"] not in TORCH_ESTIMATORS:  # earlier releases trained every estimator on a GPU
         options = {**options, "device": "auto"}
     request = {
         "model": model,
@@ -356,17 +366,16 @@ def _nothing(version: VersionRow, rows: int, left_out: list[dict[str, str]], lea
 
 
 def refreshes_of(model: str) -> Select[JobRow]:
-    """Jobs that refresh a model."""
+    """Return the query for all refresh jobs of a model."""
     refreshed = JobRow.request["refresh"]["version"].as_integer()
     return select(JobRow).where(JobRow.model == model, refreshed.is_not(None))
 
 
-def retry(queue: JobQueue, job: str, named: Identity | None = None) -> Job:
-    """Queue a job that repeats one that failed or was cancelled; a refresh starts from what serves and is known now.
+def retry(queue: JobQueue, job: str, named: RequestIdentity | None = None) -> Job:
+    """Queue a job that repeats a failed or cancelled one. A repeated refresh uses the current serving version and log.
 
-    named: the request, which is not done again where it was before.
-    Raise NotFoundError, ConflictError where the job has not failed or what it needs is no longer there,
-    InvalidRequestError where a limit has become lower since, BusyError for a full queue.
+    `named` identifies the request, which runs only once. Raise NotFoundError, ConflictError if the job has not failed
+    or its inputs were deleted, InvalidRequestError if a limit is lower now, BusyError if the queue is full.
     """
     row = find(queue.database, job)
     if (before := done_before(queue.database, named)) is not None:

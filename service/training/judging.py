@@ -1,4 +1,4 @@
-"""What the rows held out say of a fit that has not learnt them, for the lineage of its version."""
+"""Judge a fit on held-out rows, which it has not learnt, for the lineage of its version."""
 
 from __future__ import annotations
 
@@ -12,33 +12,33 @@ from service.foundation.fields import finite
 from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation
 from service.models.lineage import answer_of, figures
 from service.training import repeating
-from service.training.material import Material
+from service.training.material import TrainingData
 from service.training.table import TablePart
 
 
-def judged_figures(model: TorqueModel, material: Material) -> dict[str, Any]:
-    """Return the figures of a fit on what was held out, as a lineage keeps them.
+def judged_figures(model: TorqueModel, data: TrainingData) -> dict[str, Any]:
+    """Return the figures of a fit on the held-out rows, as a lineage contains them.
 
-    If a last fit follows, these are also what can be computed no more after it: fields of a `HoldoutLineage`.
+    If a last fit follows, include what cannot be computed after it: fields of a `HoldoutLineage`.
     """
-    table, most = material.held_out, MAX_EVALUATION_SAMPLES
+    table, most = data.held_out, MAX_EVALUATION_SAMPLES
     assert table is not None  # something was held out
     samples = table.thinned(most)
-    repeats = repeating.look(material.table.parts, samples, model.joint_types)
-    judged = {"judged_rows": material.rows, "torque_noise": white(material.samples, material.stretches).tolist()}
+    repeats = repeating.look(data.table.parts, samples, model.joint_types)
+    judged = {"judged_rows": data.rows, "torque_noise": white(data.samples, data.stretches).tolist()}
     found = {**judged, **figures(model, samples, most, len(table)), **repeats}
-    if material.every is None:
+    if data.every is None:
         return found
     scores = BlockScores.of(samples, answer_of(model, samples))
     nlpd, nmse = (finite(sums) for sums in scores.sums.T)
     blocks = {"rows": scores.rows.tolist(), "nlpd": nlpd, "nmse": nmse}
-    evaluations = {part.row.id: _evaluation(model, material, part, most) for part in table.parts}
+    evaluations = {part.row.id: _evaluation(model, data, part, most) for part in table.parts}
     return {**found, "blocks": blocks, "evaluations": evaluations}
 
 
-def _evaluation(model: TorqueModel, material: Material, part: TablePart, most: int) -> dict[str, Any]:
-    """What an evaluation of the fit on the rows held out of one data set answers."""
+def _evaluation(model: TorqueModel, data: TrainingData, part: TablePart, most: int) -> dict[str, Any]:
+    """Return the evaluation of the fit on the held-out rows of one data set."""
     _, samples = part.motion(most)
     found = evaluation(samples, answer_of(model, samples))
-    repeats = repeating.look(material.table.parts, samples, model.joint_types)
+    repeats = repeating.look(data.table.parts, samples, model.joint_types)
     return Evaluation(samples=len(part), **found, **repeats).model_dump(mode="json")

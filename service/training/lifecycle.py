@@ -1,7 +1,7 @@
-"""What becomes of a job, from when it is queued to its end: every change has an entry in its row.
+"""States of a job from the queue to its end; every change adds an entry to its row.
 
-A process that runs a job is judged by its signs of life; once it no longer runs it, the job waits again or has ended,
-and files that it began to write and did not publish are removed.
+The heartbeats of a process show whether it still runs its job. Once it does not, the job waits again or has ended, and
+its unpublished files are removed.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from service.runtime.progress import HEARTBEAT_S
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files, new_id
 
-MOST_ENTRIES = 100
-"""Entries that a job keeps: a service may be started and stopped any number of times while one waits."""
+MAX_ENTRIES = 100
+"""Maximum entries of a job. A waiting job may see any number of service restarts."""
 
 
 def enter(row: JobRow, state: JobState, message: str) -> None:
-    """Set a job's state and note when and why. An end is stamped; who waits again has made no progress."""
+    """Set a job's state and add an entry with time and reason. An end is stamped; a waiting job has no progress."""
     at = now()
     entries = [*(row.history or []), {"at": at, "state": state, "message": message}]
-    # the first entry says who queued it; of the others the newest count
-    row.history = entries if len(entries) <= MOST_ENTRIES else [entries[0], *entries[1 - MOST_ENTRIES :]]
+    # the first entry tells how it was queued; of the others the newest are kept
+    row.history = entries if len(entries) <= MAX_ENTRIES else [entries[0], *entries[1 - MAX_ENTRIES :]]
     row.state = state
     if state == QUEUED:
         row.progress = {"stage": "waiting"}
-        row.owner = None  # any service may have it run
+        row.owner = None  # any service may run it
     elif state not in ACTIVE:
         row.finished_at = at
 
 
 def row_of(session: Session, job: str) -> JobRow | None:
-    """The row of a job, None where there is none."""
+    """Return the row of a job, None if there is none."""
     row: JobRow | None = session.scalar(select(JobRow).where(JobRow.id == job))
     return row
 
 
 def hand_back(row: JobRow, why: str) -> None:
-    """Let a job wait again whose process was stopped in order: such a start is no failed attempt."""
+    """Let a job wait again after an orderly stop of its process; that start does not count as an attempt."""
     if row.cancel_requested:
         enter(row, CANCELLED, f"cancelled: {why}")
     else:
@@ -58,105 +58,116 @@ Why = Literal["returned", "ended", "cancelled", "silent", "too_long", "not_start
 
 @dataclass(frozen=True)
 class JobLimits:
-    """How often a job is started, and how long its process may take.
-
-    attempts: starts before an interruption fails the job. start_s: until the process is ready. heartbeat_s: without
-    progress. cancel_s: until it obeys a cancel. linger_s: to tidy up after the end of its job. pause_s: before a job is
-    handed out again whose process could not be started; each time twice as long.
-    """
+    """Limits on the attempts of a job and on the times of its process."""
 
     attempts: int = 3
+    """Starts before an interruption fails the job."""
     start_s: float = 120.0
+    """Time until the process must be ready, s."""
     heartbeat_s: float = HEARTBEAT_S
+    """Maximum time without progress, s."""
     cancel_s: float = 1.0
+    """Time to obey a cancellation, s."""
     linger_s: float = 10.0
+    """Time to clean up after the end of the job, s."""
     pause_s: float = 1.0
+    """Delay before a job is started again if its process could not start, s; doubled each time."""
 
 
 LIMITS = JobLimits()
 
 
 @dataclass(frozen=True)
-class Facts:
-    """What a job's row says of it. attempts: how often it was started; ours: whether it still is this service's."""
+class JobStatus:
+    """State of a job as its row contains it."""
 
     state: str
     heartbeat_at: str | None
     cancel_requested: bool
     attempts: int = 0
+    """Number of starts."""
     ours: bool = True
+    """Whether this service still owns the job."""
 
 
 @dataclass(frozen=True)
-class Ended:
-    """A job whose process no longer runs it. message: why, in words; attempt: which one it was, None: the last one."""
+class JobEnd:
+    """The end of an attempt at a job: its process no longer runs it."""
 
     job: str
     why: Why
     message: str
+    """The reason in words."""
     attempt: int | None = None
+    """Number of the attempt; None means the last."""
 
 
 @dataclass(eq=False)
-class Hand:
-    """A job in the hands of a process. Times are monotonic, s: steps of the wall clock, or a machine that slept, are
-    no silence.
+class WatchedJob:
+    """A job that a process runs, and what its watcher has seen of it.
 
-    slot: the place of the process, and future: its end, as the kind of queue has them; away: it is the process of a
-    worker elsewhere, for which the job may have to wait; since: when it was handed over; ran, stopped, done: when it
-    was first seen to run, to be cancelled and to have ended; heartbeat: the last one seen, and beat_at: when.
+    Times are monotonic, s, so that clock changes or a suspended machine do not count as silence.
     """
 
     job: str
     slot: Any
+    """The slot of the process, as the kind of queue needs it."""
     future: Any
+    """Completes with the process's call."""
     since: float
+    """When the process received the job."""
     away: bool = False
+    """Whether the process belongs to a worker elsewhere, for which the job may have to wait."""
     ran: float | None = None
+    """When it was first seen running."""
     stopped: float | None = None
+    """When its cancellation was first seen."""
     done: float | None = None
+    """When its end was first seen."""
     heartbeat: str | None = None
+    """The last heartbeat seen."""
     beat_at: float = 0.0
+    """When that heartbeat was first seen."""
 
-    def see(self, facts: Facts, clock: float) -> None:
-        """Take note of what the row says."""
-        if facts.state == RUNNING and self.ran is None:
+    def see(self, status: JobStatus, clock: float) -> None:
+        """Record the state in the row."""
+        if status.state == RUNNING and self.ran is None:
             self.ran = self.beat_at = clock
-        if facts.heartbeat_at != self.heartbeat:
-            self.heartbeat, self.beat_at = facts.heartbeat_at, clock
-        if facts.cancel_requested:
+        if status.heartbeat_at != self.heartbeat:
+            self.heartbeat, self.beat_at = status.heartbeat_at, clock
+        if status.cancel_requested:
             self.stop(clock)
-        if (facts.state not in ACTIVE or not facts.ours) and self.done is None:
+        if (status.state not in ACTIVE or not status.ours) and self.done is None:
             self.done = clock
 
     def stop(self, clock: float) -> None:
-        """Take note of the wish to cancel: it counts once the process has begun."""
+        """Record a cancellation; it counts once the process has started."""
         if self.ran is not None and self.stopped is None:
             self.stopped = clock
 
-    def judge(self, settings: Settings, clock: float) -> Ended | None:
-        """Why the process has to be ended now, None while it need not be."""
+    def judge(self, settings: Settings, clock: float) -> JobEnd | None:
+        """Return why the process must be killed now, None if it need not be."""
         if self.away:
             if self.done is not None:
-                return Ended(self.job, "returned", "it has ended, or is another service's")
-            clock -= 0.5  # the host of a process elsewhere judges it, too
+                return JobEnd(self.job, "returned", "it has ended, or is another service's")
+            clock -= 0.5  # leave time for the worker's host, which applies the same rules
         if self.done is not None:
             late = clock - self.done >= LIMITS.linger_s
-            return Ended(self.job, "lingering", "the process did not go on after its end") if late else None
+            return JobEnd(self.job, "lingering", "the process did not go on after its end") if late else None
         if self.stopped is not None:
             if clock - self.stopped < LIMITS.cancel_s:
                 return None
             message = f"the training process did not stop within {LIMITS.cancel_s:g} s and was ended"
-            return Ended(self.job, "cancelled", message)
+            return JobEnd(self.job, "cancelled", message)
         if self.ran is None:
             if self.away or clock - self.since < LIMITS.start_s:
                 return None
-            return Ended(self.job, "not_started", f"no training process was ready within {LIMITS.start_s:g} s")
+            return JobEnd(self.job, "not_started", f"no training process was ready within {LIMITS.start_s:g} s")
         if clock - self.beat_at >= LIMITS.heartbeat_s:
             message = f"the training process gave no sign of life for {LIMITS.heartbeat_s:g} s and was ended"
-            return Ended(self.job, "silent", message)
+            return JobEnd(self.job, "silent", message)
         if clock - self.ran >= settings.max_job_s:
-            return Ended(self.job, "too_long", f"it ran for {settings.max_job_s:g} s, the longest that a job may")
+            return JobEnd(self.job, "too_long", f"it ran for {settings.max_job_s:g} s, the longest that a job may")
         return None
 
 
@@ -164,12 +175,12 @@ logger = logging.getLogger(__name__)
 
 
 def new_folder(job: str) -> str:
-    """A fresh name for a folder of a version that `job` makes, from which the job can be told."""
+    """Return a new folder name for a version that `job` makes; the name identifies the job."""
     return new_id(f"mv_{_folder_mark(job)}")
 
 
 def remove_leftovers(database: Database, files: Files, job: str) -> int:
-    """Delete what a job that runs nowhere has written and no version names; return how many folders."""
+    """Delete the folders of a job that does not run and that no version uses; return how many."""
     with database.session() as session:
         state = session.scalar(select(JobRow.state).where(JobRow.id == job))
     try:
@@ -190,18 +201,20 @@ def _folder_mark(job: str) -> str:
 
 
 @dataclass(frozen=True)
-class Settled:
-    """What has become of a job. again: it waits for a process, to be handed out after `pause_s`; made: the model and
-    the version that it has made; problem: why no process could be started for it."""
+class JobOutcome:
+    """The result of settling a job."""
 
     again: bool = False
+    """Whether it waits for a process again, to start after `pause_s`."""
     pause_s: float = 0.0
     made: tuple[str, int] | None = None
+    """Model and version that it has made."""
     problem: str | None = None
+    """Why no process could be started for it."""
 
 
 class Settler:
-    """Settles one job after the other. To be used by one thread. mine: whether a job with an owner is to be settled."""
+    """Settles ended jobs; to be used by one thread. `mine` returns whether this service settles jobs of an owner."""
 
     def __init__(
         self,
@@ -212,48 +225,51 @@ class Settler:
         self.database, self.files, self.mine = database, files, mine
         self._starts: dict[str, int] = {}
 
-    def settle(self, ended: Ended) -> Settled:
-        """Write what becomes of a job; raises what the database raises, and may be called again then."""
-        remove_leftovers(self.database, self.files, ended.job)
+    def settle(self, end: JobEnd) -> JobOutcome:
+        """Write the outcome of a job. Database errors are raised; the call can be repeated."""
+        remove_leftovers(self.database, self.files, end.job)
         with self.database.transaction() as session:
-            row = row_of(session, ended.job)
-            settled = Settled() if row is None else self._decide(row, ended)
-        if settled.problem is None:
-            self._starts.pop(ended.job, None)
+            row = row_of(session, end.job)
+            outcome = JobOutcome() if row is None else self._decide(row, end)
+        if outcome.problem is None:
+            self._starts.pop(end.job, None)
         else:
-            self._starts[ended.job] = self._starts.get(ended.job, 0) + 1
-        return settled
+            self._starts[end.job] = self._starts.get(end.job, 0) + 1
+        return outcome
 
-    def _decide(self, row: JobRow, ended: Ended) -> Settled:
+    def _decide(self, row: JobRow, end: JobEnd) -> JobOutcome:
         if row.state == SUCCEEDED and row.version is not None:
-            return Settled(made=(row.model, row.version))
+            return JobOutcome(made=(row.model, row.version))
         if row.state not in ACTIVE or not self.mine(row.owner):
-            return Settled()
-        if row.state == RUNNING and (ended.why == "refused" or ended.attempt not in (None, row.attempts)):
-            return Settled()  # another attempt runs
-        if ended.why == "cancelled" or row.cancel_requested:
-            enter(row, CANCELLED, f"cancelled: {ended.message}")
-            return Settled()
-        logger.error("%s: %s", row.id, ended.message)
-        if ended.why == "too_long":
-            fail(row, "too_long", ended.message)
-            return Settled()
+            return JobOutcome()
+        if row.state == RUNNING and (end.why == "refused" or end.attempt not in (None, row.attempts)):
+            return JobOutcome()  # another attempt runs
+        if end.why == "cancelled" or row.cancel_requested:
+            enter(row, CANCELLED, f"cancelled: {end.message}")
+            return JobOutcome()
+        logger.error("%s: %s", row.id, end.message)
+        if end.why == "too_long":
+            fail(row, "too_long", end.message)
+            return JobOutcome()
         if row.state == RUNNING:
-            return Settled(again=queue_again(row, ended.message, LIMITS.attempts))
-        if ended.why == "returned":  # it was queued again while it ran
-            return Settled(again=True)
-        starts = self._starts.get(ended.job, 0)
+            return JobOutcome(again=queue_again(row, end.message, LIMITS.attempts))
+        if end.why == "returned":  # it was queued again while it ran
+            return JobOutcome(again=True)
+        starts = self._starts.get(end.job, 0)
         if starts + 1 >= LIMITS.attempts:
-            message = f"{ended.message}: no training process could be started for it, {starts + 1} times"
+            message = f"{end.message}: no training process could be started for it, {starts + 1} times"
             fail(row, "interrupted", message)
-            return Settled()
+            return JobOutcome()
         pause = min(LIMITS.pause_s * 2**starts, 30.0)
-        enter(row, QUEUED, f"{ended.message}: it waits for another one")
-        return Settled(again=True, pause_s=pause, problem=ended.message)
+        enter(row, QUEUED, f"{end.message}: it waits for another one")
+        return JobOutcome(again=True, pause_s=pause, problem=end.message)
 
 
 def queue_again(row: JobRow, message: str, most_attempts: int) -> bool:
-    """Let an interrupted job wait again, or end it where that was wished or tried too often; return if it waits."""
+    """Queue an interrupted job again and return True, or end it and return False.
+
+    It ends if it was cancelled or has no attempts left.
+    """
     if row.cancel_requested:
         enter(row, CANCELLED, f"cancelled: {message}")
     elif row.attempts >= most_attempts:
@@ -265,6 +281,6 @@ def queue_again(row: JobRow, message: str, most_attempts: int) -> bool:
 
 
 def fail(row: JobRow, code: str, message: str) -> None:
-    """End a job that was not to be done."""
+    """End a job as failed."""
     enter(row, FAILED, message)
     row.error = {"code": code, "message": message}

@@ -1,4 +1,4 @@
-"""Metrics of training jobs: read from their rows when they are asked for, so that they outlive the service."""
+"""Metrics of training jobs, computed from their rows on each request, so that they survive restarts."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from service.contract.states import ACTIVE, CANCELLED, FAILED, QUEUED, RUNNING, 
 from service.foundation.text import counted
 from service.storage.database import Database, JobRow
 from service.telemetry.meters import Durations, MetricKind
-from service.telemetry.readiness import Lasting
+from service.telemetry.readiness import FaultAge
 from service.training.queue import JobQueue
 
 START_S = 60.0
-"""Time in s within which a job should have been started where a training process is free."""
+"""Maximum time to start a job while a training process is free, s."""
 SILENT_S = 10.0
-"""Time in s for which a training process that is well is silent at most: it beats twice a second."""
+"""Maximum time without a heartbeat from a healthy training process, s; the interval is half a second."""
 OUTCOMES = (SUCCEEDED, FAILED, CANCELLED)
 
 
 class JobMetrics(Collector):
-    """Training jobs of one service. Not for the event loop."""
+    """Metrics of the training jobs in the database. Not for the event loop."""
 
     jobs = MetricKind("gauge", "lipserve_jobs", "Training jobs that wait or run now", ("state",))
     finished = MetricKind(
@@ -42,7 +42,7 @@ class JobMetrics(Collector):
         self._database = database
 
     def describe(self) -> list[Metric]:
-        """Nothing: the rows say what there is."""
+        """Return nothing: the metrics depend on the rows."""
         return []
 
     def collect(self) -> Iterator[Metric]:
@@ -55,19 +55,19 @@ class JobMetrics(Collector):
             for outcome, started, finished in session.execute(ended):
                 if started is not None and finished is not None:
                     lasted = datetime.fromisoformat(finished) - datetime.fromisoformat(started)
-                    durations[outcome].add(max(lasted.total_seconds(), 0.0))  # clocks are set back at times
+                    durations[outcome].add(max(lasted.total_seconds(), 0.0))  # clocks may be set back
         yield self.jobs.of(([state], states.get(state, 0)) for state in ACTIVE)
         yield self.finished.of(([outcome], states.get(outcome, 0)) for outcome in OUTCOMES)
         yield self.duration.spread(([outcome], durations[outcome]) for outcome in OUTCOMES)
 
 
-def look(queue: JobQueue, lasting: Lasting) -> tuple[PartState, str]:
-    """Whether queued jobs are started, for readiness: what keeps processes from starting shows in that."""
+def look(queue: JobQueue, lasting: FaultAge) -> tuple[PartState, str]:
+    """Return whether queued jobs are started, for readiness."""
     with queue.database.session() as session:
         counts = _counts(session)
     waiting, running = counts.get(QUEUED, 0), counts.get(RUNNING, 0)
     words = f"{counted(waiting, 'job')} waiting, {running} running"
-    if (cluster := queue.cluster) is not None:  # what serves can do without
+    if (cluster := queue.cluster) is not None:  # serving does not need the cluster
         if cluster.problem is not None:
             return "warning", f"{cluster.problem}; {words}"
         none = waiting > 0 and cluster.jobs == 0
@@ -82,5 +82,5 @@ def look(queue: JobQueue, lasting: Lasting) -> tuple[PartState, str]:
 
 
 def _counts(session: Session) -> dict[str, int]:
-    """Jobs by state."""
+    """Return the number of jobs by state."""
     return dict(session.execute(select(JobRow.state, func.count()).group_by(JobRow.state)).all())

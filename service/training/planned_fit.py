@@ -1,4 +1,4 @@
-"""The fits of a job: one that is judged on what was held out, then one of all rows."""
+"""The fits of a job: one that is judged on held-out rows, then one on all rows."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from lipcore.model.selection import MAX_NAME, shortened
 from lipcore.model.torque_model import TorqueModel
 from lipcore.model.warnings import REFIT_ERROR
 from lipcore.training.conditioning import should_condition
-from lipcore.training.refit import refit, widened
+from lipcore.training.refit import refit, widen_intervals
 from lipcore.training.train import fit_model
 from lipcore.vocabulary import JointType
 from service.foundation.settings import Settings
-from service.training.material import CANDIDATES, Material
-from service.training.pulse import LAST_FIT, PACE, Pulse, Remaining
+from service.training.material import MAX_CANDIDATE_ROWS, TrainingData
+from service.training.pulse import LAST_FIT, PACE, Heartbeat, RemainingTime
 from service.training.summing import all_rows
 from service.training.table import Table
 
@@ -28,75 +28,74 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PlannedFit:
-    """A fit, and the pass over all of its rows that may follow it.
+    """A fit and the pass over all rows that may follow it."""
 
-    table: the data sets' rows of that pass, each with what it counts; pass_rows: all rows of it, 0 without one.
-    """
-
-    material: Material
+    data: TrainingData
     joint_types: tuple[JointType, ...]
     options: FitOptions
     table: Table
+    """Rows of the data sets for that pass, with weights."""
     pass_rows: int
+    """Number of rows in the pass; 0 if there is none."""
 
     @classmethod
-    def of(cls, request: dict[str, Any], material: Material) -> PlannedFit:
-        """Plan the fit of a job's material."""
+    def of(cls, request: dict[str, Any], data: TrainingData) -> PlannedFit:
+        """Plan the fit of a job's training data."""
         options = FitOptions(**request["options"])
-        table = material.table.weighed(options.posterior_samples)
-        # the version that serves has learnt all rows of a refresh, not only the few that a fit chooses
-        every = request.get("refresh") is not None or should_condition(options, material.rows, table.independent_rows())
-        if material.every is not None:  # the last fit sums all rows: judging takes no second pass as long as that
+        table = data.table.weighed(options.posterior_samples)
+        # a refresh must learn all rows as the serving version has, not only those that a fit selects
+        every = request.get("refresh") is not None or should_condition(options, data.rows, table.independent_rows())
+        if data.every is not None:  # the last fit sums all rows: a second pass as long is not worth it
             table = table.sparse(PACE.fit_rows)
-        pass_rows = len(table) + (0 if material.logged is None else len(material.logged[0])) if every else 0
-        return cls(material, tuple(request["joint_types"]), options, table, pass_rows)
+        pass_rows = len(table) + (0 if data.logged is None else len(data.logged[0])) if every else 0
+        return cls(data, tuple(request["joint_types"]), options, table, pass_rows)
 
-    def first(self, settings: Settings, estimator: str, last: PlannedFit | None, pulse: Pulse) -> TorqueModel:
-        """Fit a model. last: the fit that is to follow, if any; raise what `fit_model` does."""
-        material, count = self.material, len(self.material.samples)
-        pulse.plan(PACE.fit_rows, self.pass_rows, 0 if last is None else PACE.last_fit_rows + last.pass_rows)
-        if not self.pass_rows or material.rows <= CANDIDATES:  # else it is the pass that takes long
+    def first(self, settings: Settings, estimator: str, last: PlannedFit | None, heartbeat: Heartbeat) -> TorqueModel:
+        """Fit a model; `last` is the fit that follows, if any. Raise as `fit_model` does."""
+        data, count = self.data, len(self.data.samples)
+        heartbeat.plan(PACE.fit_rows, self.pass_rows, 0 if last is None else PACE.last_fit_rows + last.pass_rows)
+        if not self.pass_rows or data.rows <= MAX_CANDIDATE_ROWS:  # else the pass takes longest
             searched, conditioned = self.options.hyperparameter_samples, self.options.posterior_samples
-            pulse.remaining = Remaining(min(searched, count), min(conditioned, count))
-        pulse.stage("hyperparameters")
-        task = self._task(pulse.progress, pulse)
-        return self._on_all_rows(settings, fit_model(task, estimator, material.geometries), pulse)
+            heartbeat.remaining = RemainingTime(min(searched, count), min(conditioned, count))
+        heartbeat.stage("hyperparameters")
+        task = self._task(heartbeat.progress, heartbeat)
+        return self._on_all_rows(settings, fit_model(task, estimator, data.geometries), heartbeat)
 
-    def last(self, settings: Settings, judged: TorqueModel, held_out: Samples, pulse: Pulse) -> TorqueModel:
-        """Fit the model that was judged to all rows. If that fails, return it as judged; its report then says so.
+    def last(self, settings: Settings, judged: TorqueModel, held_out: Samples, heartbeat: Heartbeat) -> TorqueModel:
+        """Refit the judged model to all rows. If that fails, return the judged model with the error in its report.
 
-        held_out: what it was judged on, of which its intervals are to hold 95 %.
+        `held_out` are the rows that it was judged on, of which its intervals must cover 95 %.
         """
-        pulse.plan(PACE.last_fit_rows, self.pass_rows)
-        pulse.stage(LAST_FIT)
+        heartbeat.plan(PACE.last_fit_rows, self.pass_rows)
+        heartbeat.stage(LAST_FIT)
         try:
-            again = refit(widened(judged, held_out), self._task(pulse.last_fit, pulse))
-            return self._on_all_rows(settings, again, pulse)
+            again = refit(widen_intervals(judged, held_out), self._task(heartbeat.last_fit, heartbeat))
+            return self._on_all_rows(settings, again, heartbeat)
         except (ArithmeticError, ValueError) as error:
             logger.exception("the fit on all rows failed: the version is the model that was judged")
             why = shortened(f"{type(error).__name__}: {error}")[:MAX_NAME]
             return replace(judged, fit={**judged.fit, REFIT_ERROR: why})
 
-    def _task(self, on_progress: Progress, pulse: Pulse) -> Task:
-        material = self.material
+    def _task(self, on_progress: Progress, heartbeat: Heartbeat) -> Task:
+        data = self.data
         return Task(
-            material.samples,
+            data.samples,
             self.joint_types,
             self.options,
-            material.torque_convention,
-            material.robot,
-            material.stretches,
+            data.torque_convention,
+            data.robot,
+            data.stretches,
             on_progress,
-            pulse.cancelled,
-            material.sibling,
+            heartbeat.cancelled,
+            data.sibling,
         )
 
-    def _on_all_rows(self, settings: Settings, trained: TorqueModel, pulse: Pulse) -> TorqueModel:
-        """A model that was fitted, after the pass over all rows, if there is one."""
-        material = self.material
-        corrupt = sum(each["rows"] for each in material.lineage.get("corrupt", ()))
-        counts = {"samples_given": material.rows} | ({"samples_corrupt": corrupt} if corrupt else {})
+    def _on_all_rows(self, settings: Settings, trained: TorqueModel, heartbeat: Heartbeat) -> TorqueModel:
+        """Return a fitted model after the pass over all rows, if there is one."""
+        data = self.data
+        corrupt = sum(each["rows"] for each in data.lineage.get("corrupt", ()))
+        counts = {"samples_given": data.rows} | ({"samples_corrupt": corrupt} if corrupt else {})
         trained = replace(trained, fit={**trained.fit, **counts})
         if not self.pass_rows:
             return trained
-        return all_rows(settings, trained, self.table, material.logged, self.options, pulse.cancelled, pulse.share)
+        return all_rows(settings, trained, self.table, data.logged, self.options, heartbeat.cancelled, heartbeat.share)

@@ -1,9 +1,9 @@
-"""Whether a version that was trained answers by itself: judged by what its training held out, before its last fit.
+"""Decide whether a trained version serves, by its held-out rows and before its last fit.
 
-It waits unless `lipcore.model.acceptance` accepts it, and where it is worse than the version that serves, by paired
-differences. Both are compared as they were trained; a version that has learnt the rows held out is compared by its
-judged fit, whose scores its lineage keeps. Of versions that are as good 1 to 7 % wait (simulated: 5 to 60 s held out,
-errors that stay alike for 0.1 to 3 s).
+It stays a candidate if `lipcore.model.acceptance` does not accept it, or if paired differences show that it is worse
+than the serving version. Both are compared as trained. A version that has since learnt the held-out rows is compared by
+its judged fit, whose scores its lineage contains. Of equally good versions 1 to 7 % stay candidates (simulated: 5 to 60
+s held out, errors correlated over 0.1 to 3 s).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from service.storage.database import Database, VersionRow
 from service.storage.files import Files
 
 CANDIDATE = "candidate"
-"""Alias of the version that waits."""
+"""Alias of the version that waits for approval."""
 
 
 def judge(
@@ -39,10 +39,13 @@ def judge(
     lineage: dict[str, Any],
     option: PromotionOption,
 ) -> Promotion:
-    """Judge a version before it is added. held_out: what to judge by, None where that is nothing; lineage: of the
-    version, with the figures on these samples."""
+    """Judge a version before it is added.
+
+    `held_out` are the rows to judge by, None if there are none. `lineage` is that of the version, with its figures on
+    these rows.
+    """
     with database.session() as session:
-        number = registry.answering(session, model)
+        number = registry.serving_version(session, model)
         serving = None if number is None else session.get_one(VersionRow, (model, number))
     if held_out is None:
         found = Acceptance(unknown=("not judged, as nothing was held out",))
@@ -54,8 +57,11 @@ def judge(
 
 
 def settle(session: Session, model: str, judged: Promotion, option: PromotionOption) -> Promotion:
-    """The same as of the moment when the version is added: it waits where another one answers by now."""
-    serving = registry.answering(session, model)
+    """Return the decision at the moment when the version is added.
+
+    The version is a candidate if the serving version has changed since it was judged.
+    """
+    serving = registry.serving_version(session, model)
     if serving in (None, judged.serving) or not judged.answers or option == "always":
         return judged
     reason = f"version {serving} answers since it was judged, and was not compared with it"
@@ -63,7 +69,7 @@ def settle(session: Session, model: str, judged: Promotion, option: PromotionOpt
 
 
 def wait(session: Session, model: str, version: int) -> None:
-    """Point the alias `candidate` to a version that was just added and does not serve, if there is room for it."""
+    """Point the alias `candidate` to a version that was just added, if the model may have another alias."""
     known = aliases.names(session, model)
     if CANDIDATE in known or len(known) < registry.MAX_ALIASES:
         aliases.point(session, model, CANDIDATE, version)
@@ -72,7 +78,7 @@ def wait(session: Session, model: str, version: int) -> None:
 def _against(
     files: Files, serving: VersionRow, trained: TorqueModel, held_out: Samples, lineage: dict[str, Any]
 ) -> Acceptance:
-    """How the version is worse than the one that serves, or why that is not said."""
+    """Return whether the version is worse than the serving version, or why they are not compared."""
     name, manifest = f"version {serving.version}", serving.manifest
     kind = RobotKind(trained.joint_names, trained.joint_types, trained.torque_convention)
     if RobotKind.of_manifest(manifest).difference(kind) is not None:
@@ -86,12 +92,15 @@ def _against(
         return Acceptance(speaks_for=(f"not compared with {name}, which was trained on what was held out",))
     if len(scores.rows) < 2:
         return Acceptance(speaks_for=(f"what was held out is too short to compare it with {name}",))
-    return _verdict(scores.less(before), name)
+    return _verdict(scores.difference_from(before), name)
 
 
 def _scores(files: Files, serving: VersionRow, held_out: Samples, holdout: dict[str, Any]) -> BlockScores | None:
-    """Scores of a version on what is held out now, which it has not learnt, or else of its judged fit, if that held out
-    the same; None if neither is known. Raise ModelFormatError for a version that cannot be read."""
+    """Return the scores of a version on the held-out rows, None if there are none.
+
+    If the version has learnt these rows, return the scores of its judged fit on the same rows. Raise ModelFormatError
+    if the version cannot be read.
+    """
     earlier = serving.manifest["lineage"]
     if _is_new_to(earlier, holdout):
         other = files.load_version(serving.folder, serving.checksums)
@@ -107,7 +116,10 @@ def _scores(files: Files, serving: VersionRow, held_out: Samples, holdout: dict[
 
 
 def _verdict(total: Difference, name: str) -> Acceptance:
-    """Worse by the log predictive density, or by the errors where it is not better by the former."""
+    """Reject the version if it predicts worse than the serving version.
+
+    That is, its log predictive density is lower, or its errors are larger and its density is not higher.
+    """
     (density, nmse), (clear, larger) = total.mean.tolist(), total.significant.tolist()
     half, half_nmse = total.half_width.tolist()
     amount = f"{density:+.3g} ± {half:.2g} nats a sample"
@@ -122,7 +134,7 @@ def _verdict(total: Difference, name: str) -> Acceptance:
 
 
 def _is_new_to(earlier: dict[str, Any], holdout: dict[str, Any]) -> bool:
-    """Whether a version with an earlier lineage has learnt nothing of what is held out now."""
+    """Return whether a version with an earlier lineage has learnt none of the rows that are held out now."""
     learnt, before = learnt_from(earlier), earlier.get("holdout")
     kept = [] if before is None or before.get("learnt") else _rows_of(before)
     sets = zip(holdout["datasets"], _rows_of(holdout), strict=True)
@@ -130,7 +142,7 @@ def _is_new_to(earlier: dict[str, Any], holdout: dict[str, Any]) -> bool:
 
 
 def _rows_of(holdout: dict[str, Any]) -> list[dict[str, Any]]:
-    """What tells which rows of each data set were held out, in order."""
+    """Return what identifies the held-out rows of each data set, in order."""
     split = {name: value for name, value in holdout["split"].items() if name != "only"}
     fields = ("sha256", "rows", "guarded", "whole", "stretches")
     return [{"split": split, **{field: each.get(field) for field in fields}} for each in holdout["datasets"]]

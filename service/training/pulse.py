@@ -1,4 +1,4 @@
-"""How long a fit will still take: extrapolated from the pace of its search."""
+"""Heartbeat and progress of a training process, and the remaining time of its fit."""
 
 from __future__ import annotations
 
@@ -22,17 +22,18 @@ SEARCH = "hyperparameters"
 
 @dataclass(frozen=True)
 class PaceOptions:
-    """How long the parts of a job take."""
+    """Durations of the parts of a job, relative to each other."""
 
     min_fraction: float = 0.05
-    """Share of several fits after which their pace is known."""
+    """Share of several fits after which their pace can be estimated."""
     min_iterations: int = 3
-    """Iterations of a search after which their pace is known."""
+    """Iterations of a search after which its pace can be estimated."""
     posterior_iterations: float = 1.5
-    """Iterations of the search that conditioning, compressing and saving take as long as, on equally many samples. Both
-    grow with the cube of theirs: measured 0.9 for two joints and 1.9 for seven."""
+    """Duration of conditioning, compressing and saving in iterations of the search on equally many samples. Both grow
+    with the cube of their samples: measured 0.9 for two joints and 1.9 for seven.
+    """
     fit_rows: int = 200_000
-    """Rows whose pass takes about as long as a fit; for the fraction shown."""
+    """Rows whose pass takes about as long as a fit; for the displayed fraction."""
     last_fit_rows: int = 20_000
     """Rows whose pass takes about as long as the last fit, which does not search."""
 
@@ -40,11 +41,11 @@ class PaceOptions:
 PACE = PaceOptions()
 
 
-class Remaining:
-    """Fed with a fit's progress, it tells roughly the seconds that are left, None until they can be told.
+class RemainingTime:
+    """Estimate of a fit's remaining time, extrapolated from the pace of its search.
 
-    searched, conditioned: samples of the search and of the posterior. The search is taken to need all of its
-    iterations; it often converges earlier.
+    `searched` and `conditioned` are the samples of the search and of the posterior. The search is assumed to need all
+    of its iterations; it often converges earlier.
     """
 
     def __init__(self, searched: int, conditioned: int) -> None:
@@ -54,13 +55,13 @@ class Remaining:
         self._ends: float | None = None
 
     def step(self, at: FitProgress, clock: float) -> None:
-        """Take a step of the fit. clock: monotonic time, s."""
-        if at.estimator is not None:  # one of several: how long each takes shows in the share of all that is done
+        """Add a step of the fit; `clock` is monotonic time, s."""
+        if at.estimator is not None:  # one of several fits: estimated from the finished share of all
             if at.fraction >= PACE.min_fraction:
                 self._ends = clock + at.elapsed * (1 - at.fraction) / at.fraction
             return
         if at.stage == SEARCH:
-            if self._first is None or at.iteration <= self._first[1]:  # or another search: that for the arm comes first
+            if self._first is None or at.iteration <= self._first[1]:  # or a new search: the arm's is first
                 self._first = (clock, at.iteration)
             elif at.iteration >= PACE.min_iterations:
                 began, before = self._first
@@ -70,7 +71,7 @@ class Remaining:
             self._ends = clock + self._pace * (left + self._after_search)
 
     def seconds(self, clock: float) -> float | None:
-        """Seconds that are left at a monotonic time, None where that cannot be told, or was told too low."""
+        """Return the remaining seconds at a monotonic time; None if unknown, or if the estimate was too low."""
         if self._ends is None or clock >= self._ends:
             return None
         return self._ends - clock
@@ -79,29 +80,31 @@ class Remaining:
 logger = logging.getLogger(__name__)
 
 BEAT_S = 0.5
-"""Seconds between two signs of life."""
+"""Interval between two heartbeats, s."""
 STATISTICS = "statistics"
 """Stage of the pass over all rows."""
 LAST_FIT = "all_rows"
-"""Stage of the fit that learns what was held out, too."""
+"""Stage of the fit that also learns the held-out rows."""
 
 
 class SupersededError(RuntimeError):
-    """The job is no longer this attempt's."""
+    """Another attempt has the job."""
 
 
-class Pulse:
-    """Beats while its block runs and gets on. The fit asks and tells it without waiting for the database.
+class Heartbeat:
+    """Writes heartbeats and progress to a job's row while its block runs and makes progress.
 
-    A process whose work hangs has a pulse no longer, and is ended by whoever looks for it: see `lifecycle`.
+    The fit reports to it and reads from it without waiting for the database. A process whose work hangs sends no more
+    heartbeats and is killed by its watcher, see `lifecycle`.
 
-    own: reads the job's row in a session; raises SupersededError where it is not this attempt's any more; model: that
-    the job is of, so that those who write of others need not wait for a beat; quiet_s: longest time without progress.
+    `own` reads the job's row in a session and raises SupersededError if another attempt has the job. `model` is the
+    job's model: writers of other models need not wait for a heartbeat. `quiet_s` is the maximum time without progress,
+    s.
     """
 
     def __init__(self, database: Database, own: Callable[[Any], JobRow], model: str, quiet_s: float = inf) -> None:
         self.database, self.own, self.model = database, own, model
-        self.remaining: Remaining | None = None
+        self.remaining: RemainingTime | None = None
         self._began = time.monotonic()
         self._fit_begins, self._fit_ends, self._pass_ends = 0.0, 1.0, 1.0  # fractions
         self._passes_later, self._pass_began = 0.0, (0.0, 0.0)
@@ -111,7 +114,7 @@ class Pulse:
         pids = (os.getpid(),)
         self._progress, self._hangs = Progress(lambda: pids, quiet_s, inf), False
         self._wake, self._ended = threading.Event(), False
-        # in the context of the job, which its log lines name
+        # in the context of the job, so that log lines contain its id
         self._thread = threading.Thread(target=copy_context().run, args=(self._beat,), daemon=True, name="pulse")
 
     def __enter__(self) -> Self:
@@ -129,7 +132,7 @@ class Pulse:
         return time.monotonic() - self._began
 
     def progress(self, at: FitProgress) -> None:
-        """Take the fit's progress; it is written with the next beat."""
+        """Record the fit's progress; the next heartbeat writes it."""
         self._progress.step()
         if self.remaining is not None:
             self.remaining.step(at, time.monotonic())
@@ -146,14 +149,14 @@ class Pulse:
             self._wake.set()
 
     def last_fit(self, at: FitProgress) -> None:
-        """Take how far the last fit is; iterations and objective stay those of the search before it."""
+        """Record the progress of the last fit; iterations and objective stay those of the search before it."""
         self._progress.step()
         self._latest = {**self._latest, "fraction": self._during_fit(at)}
 
     def plan(self, fit: int, rows: int, later: int = 0) -> None:
-        """Divide the fraction that is left among a fit that begins, a pass over `rows` rows, and what follows.
+        """Divide the remaining fraction among a fit that begins, a pass over `rows` rows, and the rest.
 
-        fit, later: in rows whose pass takes as long; later: all that follows the pass.
+        `fit` and `later` are in rows whose pass takes as long; `later` is everything after the pass.
         """
         begins, total = self._latest.get("fraction", 0.0), fit + rows + later
         self._fit_begins = begins
@@ -163,10 +166,10 @@ class Pulse:
         self.remaining = self._ends = None
 
     def share(self, done: float) -> None:
-        """Take what share of the pass is done; how long the rest takes shows from then on."""
+        """Record the finished share of the pass; the remaining time is estimated from its pace."""
         self._progress.step()
         clock = time.monotonic()
-        if self._latest["stage"] != STATISTICS or self._pass_began[1] == 0.0:  # not by how long workers take to start
+        if self._latest["stage"] != STATISTICS or self._pass_began[1] == 0.0:  # the start of the workers does not count
             self._pass_began = clock, done
         began, before = self._pass_began
         if done > before:
@@ -180,14 +183,14 @@ class Pulse:
         }
 
     def stage(self, name: str) -> None:
-        """Say what is done now."""
+        """Record the stage that begins."""
         self._progress.step()
         self._latest = {**self._latest, "stage": name, "estimator": None}
         self._wake.set()
 
     def cancelled(self) -> bool:
-        """Whether to stop; raise SupersededError where the job was given to another attempt."""
-        self._progress.step()  # whoever asks is at work, if only waiting for the processes that share it
+        """Return whether to stop; raise SupersededError if another attempt has the job."""
+        self._progress.step()  # the caller is working, even if it waits for the processes that share the work
         if self._superseded:
             raise SupersededError
         return self._stop
@@ -196,7 +199,7 @@ class Pulse:
         return self._fit_begins + (self._fit_ends - self._fit_begins) * at.fraction
 
     def as_json(self) -> dict[str, Any]:
-        """The progress as it is written now."""
+        """Return the progress as it is written now."""
         left = None if self.remaining is None else self.remaining.seconds(time.monotonic())
         if self._ends is not None:
             left = max(0.0, self._ends - time.monotonic())
@@ -204,7 +207,7 @@ class Pulse:
         return {**self._latest, "elapsed_s": round(self.elapsed, 3), "remaining_s": remaining}
 
     def end(self) -> None:
-        """Stop beating: what is written to the row from then on stays."""
+        """Stop the heartbeats, so that later changes of the row persist."""
         self._ended = True
         self._wake.set()
         self._thread.join()
@@ -215,7 +218,7 @@ class Pulse:
                 self._exchange()
             except SupersededError:
                 self._superseded = True
-            except Exception:  # the database may be locked or the disk full for a while: training goes on
+            except Exception:  # the database may be locked or the disk full for a while: training continues
                 logger.exception("the progress could not be written")
             self._wake.wait(BEAT_S)
             self._wake.clear()

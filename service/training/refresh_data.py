@@ -1,4 +1,4 @@
-"""What a refresh learns from: what of a model's log, and of the data of its version, is of the robot as it is."""
+"""Data of a refresh: the logged rows and data sets that still describe the robot."""
 
 from __future__ import annotations
 
@@ -19,35 +19,36 @@ from service.journal import log
 from service.journal.log import decode
 from service.storage.database import Database, DatasetRow, EventRow
 
-MEMORY = 5.0
-"""Forgetting times after which a sample is left out: it would count less than one per cent."""
+MAX_AGE_FORGETTING_TIMES = 5.0
+"""Maximum age of a sample in forgetting times; an older one would have a weight below one per cent."""
 
 
 @dataclass(frozen=True)
 class Scope:
-    """What a refresh learns from: rows of the log up to event `through` with an event time of at least `since`, s.
-
-    newest: the latest event time of the log so far, s, None without rows; forgetting_s: time constant of forgetting;
-    changed: event time of the last change of the robot, before which all data are of another robot.
-    """
+    """Rows that a refresh learns from: of the log up to event `through`, with an event time of at least `since`."""
 
     through: int
+    """Number of the last event."""
     since: float
+    """Earliest event time, Unix s."""
     newest: float | None
+    """Latest event time of the log, Unix s; None without rows."""
     forgetting_s: float | None
+    """Time constant of forgetting, s; None if nothing is forgotten."""
     changed: float | None
+    """Event time of the last change of the robot, Unix s. Earlier data describe another robot."""
 
     def left_out(self, recorded: DatasetRow) -> str | None:
-        """Why a data set is not learnt from; None where it is. Its age counts from its upload."""
+        """Return why a data set is not learnt, None if it is. Its age counts from its upload."""
         if self.changed is not None:
             return "the robot has changed since"
         if datetime.fromisoformat(recorded.created_at).timestamp() < self.since:
-            return f"it is older than {MEMORY:g} forgetting times"
+            return f"it is older than {MAX_AGE_FORGETTING_TIMES:g} forgetting times"
         return None
 
 
 def scope_of(session: Session, model: str, through: int) -> Scope:
-    """Scope of the log up to an event, as it stands now."""
+    """Return the current scope of the log up to an event."""
     live = (EventRow.model == model, EventRow.number <= through, EventRow.void.is_(False))
     newest = session.scalar(select(func.max(EventRow.last)).where(*live, EventRow.learnt > 0))
     details = session.scalars(select(EventRow.detail).where(*live, EventRow.kind == "change"))
@@ -55,12 +56,12 @@ def scope_of(session: Session, model: str, through: int) -> Scope:
     forgetting_s = log.memory(session, model, through).forgetting_s
     since = -math.inf if changed is None else changed
     if forgetting_s is not None and newest is not None:
-        since = max(since, newest - MEMORY * forgetting_s)
+        since = max(since, newest - MAX_AGE_FORGETTING_TIMES * forgetting_s)
     return Scope(through, since, newest, forgetting_s, changed)
 
 
 def rows_within(session: Session, model: str, scope: Scope) -> int:
-    """How many rows of the log are in scope, or up to one batch more: only whole batches are counted."""
+    """Return the number of logged rows in scope, or up to one batch more, as only whole batches are counted."""
     live = (EventRow.model == model, EventRow.number <= scope.through, EventRow.void.is_(False))
     return session.scalar(select(func.sum(EventRow.learnt)).where(*live, EventRow.last >= scope.since)) or 0
 
@@ -68,7 +69,7 @@ def rows_within(session: Session, model: str, scope: Scope) -> int:
 def split_datasets(
     session: Session, scope: Scope, lineage: dict[str, Any]
 ) -> tuple[list[DatasetRow], list[dict[str, str]]]:
-    """Data sets of a version's lineage that a refresh learns from, in order, and why it leaves out the others."""
+    """Return the data sets of a lineage that a refresh learns from, in order, and why others are left out."""
     named = [item["id"] for item in lineage.get("datasets", [])]
     known = datasets(session, named)
     kept, left_out = [], []
@@ -81,8 +82,8 @@ def split_datasets(
     return kept, left_out
 
 
-def taken_back(session: Session, model: str, through: int, after: int) -> bool:
-    """Whether an event above number `after` has unlearnt or rolled back something up to event `through`."""
+def is_taken_back(session: Session, model: str, through: int, after: int) -> bool:
+    """Return whether an event after number `after` unlearnt or rolled back anything up to event `through`."""
     later = (EventRow.model == model, EventRow.number > after)
     undone = select(EventRow.kind, EventRow.detail).where(*later, EventRow.kind.in_(("unlearn", "rollback")))
     return any(
@@ -92,30 +93,30 @@ def taken_back(session: Session, model: str, through: int, after: int) -> bool:
 
 
 def datasets(session: Session, names: Collection[str]) -> dict[str, DatasetRow]:
-    """Those of some data sets that there are, by id."""
+    """Return the existing data sets among `names`, by id."""
     return {row.id: row for row in session.scalars(select(DatasetRow).where(DatasetRow.id.in_(names)))}
 
 
 PAGE = 50
-"""Events read at a time."""
-COMPARED = 1 / 3
+"""Events per read."""
+COMPARED_SHARE = 1 / 3
 """Share of the rows in scope, the newest, on which a refreshed version is compared before it learns them."""
 
 
 @dataclass(frozen=True)
-class Unlearnt:
-    """Rows of the log after event `after`, which neither a judged fit nor the version as of that event has learnt."""
+class ComparisonRows:
+    """Logged rows after event `after`; neither the judged fit nor the version as of that event has learnt them."""
 
     after: int
     samples: Samples
 
 
 def newest_part(session: Session, model: str, scope: Scope, start: int) -> int:
-    """The event after which the newest COMPARED of the rows in scope lie, from event `start` on."""
+    """Return the event after which the newest COMPARED_SHARE of the rows in scope lie, at least event `start`."""
     live = (EventRow.model == model, EventRow.number <= scope.through, EventRow.void.is_(False), EventRow.learnt > 0)
     query = select(EventRow.number, EventRow.learnt).where(*live, EventRow.last >= scope.since)
     counts = session.execute(query.order_by(EventRow.number.desc())).all()
-    left = COMPARED * sum(learnt for _, learnt in counts)
+    left = COMPARED_SHARE * sum(learnt for _, learnt in counts)
     for number, learnt in counts:
         left -= learnt
         if left <= 0:
@@ -124,8 +125,8 @@ def newest_part(session: Session, model: str, scope: Scope, start: int) -> int:
 
 
 @dataclass(frozen=True)
-class Logged:
-    """Samples of the log, t their event time, None where there are none; rows: how many before they were thinned."""
+class LoggedSamples:
+    """Samples of the log with event times as t, None if there are none. `rows` is their number before thinning."""
 
     samples: Samples | None
     rows: int
@@ -139,22 +140,24 @@ def read_log(
     most: int,
     longest_step: float,
     after: int = 0,
-) -> Logged:
-    """Rows in scope that teach, of events above number `after`, at most `most`, thinned evenly. Sorted by stream and
-    time; where time steps by more than `longest_step` seconds a new episode begins."""
+) -> LoggedSamples:
+    """Return the logged rows in scope that can be learnt, from events after number `after`, thinned evenly to `most`.
+
+    They are sorted by stream and time. A new episode begins if the time steps by more than `longest_step` seconds.
+    """
     kept, count = _thinned(database, model, scope, most, after)
     if count == 0:
-        return Logged(None, 0)
+        return LoggedSamples(None, 0)
     rows, source = Rows.concatenate([part for part, _ in kept]), np.concatenate([stream for _, stream in kept])
     order = np.lexsort((rows.time, source))
     rows, source = rows.take(order), source[order]
     breaks = (np.diff(source) != 0) | (np.diff(rows.time) > longest_step)
     episode = np.concatenate([[0], np.cumsum(breaks)]).astype(np.int64)
-    return Logged(Samples(joint_names, rows.time, episode, rows.q, rows.dq, rows.ddq, rows.tau), count)
+    return LoggedSamples(Samples(joint_names, rows.time, episode, rows.q, rows.dq, rows.ddq, rows.tau), count)
 
 
 def age_weights(times: Array, scope: Scope) -> Array | None:
-    """Weight of samples of these times, Unix s: exp(−age/forgetting_s), (N,); None where nothing is forgotten."""
+    """Return the weights exp(−age/forgetting_s) of samples, (N,); None if nothing is forgotten. times: Unix s."""
     if scope.forgetting_s is None or scope.newest is None:
         return None
     return np.exp(np.minimum(times - scope.newest, 0.0) / scope.forgetting_s)
@@ -163,8 +166,10 @@ def age_weights(times: Array, scope: Scope) -> Array | None:
 def _thinned(
     database: Database, model: str, scope: Scope, most: int, after: int
 ) -> tuple[list[tuple[Rows, Array]], int]:
-    """Every k-th row in scope in the order of the log, each with the number of its stream, and how many there are. One
-    pass, and never more than twice `most` rows in memory: k doubles whenever there are that many."""
+    """Return every k-th row in scope in log order with its stream's number, and the number of rows in scope.
+
+    One pass with at most 2·`most` rows in memory: k doubles each time that limit is reached.
+    """
     kept: list[tuple[Rows, Array]] = []
     streams: dict[str | None, int] = {}
     step, count, held = 1, 0, 0
@@ -194,7 +199,7 @@ def _thinned(
 
 
 def _where(parts: list[tuple[Rows, Array]], mask: NDArray[np.bool_]) -> list[tuple[Rows, Array]]:
-    """Rows of all parts together where the mask is set."""
+    """Return the rows of all parts at which the mask is set."""
     out, at = [], 0
     for rows, stream in parts:
         chosen = mask[at : at + len(rows)]

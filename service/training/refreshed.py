@@ -1,8 +1,9 @@
-"""Whether a refreshed version takes the place of the one that serves.
+"""Decide whether a refreshed version replaces the serving version.
 
-Both predict the newest logged rows, which neither has learnt: the refreshed one is fitted without them first, and the
-one that serves is taken as it was before them. Compared is the negative log predictive density of a row's torques,
-summed over the joints, with the noise that each version states: it rewards small errors and honest uncertainty alike.
+Both predict the newest logged rows, which neither has learnt: the refreshed version is first fitted without them, and
+the serving version is restored to its state before them. The score is the negative log predictive density of a row's
+torques, summed over the joints, with the noise that each version states. It rewards small errors and honest uncertainty
+alike.
 """
 
 from __future__ import annotations
@@ -28,31 +29,31 @@ from service.models.lineage import answer_of
 from service.storage import audit
 from service.storage.database import Database, LearningRow, VersionRow
 from service.storage.files import Files
-from service.training.refresh_data import Unlearnt
+from service.training.refresh_data import ComparisonRows
 
 
 @dataclass(frozen=True)
-class Compared:
-    """How a refreshed version compares with the one that it refreshes. evidence: the figures of it, as JSON."""
+class RefreshComparison:
+    """Comparison of a refreshed version with the version that it refreshes; `evidence` has its figures as JSON."""
 
     acceptance: Acceptance
     evidence: dict[str, Any]
 
 
 def compare(
-    database: Database, files: Files, serving: VersionRow, trained: TorqueModel, rows: Unlearnt | None
-) -> Compared:
-    """Compare the judged fit of a refresh with the version that it refreshes. rows: what neither has learnt."""
+    database: Database, files: Files, serving: VersionRow, trained: TorqueModel, rows: ComparisonRows | None
+) -> RefreshComparison:
+    """Compare the judged fit of a refresh with the version that it refreshes, on rows that neither has learnt."""
     name = f"version {serving.version}"
     if rows is None or len(metrics.blocks(rows.samples)) < MIN_BLOCKS:
-        return Compared(Acceptance(unknown=(f"too few rows are logged to compare it with {name}",)), {})
+        return RefreshComparison(Acceptance(unknown=(f"too few rows are logged to compare it with {name}",)), {})
     samples, key = rows.samples, (serving.model, serving.version)
     base = files.load_version(serving.folder, serving.checksums)
     known = restore(database, files, *key, base, rows.after)
     before = known.online.model(error_floor_of(database, *key, rows.after, base.n_joints))
     answers = {"serving": answer_of(before, samples), "candidate": answer_of(trained, samples)}
     scores = {which: BlockScores.of(samples, answer) for which, answer in answers.items()}
-    found = scores["candidate"].less(scores["serving"])
+    found = scores["candidate"].difference_from(scores["serving"])
     evidence = {
         "rows": len(samples),
         "blocks": len(scores["serving"].rows),
@@ -63,15 +64,17 @@ def compare(
     amount = f"negative log density {found.mean[0]:+.3g} ± {found.half_width[0]:.2g} nats a row"
     better = bool(found.significant[0] and found.mean[0] < 0)
     said = (f"it predicts the newest logged rows {'' if better else 'no '}better than {name}: {amount}",)
-    return Compared(Acceptance(speaks_for=said) if better else Acceptance(against=said), evidence)
+    return RefreshComparison(Acceptance(speaks_for=said) if better else Acceptance(against=said), evidence)
 
 
 def promote(session: Session, model: str, version: int, judged: Promotion, evidence: dict[str, Any]) -> str:
-    """Let a refreshed version that was just added serve if it is better and its owner wants that; raise the alarm that
-    says what came of it, and return it in words."""
+    """Let a refreshed version that was just added serve, if it is better and its owner allows that.
+
+    Raise an alarm with the outcome and return the outcome in words.
+    """
     row = session.get(LearningRow, model)
     promotes = (LearningOptions() if row is None else LearningOptions(**row.options)).auto_promote
-    serving = registry.answering(session, model)
+    serving = registry.serving_version(session, model)
     promoted = judged.answers and promotes and serving == judged.serving
     if promoted:
         registry.serve(session, model, version)
@@ -89,7 +92,7 @@ def promote(session: Session, model: str, version: int, judged: Promotion, evide
     return outcome
 
 
-def _figures(samples: Samples, answer: metrics.Answer) -> dict[str, list[float | None]]:
-    """nMSE and coverage per joint; null where the torque did not vary."""
+def _figures(samples: Samples, answer: metrics.TorqueDistribution) -> dict[str, list[float | None]]:
+    """Return nMSE and coverage per joint; null if the torque is constant."""
     found = metrics.evaluate(samples.tau, *answer)
     return {"nmse": finite(found.nmse), "coverage": finite(found.coverage)}

@@ -1,4 +1,4 @@
-"""Whether what a version is judged on repeats the motion that it was trained on, and what to hold out instead."""
+"""Check whether held-out samples repeat the training motion, and choose others to hold out."""
 
 from __future__ import annotations
 
@@ -13,19 +13,22 @@ from service.contract.models import Holdout
 from service.storage.database import Database, DatasetRow
 from service.storage.files import Files
 from service.training import holding_out, refresh_data
-from service.training.table import TablePart, opened
+from service.training.table import TablePart, open_parts
 
-MOST = 20_000
-"""Rows of a training that are looked at, thinned evenly."""
+MAX_REPETITION_ROWS = 20_000
+"""Maximum rows of a training that are compared, thinned evenly."""
 
 
 def unrepeated(part: TablePart, joint_types: Sequence[str], asked: Holdout) -> list[list[int]] | None:
-    """Rows of a data set to hold out in place of its last part, see `held_out.unrepeated`; None where that is right, or
-    the data set has no times. First and last, exclusive, in order of episode and time."""
+    """Return the rows of a data set to hold out instead of its last part, see `held_out.find_unrepeated`.
+
+    Each entry is a first and an exclusive last row, in order of episode and time. Return None if the last part is right
+    or the data set has no times.
+    """
     if not part.timed:
         return None
-    places, samples = part.motion(MOST)
-    spans = held_out.unrepeated(samples, joint_types, asked.share, asked.seed)
+    places, samples = part.motion(MAX_REPETITION_ROWS)
+    spans = held_out.find_unrepeated(samples, joint_types, asked.share, asked.seed)
     if spans is None:
         return None
     border = [*places.tolist(), len(part)]
@@ -33,26 +36,28 @@ def unrepeated(part: TablePart, joint_types: Sequence[str], asked: Holdout) -> l
 
 
 def look(training: Sequence[TablePart], part: Samples, joint_types: Sequence[str]) -> dict[str, Any]:
-    """How much of some samples repeats what is trained on, as lineages and the API name it; nulls where there is
-    nothing of that any more."""
+    """Return how much of some samples repeats the training data, under the names of lineages and the API.
+
+    Values are null if no training data are left.
+    """
     if not training:
         return {"repeats_training": None, "period_s": None, "warnings": []}
-    rows = max(MOST, sum(map(len, training)))
-    known = [each.motion(max(1, round(MOST * len(each) / rows)))[1] for each in training]
+    rows = max(MAX_REPETITION_ROWS, sum(map(len, training)))
+    known = [each.motion(max(1, round(MAX_REPETITION_ROWS * len(each) / rows)))[1] for each in training]
     repeated = repetition(Samples.concatenate(known), part, joint_types)
     if not all(each.timed for each in training):
         repeated = repeated._replace(period=None)
     return {"repeats_training": repeated.share, "period_s": repeated.period, "warnings": _warnings(repeated)}
 
 
-def trained_on(database: Database, files: Files, lineage: dict[str, Any]) -> list[TablePart]:
-    """What a version has learnt from of those of its data sets that are still there.
+def read_training_parts(database: Database, files: Files, lineage: dict[str, Any]) -> list[TablePart]:
+    """Return what a version has learnt from those of its data sets that still exist.
 
-    Raise DamagedDataError, or CannotHoldOutError where one does not split as it did.
+    Raise DamagedDataError, or CannotHoldOutError if a data set no longer splits as recorded.
     """
     with database.session() as session:
         known = refresh_data.datasets(session, [each["id"] for each in lineage.get("datasets", [])])
-    parts = opened(files, list(known.values()))
+    parts = open_parts(files, list(known.values()))
     if not (lineage.get("holdout") or {}).get("learnt"):
         parts = [_learnt(part, lineage) for part in parts]
     return [part for part in parts if len(part)]
@@ -60,12 +65,12 @@ def trained_on(database: Database, files: Files, lineage: dict[str, Any]) -> lis
 
 def _learnt(part: TablePart, lineage: dict[str, Any]) -> TablePart:
     row: DatasetRow = part.row
-    split = holding_out.remembered(row, lineage)
+    split = holding_out.find_earlier_split(row, lineage)
     return part if split is None else TablePart(row, part.reader, split.parts(*part.clock()).train)
 
 
 def _warnings(found: Repetition) -> list[str]:
-    if not found.flatters:
+    if not found.is_repeated:
         return []
     again = "" if found.period is None else f", which repeats every {found.period:.3g} s"
     return [

@@ -1,7 +1,7 @@
-"""The pass of a job over all of its rows: a posterior that stands on every one of them, summed shard by shard.
+"""Pass of a job over all of its rows: condition the posterior on every row, shard by shard.
 
-What a shard's worker is given is plain data, so that it may be a process of another host: it opens the data set's file
-itself, and makes the basis of what the model is stored as. Both are kept for the shards that follow.
+A shard's worker receives plain data, so it may be a process on another host. It opens the data set's file itself and
+rebuilds the basis from the stored model. Both are kept for later shards.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.statistics import empty
 from lipcore.posterior.summing import Summing
 from lipcore.training.conditioning import ShardStatistics, sum_samples, with_statistics
-from lipcore.vocabulary import Place
+from lipcore.vocabulary import Device
 from service.foundation.settings import Settings
-from service.runtime.executors import placed, sent, shard_executor, summed
+from service.runtime.executors import choose_settings, settings_to_send, shard_executor, sum_shards
 from service.storage.files import PATIENCE_S, Files
 from service.storage.sample_file import Reader
 from service.training.table import Shard, Table
@@ -37,13 +37,15 @@ Made = TypeVar("Made")
 
 @dataclass(frozen=True)
 class Context:
-    """What all shards of a pass share, in plain data. settings: None for a worker with settings of its own; model: its
-    files, packed; joint_names: of the data; device: to compute on."""
+    """Data that all shards of a pass share."""
 
     settings: Settings | None
+    """Settings; None for a worker that has its own."""
     model: dict[str, bytes]
+    """Packed files of the model."""
     joint_names: tuple[str, ...]
-    device: Place
+    device: Device
+    """Device to compute on."""
 
 
 def all_rows(
@@ -55,11 +57,10 @@ def all_rows(
     cancelled: Callable[[], bool],
     progress: Callable[[float], None],
 ) -> TorqueModel:
-    """The model with the posterior of all rows of a table and of a log, instead of those that its fit has chosen.
+    """Return the model with the posterior of all rows of a table and a log, not only those that its fit selected.
 
-    table: the data sets' rows, each with what it counts; logged: the log's, with weights; progress: told what share is
-    done.
-    Raise FitCancelledError when `cancelled` says so.
+    `table` and `logged` contain rows with weights. `progress` is called with the finished share. Raise
+    FitCancelledError if `cancelled` returns True.
     """
     gpu = options.device == "cuda"
     rows = len(table) + (0 if logged is None else len(logged[0]))
@@ -67,11 +68,11 @@ def all_rows(
     shards = table.shards()
     if shards:
         progress(0.0)
-        context = Context(sent(settings), packed(model), model.joint_names, "cuda" if gpu else "cpu")
+        context = Context(settings_to_send(settings), packed(model), model.joint_names, "cuda" if gpu else "cpu")
         with shard_executor(settings, gpu) as executor:
             work = partial(shard_statistics, context)
             share = len(table) / rows / len(shards)
-            total = summed(executor, work, shards, cancelled, done=lambda done: progress(share * done))
+            total = sum_shards(executor, work, shards, cancelled, done=lambda done: progress(share * done))
     if logged is not None:
         of_log = sum_samples(Summing.of(model.posterior), *logged, cancelled)
         total = of_log if total is None else total + of_log
@@ -80,21 +81,21 @@ def all_rows(
 
 
 def shard_statistics(context: Context, shard: Shard) -> ShardStatistics:
-    """What the rows of one shard tell: done by a worker."""
+    """Return the statistics of one shard's rows; runs in a worker."""
     name = hashlib.sha256(b"".join(context.model.values())).hexdigest() + context.device
     summing = _cached(_SUMMING, name, 2, lambda: _summing(context))
-    samples, weights = read(placed(context.settings), context.joint_names, shard)
+    samples, weights = read(choose_settings(context.settings), context.joint_names, shard)
     return sum_samples(summing, samples, weights)
 
 
 def read(settings: Settings, joint_names: tuple[str, ...], shard: Shard) -> tuple[Samples, Array]:
-    """The rows of a shard that count, and how much each of them does, (N,)."""
+    """Return the selected rows of a shard and their weights, (N,)."""
 
     def opened() -> Reader:
         return Reader(Files.of(settings, PATIENCE_S).samples_file(shard.dataset, shard.sha256))
 
     reader = _cached(_READERS, shard.sha256 + shard.dataset, 8, opened)
-    # one more row at both ends, as weights are those of the whole recording
+    # one more row at both ends, so that weights equal those of the whole recording
     first, last = max(0, shard.first - 1), min(reader.rows, shard.last + 1)
     rows, mask = slice(shard.first - first, shard.last - first), shard.mask()
     values = {name: reader.array(name, first, last) for name in ("t", "episode")}
@@ -108,7 +109,7 @@ def read(settings: Settings, joint_names: tuple[str, ...], shard: Shard) -> tupl
 
 
 def packed(model: TorqueModel) -> dict[str, bytes]:
-    """The files of a model without what it has learnt, a tenth of a megabyte: its basis and noise are in them."""
+    """Return the compressed files of a model without its statistics, about 0.1 MB: basis and noise are enough."""
     posterior = replace(model.posterior, statistics=empty(len(model.posterior.basis)))
     _, files = persistence.encode(replace(model, posterior=posterior))
     return {name: zlib.compress(each) for name, each in files.items()}
@@ -122,11 +123,11 @@ def _summing(context: Context) -> Summing:
 _SUMMING: OrderedDict[str, Summing] = OrderedDict()
 _READERS: OrderedDict[str, Reader] = OrderedDict()
 _lock = threading.Lock()
-"""A worker of a cluster has several threads."""
+"""Needed as a worker of a cluster has several threads."""
 
 
 def _cached(kept: OrderedDict[str, Made], key: str, most: int, make: Callable[[], Made]) -> Made:
-    """What is kept under a key, made where it is not; the `most` used last are kept."""
+    """Return the value of a key, made if missing; the `most` last used are kept."""
     with _lock:
         if key not in kept:
             kept[key] = make()

@@ -1,6 +1,6 @@
-"""Rows of data sets as one table, data set after data set, which is not in memory: what a fit chooses from is thinned
-evenly over all of it, what a sum goes over is divided into shards, and whatever is read is read from the part of a file
-where it lies.
+"""Rows of data sets as one table that stays on disk, one data set after another.
+
+A fit reads rows thinned evenly over the table; a sum reads it in shards. Only the needed part of a file is read.
 """
 
 from __future__ import annotations
@@ -20,24 +20,26 @@ from service.storage.sample_file import Reader
 from service.training.holding_out import RowTimes
 
 STRETCHES, STRETCH = 40, 500
-"""Contiguous rows that tell the white noise of a recording that is thinned, and how many of these there are at most."""
+"""Maximum number of contiguous stretches that estimate the white noise of a thinned recording, and rows of each."""
 
 
 @dataclass(frozen=True)
 class Shard:
-    """Rows `first` to `last`, exclusive, of a data set, in plain data. chosen: bits of those that count, all where
-    None; timed: whether their times say how much they count; factor: what each counts besides."""
+    """Rows `first` to `last` (exclusive) of a data set, as plain data."""
 
     dataset: str
     sha256: str
     first: int
     last: int
     chosen: bytes | None
+    """Bits of the selected rows; None means all."""
     timed: bool
+    """Whether the rows are weighted by their times."""
     factor: float
+    """Additional weight of each row."""
 
     def mask(self) -> Mask | None:
-        """Which rows count, (last − first,); None for all."""
+        """Return the mask of selected rows, (last − first,); None for all."""
         if self.chosen is None:
             return None
         bits = np.unpackbits(np.frombuffer(self.chosen, np.uint8), count=self.last - self.first)
@@ -46,27 +48,29 @@ class Shard:
 
 @dataclass(frozen=True)
 class TablePart:
-    """What of one data set belongs to a table. chosen: (rows,), all where None; factor: what each row counts."""
+    """The rows of one data set that belong to a table."""
 
     row: DatasetRow
     reader: Reader
     chosen: Mask | None = None
+    """Mask of the selected rows, (rows,); None means all."""
     factor: float = 1.0
+    """Weight of each row."""
 
     def __len__(self) -> int:
         return self.reader.rows if self.chosen is None else int(np.count_nonzero(self.chosen))
 
     @property
     def timed(self) -> bool:
-        """Whether the times of its rows say how long each stands for."""
+        """Whether its rows have times, which determine their weights."""
         return self.row.report.get("rate_hz") is not None
 
     def clock(self) -> RowTimes:
-        """Episodes and times of all rows, chosen or not."""
+        """Return episodes and times of all rows, selected or not."""
         return RowTimes(self.reader.array("episode"), self.reader.array("t"))
 
     def take(self, places: Numbers) -> Samples:
-        """Those of the chosen rows, by their places among them; a new episode begins where rows in between are not."""
+        """Return selected rows by their indices among the selected ones; a gap between rows starts a new episode."""
         index = places if self.chosen is None else np.flatnonzero(self.chosen)[places]
         values = self.reader.take(index)
         episode = values.pop("episode")
@@ -75,8 +79,10 @@ class TablePart:
         return Samples(joint_names=tuple(self.row.joint_names), episode=numbered, **values)
 
     def motion(self, most: int) -> tuple[Numbers, Samples]:
-        """Of the chosen rows, in order of episode and time, at most so many, evenly, with the episodes of the
-        recording; and their places in that order."""
+        """Return at most `most` selected rows in order of episode and time, and their indices in that order.
+
+        They are thinned evenly; episodes are those of the recording.
+        """
         clock = self.clock()
         order = np.lexsort((clock.t, clock.episode))
         order = order if self.chosen is None else order[self.chosen[order]]
@@ -86,7 +92,7 @@ class TablePart:
         return places, Samples(joint_names=tuple(self.row.joint_names), **values)
 
     def independent_rows(self) -> float:
-        """Independent samples that its rows count for."""
+        """Return the number of effective samples of its rows."""
         if not self.timed:
             return self.factor * len(self)
         clock = self.clock()
@@ -94,13 +100,13 @@ class TablePart:
         return self.factor * float(weights.sum() if self.chosen is None else weights[self.chosen].sum())
 
     def every(self, step: int) -> TablePart:
-        """Every `step`-th of its rows, which counts for as many."""
+        """Return every `step`-th row, with the weight of `step` rows."""
         chosen = np.zeros(self.reader.rows, dtype=bool)
         chosen[(np.arange(self.reader.rows) if self.chosen is None else np.flatnonzero(self.chosen))[::step]] = True
         return replace(self, chosen=chosen, factor=step * self.factor)
 
     def shards(self) -> Iterator[Shard]:
-        """Pieces of one size; those that nothing counts of are left out."""
+        """Yield shards of equal size; skip those without selected rows."""
         for first in range(0, self.reader.rows, SHARD):
             last = min(first + SHARD, self.reader.rows)
             mask = None if self.chosen is None else self.chosen[first:last]
@@ -119,7 +125,7 @@ class Table:
         return sum(len(part) for part in self.parts)
 
     def take(self, index: Numbers) -> Samples:
-        """Chosen rows, at least one; index: rising."""
+        """Return rows by rising indices, at least one."""
         parts, before = [], 0
         for part in self.parts:
             places = index[(index >= before) & (index < before + len(part))] - before
@@ -129,35 +135,37 @@ class Table:
         return Samples.concatenate(parts)
 
     def thinned(self, most: int) -> Samples:
-        """All rows, or of more than `most` so many, evenly."""
+        """Return all rows, thinned evenly to at most `most`."""
         return self.take(np.linspace(0, len(self) - 1, min(len(self), most)).round().astype(np.int64))
 
     def stretches(self) -> Samples:
-        """Contiguous rows from all over the table."""
+        """Return contiguous rows from all over the table."""
         begins = np.linspace(0, max(0, len(self) - STRETCH), STRETCHES).round().astype(np.int64)
         index = np.unique(begins[:, None] + np.arange(STRETCH))
         return self.take(index[index < len(self)])
 
     def independent_rows(self) -> float:
-        """Independent samples that all rows count for."""
+        """Return the number of effective samples of all rows."""
         return sum(part.independent_rows() for part in self.parts)
 
     def weighed(self, most: int) -> Table:
-        """The table with what rows without times count: nobody knows how fast they were recorded, and so those of one
-        data set count for no more than `most` independent ones."""
+        """Return the table with lower weights for rows without times.
+
+        Their sampling rate is unknown, so the rows of one data set weigh no more than `most` independent ones.
+        """
         bounded = [replace(part, factor=part.factor * min(1.0, most / len(part))) for part in self.parts]
         return Table([part if part.timed else less for part, less in zip(self.parts, bounded, strict=True)])
 
     def sparse(self, most: int) -> Table:
-        """The table, or of more than `most` rows about so many, evenly, which count for all."""
+        """Return about `most` rows, thinned evenly, with the weight of all rows."""
         step = -(-len(self) // most)
         return self if step <= 1 else Table([part.every(step) for part in self.parts])
 
     def shards(self) -> list[Shard]:
-        """What its rows are summed up in."""
+        """Return the shards of all parts."""
         return [shard for part in self.parts for shard in part.shards()]
 
 
-def opened(files: Files, rows: Sequence[DatasetRow]) -> list[TablePart]:
-    """Data sets as a whole; raise DamagedDataError."""
+def open_parts(files: Files, rows: Sequence[DatasetRow]) -> list[TablePart]:
+    """Return whole data sets as table parts; raise DamagedDataError."""
     return [TablePart(row, Reader(files.samples_file(row.id, row.sha256))) for row in rows]

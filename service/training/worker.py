@@ -1,4 +1,4 @@
-"""What the training process does: one job, from its row to a new model version."""
+"""The training process: run one job, from its row to a new model version."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from service.foundation.errors import NotInstalledError, ServiceError, StorageFu
 from service.foundation.settings import Settings
 from service.models import registry
 from service.models.evaluation import MAX_EVALUATION_SAMPLES
-from service.models.lineage import MOST_SAMPLES, figures, software
+from service.models.lineage import MAX_METRIC_SAMPLES, figures, software
 from service.runtime.allocator import give_back
 from service.runtime.executors import ClusterUnavailableError
 from service.storage import errors as storage_errors
@@ -32,26 +32,28 @@ from service.storage.files import PATIENCE_S, Files
 from service.telemetry.logs import job_id
 from service.training import judging, lifecycle, promotion, refresh_data, refreshed
 from service.training.holding_out import CannotHoldOutError
-from service.training.material import Material, observed, recorded
+from service.training.material import TrainingData, load_datasets, load_refresh_data
 from service.training.planned_fit import PlannedFit
-from service.training.pulse import Pulse, SupersededError
+from service.training.pulse import Heartbeat, SupersededError
 
 logger = logging.getLogger(__name__)
 
 
 class StorageError(RuntimeError):
-    """The database or the disk could not be used: the job has not failed, it is to be started again."""
+    """The database or the disk could not be used; the job has not failed and must be started again."""
 
 
 class TakenBackError(RuntimeError):
-    """What the job was training on has been unlearnt or rolled back meanwhile."""
+    """Training data of the job were unlearnt or rolled back meanwhile."""
 
     code = "observations_taken_back"
 
 
 def run(settings: Settings, job: str) -> None:
-    """Run one queued job to its end. All outcomes are written to its row; nothing is raised for a failed fit. Raise
-    StorageError where the outcome could not be written, or what is needed not be read."""
+    """Run one queued job to its end. Every outcome is written to its row; a failed fit raises nothing.
+
+    Raise StorageError if the outcome could not be written or required data not be read.
+    """
     token = job_id.set(job)
     database, files = _database(settings), Files.of(settings, PATIENCE_S)
     try:
@@ -61,12 +63,12 @@ def run(settings: Settings, job: str) -> None:
     finally:
         database.close()
         job_id.reset(token)
-        give_back()  # the process waits for the next job
+        give_back()  # return free memory, as the process waits for the next job
 
 
 @lru_cache(1)
 def _database(settings: Settings) -> Database:
-    """One for all jobs of a process: what SQLAlchemy compiles for each it keeps with the tables, 0.1 MiB a job."""
+    """Return one database for all jobs of a process: SQLAlchemy keeps what it compiles for each database, 0.1 MiB."""
     return Database.of(settings)
 
 
@@ -94,13 +96,15 @@ def _claim(database: Database, job: str) -> Claim | None:
 
 def _train(settings: Settings, database: Database, files: Files, claim: Claim) -> None:
     try:
-        with Pulse(database, lambda session: _own(session, claim), claim.model, lifecycle.LIMITS.heartbeat_s) as pulse:
+        with Heartbeat(
+            database, lambda session: _own(session, claim), claim.model, lifecycle.LIMITS.heartbeat_s
+        ) as heartbeat:
             if claim.request.get("refresh") is None:
-                material = recorded(database, files, claim.request)
+                data = load_datasets(database, files, claim.request)
             else:
-                material = observed(database, files, claim.model, claim.request)
-            trained, lineage, judged = _version(settings, database, files, claim, material, pulse)
-            pulse.stage("saving")
+                data = load_refresh_data(database, files, claim.model, claim.request)
+            trained, lineage, judged = _version(settings, database, files, claim, data, heartbeat)
+            heartbeat.stage("saving")
             folder = lifecycle.new_folder(claim.job)
             Disk(settings).require()
             with files.new_version(folder) as target:
@@ -109,8 +113,8 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
             row = _own(session, claim)
             if row.cancel_requested:
                 raise lipcore.FitCancelledError("cancelled after the last look at the flag")
-            row.version, outcome = _publish(session, settings, claim, material, folder, manifest, judged)
-            row.progress = {**pulse.as_json(), "stage": "done", "fraction": 1.0, "remaining_s": 0.0}
+            row.version, outcome = _publish(session, settings, claim, data, folder, manifest, judged)
+            row.progress = {**heartbeat.as_json(), "stage": "done", "fraction": 1.0, "remaining_s": 0.0}
             lifecycle.enter(row, SUCCEEDED, f"version {row.version} is trained{outcome}")
     except lipcore.FitCancelledError:
         _finish(database, files, claim, CANCELLED, "cancelled while it ran")
@@ -119,51 +123,51 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
     except Exception as error:
         logger.exception("%s failed", claim.job)
         unavailable = isinstance(error, ClusterUnavailableError)
-        if unavailable or isinstance(storage_errors.translated(error), StorageUnavailableError):
-            raise StorageError(str(error)) from None  # another time it may work
+        if unavailable or isinstance(storage_errors.translate_error(error), StorageUnavailableError):
+            raise StorageError(str(error)) from None  # a later attempt may succeed
         _finish(database, files, claim, FAILED, f"{type(error).__name__}: {error}", _code(error))
 
 
 def _version(
-    settings: Settings, database: Database, files: Files, claim: Claim, material: Material, pulse: Pulse
+    settings: Settings, database: Database, files: Files, claim: Claim, data: TrainingData, heartbeat: Heartbeat
 ) -> tuple[TorqueModel, dict[str, Any], Promotion]:
-    """The model of a version, its lineage, and what came of its judgement: it is judged before its last fit."""
-    fit = PlannedFit.of(claim.request, material)
-    last = None if material.every is None else PlannedFit.of(claim.request, material.for_last_fit())
-    trained = fit.first(settings, claim.request["estimator"], last, pulse)
-    lineage = {"job": claim.job, **material.lineage}
-    if material.held_out is not None:
-        pulse.stage("evaluating")
-        lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(trained, material)}
-    judged_on = _judged_on(material)
-    judged = _judged(settings, database, files, claim, material, trained, judged_on, lineage)
-    learnt = material
+    """Return a version's model, its lineage and the decision on its promotion, which precedes the last fit."""
+    fit = PlannedFit.of(claim.request, data)
+    last = None if data.every is None else PlannedFit.of(claim.request, data.for_last_fit())
+    trained = fit.first(settings, claim.request["estimator"], last, heartbeat)
+    lineage = {"job": claim.job, **data.lineage}
+    if data.held_out is not None:
+        heartbeat.stage("evaluating")
+        lineage["holdout"] = {**lineage["holdout"], **judging.judged_figures(trained, data)}
+    judged_on = _judged_on(data)
+    judged = _judged(settings, database, files, claim, data, trained, judged_on, lineage)
+    learnt = data
     if last is not None and judged_on is not None:
-        trained = last.last(settings, trained, judged_on, pulse)
+        trained = last.last(settings, trained, judged_on, heartbeat)
         if REFIT_ERROR not in trained.fit:
-            learnt = last.material
-            if material.learns_held_out:
+            learnt = last.data
+            if data.learns_held_out:
                 lineage["holdout"]["learnt"] = True
     lineage |= {
         "trained_at": now(),
-        "training_process": {"seconds": round(pulse.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
+        "training_process": {"seconds": round(heartbeat.elapsed, 1), "peak_memory_mb": _peak_memory_mb()},
         "software": software(),
-        "training_metrics": figures(trained, learnt.samples, MOST_SAMPLES, learnt.rows),
+        "training_metrics": figures(trained, learnt.samples, MAX_METRIC_SAMPLES, learnt.rows),
     }
     return trained, lineage, judged
 
 
 def _option(settings: Settings, claim: Claim) -> PromotionOption:
-    """Whether the version answers by itself, as the job or else the settings say."""
+    """Return the promotion option of the job, or else of the settings."""
     option: PromotionOption = claim.request.get("promotion") or settings.promotion
     return option
 
 
-def _judged_on(material: Material) -> Samples | None:
-    """What a version is judged on before it learns it: of a refresh the newest logged rows, else what was held out."""
-    if material.unlearnt is not None:
-        return material.unlearnt.samples
-    return None if material.held_out is None else material.held_out.thinned(MAX_EVALUATION_SAMPLES)
+def _judged_on(data: TrainingData) -> Samples | None:
+    """Return the rows that a version is judged on: for a refresh the newest logged rows, else the held-out rows."""
+    if data.unlearnt is not None:
+        return data.unlearnt.samples
+    return None if data.held_out is None else data.held_out.thinned(MAX_EVALUATION_SAMPLES)
 
 
 def _judged(
@@ -171,20 +175,19 @@ def _judged(
     database: Database,
     files: Files,
     claim: Claim,
-    material: Material,
+    data: TrainingData,
     trained: TorqueModel,
     judged_on: Samples | None,
     lineage: dict[str, Any],
 ) -> Promotion:
-    """Whether the version answers by itself. The lineage of a refresh says how it compares with the version that it
-    refreshes."""
+    """Return whether the version serves; for a refresh also add its comparison to the lineage."""
     refresh = claim.request.get("refresh")
     if refresh is None:
         option = _option(settings, claim)
         return promotion.judge(database, files, claim.model, trained, judged_on, lineage, option)
     with database.session() as session:
         serving = session.get_one(VersionRow, (claim.model, refresh["version"]))
-    compared = refreshed.compare(database, files, serving, trained, material.unlearnt)
+    compared = refreshed.compare(database, files, serving, trained, data.unlearnt)
     lineage["refresh"] = {**lineage["refresh"], "compared": compared.acceptance.reason, "evidence": compared.evidence}
     return Promotion.of(compared.acceptance, serving.version)
 
@@ -193,12 +196,12 @@ def _publish(
     session: Session,
     settings: Settings,
     claim: Claim,
-    material: Material,
+    data: TrainingData,
     folder: str,
     manifest: dict[str, Any],
     judged: Promotion,
 ) -> tuple[int, str]:
-    """Add the version that was trained; return its number, and in words what came of it."""
+    """Add the trained version; return its number and the outcome in words."""
     if (refresh := claim.request.get("refresh")) is None:
         judged = promotion.settle(session, claim.model, judged, _option(settings, claim))
         waits = not judged.answers
@@ -206,7 +209,7 @@ def _publish(
         if waits:
             promotion.wait(session, claim.model, version)
         return version, f" and {'waits as candidate' if waits else 'answers'}: {judged.reason}"
-    if refresh_data.taken_back(session, claim.model, refresh["through"], material.seen):
+    if refresh_data.is_taken_back(session, claim.model, refresh["through"], data.seen):
         raise TakenBackError("part of what was observed has been taken back while it was trained on: refresh again")
     start, evidence = refresh["through"], manifest["lineage"]["refresh"]["evidence"]
     version = registry.publish(session, claim.model, folder, manifest, claim.job, True, start, judged)
@@ -214,10 +217,10 @@ def _publish(
 
 
 def _code(error: Exception) -> str:
-    """Stable word for why a job failed."""
-    if isinstance(storage_errors.translated(error), StorageFullError):
+    """Return the error code of a failed job."""
+    if isinstance(storage_errors.translate_error(error), StorageFullError):
         return StorageFullError.code
-    if isinstance(error, (TakenBackError, CannotHoldOutError, ServiceError)):  # the last as of a damaged data set
+    if isinstance(error, (TakenBackError, CannotHoldOutError, ServiceError)):  # ServiceError: a damaged data set
         return error.code
     if isinstance(error, MissingExtraError):
         return NotInstalledError.code
@@ -225,13 +228,13 @@ def _code(error: Exception) -> str:
 
 
 def _peak_memory_mb() -> int:
-    """Largest resident memory of this process so far; earlier jobs of the same process count too."""
+    """Return the peak resident memory of this process, earlier jobs included, MB."""
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return int(peak / (1024 * 1024 if sys.platform == "darwin" else 1024))
 
 
 def _own(session: Any, claim: Claim) -> JobRow:
-    """Return the job's row while it still is this attempt's; a restarted service may have given it away."""
+    """Return the job's row; raise SupersededError if a restarted service has given the job to another attempt."""
     row = lifecycle.row_of(session, claim.job)
     if row is None or row.state != RUNNING or row.attempts != claim.attempt:
         raise SupersededError(claim.job)

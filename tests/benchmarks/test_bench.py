@@ -17,7 +17,7 @@ from benchmarks.latency.targets import targets
 from benchmarks.latency.websocket import read_answer, request_frame
 from benchmarks.timing import Timing, median
 from benchmarks.workload import BenchError, Source
-from lipcore.robots.simulation import Stream
+from lipcore.robots.simulation import Simulation
 from lipserve.frames import ANSWER, ERROR, REQUEST
 from tests.service.data import QUICK
 
@@ -113,7 +113,7 @@ def test_a_run_measures_everything_in_both_states():
     """On a double pendulum, far too short to tell anything but that every step works."""
     source = Source(
         robot="double-pendulum",
-        stream=Stream(n_samples=80, speed=5.0),
+        stream=Simulation(n_samples=80, speed=5.0),
         fit=QUICK,
         load={"hyperparameter_samples": 80, "max_iterations": 10_000, "starts": 20},
     )

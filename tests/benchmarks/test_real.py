@@ -16,7 +16,7 @@ from benchmarks.real.rivals import Forecast
 from benchmarks.real.splits import GUARD_S, MAX_TEST_ROWS, Split, elapsed, splits
 from lipcore.data.samples import Samples
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody
 from lipserve.asking import Reading
 from service.cli.simulate import write_recording
@@ -25,7 +25,7 @@ PENDULUM = Recording("pendulum", robot="double-pendulum")
 
 
 def simulated(robot="double-pendulum", seed=1, samples=300, **stream):
-    return simulate(load_robot(robot), Stream(samples, 20.0, 10, speed=5.0, **stream), seed)
+    return simulate(load_robot(robot), Simulation(samples, 20.0, 10, speed=5.0, **stream), seed)
 
 
 def still(seconds, rate=100.0, episode=0):

@@ -16,7 +16,7 @@ from benchmarks.reproduce.experiment import Cell, Experiment
 from benchmarks.reproduce.results import Results, ResultsError
 from lipcore.estimators.options import FitOptions
 from lipcore.robots.library import ROBOTS, load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 
 ESTIMATORS = ("se", "rigid-body", "lip-chain")
 JOINTS = ("joint1", "joint2")
@@ -85,9 +85,9 @@ def test_every_file_is_written_and_every_cell_computed_once(finished):
 def test_results_are_those_of_training_and_judging_by_hand(finished):
     """Error against Pinocchio's torque, coverage and width against the measured torque, all computed here."""
     robot = load_robot("double-pendulum")
-    training = simulate(robot, Stream(40), 1).rows(np.round(np.linspace(0, 39, 20)).astype(int))
+    training = simulate(robot, Simulation(40), 1).rows(np.round(np.linspace(0, 39, 20)).astype(int))
     model = lipcore.train(training, robot.joint_types, "lip-chain", FitOptions(device="cpu", prior="zero"))
-    test = simulate(robot, Stream(40, n_sinusoids=100), 1002).rows(slice(None, None, 2))
+    test = simulate(robot, Simulation(40, n_sinusoids=100), 1002).rows(slice(None, None, 2))
     answer = model.predict(test.q, test.dq, test.ddq)
     data = robot.model.createData()
     true = np.array(
@@ -155,7 +155,7 @@ def test_training_and_test_sets_have_other_seeds_and_frequencies():
     assert set(fewer.t) <= set(whole.t)
     assert not set(experiment.training_seeds(10)) & set(experiment.test_seeds())
     found, torque = experiment.test_set(1.0, 1001)
-    expected = simulate(load_robot("double-pendulum"), Stream(40, n_sinusoids=100), 1001)
+    expected = simulate(load_robot("double-pendulum"), Simulation(40, n_sinusoids=100), 1001)
     np.testing.assert_array_equal(found.tau, expected.tau)
     assert np.std(found.tau - torque) == pytest.approx(0.01, rel=0.3)
 

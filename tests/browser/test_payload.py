@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 from tests.browser.accessibility import audit, expect
 from tests.browser.conftest import Dashboard, Visit
 from tests.browser.film import Film
@@ -62,7 +62,9 @@ def batch(samples: Samples, first: int, last: int) -> dict[str, object]:
 
 def test_what_is_picked_up_is_weighed_and_answers_contain_it(windows: Visit, dashboard: Dashboard, robot: str) -> None:
     load = Payload(MASS, TAKEN)
-    samples = simulate(load_robot("panda"), Stream(int(END * RATE), RATE, noise=0.05, speed=5.0, payload=load), seed=3)
+    samples = simulate(
+        load_robot("panda"), Simulation(int(END * RATE), RATE, noise=0.05, speed=5.0, payload=load), seed=3
+    )
     client, where = dashboard.client, f"/v1/models/{robot}"
     visitor = windows(dashboard.server.url, size=WINDOW)
     page = visitor.open(f"#/live/{robot}?window=10")

@@ -16,7 +16,7 @@ from service import cli
 from service.foundation.errors import StorageFullError, StorageUnavailableError
 from service.foundation.settings import Settings
 from service.storage.database import Base, Database, LearningRow, ModelRow, now
-from service.storage.errors import translated
+from service.storage.errors import translate_error
 from service.storage.storage import HomeError, check_home
 from tests.histories.proxy import Proxy
 from tests.service.database.starting import check_starts_together
@@ -101,7 +101,7 @@ def test_writers_wait_for_each_other_unless_their_models_differ(database, other,
             return
         with pytest.raises(DBAPIError) as found, other.transaction(second):
             pass
-    said = translated(found.value)
+    said = translate_error(found.value)
     assert isinstance(said, StorageUnavailableError)
     assert "locked by another writer" in str(said)
     assert said.headers == {"Retry-After": "1"}
@@ -189,7 +189,7 @@ def failed(database, *statements):
 )
 def test_errors_of_the_server_are_told_apart(database, state, kind, said):
     raised = failed(database, f"DO $$ BEGIN RAISE EXCEPTION 'secret detail' USING ERRCODE = '{state}'; END $$")
-    told = translated(raised)
+    told = translate_error(raised)
     assert type(told) is kind
     assert said in str(told)
     assert "secret" not in str(told)
@@ -197,12 +197,12 @@ def test_errors_of_the_server_are_told_apart(database, state, kind, said):
 
 def test_faults_of_ours_are_not_taken_for_the_storages(database):
     for statement in ("SELECT 1 / 0", "SELECT nothing", "INSERT INTO models (name) VALUES (NULL)"):
-        assert translated(failed(database, statement)) is None
+        assert translate_error(failed(database, statement)) is None
 
 
 def test_a_connection_that_is_lost(shared, database):
     lost = failed(database, "SELECT pg_terminate_backend(pg_backend_pid())", "SELECT 1")
-    assert "cannot be reached" in str(translated(lost))
+    assert "cannot be reached" in str(translate_error(lost))
     with database.session() as session:
         assert session.scalar(text("SELECT 1")) == 1
     shared.postgres.disconnect(shared.database)  # while it lies in the pool
@@ -214,7 +214,7 @@ def test_more_requests_than_connections(shared):
     database = Database(shared.home("one"), 0.1, shared.database_url, 1)
     with database.session() as session:
         session.execute(text("SELECT 1"))
-        assert "too many requests" in str(translated(failed(database, "SELECT 1")))
+        assert "too many requests" in str(translate_error(failed(database, "SELECT 1")))
     database.close()
 
 

@@ -3,7 +3,7 @@
 import pytest
 
 from service.storage.database import ReplicaRow
-from service.storage.replicas import alive, identity
+from service.storage.replicas import load_replica_id, read_live_ids
 from service.training import worker
 from service.training.cluster import ClusterQueue
 from service.training.queue import JobQueue
@@ -160,7 +160,7 @@ def test_a_job_of_a_service_that_is_gone_is_started_again_by_one_other(neighbour
     row = one.running(job, 2)
     assert row.owner in {other.replicas.id, third.replicas.id}
     assert "the service that had it run is gone: queued again" in messages_of(row)
-    eventually(lambda: command(process) == "" or not one._hands)  # which learns that it is not its own any more
+    eventually(lambda: command(process) == "" or not one._watched_jobs)  # which learns that it is not its own any more
     one.tell(job, "finish")
     row = one.ended(job)
     assert (row.state, row.attempts) == ("succeeded", 2)
@@ -186,9 +186,9 @@ def test_a_service_that_stops_hands_back_its_own_jobs_alone(neighbours):
 
 def test_a_service_knows_its_own_jobs_after_a_restart_and_others_know_that_it_lives(neighbours, shared):
     one = neighbours("a")
-    assert identity(one.settings.home) == one.replicas.id
+    assert load_replica_id(one.settings.home) == one.replicas.id
     with one.database.session() as session:
-        assert alive(session, 5.0) == {one.replicas.id}
+        assert read_live_ids(session, 5.0) == {one.replicas.id}
     one.replicas.close()
     with one.database.session() as session:
         assert session.get(ReplicaRow, one.replicas.id) is None
@@ -201,11 +201,12 @@ def test_who_could_give_no_sign_itself_takes_nobody_for_lost(neighbours):
     one.replicas._beat = lambda: 1 / 0
     eventually(lambda: one.replicas.id not in _living(other, 1.0))
     with other.database.session() as session:
-        assert one.replicas.id not in other.replicas.free(session)  # it lives too short a time to judge
+        # it lives too short a time to judge
+        assert one.replicas.id not in other.replicas.list_claimable_owners(session)
     one.cancel(job)
     one.ended(job)
 
 
 def _living(queue, lost_s):
     with queue.database.session() as session:
-        return alive(session, lost_s)
+        return read_live_ids(session, lost_s)

@@ -226,7 +226,7 @@ def _taken(pupil, number):
 @pytest.mark.slow
 def test_without_any_notice_a_service_looks_for_itself(pair, arm, monkeypatch):
     first, second = arm
-    monkeypatch.setattr(replication, "LOOK_S", 0.2)
+    monkeypatch.setattr(replication, "FULL_LOOK_S", 0.2)
     for client in pair.clients:  # each takes notices of the other for its own
         monkeypatch.setattr(service_of(client).database, "origin", "the same")
     one, two = answers((first, second), teach((first,), range(3)))

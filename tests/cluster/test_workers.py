@@ -6,7 +6,13 @@ import pytest
 
 from lipcore.estimators.hyperparameters import FitCancelledError
 from service.foundation.settings import Settings
-from service.runtime.executors import ClusterUnavailableError, lost, sent, shard_executor, summed
+from service.runtime.executors import (
+    ClusterUnavailableError,
+    is_worker_lost,
+    settings_to_send,
+    shard_executor,
+    sum_shards,
+)
 from tests.cluster.workers import cluster
 from tests.service.data import ended, job, queue, running, stream, upload
 from tests.service.runtime.work import dying, home, numbers
@@ -16,7 +22,7 @@ SHARDS = range(20)
 
 
 def summed_by(executor, work=numbers):
-    return summed(executor, work, SHARDS, lambda: False)
+    return sum_shards(executor, work, SHARDS, lambda: False)
 
 
 @pytest.mark.slow
@@ -25,7 +31,7 @@ def test_workers_of_a_cluster_come_to_the_same_sum_and_a_lost_one_costs_nothing(
         once = summed_by(inline)
     with cluster(shared, tmp_path / "cluster", "one", "two") as workers:
         settings = shared.settings(cluster=workers.address)
-        assert sent(settings) is None  # each has its own
+        assert settings_to_send(settings) is None  # each has its own
         with shard_executor(settings) as executor:
             assert summed_by(executor).tobytes() == once.tobytes()
             lengths = {len(str(shared.home(name))) for name in ("one", "two")}
@@ -33,7 +39,7 @@ def test_workers_of_a_cluster_come_to_the_same_sum_and_a_lost_one_costs_nothing(
             assert summed_by(executor, partial(dying, str(tmp_path))).tobytes() == once.tobytes()
             assert summed_by(executor).tobytes() == once.tobytes()  # by the one that is left
             with pytest.raises(FitCancelledError):
-                summed(executor, numbers, SHARDS, lambda: True)
+                sum_shards(executor, numbers, SHARDS, lambda: True)
 
 
 @pytest.mark.slow
@@ -41,7 +47,7 @@ def test_without_a_scheduler_there_is_no_executor(shared):
     settings = shared.settings(cluster="tcp://127.0.0.1:1")
     with pytest.raises(ClusterUnavailableError, match="cannot be reached"), shard_executor(settings):
         pass
-    assert not lost(ValueError("wrong"))
+    assert not is_worker_lost(ValueError("wrong"))
 
 
 LOST_SOON = {"LIPSERVE_REPLICA_LOST_S": "2"}

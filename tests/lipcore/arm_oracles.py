@@ -16,7 +16,7 @@ from lipcore.estimators.task import Task
 from lipcore.kernels.geometry import Geometry
 from lipcore.online.batch import Rows
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.training.fit import fit_estimator
 from tests.lipcore.arms import random_bodies, random_geometry
@@ -56,13 +56,13 @@ def followed(
 
 def recorded(robot: Robot, seed: int, size: int = 120, noise: float = 0.01, viscous: float = 0.2) -> Samples:
     """Samples of a robot that moves over most of its range."""
-    return simulate(robot, Stream(size, speed=10, noise=noise, viscous=viscous, motion="full"), seed)
+    return simulate(robot, Simulation(size, speed=10, noise=noise, viscous=viscous, motion="full"), seed)
 
 
 def pendulum_from_its_tip(mode: str, options: FitOptions) -> TorqueModel:
     """A model around a URDF, of a pendulum whose data have the joints from tip to base. mode: of its geometry."""
     robot = load_robot("double-pendulum")
-    data = simulate(robot, Stream(80, speed=10, noise=0.002, viscous=0.02), 1)
+    data = simulate(robot, Simulation(80, speed=10, noise=0.002, viscous=0.02), 1)
     turned = {name: getattr(data, name)[:, ::-1].copy() for name in ("q", "dq", "ddq", "tau")}
     data = replace(data, joint_names=data.joint_names[::-1], **turned)
     body = RigidBody.from_profile(robot.name, data.joint_names, ("revolute",) * 2)

@@ -10,7 +10,7 @@ from lipcore.data.motion import Motion
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.fast.arm import arm_energies, arm_masses, arm_shapes, arm_torques
-from lipcore.kernels.geometry import Geometry, aligned, rotation_of, skew, turn_of
+from lipcore.kernels.geometry import Geometry, rotation_of, rotation_to_axis, rotation_vector_of, skew
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
@@ -121,10 +121,10 @@ def test_axes_that_are_aligned_with_nothing_are_read_from_pinocchio() -> None:
 def test_rotations() -> None:
     for turn in (np.array([0.3, -0.2, 0.9]), np.array([0.0, 0.0, 3.0]), np.zeros(3)):
         np.testing.assert_allclose(rotation_of(turn), pin.exp3(turn), atol=1e-12)
-        np.testing.assert_allclose(turn_of(rotation_of(turn)), turn, atol=1e-9)
+        np.testing.assert_allclose(rotation_vector_of(rotation_of(turn)), turn, atol=1e-9)
         np.testing.assert_allclose(skew(turn) @ [1.0, 2.0, 3.0], np.cross(turn, [1.0, 2.0, 3.0]), atol=1e-12)
     for axis in (*np.eye(3), np.array([2.0, -1.0, 2.0]) / 3):
-        turned = aligned(axis)
+        turned = rotation_to_axis(axis)
         np.testing.assert_allclose(turned[:, 2], axis)
         np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(turned) == pytest.approx(1.0)

@@ -26,7 +26,7 @@ from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.friction import friction_features
 from lipcore.model.parameters import inertial_parameters, report
 from lipcore.online.learner import OnlineModel
-from lipcore.posterior.compression import linear
+from lipcore.posterior.compression import build_linear
 from tests.lipcore.arm_oracles import arm, as_robot, as_rows, followed, motions, pendulum_from_its_tip, recorded
 from tests.lipcore.arms import parameters, random_bodies, random_geometry
 
@@ -67,7 +67,7 @@ def with_alternatives(model: TorqueModel, samples: Samples, count: int = 1) -> T
     chosen = make_estimator("rigid-body", model.joint_types, arm=replace(found, alternatives=tuple(others)))
     posterior = model.posterior
     once = np.broadcast_to(posterior.noise_variance, samples.tau.shape)
-    made = linear(chosen.kernel, posterior.params, samples, once, 0.01, 1.0, posterior.misfit)
+    made = build_linear(chosen.kernel, posterior.params, samples, once, 0.01, 1.0, posterior.misfit)
     return replace(model, estimator=chosen, posterior=made.posterior)
 
 

@@ -15,7 +15,7 @@ from lipcore.arm import search as searching
 from lipcore.arm.learning import learn
 from lipcore.arm.posing import make_problem
 from lipcore.arm.problem import WIDTHS, Point, Problem, root_of
-from lipcore.arm.scales import _Evidence, rescale, tempered
+from lipcore.arm.scales import _Evidence, raise_counts, rescale
 from lipcore.arm.search import SearchResult, search
 from lipcore.data.metrics import evaluate
 from lipcore.data.signals import noise_level
@@ -326,7 +326,7 @@ def linearised(problem: Problem, point: Point, scale: np.ndarray) -> float:
     both = np.concatenate([plain_features(problem, point.geometry), problem.shapes(point)], axis=2)
     mean = np.concatenate([problem.centre, expected.step(point.geometry)])
     std = np.concatenate([scale, expected.widths])
-    return dense(replace(problem, counts=tempered(problem.counts)), both, mean, std, point.sigma)
+    return dense(replace(problem, counts=raise_counts(problem.counts)), both, mean, std, point.sigma)
 
 
 def test_scales_are_never_worse_than_before(posed: tuple[Problem, Point]) -> None:

@@ -22,7 +22,7 @@ from lipcore.model.parameters import friction_coefficients, report
 from lipcore.model.warnings import REFIT_ERROR, linearisation_error, warnings
 from lipcore.online.learner import OnlineModel
 from lipcore.robots.library import Robot
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
 from tests.lipcore.arm_oracles import arm, as_rows, followed
 from tests.lipcore.test_arm_model import errors
 
@@ -33,7 +33,7 @@ SHARE, MORE = 0.27, 1.5
 
 def moving(robot: Robot, count: int, rate: float, seed: int) -> Samples:
     """Samples of an arm that moves over all of its range."""
-    stream = Stream(count, rate, n_sinusoids=50, speed=10.0, motion="full", noise=0.05, viscous=0.3)
+    stream = Simulation(count, rate, n_sinusoids=50, speed=10.0, motion="full", noise=0.05, viscous=0.3)
     return simulate(robot, stream, seed)
 
 
@@ -165,7 +165,7 @@ SLOW_GEOMETRY = Geometry(
     SLOW.model.gravity.linear.copy(),
 )
 OPTIONS = FitOptions(device="cpu")
-STREAM = Stream(300, n_sinusoids=30, speed=5.0, noise=0.05, viscous=0.3)
+STREAM = Simulation(300, n_sinusoids=30, speed=5.0, noise=0.05, viscous=0.3)
 
 
 def recorded(seed: int, stribeck: float) -> Samples:

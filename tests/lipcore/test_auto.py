@@ -16,7 +16,7 @@ from lipcore.files.manifest import ModelFormatError, read_manifest_bytes
 from lipcore.files.persistence import load, manifest_bytes, save
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.training import auto, held_out
 from lipcore.training.held_out import hold_out
@@ -33,7 +33,7 @@ NAMES = ["rigid-body", "rigid-body+local", "lip-chain"]
 
 
 def recorded(rows=200, seed=3, speed=4.0):
-    return simulate(load_robot(ARM), Stream(rows, rate=10.0, speed=speed, noise=0.0005, coulomb=0.005), seed)
+    return simulate(load_robot(ARM), Simulation(rows, rate=10.0, speed=speed, noise=0.0005, coulomb=0.005), seed)
 
 
 def disturbed(samples):
@@ -196,7 +196,7 @@ def test_one_that_fails_is_in_the_table_and_the_others_go_on(monkeypatch):
     def fails(self, samples, place, before=None):
         raise NotPositiveDefiniteError("nothing can be\nlearnt")
 
-    monkeypatch.setattr(auto.Fits, "learn", fails)
+    monkeypatch.setattr(auto.FitContext, "learn", fails)
     model = train(recorded(), TYPES, options=OPTIONS)
     assert model.selection["chosen"] == model.estimator.name == "lip-chain"
     assert model.selection["reason"] == "no other estimator was trained"
@@ -247,8 +247,8 @@ def test_it_can_be_cancelled(at_work):
 def test_where_the_chain_leads_the_search_is_taken_up_again_and_both_stand_around_its_arm(monkeypatch, tmp_path):
     seeds, learn = [], auto.learn
     monkeypatch.setattr(auto, "learn", lambda *given: (seeds.append(given[-1]), learn(*given))[1])
-    monkeypatch.setattr(auto.Contest, "_chain_leads", lambda self: True)
-    monkeypatch.setattr(auto.Contest, "verdict", lambda self: ("rigid-body+local", "it is wanted"))
+    monkeypatch.setattr(auto.EstimatorComparison, "_chain_leads", lambda self: True)
+    monkeypatch.setattr(auto.EstimatorComparison, "verdict", lambda self: ("rigid-body+local", "it is wanted"))
     model = train(disturbed(recorded()), TYPES, options=replace(OPTIONS, posterior_samples=300))
     assert seeds[:2] == [0, 1]
     assert model.selection["chosen"] == model.estimator.name == "rigid-body+local"

@@ -19,11 +19,11 @@ from lipcore.data.motion import Motion
 from lipcore.estimators.catalogue import make_estimator
 from lipcore.estimators.task import Task
 from lipcore.export.c_weights import UnsupportedEstimatorError
-from lipcore.export.c_writer import HEADER, SOURCE, Origin, c_files
+from lipcore.export.c_writer import HEADER, SOURCE, ModelOrigin, c_files
 from lipcore.kernels.base import PairKernel
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
-from lipcore.posterior.compression import linear
+from lipcore.posterior.compression import build_linear
 from lipcore.posterior.misfit import Misfit
 from lipcore.training.fit import fit_estimator
 from tests.clients.building import sanitizers
@@ -31,7 +31,7 @@ from tests.lipcore.arm_oracles import arm, followed, pendulum_from_its_tip, reco
 from tests.lipcore.test_arm_model import with_alternatives
 
 OPTIONS = FitOptions(device="cpu", statistics="chosen")
-ORIGIN = Origin("an-arm", 3, 7, "0123")
+ORIGIN = ModelOrigin("an-arm", 3, 7, "0123")
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 PANDA = Path(__file__).parents[2] / "models/panda-sim"
 INERTIA = np.array([[0.020, 0.003, 0.001], [0.003, 0.015, -0.002], [0.001, -0.002, 0.010]])
@@ -153,7 +153,7 @@ def with_slow_friction() -> TorqueModel:
     widths = posterior.params["friction.log_std"]
     params = {**posterior.params, "friction.log_std": np.concatenate([widths, widths[:, 1:2]], axis=1)}
     variance = np.broadcast_to(posterior.noise_variance, samples.tau.shape)
-    made = linear(estimator.kernel, params, samples, variance, 0.01, 1.0, posterior.misfit)
+    made = build_linear(estimator.kernel, params, samples, variance, 0.01, 1.0, posterior.misfit)
     return replace(model, estimator=estimator, posterior=made.posterior)
 
 
@@ -196,7 +196,7 @@ def test_its_numbers_are_those_of_the_model(name: str, tmp_path: Path) -> None:
 def test_a_payload_is_that_which_a_query_declares(name: str, body: Body, tmp_path: Path) -> None:
     model = MODELS[name]()
     motion, carrier = drawn(model, 300, 1), Carrier(model)
-    expected, tau_std, *_ = carrier.carrying(carrier.known(body.parameters)).evaluator.many(*motion)
+    expected, tau_std, *_ = carrier.with_payload(carrier.known(body.parameters)).evaluator.many(*motion)
     tau, std = asked(compiled(c_files(model, ORIGIN), tmp_path), motion, body)
     np.testing.assert_allclose(tau, expected, rtol=1e-9, atol=1e-10 * np.abs(expected).max())
     np.testing.assert_allclose(std, tau_std, rtol=1e-7)
@@ -302,7 +302,7 @@ def test_intervals_and_the_range_of_the_training(tmp_path: Path) -> None:
 def test_names_cannot_end_a_comment_or_a_string(tmp_path: Path) -> None:
     names = ("*/ int x; /*", '", 0}; int y; //', "gelenk ü\\\n?/")
     model = replace(learnt("RRR", 50), joint_names=names)
-    files = c_files(model, Origin('*/"\\', 1, 0, "*/"))
+    files = c_files(model, ModelOrigin('*/"\\', 1, 0, "*/"))
     assert all(text.isascii() for text in files.values())
     code = re.sub(r'/\*.*?\*/|"(\\.|[^"\\\n])*"', "", files[HEADER] + files[SOURCE], flags=re.DOTALL)
     assert "int x" not in code

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.data.metrics import Answer
+from lipcore.data.metrics import TorqueDistribution
 from lipcore.data.samples import Samples
 from lipcore.training.choice import HeldOutSamples, choose_estimator
 
@@ -25,12 +25,12 @@ def held_out(edge=EDGE, seconds=TIME[-1] + 1) -> HeldOutSamples:
     return HeldOutSamples(samples.rows(rows), edge[rows])
 
 
-def answer(inside: float, edge: float, stated: float | None = None, seconds=TIME[-1] + 1, seed=0) -> Answer:
+def answer(inside: float, edge: float, stated: float | None = None, seconds=TIME[-1] + 1, seed=0) -> TorqueDistribution:
     """What errs by these shares of each joint's spread, in and not at the edge, and states the first or another."""
     scale = np.random.default_rng(seed).normal(size=(ROWS, 1)) * TAU.std(axis=0)
     mean = TAU + np.where(EDGE, edge, inside)[:, None] * scale
     rows = seconds > TIME
-    return Answer(
+    return TorqueDistribution(
         mean[rows], np.zeros((int(rows.sum()), JOINTS)), (inside if stated is None else stated) * TAU.std(axis=0)
     )
 

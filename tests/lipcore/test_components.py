@@ -20,7 +20,7 @@ from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.statistics import collect
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.choosing import few
 from tests.lipcore.oracles import (
@@ -78,12 +78,12 @@ class Case(NamedTuple):
 def case(request: pytest.FixtureRequest) -> Case:
     setting = request.param
     robot, options = load_robot(setting.robot), FitOptions(100, max_iterations=150, device="cpu", prior=setting.prior)
-    samples = simulate(robot, Stream(n_samples=150, speed=10, noise=1e-5, viscous=setting.viscous), seed=1)
+    samples = simulate(robot, Simulation(n_samples=150, speed=10, noise=1e-5, viscous=setting.viscous), seed=1)
     bodies = None
     if setting.estimator.startswith("rigid-body"):
         bodies = RigidBody.from_profile(setting.robot, samples.joint_names, robot.joint_types)
     model = in_full(train(samples, robot.joint_types, setting.estimator, options, robot=bodies), samples)
-    unseen = simulate(robot, Stream(n_samples=40, n_sinusoids=100, speed=10, noise=0.0), seed=7)
+    unseen = simulate(robot, Simulation(n_samples=40, n_sinusoids=100, speed=10, noise=0.0), seed=7)
     tau = unseen.tau
     found = dynamics.components(model, unseen.motion(), dynamics.COMPONENTS, tau)
     reference = dynamics.reference_posture(model)
@@ -127,9 +127,9 @@ def test_components_are_those_of_pinocchio(case: Case, name: str) -> None:
 @pytest.mark.slow
 def test_a_panda_is_learnt_as_the_documentation_says() -> None:
     robot, options = load_robot("panda"), FitOptions(100, max_iterations=100, starts=1, device="cpu")
-    samples = simulate(robot, Stream(500, motion="middle", speed=10, noise=0.0), seed=5)
+    samples = simulate(robot, Simulation(500, motion="middle", speed=10, noise=0.0), seed=5)
     model = train(samples, robot.joint_types, "lip-chain", options)
-    unseen = simulate(robot, Stream(501, n_sinusoids=100, motion="middle", speed=10, noise=0.0), seed=101)
+    unseen = simulate(robot, Simulation(501, n_sinusoids=100, motion="middle", speed=10, noise=0.0), seed=101)
     found = dynamics.components(model, unseen.motion(), ["inertia_matrix", "gravity"])
     truth = truth_of(robot, unseen, unseen.q[0], 0.0)
     assert (np.linalg.eigvalsh(found["inertia_matrix"].mean) > 0).all()

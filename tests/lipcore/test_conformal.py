@@ -9,10 +9,10 @@ from lipcore.data.samples import Array, Samples
 from lipcore.data.splits import GUARD_S
 from lipcore.model.torque_model import TorquePrediction
 from lipcore.posterior.compact import CompactPosterior
-from lipcore.posterior.conformal import Conformal, _quantile, conform, scores
+from lipcore.posterior.conformal import Conformal, _quantile, fit_conformal, scores
 from lipcore.posterior.statistics import collect
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 
 TYPES = ("revolute",) * 2
 QUICK = FitOptions(hyperparameter_samples=40, posterior_samples=150, max_iterations=10, starts=1, device="cpu")
@@ -20,7 +20,7 @@ QUICK = FitOptions(hyperparameter_samples=40, posterior_samples=150, max_iterati
 
 @pytest.fixture(scope="module")
 def samples() -> Samples:
-    robot, stream = load_robot("double-pendulum"), Stream(n_samples=50, rate=10.0, speed=5.0, noise=0.05)
+    robot, stream = load_robot("double-pendulum"), Simulation(n_samples=50, rate=10.0, speed=5.0, noise=0.05)
     first, second = (simulate(robot, stream, seed) for seed in (1, 2))
     return Samples.concatenate([first, second])
 
@@ -58,7 +58,7 @@ def test_the_order_of_samples_does_not_matter(model: TorqueModel, samples: Sampl
     order = np.random.default_rng(1).permutation(len(samples))
     variance = 2 * np.broadcast_to(model.posterior.noise_variance, samples.tau.shape)
     posterior = taught(model, samples, variance)
-    found, expected = (conform(posterior, each, variance) for each in (samples.rows(order), samples))
+    found, expected = (fit_conformal(posterior, each, variance) for each in (samples.rows(order), samples))
     np.testing.assert_allclose(found.scale, expected.scale, rtol=1e-9)
 
 
@@ -97,9 +97,9 @@ def test_a_noise_taken_too_small_is_made_up_for(model: TorqueModel, samples: Sam
     old, motion = posterior, samples.motion()
     residual = samples.tau - old.kernel.mean(motion)
     proud = CompactPosterior.build(old.kernel, old.basis, collect(old.basis, tenth, motion, residual), tenth)
-    found = conform(proud, samples, np.broadcast_to(tenth, samples.tau.shape))
+    found = fit_conformal(proud, samples, np.broadcast_to(tenth, samples.tau.shape))
     assert min(found.scale) > 3
-    unseen = simulate(load_robot("double-pendulum"), Stream(n_samples=200, rate=10.0, speed=5.0, noise=0.05), 9)
+    unseen = simulate(load_robot("double-pendulum"), Simulation(n_samples=200, rate=10.0, speed=5.0, noise=0.05), 9)
     answer = proud.predict(unseen.motion())
     given = unseen.tau, answer.mean, answer.std, np.sqrt(tenth)
     assert (evaluate(*given).coverage < 0.6).all()

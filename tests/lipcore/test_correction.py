@@ -16,7 +16,7 @@ from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
 from lipcore.training.correction import corrected_joints
-from lipcore.training.refit import refit, widened
+from lipcore.training.refit import refit, widen_intervals
 from lipcore.training.train import fit_model, train
 
 ARM, TYPES = "finger-edu", ("revolute",) * 3
@@ -92,7 +92,7 @@ def test_what_repeats_is_corrected_where_it_was_seen_and_only_there(both):
 
 def test_its_intervals_hold_what_it_predicts(both):
     again = recorded(8.0, start=100.0, seed=1)
-    held = both[0].predict(again.q, again.dq, again.ddq).interval.holds(again.tau).mean(axis=0)
+    held = both[0].predict(again.q, again.dq, again.ddq).interval.contains(again.tau).mean(axis=0)
     assert (held > 0.9).all()
 
 
@@ -131,10 +131,10 @@ def test_the_last_fit_corrects_the_same_joints_and_keeps_how_much_wider_interval
     part = fit_model(task.on(samples.rows(slice(600))), "rigid-body+local")
     rest = samples.rows(slice(620, None))
     shifted = replace(rest, tau=rest.tau + np.array([0.0, 0.0, 0.05]))
-    wider = widened(part, shifted)
+    wider = widen_intervals(part, shifted)
     whole = refit(wider, task)
     assert corrected_joints(whole.fit) == corrected_joints(part.fit) == [RIPPLED]
-    assert wider.predict(rest.q, rest.dq, rest.ddq).interval.holds(shifted.tau).mean(axis=0)[2] >= 0.95
+    assert wider.predict(rest.q, rest.dq, rest.ddq).interval.contains(shifted.tau).mean(axis=0)[2] >= 0.95
     assert whole.fit["widened_3"] == wider.fit["widened_3"] > 2
     assert whole.scale[2] > 2 > refit(part, task).scale[2]
 

@@ -8,7 +8,7 @@ from scipy.signal import lfilter
 from scipy.stats import binomtest, norm
 
 from lipcore.data.coverage import clopper_pearson, coverage_interval
-from lipcore.data.metrics import Answer
+from lipcore.data.metrics import TorqueDistribution
 from lipcore.data.samples import Samples
 
 
@@ -37,8 +37,8 @@ def autoregressive(rng: np.random.Generator, rho: float, rows: int, n: int) -> n
     return np.asarray(lfilter([np.sqrt(1 - rho**2)], [1, -rho], white, axis=0)[1000:])
 
 
-def zero(samples: Samples, deviation: float) -> Answer:
-    return Answer(0 * samples.tau, 0 * samples.tau, np.full(samples.n_joints, deviation))
+def zero(samples: Samples, deviation: float) -> TorqueDistribution:
+    return TorqueDistribution(0 * samples.tau, 0 * samples.tau, np.full(samples.n_joints, deviation))
 
 
 @pytest.mark.parametrize(("rho", "rows"), [(0.0, 300), (0.8, 1000), (0.95, 4000), (0.99, 2000)])
@@ -62,8 +62,8 @@ def test_what_is_too_narrow_is_known_only_from_enough_errors() -> None:
     """Intervals of 70 % of the width: coverage of 83 %."""
     rng = np.random.default_rng(5)
     few, many = (errors(autoregressive(rng, 0.95, rows, 20)) for rows in (150, 20_000))
-    assert coverage_interval(few, zero(few, 0.7)).below(0.9).mean() < 0.2
-    assert coverage_interval(many, zero(many, 0.7)).below(0.9).all()
+    assert coverage_interval(few, zero(few, 0.7)).is_below(0.9).mean() < 0.2
+    assert coverage_interval(many, zero(many, 0.7)).is_below(0.9).all()
 
 
 def test_errors_that_stay_for_an_episode_count_once() -> None:

@@ -16,7 +16,7 @@ from lipcore.model import dynamics
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier, NoArmError
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.choosing import slow
 from tests.lipcore.arm_oracles import arm, as_robot, followed, lagrangian_torque, motions, recorded
@@ -39,7 +39,7 @@ def loaded(robot: Robot, body: Body) -> Robot:
 
 
 def moved(robot: Robot, seed: int, size: int, noise: float) -> Samples:
-    motion = Stream(size, n_sinusoids=50, speed=10, noise=noise, viscous=VISCOUS)
+    motion = Simulation(size, n_sinusoids=50, speed=10, noise=noise, viscous=VISCOUS)
     return simulate(robot, motion, seed)
 
 
@@ -80,7 +80,7 @@ def learnt(request: pytest.FixtureRequest) -> tuple[Robot, TorqueModel]:
 
 def carrying(model: TorqueModel, body: Body) -> TorqueModel:
     carrier = Carrier(model)
-    return carrier.carrying(carrier.known(body.parameters))
+    return carrier.with_payload(carrier.known(body.parameters))
 
 
 @pytest.mark.parametrize("body", [BODY, slow(POINT)])

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from lipcore.robots.dirt import FINE_HZ, RELATIVE, Dirt, coloured, lugre
+from lipcore.robots.dirt import MIN_SIMULATION_HZ, SCALED_AMOUNTS, Dirt, draw_coloured_noise, simulate_lugre
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import FAST, PERIOD, Course, Stream, simulate
+from lipcore.robots.simulation import FAST_SPEED, PERIOD_S, Course, Simulation, simulate
 
-NOTHING = replace(Dirt().times(0.0), motion_hz=400.0)
-FINE = Stream(n_samples=2000, rate=FINE_HZ, speed=FAST, noise=0.0)
+NOTHING = replace(Dirt().scaled(0.0), motion_hz=400.0)
+FINE = Simulation(n_samples=2000, rate=MIN_SIMULATION_HZ, speed=FAST_SPEED, noise=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def robot() -> Robot:
 
 def friction(t: np.ndarray, dq: np.ndarray, coulomb: float = 2.0, breaks: float = 3.0) -> np.ndarray:
     column = np.ones((len(t), 1))
-    return lugre(t, dq[:, None], coulomb * column, breaks * column, 0.004, 0.05)[:, 0]
+    return simulate_lugre(t, dq[:, None], coulomb * column, breaks * column, 0.004, 0.05)[:, 0]
 
 
 def test_friction_is_the_solution_of_its_differential_equation() -> None:
@@ -61,7 +61,7 @@ def test_clean_dirt_adds_nothing_and_derives_the_motion_from_positions(robot: Ro
         np.testing.assert_allclose(getattr(made, name)[inner], exact[inner], atol=0.01 * np.abs(exact).max())
 
 
-@pytest.mark.parametrize("part", [name for name in RELATIVE if name != "encoder"])
+@pytest.mark.parametrize("part", [name for name in SCALED_AMOUNTS if name != "encoder"])
 def test_every_part_is_in_the_torque(robot: Robot, part: str) -> None:
     friction = part in ("stiction", "load", "position", "warmth")  # which are parts of friction
     without = replace(NOTHING, friction=0.3) if friction else NOTHING
@@ -73,7 +73,7 @@ def test_every_part_is_in_the_torque(robot: Robot, part: str) -> None:
 
 
 def test_positions_are_counts_and_other_rates_take_every_so_many_samples(robot: Robot) -> None:
-    stream = Stream(n_samples=50, rate=25.0, speed=FAST, dirt=Dirt(encoder=1e-3))
+    stream = Simulation(n_samples=50, rate=25.0, speed=FAST_SPEED, dirt=Dirt(encoder=1e-3))
     made = simulate(robot, stream, 2)
     np.testing.assert_allclose(made.q / 1e-3, np.round(made.q / 1e-3), atol=1e-6)
     np.testing.assert_allclose(np.diff(made.t), 0.04)
@@ -82,7 +82,7 @@ def test_positions_are_counts_and_other_rates_take_every_so_many_samples(robot: 
 
 
 def test_noise_has_its_deviation_and_its_colour() -> None:
-    made = coloured(np.random.default_rng(0), (200_000, 2), 1e-3, 20.0)
+    made = draw_coloured_noise(np.random.default_rng(0), (200_000, 2), 1e-3, 20.0)
     assert made.std() == pytest.approx(1.0, abs=0.03)
     for lag in (1, 8, 20):
         expected = np.exp(-2 * np.pi * 20.0 * lag * 1e-3)
@@ -91,7 +91,7 @@ def test_noise_has_its_deviation_and_its_colour() -> None:
 
 def test_periodic_motion_repeats_and_motion_with_rests_rests(robot: Robot) -> None:
     again = simulate(robot, replace(FINE, n_samples=3000, course="periodic"), 3)
-    period = round(PERIOD / FAST * FINE_HZ)
+    period = round(PERIOD_S / FAST_SPEED * MIN_SIMULATION_HZ)
     np.testing.assert_allclose(again.q[period:], again.q[:-period], atol=1e-9)
     stops = simulate(robot, replace(FINE, n_samples=20_000, course="rests", speed=1.0), 3)
     assert 0.2 < np.mean(np.abs(stops.dq).max(1) < 1e-9) < 0.7
@@ -99,7 +99,7 @@ def test_periodic_motion_repeats_and_motion_with_rests_rests(robot: Robot) -> No
     for course in courses:
         made = simulate(robot, replace(FINE, course=course), 3)
         for signal, derivative in ((made.q, made.dq), (made.dq, made.ddq)):
-            error = np.gradient(signal, 1 / FINE_HZ, axis=0)[1:-1] - derivative[1:-1]
+            error = np.gradient(signal, 1 / MIN_SIMULATION_HZ, axis=0)[1:-1] - derivative[1:-1]
             assert np.abs(error).max() < 0.02 * np.abs(derivative).max()
 
 
@@ -109,4 +109,4 @@ def test_what_cannot_be_is_refused(robot: Robot) -> None:
     with pytest.raises(ValueError, match="warm_s of the dirt is 0, expected a positive number"):
         Dirt(warm_s=0)
     with pytest.raises(ValueError, match="course is 'circles', expected one of sinusoids, periodic, rests"):
-        simulate(robot, Stream(course="circles"), 0)  # type: ignore[arg-type]
+        simulate(robot, Simulation(course="circles"), 0)  # type: ignore[arg-type]

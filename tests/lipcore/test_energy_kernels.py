@@ -9,7 +9,7 @@ from lipcore import FitOptions, train
 from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Motion
 from lipcore.kernels.lip import shares
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from tests.choosing import slow
 from tests.lipcore.arm_oracles import arm
 from tests.lipcore.oracles import (
@@ -106,9 +106,9 @@ def test_dynamics_of_a_true_chain_lie_in_the_space_of_the_kernel(kinds: str) -> 
     """Enough noise-free torques of an arm pin down all that it ever does, whatever the hyperparameters."""
     _, _, robot = arm(kinds, seed=len(kinds))
     options = FitOptions(hyperparameter_samples=80, posterior_samples=400, max_iterations=30, device="cpu")
-    training = simulate(robot, Stream(400, speed=10, noise=0.0, motion="full"), seed=1)
+    training = simulate(robot, Simulation(400, speed=10, noise=0.0, motion="full"), seed=1)
     model = train(training, robot.joint_types, "lip-chain", options)
-    unseen = simulate(robot, Stream(100, n_sinusoids=100, speed=10, noise=0.0, motion="full"), seed=2)
+    unseen = simulate(robot, Simulation(100, n_sinusoids=100, speed=10, noise=0.0, motion="full"), seed=2)
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
     nmse = evaluate(unseen.tau, *answer.interval).nmse
     assert (nmse < 1e-6).all(), nmse

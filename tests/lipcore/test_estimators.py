@@ -25,7 +25,7 @@ from lipcore.model import dynamics
 from lipcore.model.parameters import friction_coefficients, inertial_parameters, weight_posterior
 from lipcore.posterior.exact import negative_log_evidence
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.training import fit
 from lipcore.vocabulary import ROBOT_ESTIMATORS
@@ -37,7 +37,7 @@ every_estimator = pytest.mark.parametrize("name", ESTIMATORS)
 
 
 def recorded(noise: float = 0.002, seed: int = 1) -> Samples:
-    return simulate(load_robot(ROBOT), Stream(n_samples=60, speed=10, noise=noise, viscous=0.05), seed)
+    return simulate(load_robot(ROBOT), Simulation(n_samples=60, speed=10, noise=noise, viscous=0.05), seed)
 
 
 def robot_of(name: str, samples: Samples) -> RigidBody | None:

@@ -12,10 +12,10 @@ from lipcore.data.motion import Motion
 from lipcore.excitation import Belief, Limits, PlanOptions, Series, plan
 from lipcore.excitation.information import Information
 from lipcore.excitation.motions import Shape, draw, overshoot
-from lipcore.excitation.searching import MARGIN, Goal, TorqueCheck, search
+from lipcore.excitation.searching import MAX_TORQUE_SHARE, Goal, TorqueCheck, search
 from lipcore.posterior.exact import ExactPosterior
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.lipcore.oracles import in_full
 
@@ -33,7 +33,7 @@ def robot():
 def limits(robot):
     unknown = np.full(2, np.nan)
     known = robot.joint_names, robot.joint_types, robot.lower, robot.upper, robot.speed
-    return Limits.known(*known, unknown, unknown).within(0.5, 1.0)
+    return Limits.with_defaults(*known, unknown, unknown).within(0.5, 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def prior(robot, limits):
 
 @pytest.fixture(scope="module")
 def samples(robot):
-    return simulate(robot, Stream(n_samples=40, speed=5.0, noise=NOISE), 3)
+    return simulate(robot, Simulation(n_samples=40, speed=5.0, noise=NOISE), 3)
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_a_plan_tells_more_than_random_sinusoids_about_what_a_model_does_not_kno
     planned = fresh.left(Motion.from_arrays(*motion))
     for seed in range(3):
         for speed in (1.0, 10.0):
-            stream = simulate(own, Stream(n_samples=len(t), motion="full", speed=speed), seed)
+            stream = simulate(own, Simulation(n_samples=len(t), motion="full", speed=speed), seed)
             assert float(np.log(planned).mean()) < float(np.log(fresh.left(stream.motion())).mean())
 
 
@@ -148,7 +148,7 @@ def test_the_table_keeps_all_limits_and_has_the_length_asked_for(robot, prior, l
     q, dq, ddq = made.series.at(np.linspace(0, 8.0, 20_000))
     assert (made.series.used(tight) <= 1 + 1e-9).all()
     assert (np.abs(inverse_dynamics(robot, q, dq, ddq)) <= tight.torque).all()
-    assert (made.used[3] <= MARGIN + 1e-9).all()
+    assert (made.used[3] <= MAX_TORQUE_SHARE + 1e-9).all()
 
 
 def test_a_robot_too_weak_is_refused_and_a_budget_ends_a_search(robot, prior, limits):
@@ -255,7 +255,9 @@ def test_a_polynomial_that_reaches_the_bound_of_ehlich_and_zeller():
 
 def test_unknown_limits_have_usual_ones_standing_in():
     nan = np.array([np.nan, np.nan])
-    found = Limits.known(("a", "b"), ("revolute", "prismatic"), nan, nan, np.array([2.0, np.inf]), nan, np.zeros(2))
+    found = Limits.with_defaults(
+        ("a", "b"), ("revolute", "prismatic"), nan, nan, np.array([2.0, np.inf]), nan, np.zeros(2)
+    )
     np.testing.assert_allclose(found.upper, [np.pi, 0.5])
     np.testing.assert_allclose(found.speed, [2.0, 0.2])
     np.testing.assert_allclose(found.acceleration, [8.0, 0.8])

@@ -19,7 +19,7 @@ from lipcore.online.learner import OnlineModel
 from lipcore.online.transfer import Revision, consolidate
 from lipcore.posterior.evaluator import QUERIES
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.lipcore.arm_oracles import arm, followed
 from tests.lipcore.test_declared_payload import BODY
@@ -33,7 +33,7 @@ FAST = 10.0
 
 def moving(robot: Robot, speed: float, seconds: float, seed: int) -> Samples:
     """Motion at 50 Hz, with friction."""
-    stream = Stream(int(50 * seconds), 50.0, speed=speed, noise=0.05, viscous=0.3, coulomb=0.2, motion="full")
+    stream = Simulation(int(50 * seconds), 50.0, speed=speed, noise=0.05, viscous=0.3, coulomb=0.2, motion="full")
     return simulate(robot, stream, seed)
 
 
@@ -117,7 +117,7 @@ def test_answers_are_those_of_the_formulas(model: TorqueModel, fast: Samples) ->
 @pytest.mark.parametrize("estimator", ["rigid-body"], indirect=True)
 def test_a_payload_is_added_to_what_is_answered_instead(model: TorqueModel, fast: Samples) -> None:
     motion, carrier = fast.motion()[:60], Carrier(model)
-    carrying = carrier.carrying(carrier.known(BODY.parameters))
+    carrying = carrier.with_payload(carrier.known(BODY.parameters))
     tau, share = dense(carrying, motion)
     answer = carrying.predict(motion.q, motion.dq, motion.ddq)
     assert (share > 0).any()

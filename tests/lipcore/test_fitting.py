@@ -17,7 +17,7 @@ from lipcore.estimators.options import FitOptions
 from lipcore.posterior import exact as evidence
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.training.train import train
 from tests.choosing import slow
 
@@ -25,7 +25,7 @@ SMALL = FitOptions(hyperparameter_samples=25, posterior_samples=60, max_iteratio
 
 
 def pendulum(noise: float = 0.01, n_samples: int = 80) -> Samples:
-    return simulate(load_robot("double-pendulum"), Stream(n_samples=n_samples, speed=10, noise=noise), seed=1)
+    return simulate(load_robot("double-pendulum"), Simulation(n_samples=n_samples, speed=10, noise=noise), seed=1)
 
 
 def fit_pendulum(samples: Samples, options: FitOptions = SMALL, estimator: str = "lip", **callbacks) -> Fit:
@@ -92,7 +92,7 @@ def test_noise_stays_above_its_floor_on_noise_free_data() -> None:
 @pytest.mark.parametrize(("robot", "viscous"), [("double-pendulum", 0.0), slow("ur5", 0.1)])
 def test_noise_is_recovered(robot: str, viscous: float) -> None:
     arm = load_robot(robot)
-    samples = simulate(arm, Stream(n_samples=200, speed=10, noise=0.05, viscous=viscous), seed=1)
+    samples = simulate(arm, Simulation(n_samples=200, speed=10, noise=0.05, viscous=viscous), seed=1)
     options = FitOptions(hyperparameter_samples=70, max_iterations=50, device="cpu")
     noise = np.exp(fit(make_estimator("lip", arm.joint_types).kernel, samples, options).params["noise.log_std"])
     assert np.allclose(noise, 0.05, rtol=0.3)
@@ -160,8 +160,8 @@ def test_only_estimators_without_compiled_code_use_a_gpu(monkeypatch: pytest.Mon
 @pytest.mark.parametrize("estimator", ["se", "gip", "lse"])
 def test_fit_on_cuda_agrees_with_the_processor(estimator: str) -> None:
     arm = load_robot("tiago")
-    samples = simulate(arm, Stream(n_samples=80, speed=10, noise=0.05), seed=1)
-    unseen = simulate(arm, Stream(n_samples=50, speed=10, noise=0.0), seed=101)
+    samples = simulate(arm, Simulation(n_samples=80, speed=10, noise=0.05), seed=1)
+    unseen = simulate(arm, Simulation(n_samples=50, speed=10, noise=0.0), seed=101)
     # few iterations: rounding differs, and L-BFGS amplifies it with every step
     options = replace(SMALL, max_iterations=5)
     models = {d: train(samples, arm.joint_types, estimator, replace(options, device=d)) for d in ("cpu", "cuda")}

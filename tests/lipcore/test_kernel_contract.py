@@ -31,7 +31,7 @@ from lipcore.kernels.mixture import MixtureKernel
 from lipcore.kernels.newton_euler import rigid_body_torque
 from lipcore.kernels.payload import PayloadKernel
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 from tests.lipcore.arms import random_bodies, random_geometry
@@ -291,7 +291,7 @@ def test_a_query_meets_inducing_samples_and_features_as_the_formula_says(
 
 @pytest.fixture(scope="module")
 def samples() -> Samples:
-    return simulate(load_robot("double-pendulum"), Stream(n_samples=60, speed=10, noise=0.002, viscous=0.05), 1)
+    return simulate(load_robot("double-pendulum"), Simulation(n_samples=60, speed=10, noise=0.002, viscous=0.05), 1)
 
 
 @pytest.mark.parametrize("name", ESTIMATORS)

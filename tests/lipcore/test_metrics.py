@@ -13,7 +13,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from lipcore.data.metrics import LEVELS, MIN_BLOCKS, RELIABILITY_LEVELS, Answer, blocks, compare, difference, evaluate
+from lipcore.data.metrics import (
+    LEVELS,
+    MIN_BLOCKS,
+    RELIABILITY_LEVELS,
+    TorqueDistribution,
+    average_differences,
+    blocks,
+    compare,
+    evaluate,
+)
 from lipcore.data.samples import Samples
 from lipcore.online.record import Record, error_floor
 
@@ -83,7 +92,10 @@ def recording(t, tau, episode=None):
 
 
 def answers(rng, shape):
-    return [Answer(rng.normal(size=shape), rng.uniform(0.1, 0.5, shape), rng.uniform(0.1, 0.5, 2)) for _ in range(2)]
+    return [
+        TorqueDistribution(rng.normal(size=shape), rng.uniform(0.1, 0.5, shape), rng.uniform(0.1, 0.5, 2))
+        for _ in range(2)
+    ]
 
 
 def correlated(rng, seconds, step, memory, count):
@@ -125,7 +137,7 @@ def test_the_interval_misses_zero_as_rarely_as_it_says(seconds, memory):
     step = max(0.02, seconds / 5000)
     values = correlated(np.random.default_rng(5), seconds, step, memory, 600)
     starts = blocks(recording(np.arange(len(values)) * step, np.zeros((len(values), 1))))
-    wrong = difference(values, starts).significant.mean()
+    wrong = average_differences(values, starts).significant.mean()
     assert wrong < 0.085, wrong
     naive = np.abs(values.mean(axis=0)) > 1.96 * values.std(axis=0) / np.sqrt(len(values))
     assert naive.mean() > (0.1 if memory < 0.1 else 0.3)
@@ -134,11 +146,11 @@ def test_the_interval_misses_zero_as_rarely_as_it_says(seconds, memory):
 def test_a_difference_that_is_there_is_found():
     values = correlated(np.random.default_rng(6), 60, 0.02, 0.3, 300) + 0.5
     starts = blocks(recording(np.arange(3000) / 50, np.zeros((3000, 1))))
-    assert difference(values, starts).significant.mean() > 0.9
+    assert average_differences(values, starts).significant.mean() > 0.9
 
 
 def test_a_single_block_tells_nothing():
-    found = difference(np.array([[1.0], [2.0]]), np.array([0]))
+    found = average_differences(np.array([[1.0], [2.0]]), np.array([0]))
     assert (found.mean.tolist(), found.standard_error.tolist()) == ([1.5], [np.inf])
     assert not found.significant.any()
 

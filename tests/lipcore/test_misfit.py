@@ -15,16 +15,16 @@ from lipcore.estimators.task import Task
 from lipcore.kernels.fast.answer import ACCELERATED
 from lipcore.kernels.geometry import Geometry
 from lipcore.model.torque_model import TorqueModel
-from lipcore.posterior.misfit import OPTIONS, Misfit, estimate, low_speed_variance, shared_rows
+from lipcore.posterior.misfit import OPTIONS, Misfit, estimate_misfit, low_speed_variance, shared_rows
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.training.fit import fit_estimator
 
 TYPES = ("revolute",) * 2
 ROBOT = load_robot("double-pendulum")
-STREAM = Stream(n_samples=1000, rate=50.0, speed=5.0, noise=0.0)
+STREAM = Simulation(n_samples=1000, rate=50.0, speed=5.0, noise=0.0)
 QUICK = FitOptions(hyperparameter_samples=40, posterior_samples=200, max_iterations=20, starts=1, device="cpu")
 
 
@@ -67,7 +67,7 @@ def test_what_lasts_is_no_white_noise(seconds: float) -> None:
         residual = np.apply_along_axis(lambda x: np.convolve(x, np.hanning(width), "same"), 0, residual)
     dq = 1.0 + rng.uniform(0, 1, residual.shape)
     moved = np.stack([dq, 3 * dq])
-    misfit, noise = estimate(residual, residual, moved, [slice(0, 2500), slice(2500, 5000)])
+    misfit, noise = estimate_misfit(residual, residual, moved, [slice(0, 2500), slice(2500, 5000)])
     share = misfit.lasting / noise
     assert share == pytest.approx(1.0 if seconds else 0.0, abs=0.05)
     usual = np.sqrt(np.mean(dq**2, axis=0))
@@ -93,7 +93,7 @@ def test_answers_hold_it(model: TorqueModel) -> None:
     """Standing still, and faster than ever, against the formula; the compiled answer and the plain one agree."""
     posterior, n = model.posterior, 2
     misfit = posterior.misfit
-    assert misfit.exists
+    assert misfit.is_nonzero
     q = np.full((4, n), 0.3)
     dq = np.array([[0.0, 0.0], [0.01, -0.02], [9.0, -7.0], [2.0, 9.0]])
     ddq = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.0], [-50.0, 90.0]])

@@ -98,7 +98,7 @@ def test_second_step_judges_stretches_predicted_from_all_others(samples: int) ->
         ratios.append(((y[out] - gain @ y[rest]) ** 2 / covariance.diagonal()).reshape(-1, 3))
     expected = np.concatenate(ratios).mean(0)
     dense = np.linalg.inv(gram)
-    found = noise._left_out(dense, dense @ y, 3)
+    found = noise._cross_validate(dense, dense @ y, 3)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

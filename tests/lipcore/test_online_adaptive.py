@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lipcore.online import adaptive
-from lipcore.online.adaptive import Adaptive, outside, scores, widest
+from lipcore.online.adaptive import AdaptiveScale, outside, scores, widest
 
 RATE, BATCH = 100.0, 10
 MINUTE = 6000
@@ -14,7 +14,7 @@ MINUTE = 6000
 
 def play(score, batch=BATCH, rate=RATE, delay=0):
     """Which rows lay outside, the scales that they were answered with, and the last state."""
-    state, missed, factors = Adaptive.start(np.ones(score.shape[1])), [], []
+    state, missed, factors = AdaptiveScale.start(np.ones(score.shape[1])), [], []
     waiting = [state.factor] * (delay + 1)
     for first in range(0, len(score), batch):
         part = score[first : first + batch]
@@ -52,7 +52,7 @@ def test_every_minute_of_any_scores_is_held_as_promised(seed):
 
 def test_an_adversary_who_knows_the_scale_is_held_as_well():
     """Scores right outside or far inside, whichever hurts: misses for 3 s, then none until the scale is back."""
-    state, missed, now = Adaptive.start(np.ones(1)), [], 0.0
+    state, missed, now = AdaptiveScale.start(np.ones(1)), [], 0.0
     hurting = True
     for _ in range(4 * MINUTE // BATCH):
         factor = state.factor
@@ -96,7 +96,7 @@ def test_the_rate_of_a_stream_changes_nothing_of_what_is_promised(rate, batch):
 
 
 def test_what_a_long_batch_cannot_pay_is_owed():
-    state = Adaptive.start(np.ones(1)).step(np.arange(500) / RATE, np.full((500, 1), 3.0))
+    state = AdaptiveScale.start(np.ones(1)).step(np.arange(500) / RATE, np.full((500, 1), 3.0))
     assert state.log[0] == pytest.approx(np.log(3.0 * adaptive.OPTIONS.margin))
     assert state.owed[0] == pytest.approx(
         min(0.95 * 500 / RATE * adaptive.OPTIONS.rate - state.log[0], adaptive.OPTIONS.max_owed), rel=0.01
@@ -107,7 +107,7 @@ def test_what_a_long_batch_cannot_pay_is_owed():
 
 
 def test_frames_count_by_what_they_were_answered_with():
-    state = Adaptive(np.log([4.0]), np.zeros(1), 0.0)
+    state = AdaptiveScale(np.log([4.0]), np.zeros(1), 0.0)
     time = np.arange(1, 11) / RATE
     late = state.step(time, np.full((10, 1), 3.0), np.ones((10, 1)))
     now = state.step(time, np.full((10, 1), 3.0))
@@ -116,7 +116,7 @@ def test_frames_count_by_what_they_were_answered_with():
 
 def test_rows_without_times_or_after_a_pause_count_as_usual():
     score = np.full((1, 1), 5.0)
-    at_once = Adaptive.start(np.ones(1)).step(np.full(1, 7.0), score)
+    at_once = AdaptiveScale.start(np.ones(1)).step(np.full(1, 7.0), score)
     assert at_once.log[0] == pytest.approx(0.95 * adaptive.OPTIONS.rate * adaptive.OPTIONS.usual_step_s)
     paused = at_once.step(np.full(1, 1000.0), score)
     assert paused.log[0] - at_once.log[0] == pytest.approx(at_once.log[0])
@@ -126,7 +126,7 @@ def test_rows_without_times_or_after_a_pause_count_as_usual():
 
 def test_it_is_kept_to_the_last_bit():
     _, _, state = play(adversary(7, 1000))
-    again = Adaptive.from_json(json.loads(json.dumps(state.to_json())))
+    again = AdaptiveScale.from_json(json.loads(json.dumps(state.to_json())))
     assert (again.log.tolist(), again.owed.tolist(), again.last) == (
         state.log.tolist(),
         state.owed.tolist(),

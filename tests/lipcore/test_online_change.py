@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from lipcore.online.changes.detectors import Change, ChangeDetector, friction_share, suspect
 from lipcore.online.record import Record
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Payload, Simulation, inverse_dynamics, simulate
 from tests.choosing import few
 
 Scale = Callable[[np.ndarray], np.ndarray]
@@ -146,7 +146,7 @@ def test_records_of_other_times_and_of_no_rows_are_taken() -> None:
 
 RATE = 50.0
 NOISE = np.full(7, 0.05)
-PLAIN = Stream(n_samples=int(60 * RATE), rate=RATE, speed=5, noise=0.05)
+PLAIN = Simulation(n_samples=int(60 * RATE), rate=RATE, speed=5, noise=0.05)
 GRIPPER = Payload(0.05)
 
 
@@ -155,7 +155,7 @@ def panda() -> Robot:
     return load_robot("panda")
 
 
-def judged(robot: Robot, stream: Stream, seed: int = 0) -> tuple[np.ndarray, ...]:
+def judged(robot: Robot, stream: Simulation, seed: int = 0) -> tuple[np.ndarray, ...]:
     """t, dq, tau, mean, std of a stream; std is the root mean square of what the unknown gripper weighs."""
     samples = simulate(robot, stream, seed)
     mean = inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)

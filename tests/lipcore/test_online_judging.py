@@ -11,13 +11,13 @@ from lipcore.online.batch import Placement, Rows
 from lipcore.online.judgement import Innovations, LoggedJudgement, ModelRecord
 from lipcore.online.judging import Judgement, JudgeOptions, judge
 from lipcore.online.record import Record
-from lipcore.online.screening import Screened, Seen, Trained
+from lipcore.online.screening import BasePrediction, IntervalScores, PredictedBatch
 from lipcore.online.stream import StreamRecord
 
 N = 2
 
 
-def screened(start: float, count: int, push: float = 0.0, seed: int = 0) -> Screened:
+def screened(start: float, count: int, push: float = 0.0, seed: int = 0) -> PredictedBatch:
     """Rows at 100 Hz from a time on, s, whose answers are right within the noise but for a push, N·m."""
     rng = np.random.default_rng(seed)
     tau = rng.standard_normal((count, N)) + push
@@ -25,9 +25,11 @@ def screened(start: float, count: int, push: float = 0.0, seed: int = 0) -> Scre
     rows = Rows(time, zeros, zeros + 0.1, zeros, tau, np.zeros(count, np.uint8), np.full(count, 0.1))
     every = np.ones(count, np.bool_)
     places = np.arange(0, count, 4)
-    trained = Trained(places, 4.0, zeros[places], zeros[places])
-    seen = Seen(time, np.abs(tau) / 1.96, None)
-    return Screened(rows, slice(0, count), every, every, zeros, zeros, zeros, np.ones(N), 1, np.ones(N), trained, seen)
+    trained = BasePrediction(places, 4.0, zeros[places], zeros[places])
+    seen = IntervalScores(time, np.abs(tau) / 1.96, None)
+    return PredictedBatch(
+        rows, slice(0, count), every, every, zeros, zeros, zeros, np.ones(N), 1, np.ones(N), trained, seen
+    )
 
 
 def course(pushes: list[float], **options: Any) -> list[Judgement]:

@@ -21,7 +21,7 @@ from lipcore.online.transfer import Revision, consolidate
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.misfit import shared_rows
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS, Code
 from tests.choosing import few
@@ -33,7 +33,7 @@ OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=25, starts=1, dev
 
 @pytest.fixture(scope="module", params=few(ESTIMATORS, {"lip-chain", "se", "rigid-body+lip-chain"}.__contains__))
 def model(request: pytest.FixtureRequest) -> TorqueModel:
-    samples = simulate(load_robot(ROBOT), Stream(n_samples=80, speed=10, noise=0.02, viscous=0.1), seed=1)
+    samples = simulate(load_robot(ROBOT), Simulation(n_samples=80, speed=10, noise=0.02, viscous=0.1), seed=1)
     robot = None
     if request.param in ROBOT_ESTIMATORS:
         robot = RigidBody.from_profile(ROBOT, samples.joint_names, ("revolute",) * 2)
@@ -43,7 +43,7 @@ def model(request: pytest.FixtureRequest) -> TorqueModel:
 @pytest.fixture(scope="module")
 def rows() -> Rows:
     """Another motion of the same robot, which is a little more viscous than it was."""
-    return as_rows(simulate(load_robot(ROBOT), Stream(n_samples=120, speed=10, noise=0.02, viscous=0.12), seed=2))
+    return as_rows(simulate(load_robot(ROBOT), Simulation(n_samples=120, speed=10, noise=0.02, viscous=0.12), seed=2))
 
 
 def test_nothing_learnt_is_the_version_and_parts_and_order_do_not_matter(model: TorqueModel, rows: Rows) -> None:
@@ -126,7 +126,7 @@ def test_change_keeps_the_mean_and_opens_the_rest(model: TorqueModel, rows: Rows
 
 
 CLOSER = FitOptions(hyperparameter_samples=60, max_iterations=60, starts=1, device="cpu")
-STREAM = Stream(n_samples=120, speed=10, noise=0.02, viscous=0.1)
+STREAM = Simulation(n_samples=120, speed=10, noise=0.02, viscous=0.1)
 
 
 def recorded(seed: int, **changes: object) -> Samples:

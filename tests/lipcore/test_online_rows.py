@@ -8,9 +8,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lipcore.online.acceleration import RateError, derive, rate_of, window
-from lipcore.online.gates import LARGEST_TORQUE, Patience, RowLimits, check_rows, is_contact, time_span
+from lipcore.online.gates import MAX_TORQUE, Patience, RowLimits, check_rows, is_contact, time_span
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
 from lipcore.vocabulary import CODES
 
 LIMITS = RowLimits(12.6, 50.0, 2000.0, None, 1.0, 1e-3)
@@ -40,7 +40,7 @@ def jumps(t: list[float], limits: RowLimits = LIMITS, **bounds) -> list[int]:
     return [place for place, code in enumerate(codes) if code == "time_jump"]
 
 
-@pytest.mark.parametrize(("field", "most"), [("q", 12.6), ("dq", 50.0), ("ddq", 2000.0), ("tau", LARGEST_TORQUE)])
+@pytest.mark.parametrize(("field", "most"), [("q", 12.6), ("dq", 50.0), ("ddq", 2000.0), ("tau", MAX_TORQUE)])
 def test_magnitude_beyond_its_limit_costs_its_row_and_at_the_limit_it_does_not(field: str, most: float) -> None:
     data = batch()
     data[field][2, 1], data[field][5, 0], data[field][6, 1] = -np.nextafter(most, np.inf), most, 1e300
@@ -50,7 +50,7 @@ def test_magnitude_beyond_its_limit_costs_its_row_and_at_the_limit_it_does_not(f
 
 
 def test_honest_motion_of_a_panda_is_learnt_and_saturated_torque_is_not(panda: Robot) -> None:
-    samples = simulate(panda, Stream(n_samples=500, rate=50, speed=5, noise=0.05), seed=0)
+    samples = simulate(panda, Simulation(n_samples=500, rate=50, speed=5, noise=0.05), seed=0)
     q, dq, ddq, tau = samples.q, samples.dq, samples.ddq, samples.tau
     for t, second in ((samples.t, ddq), (None, ddq), (samples.t, None)):
         codes = check_rows(t, q, dq, second, tau, replace(LIMITS, torque=PANDA_TORQUE))

@@ -12,12 +12,12 @@ from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.transfer import consolidate
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.lipcore.arm_oracles import as_rows, same_answers
 
 ROBOT, BEGAN = "double-pendulum", 1000.0
-STREAM = Stream(n_samples=120, speed=10, noise=0.02, viscous=0.1, coulomb=0.2)
+STREAM = Simulation(n_samples=120, speed=10, noise=0.02, viscous=0.1, coulomb=0.2)
 OPTIONS = FitOptions(hyperparameter_samples=60, max_iterations=60, starts=1, device="cpu", compact_tolerance=0.1)
 
 

@@ -7,17 +7,17 @@ import pytest
 
 import lipcore
 from lipcore.data import outliers
-from lipcore.data.outliers import CorruptError, of_long, of_samples
+from lipcore.data.outliers import CorruptRowsError, find_in_blocks, find_in_samples
 from lipcore.data.samples import Samples
 from lipcore.estimators.options import FitOptions
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from tests.choosing import slow
 
 ROBOT = load_robot("double-pendulum")
 NOISE = 0.05
-CLEAN = simulate(ROBOT, Stream(300, 20.0, noise=NOISE, speed=3.0, coulomb=0.3, viscous=0.1), 41)
+CLEAN = simulate(ROBOT, Simulation(300, 20.0, noise=NOISE, speed=3.0, coulomb=0.3, viscous=0.1), 41)
 ROW = 110
 """Where no joint turns back: friction leaps there, which is no corruption."""
 QUICK = FitOptions(hyperparameter_samples=40, posterior_samples=80, max_iterations=3, starts=1)
@@ -25,14 +25,14 @@ QUICK = FitOptions(hyperparameter_samples=40, posterior_samples=80, max_iteratio
 
 def spoilt(samples, *spikes):
     """Samples with (quantity, row, joint, amount) added."""
-    arrays = {name: getattr(samples, name).copy() for name in outliers.LARGEST}
+    arrays = {name: getattr(samples, name).copy() for name in outliers.MAX_VALUES}
     for name, row, joint, amount in spikes:
         arrays[name][row, joint] += amount
     return replace(samples, **arrays)
 
 
 def corrupt_rows(samples):
-    return np.flatnonzero(of_samples(samples).rows).tolist()
+    return np.flatnonzero(find_in_samples(samples).rows).tolist()
 
 
 @pytest.mark.parametrize("joint", [0, 1])
@@ -45,11 +45,11 @@ def test_one_corrupt_row_is_found(quantity, amount, joint):
 
 
 def test_several_are_found_and_reported_with_why():
-    found = of_samples(spoilt(CLEAN, ("tau", 20, 0, 1e12), ("tau", 21, 1, 4.0), ("dq", 200, 0, 3.0)))
+    found = find_in_samples(spoilt(CLEAN, ("tau", 20, 0, 1e12), ("tau", 21, 1, 4.0), ("dq", 200, 0, 3.0)))
     assert found.report() == {"rows": 3, "first": [20, 21, 200], "why": {"magnitude": 1, "course": 2}}
-    assert found.in_fit()["samples_corrupt"] == 3
-    assert "rows 20, 21, 200" in found.in_fit()["corrupt"]
-    assert of_samples(CLEAN).in_fit() == {}
+    assert found.fit_entries()["samples_corrupt"] == 3
+    assert "rows 20, 21, 200" in found.fit_entries()["corrupt"]
+    assert find_in_samples(CLEAN).fit_entries() == {}
 
 
 def test_the_order_of_rows_does_not_matter():
@@ -60,21 +60,21 @@ def test_the_order_of_rows_does_not_matter():
 
 def test_more_than_accident_is_an_error_that_names_rows():
     spikes = [("tau", row, 0, 1e9) for row in range(10, 80, 10)]
-    with pytest.raises(CorruptError, match=r"7 corrupt ones of 300: the first are 11, 21, .*, expected at most 6"):
-        of_samples(spoilt(CLEAN, *spikes))
+    with pytest.raises(CorruptRowsError, match=r"7 corrupt ones of 300: the first are 11, 21, .*, expected at most 6"):
+        find_in_samples(spoilt(CLEAN, *spikes))
     assert len(corrupt_rows(spoilt(CLEAN, *spikes[:6]))) == 6
 
 
 SOUND = {
-    "sinusoids": Stream(300, 10.0),
-    "noiseless": Stream(300, 10.0, noise=0.0),
-    "fast": Stream(300, 10.0, speed=10.0),
-    "friction": Stream(300, 10.0, speed=5.0, coulomb=1.0, viscous=0.3),
-    "rests": Stream(300, 20.0, course="rests", coulomb=1.0),
-    "rests at 100 Hz": Stream(600, 100.0, course="rests", speed=2.0, coulomb=1.0),
-    "periodic": Stream(300, 20.0, course="periodic", speed=5.0),
-    "dirt": Stream(400, 20.0, dirt=Dirt(seed=5), noise=0.0),
-    "dirt with rests": Stream(600, 50.0, course="rests", dirt=Dirt(seed=6), noise=0.0),
+    "sinusoids": Simulation(300, 10.0),
+    "noiseless": Simulation(300, 10.0, noise=0.0),
+    "fast": Simulation(300, 10.0, speed=10.0),
+    "friction": Simulation(300, 10.0, speed=5.0, coulomb=1.0, viscous=0.3),
+    "rests": Simulation(300, 20.0, course="rests", coulomb=1.0),
+    "rests at 100 Hz": Simulation(600, 100.0, course="rests", speed=2.0, coulomb=1.0),
+    "periodic": Simulation(300, 20.0, course="periodic", speed=5.0),
+    "dirt": Simulation(400, 20.0, dirt=Dirt(seed=5), noise=0.0),
+    "dirt with rests": Simulation(600, 50.0, course="rests", dirt=Dirt(seed=6), noise=0.0),
 }
 
 
@@ -102,7 +102,7 @@ def test_samples_without_a_course_keep_all_rows_but_absurd_ones(seed):
 
 def test_a_long_recording_is_looked_at_in_blocks():
     samples = spoilt(CLEAN, ("tau", 109, 0, 3.0), ("tau", 110, 1, 1e12), ("tau", 250, 0, 3.0))
-    found = of_long(300, lambda first, last: samples.rows(slice(first, last)), block=110)
+    found = find_in_blocks(300, lambda first, last: samples.rows(slice(first, last)), block=110)
     assert np.flatnonzero(found.rows).tolist() == [109, 110, 250]
 
 

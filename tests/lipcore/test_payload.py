@@ -9,14 +9,14 @@ import lipcore
 from lipcore.data.motion import Motion
 from lipcore.estimators.options import FitOptions
 from lipcore.model.body import Body
-from lipcore.model.payload import Carrier, Linearised, Load, NoArmError
+from lipcore.model.payload import Carrier, LinearisedCarrier, NoArmError, PayloadPosterior
 from lipcore.online.batch import Rows
-from lipcore.online.payload.bodies import ANY, body, eta_of
-from lipcore.online.payload.draws import arms
-from lipcore.online.payload.estimate import known
+from lipcore.online.payload.bodies import ANY_PAYLOAD, body, eta_of
+from lipcore.online.payload.draws import draw_arms
+from lipcore.online.payload.estimate import estimate_from_prior
 from lipcore.online.payload.payload import estimate, refine
 from lipcore.robots.library import load_robot, pinocchio
-from lipcore.robots.simulation import Payload, Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Payload, Simulation, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody
 from tests.lipcore.stepping import finished
 
@@ -34,8 +34,8 @@ def carrier():
 def recorded():
     """Ten seconds of a Panda that carries 1.5 kg off its last axis, and another motion without noise."""
     robot = load_robot("panda")
-    seen = simulate(robot, Stream(1000, 100.0, speed=5.0, noise=0.05, payload=CARRIED), 7)
-    other = simulate(robot, Stream(3000, 100.0, speed=5.0, noise=0.0, payload=CARRIED, n_sinusoids=100), 11)
+    seen = simulate(robot, Simulation(1000, 100.0, speed=5.0, noise=0.05, payload=CARRIED), 7)
+    other = simulate(robot, Simulation(3000, 100.0, speed=5.0, noise=0.0, payload=CARRIED, n_sinusoids=100), 11)
     return seen, other.rows(slice(None, None, 10))
 
 
@@ -96,7 +96,7 @@ def test_every_eta_is_a_body_that_can_exist_and_its_derivative_is_that_of_differ
 
 def test_a_model_without_an_arm_carries_nothing():
     robot = load_robot("double-pendulum")
-    model = lipcore.train(simulate(robot, Stream(30), 0), robot.joint_types, "lip-chain")
+    model = lipcore.train(simulate(robot, Simulation(30), 0), robot.joint_types, "lip-chain")
     with pytest.raises(NoArmError, match="knows no rigid bodies"):
         Carrier(model)
 
@@ -104,7 +104,7 @@ def test_a_model_without_an_arm_carries_nothing():
 def test_without_a_payload_the_model_answers_as_it_did(carrier, recorded):
     _, other = recorded
     before = carrier.model.predict(other.q, other.dq, other.ddq)
-    after = carrier.carrying(carrier.known(np.zeros(10))).predict(other.q, other.dq, other.ddq)
+    after = carrier.with_payload(carrier.known(np.zeros(10))).predict(other.q, other.dq, other.ddq)
     np.testing.assert_allclose(after.tau, before.tau, atol=1e-6)
     np.testing.assert_allclose(after.tau_std, before.tau_std, rtol=1e-3)
 
@@ -115,11 +115,11 @@ def test_what_answers_is_the_linear_model_around_the_load(carrier, recorded):
     spread = np.diag(rng.uniform(1e-4, 1e-2, 10))
     load = carrier.known(body(eta_of(Body(1.5, np.array([0.03, 0.02, 0.1]))))[0], spread)
     motion = as_rows(other).motion()
-    features, base = Linearised(carrier, load).rows(motion)
+    features, base = LinearisedCarrier(carrier, load).rows(motion)
     mean = base + np.einsum("knj,k->nj", features, load.mean)
     variance = np.einsum("knj,kl,lnj->nj", features, load.covariance, features)
     variance += carrier.model.posterior.misfit.variance(motion)
-    answer = carrier.carrying(load).predict(other.q, other.dq, other.ddq)
+    answer = carrier.with_payload(load).predict(other.q, other.dq, other.ddq)
     np.testing.assert_allclose(answer.tau, mean, atol=1e-6)
     np.testing.assert_allclose(answer.tau_std, np.sqrt(variance), rtol=1e-3)
 
@@ -133,7 +133,7 @@ def test_a_payload_is_known_within_a_second_and_its_intervals_hold(carrier, reco
             found = found_by(carrier, rows.take(slice(0, count)))
             mass, std = found.mass
             assert abs(mass - 1.5) < 3 * std < widest
-            nmse, inside = errors(carrier.carrying(found.load), other)
+            nmse, inside = errors(carrier.with_payload(found.load), other)
             assert nmse < most * unaware
             assert inside > 0.85
     assert found.gain > 1e4
@@ -143,7 +143,7 @@ def test_a_payload_is_known_within_a_second_and_its_intervals_hold(carrier, reco
 def open_arm():
     """A UR10 learnt from torque alone, whose wrist bears next to none: much of its geometry is open."""
     robot = load_robot("ur10")
-    samples = simulate(robot, Stream(speed=5.0, noise=0.05, motion="full"), 53)
+    samples = simulate(robot, Simulation(speed=5.0, noise=0.05, motion="full"), 53)
     return samples, Carrier(lipcore.train(samples, robot.joint_types, "rigid-body"))
 
 
@@ -156,10 +156,10 @@ def test_what_training_says_of_an_arm_of_another_geometry_is_what_its_samples_sa
     virtual = Motion.from_arrays(*memory.motions.swapaxes(0, 1))
 
     def energies(w, geometry):
-        load = Load(np.append(w, np.zeros(10)), np.zeros((0, 0)), np.ones(10), geometry)
+        load = PayloadPosterior(np.append(w, np.zeros(10)), np.zeros((0, 0)), np.ones(10), geometry)
         here, there = (
             base + np.einsum("knj,k->nj", features, load.mean)
-            for features, base in (Linearised(carrier, load).rows(each) for each in (seen, virtual))
+            for features, base in (LinearisedCarrier(carrier, load).rows(each) for each in (seen, virtual))
         )
         residual = memory.residual(w, there)
         samples_say = weight * ((samples.tau - here) ** 2 / variance).sum() + w @ w
@@ -190,7 +190,7 @@ def test_draws_begin_with_an_open_last_axis_in_each_direction(open_arm):
         return (turns @ geometry.axis[..., None])[..., 0]
 
     _, wrist = open_arm
-    begun = [axes(each.place.geometry) for each in finished(arms(wrist))]
+    begun = [axes(each.place.geometry) for each in finished(draw_arms(wrist))]
     for each in begun:
         np.testing.assert_allclose(each[:-1], axes(wrist.term.arm.geometry.moved(wrist.step))[:-1], atol=1e-9)
     tips = np.array([each[-1] for each in begun])
@@ -201,17 +201,17 @@ def test_a_payload_shows_where_an_open_geometry_lies_and_its_intervals_hold(open
     _, carrier = open_arm
     robot, found = load_robot("ur10"), None
     carried = Payload(1.0, 0.0, (0.05, 0.03, 0.08))
-    rows = as_rows(simulate(robot, Stream(300, 100.0, speed=5.0, noise=0.05, payload=carried), 54))
-    other = simulate(robot, Stream(300, 10.0, speed=5.0, noise=0.0, payload=carried, n_sinusoids=100), 55)
+    rows = as_rows(simulate(robot, Simulation(300, 100.0, speed=5.0, noise=0.05, payload=carried), 54))
+    other = simulate(robot, Simulation(300, 10.0, speed=5.0, noise=0.0, payload=carried, n_sinusoids=100), 55)
     for count in (10, 20, 30, 40, 50, 70, 90, 120, 150, 190, 240, 300):
         found = refined(carrier, rows.take(slice(0, count, max(1, count // 100))), start=found)
     mass, std = found.mass
     assert abs(mass - 1.0) < 4 * std < 0.1
     turned = np.abs(carrier.term.arm.geometry.towards(found.load.geometry)[carrier.term.arm.geometry.turns])
     assert turned.max() > 0.1  # further than anything is linear
-    answer = carrier.carrying(found.load).predict(other.q, other.dq, other.ddq)
+    answer = carrier.with_payload(found.load).predict(other.q, other.dq, other.ddq)
     assert ((answer.tau - other.tau) ** 2).mean(0).sum() < 3e-3 * other.tau.var(0).sum()
-    assert errors(carrier.carrying(found.load), other)[1] > 0.85
+    assert errors(carrier.with_payload(found.load), other)[1] > 0.85
 
 
 def test_a_payload_that_is_there_no_more_leaves_the_arm_as_it_was(carrier, recorded):
@@ -223,25 +223,25 @@ def test_a_payload_that_is_there_no_more_leaves_the_arm_as_it_was(carrier, recor
 
 
 def test_rows_of_an_arm_that_carries_nothing_speak_against_a_payload(carrier):
-    free = simulate(load_robot("panda"), Stream(100, 100.0, speed=5.0, noise=0.05), 8)
+    free = simulate(load_robot("panda"), Simulation(100, 100.0, speed=5.0, noise=0.05), 8)
     assert estimate(carrier, as_rows(free)).gain < 0
 
 
 def test_a_declared_payload_is_what_pinocchio_adds_to_an_arm_whose_frame_is_known():
     robot = load_robot("panda")
-    still = simulate(robot, Stream(300, 10.0, speed=10.0, noise=0.01), 1)
+    still = simulate(robot, Simulation(300, 10.0, speed=10.0, noise=0.01), 1)
     bodies = RigidBody.from_profile("panda", robot.joint_names, robot.joint_types)
     model = lipcore.train(still, robot.joint_types, "rigid-body", FitOptions(geometry="fixed"), robot=bodies)
     carrier = Carrier(model)
-    asked = simulate(robot, Stream(100, 10.0, speed=5.0, noise=0.0), 2)
+    asked = simulate(robot, Simulation(100, 10.0, speed=5.0, noise=0.0), 2)
     carried = Body(2.0, np.array([0.02, -0.03, 0.11]))
-    answer = carrier.carrying(carrier.known(carried.parameters)).predict(asked.q, asked.dq, asked.ddq)
+    answer = carrier.with_payload(carrier.known(carried.parameters)).predict(asked.q, asked.dq, asked.ddq)
     more = Payload(2.0, 0.0, (0.02, -0.03, 0.11))
     expected = inverse_dynamics(robot, asked.q, asked.dq, asked.ddq, np.ones(100), more)
     assert ((answer.tau - expected) ** 2).mean() < 1e-4 * expected.var()
 
 
 def test_what_is_known_beforehand_is_the_load_without_rows(carrier):
-    found = known(carrier, ANY)
-    np.testing.assert_allclose(found.load.payload, body(ANY.centre)[0])
+    found = estimate_from_prior(carrier, ANY_PAYLOAD)
+    np.testing.assert_allclose(found.load.payload, body(ANY_PAYLOAD.centre)[0])
     assert found.mass[1] == pytest.approx(1.2 * found.mass[0])

@@ -10,9 +10,9 @@ from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
-from lipcore.online.payload.holding import Watch
+from lipcore.online.payload.holding import PayloadTracker
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 from tests.lipcore.stepping import finished
 
 SHIPPED = Path(__file__).parents[2] / "models" / "panda-sim"
@@ -26,10 +26,10 @@ def carrier():
 
 def stream(seed, mass=0.0, noise=0.05, first=19.0, last=23.0):
     """Rows of a Panda that carries a mass from UP to DOWN, off its last axis."""
-    robot, asked = load_robot("panda"), Stream(2400, RATE, speed=5.0, noise=noise)
+    robot, asked = load_robot("panda"), Simulation(2400, RATE, speed=5.0, noise=noise)
     free = simulate(robot, asked, seed)
     full = simulate(
-        robot, Stream(2400, RATE, speed=5.0, noise=noise, payload=Payload(mass, 0.0, (0.02, 0.02, 0.08))), seed
+        robot, Simulation(2400, RATE, speed=5.0, noise=noise, payload=Payload(mass, 0.0, (0.02, 0.02, 0.08))), seed
     )
     carried = ((free.t >= UP) & (free.t < DOWN))[:, None] if mass else np.zeros((len(free), 1), bool)
     tau = np.where(carried, full.tau, free.tau)
@@ -39,7 +39,7 @@ def stream(seed, mass=0.0, noise=0.05, first=19.0, last=23.0):
 
 def followed(carrier, rows, block=10):
     """The watches after each block."""
-    watch, out = Watch(7), []
+    watch, out = PayloadTracker(7), []
     for first in range(0, len(rows), block):
         watch = watch.step(carrier, rows.take(slice(first, first + block)))
         out.append((rows.time[min(first + block, len(rows)) - 1], watch))
@@ -106,7 +106,7 @@ def test_batches_of_any_size_notice_the_same(carrier):
 
 def test_rows_that_came_before_and_a_gap_are_passed_over(carrier):
     rows = stream(300, 1.0, last=21.0)
-    watch = Watch(7).step(carrier, rows)
+    watch = PayloadTracker(7).step(carrier, rows)
     again = watch.step(carrier, rows)
     assert again.held.count == watch.held.count
     later = rows.take(slice(50, 60))
@@ -117,10 +117,10 @@ def test_rows_that_came_before_and_a_gap_are_passed_over(carrier):
 def test_a_declared_payload_answers_at_once_and_rows_overrule_it(carrier):
     rows = stream(305, 1.0, last=21.9)
     carried = rows.take(rows.time >= UP)
-    right = Watch(7).declare(carrier, Body(1.0, np.array([0.0, 0.04, 0.08])), UP)
+    right = PayloadTracker(7).declare(carrier, Body(1.0, np.array([0.0, 0.04, 0.08])), UP)
     assert right.held.declared
     np.testing.assert_allclose(right.load.payload[:1], 1.0)
-    wrong = Watch(7).declare(carrier, Body(3.0, np.array([0.0, 0.0, 0.1])), UP)
+    wrong = PayloadTracker(7).declare(carrier, Body(3.0, np.array([0.0, 0.0, 0.1])), UP)
     for block in range(0, len(carried), 10):
         wrong = wrong.step(carrier, carried.take(slice(block, block + 10)))
     assert wrong.held.estimate.mass[0] == pytest.approx(1.0, abs=0.05)
@@ -130,11 +130,11 @@ def test_a_declared_payload_answers_at_once_and_rows_overrule_it(carrier):
 
 def test_what_a_report_says_of_a_payload_is_taken_up_again(carrier):
     watch = followed(carrier, stream(300, 1.0, last=21.0))[-1][1]
-    again = Watch.from_json(watch.to_json(), 7, carrier)
+    again = PayloadTracker.from_json(watch.to_json(), 7, carrier)
     assert (again.state, again.since, again.held.count) == (watch.state, watch.since, watch.held.count)
     np.testing.assert_allclose(again.load.payload, watch.load.payload)
     np.testing.assert_allclose(again.held.estimate.covariance, watch.held.estimate.covariance)
-    nothing = Watch.from_json(Watch(7).put_down(3.0).to_json(), 7, carrier)
+    nothing = PayloadTracker.from_json(PayloadTracker(7).put_down(3.0).to_json(), 7, carrier)
     assert (nothing.held, nothing.since) == (None, 3.0)
 
 
@@ -184,8 +184,8 @@ def test_what_is_refined_stays_until_more_rows_are_refined(carrier):
     assert late.load is last.held.estimate.load
     assert late.draws is found.estimate.draws
     assert refined(last).estimate.mass[0] == pytest.approx(1.0, abs=0.02)
-    assert last.put_down(30.0)._around(carrier).refined(found).held is None
-    other = last.declare(carrier, Body(1.0, np.array([0.0, 0.04, 0.08])), UP)._around(carrier)
+    assert last.put_down(30.0)._relinearise(carrier).refined(found).held is None
+    other = last.declare(carrier, Body(1.0, np.array([0.0, 0.04, 0.08])), UP)._relinearise(carrier)
     assert other.refined(found).held is other.held
     assert other.refinement() is None  # nothing was seen with it
 
@@ -208,19 +208,19 @@ def test_an_outline_goes_on_as_the_watch_does(carrier):
 def test_what_one_version_has_noticed_another_takes_for_about_there(carrier):
     rows = stream(300, 1.5, last=21.9)
     noticed = followed(carrier, rows.take(rows.time < UP + 0.5))[-1][1]
-    watch = Watch.of_another(noticed.to_json(), 7, carrier)
+    watch = PayloadTracker.from_other_version(noticed.to_json(), 7, carrier)
     assert (watch.state, watch.since, watch.held.declared) == ("payload", noticed.since, False)
     mass, std = watch.held.estimate.mass
     assert mass == pytest.approx(1.5, abs=0.02)
     assert 0.03 < std < 0.1
     asked = rows.take(rows.time >= UP + 0.5)
-    vague, exact = (carrier.carrying(each.load).predict(asked.q, asked.dq, asked.ddq) for each in (watch, noticed))
+    vague, exact = (carrier.with_payload(each.load).predict(asked.q, asked.dq, asked.ddq) for each in (watch, noticed))
     assert (vague.tau_std.max(0) > 5 * exact.tau_std.max(0)).any()
     assert (np.abs(vague.tau - asked.tau) < 1.96 * np.sqrt(vague.tau_std**2 + vague.noise_std**2)).mean() > 0.9
     for block in range(0, len(asked), 10):
         watch = watch.step(carrier, asked.take(slice(block, block + 10)))
     assert watch.held.estimate.mass[1] < 0.03
-    nothing = Watch.of_another(Watch(7).put_down(3.0).to_json(), 7, carrier)
+    nothing = PayloadTracker.from_other_version(PayloadTracker(7).put_down(3.0).to_json(), 7, carrier)
     assert (nothing.held, nothing.since) == (None, 3.0)
 
 
@@ -231,7 +231,7 @@ def test_the_state_changes_at_most_once_a_second_whatever_knocks(carrier):
     hit = rows.time % 0.4 < 0.15
     tau[hit, knock[hit] % 7] += np.where(knock[hit] % 2, 20.0, -20.0)
     knocked = Rows(rows.time, rows.q, rows.dq, rows.ddq, tau, rows.code)
-    watch, states = Watch(7), []
+    watch, states = PayloadTracker(7), []
     for first in range(0, len(knocked), 10):
         watch = watch.step(carrier, knocked.take(slice(first, first + 10)))
         states.append(watch.state)

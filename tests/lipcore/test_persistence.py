@@ -18,13 +18,13 @@ from lipcore.data.motion import Array
 from lipcore.files import persistence
 from lipcore.files.strict_json import MAX_DEPTH, StrictJsonError, quote, read
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from tests.choosing import slow
 
 
 @pytest.fixture(scope="module")
 def samples() -> Samples:
-    return simulate(load_robot("double-pendulum"), Stream(n_samples=60, speed=10, noise=0.01), seed=1)
+    return simulate(load_robot("double-pendulum"), Simulation(n_samples=60, speed=10, noise=0.01), seed=1)
 
 
 @pytest.fixture(scope="module", params=["lip-chain", slow("lip"), slow("lip untied")])

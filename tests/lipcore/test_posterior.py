@@ -23,7 +23,7 @@ from lipcore.posterior.exact import ExactPosterior, negative_log_evidence
 from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.posterior.statistics import collect
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import ROBOT_ESTIMATORS
 from tests.lipcore.oracles import KERNELS, Problem, TorchForm, in_full, random_problem
@@ -154,7 +154,7 @@ def test_covariance_that_cannot_be_factored_is_reported() -> None:
 
 ROBOT = "double-pendulum"
 OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=40, starts=1, device="cpu")
-STREAM = Stream(n_samples=120, speed=10, noise=0.02, viscous=0.1, coulomb=0.05)
+STREAM = Simulation(n_samples=120, speed=10, noise=0.02, viscous=0.1, coulomb=0.05)
 
 
 class Case(NamedTuple):
@@ -216,7 +216,7 @@ def test_with_every_output_it_is_the_exact_posterior(case: Case) -> None:
 
 
 def test_components_and_energies(case: Case) -> None:
-    names = [name for name in dynamics.available(case.model.estimator) if name != "forward_dynamics"]
+    names = [name for name in dynamics.available_components(case.model.estimator) if name != "forward_dynamics"]
     expected = dynamics.components(replace(case.model, posterior=case.exact), case.unseen[:20], names)
     answer = dynamics.components(case.model, case.unseen[:20], names)
     for name in names:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.signal import butter, sosfiltfilt
 
 from lipcore.preparation.causal import CausalFilter
-from lipcore.preparation.filtering import settle
+from lipcore.preparation.filtering import resolve_filters
 from lipcore.preparation.plan import plan
 from lipcore.preparation.recipe import PreparationError, Recipe
 
@@ -279,7 +279,7 @@ def two_joints(count, names):
 
 def live(rate, n_joints, recipe, names=("q", "dq", "tau")):
     """The filter of a recipe for rows that come one after the other."""
-    return CausalFilter(settle(rate, tuple(name for name in ALL if name in names), recipe), n_joints)
+    return CausalFilter(resolve_filters(rate, tuple(name for name in ALL if name in names), recipe), n_joints)
 
 
 @given(

@@ -8,14 +8,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lipcore.profiles import from_urdf, names, profile, profiles, recognise
-from lipcore.profiles.catalogue import sheets
-from lipcore.profiles.names import words
+from lipcore.profiles.catalogue import read_entries
+from lipcore.profiles.names import split_words
 from lipcore.robots.library import ROBOTS, UnknownRobotError, load_robot, profile_urdf
 from lipcore.robots.urdf import RigidBody
 from lipcore.robots.urdf_text import UrdfError
 from tests.lipcore.test_urdf import joint, link, robot
 
-SHEETS = sheets()
+SHEETS = read_entries()
 ALL = tuple(SHEETS)
 ARMS = tuple(name for name, sheet in SHEETS.items() if sheet.ranges)
 UR = tuple(f"{each}_joint" for each in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3"))
@@ -51,7 +51,9 @@ def test_every_profile_is_complete(name: str) -> None:
     for limit in (found.speed, found.acceleration, found.torque):
         assert (np.isnan(limit) | (np.isfinite(limit) & (limit > 0))).all()
     # no two joints may be called the same
-    spellings = [{words(each) for each in (a, *b)} for a, b in zip(found.joint_names, found.joint_aliases, strict=True)]
+    spellings = [
+        {split_words(each) for each in (a, *b)} for a, b in zip(found.joint_names, found.joint_aliases, strict=True)
+    ]
     assert sum(map(len, spellings)) == len(set().union(*spellings))
 
 
@@ -77,10 +79,10 @@ def test_limits_are_those_of_the_urdf_as_pinocchio_reads_it(name: str) -> None:
 def test_without_example_robot_data_the_arms_with_numbers_of_their_own_are_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("lipcore.profiles.catalogue.installed_profiles", lambda: ())
+    monkeypatch.setattr("lipcore.profiles.catalogue.list_installed_robots", lambda: ())
     assert names() == ARMS
     assert profile("panda").urdf is None
-    assert "no URDF is installed" in profile("panda").why_no_urdf()
+    assert "no URDF is installed" in profile("panda").explain_missing_urdf()
     assert profile("panda").lower[0] == -2.8973
     with pytest.raises(UnknownRobotError, match="robot is 'tiago', expected one of panda, fr3") as caught:
         profile("tiago")
@@ -117,7 +119,7 @@ def test_joints_are_found_under_the_names_of_drivers_in_any_order(
     assert order is not None
     assert [mixed[place] for place in order] == list(joints)
     assert found.match(mixed) == tuple(joints.index(each) if each in joints else None for each in mixed)
-    assert found.called(joints) == found.joint_names
+    assert found.official_names(joints) == found.joint_names
 
 
 @pytest.mark.parametrize(
@@ -141,14 +143,14 @@ def test_some_joints_of_a_robot_are_matched_but_no_whole() -> None:
     panda = profile("panda")
     fingers, arm = ("panda_finger_joint1", "panda_finger_joint2"), numbered("panda_joint{}", 7)
     assert panda.order_of((*fingers, *arm)) == list(range(2, 9))
-    assert panda.called((*fingers, *arm)) is None
+    assert panda.official_names((*fingers, *arm)) is None
     some = ("panda_joint4", "panda_joint2")
     assert panda.match(some) == (3, 1)
     assert panda.order_of(some) is None
-    assert panda.called(some) == some
-    assert panda.called(("fer_joint4", "fer_joint2")) == some
+    assert panda.official_names(some) == some
+    assert panda.official_names(("fer_joint4", "fer_joint2")) == some
     assert panda.match(("joint4", "joint2")) == (3, 1)
-    assert panda.called(("joint4", "joint2")) is None
+    assert panda.official_names(("joint4", "joint2")) is None
 
 
 def test_what_is_recognised() -> None:

@@ -13,7 +13,7 @@ from lipcore.model.sibling import arm_of_sibling
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.training.refit import refit
 from lipcore.training.train import fit_model
@@ -27,7 +27,7 @@ OPTIONS = FitOptions(
 
 def moving(seed=3):
     """An arm whose joints all move, with friction and noise."""
-    return simulate(load_robot(ARM), Stream(200, rate=10.0, speed=4.0, noise=0.0005, coulomb=0.005), seed)
+    return simulate(load_robot(ARM), Simulation(200, rate=10.0, speed=4.0, noise=0.0005, coulomb=0.005), seed)
 
 
 def resting():

@@ -5,12 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.data.repetition import OPTIONS, distinct, features, groups, period, repetition, share_repeated
+from lipcore.data.repetition import (
+    OPTIONS,
+    features,
+    find_period,
+    group_blocks,
+    measure_distinct_share,
+    measure_repeated_share,
+    repetition,
+)
 from lipcore.data.samples import Samples
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
-from lipcore.training.held_out import unrepeated
+from lipcore.robots.simulation import Simulation, simulate
+from lipcore.training.held_out import find_unrepeated
 
 PANDA = load_robot("panda")
 TYPES = ("revolute",) * 7
@@ -18,7 +26,7 @@ TYPES = ("revolute",) * 7
 
 def motion(course="sinusoids", seed=1, rows=2000, speed=2.0, **kwargs) -> Samples:
     """Panda at 50 Hz; periodic motion repeats every 10 s / speed."""
-    return simulate(PANDA, Stream(n_samples=rows, rate=50.0, course=course, speed=speed, **kwargs), seed)
+    return simulate(PANDA, Simulation(n_samples=rows, rate=50.0, course=course, speed=speed, **kwargs), seed)
 
 
 def joined(*parts: Samples) -> Samples:
@@ -37,7 +45,7 @@ def halves(samples: Samples) -> tuple[Samples, Samples]:
 def test_periodic_motion_is_found_with_its_period(speed: float, dirt: Dirt | None) -> None:
     found = repetition(*halves(motion("periodic", speed=speed, dirt=dirt)), TYPES)
     assert found.share > 0.9
-    assert found.flatters
+    assert found.is_repeated
     assert found.period == pytest.approx(10.0 / speed, rel=0.02)
 
 
@@ -45,7 +53,7 @@ def test_periodic_motion_is_found_with_its_period(speed: float, dirt: Dirt | Non
 def test_motion_that_goes_on_is_new(course: str) -> None:
     found = repetition(*halves(motion(course)), TYPES)
     assert found.share < 0.1
-    assert not found.flatters
+    assert not found.is_repeated
     assert found.period is None
 
 
@@ -54,11 +62,11 @@ def test_motion_that_comes_again_counts_once(course: str, passes: int) -> None:
     """Forty seconds, periodic ones of four periods: also with noisy signals, after a rest, and in an episode each."""
     for dirt in (None, Dirt()):
         samples = motion(course, speed=1.0, dirt=dirt)
-        assert distinct(samples, TYPES) == pytest.approx(1 / passes, rel=0.1)
+        assert measure_distinct_share(samples, TYPES) == pytest.approx(1 / passes, rel=0.1)
     apart = replace(samples, episode=np.arange(2000) // 500)
-    assert distinct(apart, TYPES) == distinct(samples, TYPES)
+    assert measure_distinct_share(apart, TYPES) == measure_distinct_share(samples, TYPES)
     still = samples.rows(np.zeros(500, np.int64))
-    assert distinct(joined(still, samples), TYPES) == pytest.approx((500 + 2000 / passes) / 2500, rel=0.1)
+    assert measure_distinct_share(joined(still, samples), TYPES) == pytest.approx((500 + 2000 / passes) / 2500, rel=0.1)
 
 
 def test_motion_of_another_recording_is_known_again() -> None:
@@ -82,19 +90,19 @@ def test_shares_are_those_of_distances_taken_one_by_one() -> None:
     states = known[1::2] + away
     nearest = [min(np.linalg.norm(state - each) for each in known) for state in states]
     expected = np.mean(np.array(nearest[:30]) <= OPTIONS.min_near * usual) * 0.75
-    assert share_repeated(known[1::2].repeat(3, axis=0), states) >= expected > 0.7
+    assert measure_repeated_share(known[1::2].repeat(3, axis=0), states) >= expected > 0.7
 
 
 def test_blocks_that_repeat_each_other_are_of_one_group() -> None:
     one, two = (motion("periodic", seed=seed, rows=500) for seed in (1, 2))
     recording = joined(one, two)
-    found = groups(features(recording, TYPES), np.arange(0, 1001, 250))  # 5 s are a period
+    found = group_blocks(features(recording, TYPES), np.arange(0, 1001, 250))  # 5 s are a period
     assert found[0] == found[1] != found[2] == found[3]
 
 
 def test_what_is_not_repeated_is_held_out_instead_of_a_last_part_that_is() -> None:
     free, again = motion(seed=3, rows=600, speed=10.0), motion("periodic", rows=2000)
-    ((first, last),) = unrepeated(joined(free, again), TYPES, 0.25, 0)
+    ((first, last),) = find_unrepeated(joined(free, again), TYPES, 0.25, 0)
     assert first == 0
     assert last == pytest.approx(600, abs=250)
 
@@ -103,13 +111,13 @@ def test_whole_groups_of_periods_are_held_out() -> None:
     """Two motions take turns, three periods each: the last part repeats both, a group of one is new."""
     one, two = (motion("periodic", seed=seed, rows=750) for seed in (1, 2))
     recording = joined(one, two, one)
-    found = unrepeated(recording, TYPES, 0.3, 0)
+    found = find_unrepeated(recording, TYPES, 0.3, 0)
     assert found == [(750, 1500)]
 
 
 @pytest.mark.parametrize("course", ["periodic", "sinusoids"])
 def test_the_last_part_stays_where_all_or_nothing_repeats(course: str) -> None:
-    assert unrepeated(motion(course), TYPES, 0.3, 0) is None
+    assert find_unrepeated(motion(course), TYPES, 0.3, 0) is None
 
 
 def test_episodes_count_as_blocks() -> None:
@@ -117,7 +125,7 @@ def test_episodes_count_as_blocks() -> None:
     seeds = (1, 2, 3, 4, 2, 1)
     parts = [motion(seed=seed, rows=300, speed=10.0) for seed in seeds]
     recording = replace(joined(*parts), episode=np.repeat(np.arange(6), 300))
-    found = unrepeated(recording, TYPES, 0.3, 0)
+    found = find_unrepeated(recording, TYPES, 0.3, 0)
     held = {place for first, last in found for place in range(first // 300, last // 300)}
     assert held
     for seed in (1, 2):
@@ -125,7 +133,7 @@ def test_episodes_count_as_blocks() -> None:
 
 
 def test_motion_without_return_has_no_period() -> None:
-    assert period(motion("rests"), TYPES) is None
+    assert find_period(motion("rests"), TYPES) is None
     still = motion(rows=100)
     still = replace(still, q=0 * still.q, dq=0 * still.dq, ddq=0 * still.ddq)
-    assert period(still, TYPES) is None
+    assert find_period(still, TYPES) is None

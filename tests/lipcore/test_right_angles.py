@@ -8,22 +8,22 @@ import numpy as np
 import pytest
 
 from lipcore.arm import right_angles
-from lipcore.arm.learning import Learnt, learn
-from lipcore.arm.problem import Expected
+from lipcore.arm.learning import ArmFit, learn
+from lipcore.arm.problem import GeometryPrior
 from lipcore.arm.right_angles import (
     DIRECTIONS,
     Candidate,
-    certainty,
+    apply_layout,
+    candidate_probabilities,
     expected_layout,
-    laid_out,
-    shares,
+    right_angle_probabilities,
 )
 from lipcore.data.samples import Samples
 from lipcore.estimators.options import FitOptions
 from lipcore.estimators.task import Task
 from lipcore.kernels.geometry import Geometry
 from lipcore.robots.library import Robot, load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.training.fit import fit_estimator
 from tests.lipcore.arm_oracles import arm, recorded
@@ -56,7 +56,7 @@ def panda() -> Geometry:
 def test_a_layout_turns_its_axes_and_leaves_the_others_and_all_places() -> None:
     geometry = panda().moved(np.random.default_rng(1).normal(0, 0.1, panda().size))
     layout = (4, None, 4, 2, None, 3, 5)
-    turned = laid_out(geometry, layout)
+    turned = apply_layout(geometry, layout)
     for joint, direction in enumerate(layout):
         wanted = axes(geometry)[joint] if direction is None else DIRECTIONS[direction]
         np.testing.assert_allclose(axes(turned)[joint], wanted, atol=1e-12)
@@ -64,9 +64,9 @@ def test_a_layout_turns_its_axes_and_leaves_the_others_and_all_places() -> None:
 
 
 def test_a_layout_expects_its_axes_closely_and_the_others_anywhere() -> None:
-    geometry = laid_out(panda(), (4, None, 4, None, 4, None, 5))
+    geometry = apply_layout(panda(), (4, None, 4, None, 4, None, 5))
     prior = expected_layout(geometry, (4, None, 4, None, 4, None, 5))
-    assert isinstance(prior, Expected)
+    assert isinstance(prior, GeometryPrior)
     turns = np.split(prior.widths, np.cumsum(geometry.screws)[:-1])
     for joint, widths in enumerate(turns):
         assert (widths[:2] == (right_angles.OPTIONS.turn_width_rad if joint % 2 == 0 else 1.0)).all()
@@ -78,21 +78,21 @@ def test_a_layout_expects_its_axes_closely_and_the_others_anywhere() -> None:
 def test_probabilities_follow_the_evidence() -> None:
     cases = [((4, 2), 0.0), ((4, None), np.log(2)), ((None, None), np.log(4))]
     found = [Candidate(layout, None, None, evidence) for layout, evidence in cases]  # type: ignore[arg-type]
-    np.testing.assert_allclose(shares(found), np.array([4, 2, 1]) / 7)
-    np.testing.assert_allclose(certainty(found), np.array([6, 4]) / 7)
+    np.testing.assert_allclose(candidate_probabilities(found), np.array([4, 2, 1]) / 7)
+    np.testing.assert_allclose(right_angle_probabilities(found), np.array([6, 4]) / 7)
 
 
 def short_recording(robot: Robot, seed: int, rows: int = 80) -> Samples:
     """A few seconds of moderate motion with friction and noise, which leave much of the geometry open."""
-    return simulate(robot, Stream(rows, rate=20.0, speed=4.0, noise=0.05, coulomb=0.2), seed)
+    return simulate(robot, Simulation(rows, rate=20.0, speed=4.0, noise=0.05, coulomb=0.2), seed)
 
 
-def certainties(found: Learnt) -> np.ndarray:
+def certainties(found: ArmFit) -> np.ndarray:
     """How probable the report says right angles are, (n,)."""
     return np.array([found.report[f"right_angle_{joint + 1}"] for joint in range(found.arm.n_joints)], float)
 
 
-def errors(found: Learnt, task: Task, unseen: Samples) -> np.ndarray:
+def errors(found: ArmFit, task: Task, unseen: Samples) -> np.ndarray:
     """nMSE on another motion, (n,)."""
     model = fit_estimator(task, "rigid-body", found)
     error = model.predict(unseen.q, unseen.dq, unseen.ddq).tau - unseen.tau
@@ -101,7 +101,7 @@ def errors(found: Learnt, task: Task, unseen: Samples) -> np.ndarray:
 
 def test_axes_that_a_short_recording_leaves_open_are_expected_at_right_angles(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = load_robot("panda")
-    samples, unseen = short_recording(robot, 3), simulate(robot, Stream(100, speed=6.0, coulomb=0.2), 9)
+    samples, unseen = short_recording(robot, 3), simulate(robot, Simulation(100, speed=6.0, coulomb=0.2), 9)
     task = Task(samples, robot.joint_types, OPTIONS)
     begin = panda().moved(np.random.default_rng(2).normal(0, 0.15, panda().size))
     found = learn(task, begin=(begin,))

@@ -16,7 +16,7 @@ from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.model.parameters import friction_coefficients, inertial_parameters
 from lipcore.model.plausible import is_plausible, pseudo_inertia
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import JointMismatchError, RigidBody
 
 VISCOUS, COULOMB = 0.5, 0.3
@@ -57,13 +57,13 @@ def wrong_panda(panda: RigidBody) -> RigidBody:
 @pytest.fixture(scope="module")
 def recorded() -> Samples:
     """300 samples of a moving Panda with friction, its sign as smooth about standstill as the model says."""
-    samples = simulate(load_robot("panda"), Stream(300, speed=10, noise=0.005, viscous=VISCOUS), seed=1)
+    samples = simulate(load_robot("panda"), Simulation(300, speed=10, noise=0.005, viscous=VISCOUS), seed=1)
     return replace(samples, tau=samples.tau + COULOMB * np.tanh(samples.dq / 0.02))
 
 
 @pytest.fixture(scope="module")
 def unseen() -> Samples:
-    return simulate(load_robot("panda"), Stream(100, speed=10, noise=0.0, n_sinusoids=100), seed=2)
+    return simulate(load_robot("panda"), Simulation(100, speed=10, noise=0.0, n_sinusoids=100), seed=2)
 
 
 @pytest.fixture(scope="module", params=["urdf", pytest.param("zero", marks=pytest.mark.slow)])
@@ -174,8 +174,8 @@ def test_energies_take_what_rigid_bodies_leave(tmp_path: Path) -> None:
     def spring(samples: Samples) -> Samples:
         return replace(samples, tau=samples.tau + np.stack([0 * samples.q[:, 1], 0.4 * np.sin(2 * samples.q[:, 1])], 1))
 
-    data = spring(simulate(robot, Stream(150, speed=10, noise=0.001), seed=1))
-    unseen = spring(simulate(robot, Stream(60, speed=10, noise=0.0), seed=2))
+    data = spring(simulate(robot, Simulation(150, speed=10, noise=0.001), seed=1))
+    unseen = spring(simulate(robot, Simulation(60, speed=10, noise=0.0), seed=2))
     options = replace(OPTIONS, hyperparameter_samples=60, max_iterations=40)
     errors = {}
     for name in ("rigid-body", "rigid-body+lip-chain"):

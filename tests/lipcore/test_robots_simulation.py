@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.arms import another_unit
 from lipcore.robots.library import ROBOTS, Robot, load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +30,7 @@ def test_every_robot_moves_its_joints_with_the_torque_of_pinocchio(name: str) ->
     assert robot.joint_names == ROBOTS[name].free
     assert robot.joint_types[1:] == ("revolute",) * (count - 1)
     assert robot.joint_types[0] == ("prismatic" if name == "tiago" else "revolute")
-    samples = simulate(robot, Stream(n_samples=20, motion="full", speed=10, noise=0.0), seed=1)
+    samples = simulate(robot, Simulation(n_samples=20, motion="full", speed=10, noise=0.0), seed=1)
     assert samples.tau.shape == (20, count)
     assert samples.joint_names == robot.joint_names
     expected = rnea(robot, samples.q, samples.dq, samples.ddq)
@@ -39,7 +39,7 @@ def test_every_robot_moves_its_joints_with_the_torque_of_pinocchio(name: str) ->
 
 
 def test_equal_seeds_give_equal_samples_and_others_do_not(panda: Robot) -> None:
-    one, same, other = (simulate(panda, Stream(n_samples=30), seed) for seed in (3, 3, 4))
+    one, same, other = (simulate(panda, Simulation(n_samples=30), seed) for seed in (3, 3, 4))
     for name in ("t", "q", "dq", "ddq", "tau"):
         assert np.array_equal(getattr(one, name), getattr(same, name))
     for name in ("q", "dq", "ddq", "tau"):
@@ -48,7 +48,7 @@ def test_equal_seeds_give_equal_samples_and_others_do_not(panda: Robot) -> None:
 
 def test_velocity_and_acceleration_are_the_derivatives_of_position(panda: Robot) -> None:
     rate = 1000.0
-    fine = simulate(panda, Stream(n_samples=3000, rate=rate, speed=10), seed=0)
+    fine = simulate(panda, Simulation(n_samples=3000, rate=rate, speed=10), seed=0)
     assert np.allclose(np.diff(fine.t), 1 / rate)
     for signal, derivative in ((fine.q, fine.dq), (fine.dq, fine.ddq)):
         error = np.gradient(signal, 1 / rate, axis=0)[1:-1] - derivative[1:-1]
@@ -59,7 +59,7 @@ def test_velocity_and_acceleration_are_the_derivatives_of_position(panda: Robot)
 @pytest.mark.parametrize("name", ["panda", "kinova", "tiago"])
 def test_motion_spans_its_range_unless_speed_limits_it(name: str, motion: str) -> None:
     robot = load_robot(name)
-    samples, half = simulate(robot, Stream(motion=motion, speed=10), seed=2), (robot.upper - robot.lower) / 2
+    samples, half = simulate(robot, Simulation(motion=motion, speed=10), seed=2), (robot.upper - robot.lower) / 2
     reach = np.minimum(0.5, half) if motion == "middle" else 0.95 * half
     away, speed = np.abs(samples.q - (robot.lower + robot.upper) / 2).max(0), np.abs(samples.dq).max(0)
     assert (away <= reach * (1 + 1e-9)).all()
@@ -68,7 +68,7 @@ def test_motion_spans_its_range_unless_speed_limits_it(name: str, motion: str) -
 
 
 def test_friction_and_noise_are_added_as_stated(panda: Robot) -> None:
-    plain = Stream(n_samples=400, speed=10, noise=0.0)
+    plain = Simulation(n_samples=400, speed=10, noise=0.0)
     viscous, coulomb = np.linspace(0.1, 0.7, 7), 0.3
     clean = simulate(panda, plain, seed=5)
     rubbing = simulate(panda, replace(plain, viscous=tuple(viscous), coulomb=coulomb), seed=5)
@@ -97,7 +97,7 @@ def test_another_unit_has_the_same_joints_and_other_masses(panda: Robot) -> None
 def test_payload_is_the_weight_it_says(panda: Robot) -> None:
     """The extra torque does the work of lifting the mass: Jᵀ m (a − g) of its point."""
     payload = Payload(mass=1.5, at=0.35, offset=(0.0, 0.03, 0.1))
-    stream = Stream(n_samples=10, speed=10, noise=0.0)
+    stream = Simulation(n_samples=10, speed=10, noise=0.0)
     free, loaded = simulate(panda, stream, seed=7), simulate(panda, replace(stream, payload=payload), seed=7)
     assert np.array_equal(loaded.tau[:4], free.tau[:4])
     model = panda.model.copy()
@@ -133,4 +133,4 @@ def test_payload_is_the_weight_it_says(panda: Robot) -> None:
 )
 def test_stream_that_cannot_be_simulated_names_the_field(panda: Robot, changes: dict, field: str) -> None:
     with pytest.raises(ValueError, match=f"^{field} "):
-        simulate(panda, replace(Stream(n_samples=5), **changes), seed=0)
+        simulate(panda, replace(Simulation(n_samples=5), **changes), seed=0)

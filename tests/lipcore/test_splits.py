@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lipcore.data.samples import Samples
-from lipcore.data.splits import GUARD_S, Split, SplitError, choose, split, taken
+from lipcore.data.splits import GUARD_S, Split, SplitError, choose_stretches, select_rows, split
 
 KINDS = ("episodes", "last", "blocks")
 
@@ -125,7 +125,7 @@ def test_blocks_are_stretches_of_equal_length(rows, blocks, share, seed):
 @given(st.lists(st.integers(1, 1000), min_size=2, max_size=50), st.floats(0.01, 0.99), st.integers(0, 3))
 def test_choices_are_near_the_share(lengths, share, seed):
     counts = np.array(lengths)
-    chosen = choose(counts, share, seed)
+    chosen = choose_stretches(counts, share, seed)
     assert chosen.any()
     assert not chosen.all()
     held, wanted = counts[chosen].sum(), share * counts.sum()
@@ -136,9 +136,9 @@ def test_choices_are_near_the_share(lengths, share, seed):
 
 def test_the_seed_decides_and_what_was_held_out_is_found_again_in_later_releases():
     """Lineages count on it: these numbers never change."""
-    chosen = choose(np.array([10, 20, 30, 40, 50, 60]), 0.3, 7)
+    chosen = choose_stretches(np.array([10, 20, 30, 40, 50, 60]), 0.3, 7)
     assert np.flatnonzero(chosen).tolist() == [0, 2, 3]
-    assert len({choose(np.full(20, 50), 0.3, seed).tobytes() for seed in range(20)}) > 10
+    assert len({choose_stretches(np.full(20, 50), 0.3, seed).tobytes() for seed in range(20)}) > 10
 
 
 def test_a_pause_ends_the_guard_and_clocks_that_start_anew_need_none():
@@ -190,8 +190,8 @@ def test_rows_that_are_taken_begin_an_episode_after_every_interruption():
     episode = np.repeat([3, 5], 6)
     samples = Samples(("a", "b"), np.arange(12.0), episode, rows, rows + 1, rows + 2, rows + 3)
     kept = np.array([1, 1, 0, 0, 1, 1, 1, 0, 1, 1, 1, 1], dtype=bool)
-    found = taken(samples, kept)
+    found = select_rows(samples, kept)
     assert found.episode.tolist() == [0, 0, 1, 1, 2, 3, 3, 3, 3]
     np.testing.assert_array_equal(found.tau, samples.tau[kept])
     np.testing.assert_array_equal(found.t, samples.t[kept])
-    assert len(taken(samples, np.zeros(12, dtype=bool))) == 0
+    assert len(select_rows(samples, np.zeros(12, dtype=bool))) == 0

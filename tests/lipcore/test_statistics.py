@@ -20,8 +20,8 @@ from lipcore.posterior.statistics import (
     collect,
     decay,
     empty,
-    known,
     learnt_root,
+    make_solution,
     merge,
     solve,
 )
@@ -137,7 +137,7 @@ def test_what_is_learnt_is_exact_and_triangular(first: int, count: int, largest:
     assert np.allclose(np.eye(20) - found.covariance, learnt, rtol=0, atol=1e-10)
     assert np.allclose(found.mean, mean, rtol=0, atol=1e-9)
     assert np.count_nonzero(np.triu(found.root, 1)) == 0
-    again = known(found.mean, found.covariance, first)
+    again = make_solution(found.mean, found.covariance, first)
     assert np.allclose(again.covariance, found.covariance, rtol=0, atol=1e-9)
     whole = learnt_root(found.covariance)
     assert np.allclose((whole.T @ whole), learnt, rtol=0, atol=1e-10)

@@ -14,7 +14,7 @@ from lipcore.estimators.base import BaseMismatchError, RobotKind, check_base
 from lipcore.kernels.arm import ArmKernel
 from lipcore.model.sibling import arm_as_expected, arm_of_sibling
 from lipcore.robots.library import Robot
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
 from tests.choosing import slow
 from tests.lipcore.arm_oracles import arm, followed, motions, pendulum_from_its_tip
 
@@ -28,7 +28,7 @@ SECOND = another_unit(ROBOT, 0.1, seed=0)
 def recorded(robot: Robot, seed: int, size: int, noise: float = NOISE) -> Samples:
     """A unit in motion, each with friction of its own."""
     viscous = (2.0, 2.0, 0.3) if robot is ROBOT else (4.0, 1.0, 0.6)
-    return simulate(robot, Stream(size, speed=10, motion="full", noise=noise, viscous=viscous), seed)
+    return simulate(robot, Simulation(size, speed=10, motion="full", noise=noise, viscous=viscous), seed)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from lipcore.kernels.arm_prior import Alternative
 from lipcore.kernels.fast import compile as compiling
 from lipcore.kernels.fast.compile import source_stamp, use_cache
 from lipcore.model.functionals import kinetic_energy
-from lipcore.warm_up import COMPILED, warm_up
+from lipcore.warm_up import COMPILED_ESTIMATORS, warm_up
 from tests.choosing import few
 
 
@@ -33,7 +33,7 @@ def signatures() -> set[tuple[str, str]]:
     return {(each.py_func.__qualname__, str(one)) for each in ours for one in each.signatures}
 
 
-@pytest.mark.parametrize("name", few(COMPILED, lambda name: "+" in name))
+@pytest.mark.parametrize("name", few(COMPILED_ESTIMATORS, lambda name: "+" in name))
 def test_a_first_training_compiles_nothing_more(name: str) -> None:
     """On a robot of other joints and another number of them."""
     warm_up(name)

@@ -157,8 +157,8 @@ def test_a_module_that_cannot_be_imported_is_told_from_one_that_is_not_there(tmp
     (tmp_path / "halfway.py").write_text("raise ImportError('libgomp.so.1: no such file')")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(MissingExtraError, match=r"halfway, which cannot be imported \(libgomp") as caught:
-        extras.need("halfway", "robots")
+        extras.import_extra("halfway", "robots")
     again = pickle.loads(pickle.dumps(caught.value))
     assert (str(again), again.extra) == (str(caught.value), "robots")
     with pytest.raises(MissingExtraError, match="the module nowhere, which is not installed"):
-        extras.need("nowhere.else", "train")
+        extras.import_extra("nowhere.else", "train")

@@ -10,7 +10,7 @@ import numpy as np
 
 from lipcore.data.samples import Samples
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from lipserve.states import ACTIVE
 from service.learning.learners import Learners
 from service.models.loaded import LoadedModels
@@ -32,7 +32,7 @@ DEADLINE = 60.0
 @cache
 def stream(robot: str = "double-pendulum", samples: int = 80, seed: int = 1, **kwargs: Any) -> Samples:
     """A simulated recording; equal arguments give the same object."""
-    return simulate(load_robot(robot), Stream(n_samples=samples, **{"speed": 5.0, **kwargs}), seed)
+    return simulate(load_robot(robot), Simulation(n_samples=samples, **{"speed": 5.0, **kwargs}), seed)
 
 
 def arrays(samples: Samples, *names: str) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 import lipcore
 from lipcore.profiles import profile
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
 from service.cli import excite as command
 from service.cli.excite import fetch, find
 from tests.service.data import QUICK, stream, train, upload
@@ -83,7 +83,7 @@ def test_a_served_model_is_fetched_as_it_is(server):
 
 
 def test_the_robot_is_told_by_the_joints_of_the_model():
-    samples = simulate(load_robot("panda"), Stream(n_samples=20), 0)
+    samples = simulate(load_robot("panda"), Simulation(n_samples=20), 0)
     model = lipcore.train(samples, ("revolute",) * 7, "lip-chain", lipcore.FitOptions(**QUICK, starts=1))
     result = find(None, model)
     assert result.name == "panda"

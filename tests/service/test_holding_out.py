@@ -14,11 +14,11 @@ from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import inverse_dynamics
 from service.models import registry
 from service.models.archive_lineage import Lineage
-from service.models.lineage import learnt_from, named
+from service.models.lineage import describe_datasets, learnt_from
 from service.storage.database import DatasetRow
 from service.training import planned_fit, worker
-from service.training.holding_out import CannotHoldOutError, remembered
-from service.training.material import recorded
+from service.training.holding_out import CannotHoldOutError, find_earlier_split
+from service.training.material import load_datasets
 from tests.service.archives.packing import exported, send
 from tests.service.data import (
     QUICK,
@@ -72,7 +72,7 @@ def rows_of(samples, result):
 def material(api, *datasets, **holdout):
     service = service_of(api)
     request = {"datasets": list(datasets), "holdout": holdout, "joint_types": ["revolute"] * 2}
-    return recorded(service.database, service.files, request)
+    return load_datasets(service.database, service.files, request)
 
 
 def held_out(result):
@@ -415,7 +415,7 @@ def test_by_itself_a_part_is_held_out_that_repeats_nothing_and_is_found_again(ap
     assert first == 0
     assert last == pytest.approx(200, abs=100)  # a period
     assert rows_of(samples, held_out(result)) == list(range(last - 5))  # a quarter of a second of guard
-    split = remembered(DatasetRow(id=dataset, sha256="?"), result.lineage)
+    split = find_earlier_split(DatasetRow(id=dataset, sha256="?"), result.lineage)
     assert np.flatnonzero(split.held_out(samples.episode, samples.t)).tolist() == list(range(last - 5))
     assert material(api, dataset, share=0.3, kind="last").lineage["holdout"]["datasets"][0]["stretches"] is None
 
@@ -429,8 +429,8 @@ def test_lineages_name_how_data_were_prepared():
     report = {"rows": 5, "recipe": {"cutoff_hz": 4.0}, "steps": [{"step": "trim", "text": "5 rows cut off"}]}
     row = DatasetRow(id="ds_1", name="n", sha256="s", rows=5, report=report)
     record = {"id": "ds_1", "name": "n", "sha256": "s", "rows": 5}
-    assert named([row]) == [{**record, "recipe": report["recipe"], "steps": report["steps"]}]
-    assert named([DatasetRow(id="ds_1", name="n", sha256="s", rows=5, report={"rows": 5})]) == [record]
+    assert describe_datasets([row]) == [{**record, "recipe": report["recipe"], "steps": report["steps"]}]
+    assert describe_datasets([DatasetRow(id="ds_1", name="n", sha256="s", rows=5, report={"rows": 5})]) == [record]
 
 
 def test_data_sets_that_nothing_was_learnt_of_are_not_in_training():
@@ -444,9 +444,9 @@ def test_data_sets_that_nothing_was_learnt_of_are_not_in_training():
 
 @pytest.mark.parametrize("row", [DatasetRow(id="ds_1", sha256="?"), DatasetRow(id="ds_9", sha256="s")])
 def test_a_data_set_is_known_by_its_id_or_its_samples(row):
-    assert remembered(DatasetRow(id="ds_9", sha256="?"), {"holdout": HOLDOUT}) is None
-    assert remembered(row, {}) is None
-    split = remembered(row, {"holdout": HOLDOUT})
+    assert find_earlier_split(DatasetRow(id="ds_9", sha256="?"), {"holdout": HOLDOUT}) is None
+    assert find_earlier_split(row, {}) is None
+    split = find_earlier_split(row, {"holdout": HOLDOUT})
     assert np.flatnonzero(split.held_out(EPISODE, TIMES)).tolist() == list(range(86, 120))
 
 
@@ -455,7 +455,7 @@ def test_a_lineage_that_splits_otherwise_is_not_believed(counts):
     """Counts that do not fit: the samples may not be those that were held out."""
     reply = {**HOLDOUT, "datasets": [{**ENTRY, **counts}]}
     with pytest.raises(CannotHoldOutError, match="does not split as it did"):
-        remembered(DatasetRow(id="ds_1", sha256="s"), {"holdout": reply}).held_out(EPISODE, TIMES)
+        find_earlier_split(DatasetRow(id="ds_1", sha256="s"), {"holdout": reply}).held_out(EPISODE, TIMES)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from service.foundation.settings import Settings
 from service.models import registry
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files
-from service.storage.storage import HomeInUseError, hold_home
+from service.storage.storage import HomeInUseError, lock_home
 from tests.service.data import ADDRESS, DEADLINE, QUICK, ended, error, job, stream, train, upload
 from tests.service.warm import Served
 
@@ -144,25 +144,25 @@ def test_a_second_service_on_the_same_home_is_refused(second_start):
 
 
 def test_deleting_the_lock_file_admits_no_second_service(tmp_path):
-    with hold_home(tmp_path / "home"):
+    with lock_home(tmp_path / "home"):
         (tmp_path / "home" / ".lock").unlink()
         with pytest.raises(HomeInUseError):
-            hold_home(tmp_path / "home")
-    hold_home(tmp_path / "home").close()
+            lock_home(tmp_path / "home")
+    lock_home(tmp_path / "home").close()
 
 
 def test_where_folders_cannot_be_locked_the_file_is(tmp_path):
     with (tmp_path / ".lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         with pytest.raises(HomeInUseError):
-            hold_home(tmp_path)
+            lock_home(tmp_path)
 
 
 def test_a_new_home_is_its_owners_alone(tmp_path):
     home = tmp_path / "home"
     mask = os.umask(0)
     try:
-        hold_home(home).close()
+        lock_home(home).close()
         Database.of(Settings(home=home)).close()
     finally:
         os.umask(mask)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lipcore.vocabulary import CHOICES
+from lipcore.vocabulary import ESTIMATOR_CHOICES
 from tests.service.data import error, queue, stream, upload
 
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 40, "max_iterations": 4}
@@ -45,7 +45,11 @@ def test_data_sets_that_do_not_go_together(no_worker, datasets, names, field, me
 
 def test_unknown_estimator_is_refused_with_those_that_are_known(no_worker, datasets):
     reply = error(ask(no_worker, datasets, estimator="magic"), 422, "invalid_request")
-    assert reply["detail"][0] == {"field": "estimator", "value": "magic", "expected": f"one of {', '.join(CHOICES)}"}
+    assert reply["detail"][0] == {
+        "field": "estimator",
+        "value": "magic",
+        "expected": f"one of {', '.join(ESTIMATOR_CHOICES)}",
+    }
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from lipcore.model.payload import Carrier, NoArmError
 from lipserve import AsyncClient
 from service.inference import predicting
 from service.models import declared
-from service.models.declared import Declared
+from service.models.declared import DeclaredPayloads
 from tests.service.data import error, service_of
 
 PREDICT = "/v1/models/panda-sim/predict"
@@ -53,7 +53,7 @@ def carrying(model, payload):
     inertia = payload.get("inertia")
     body = Body(payload["mass"], np.array(payload["com"]), None if inertia is None else np.array(inertia))
     carrier = Carrier(model)
-    return carrier.carrying(carrier.known(body.parameters))
+    return carrier.with_payload(carrier.known(body.parameters))
 
 
 def body(motion, **more):
@@ -88,7 +88,7 @@ def test_one_motion_is_answered_on_the_event_loop_once_its_payload_is_known(api,
     expected = carrying(panda, POINT).predict(*motion)
     computed, predict = [], predicting.predict
     monkeypatch.setattr(predicting, "predict", lambda *given: computed.append(1) or predict(*given))
-    service_of(api).loaded.get("panda-sim", None).declared._kept.clear()
+    service_of(api).loaded.get("panda-sim", None).declared_payloads._kept.clear()
     for row in range(4):
         for payload in (POINT, {**POINT, "com": [0, 0, 0.2], "mass": 5e-1}, {**POINT, "inertia": None}):
             answer = ask(api, motion[:, row], payload=payload)
@@ -174,19 +174,19 @@ def revisions(panda):
 )
 def test_threads_never_get_the_answer_to_another_question(revisions, asked):
     models, at, answers = revisions
-    kept = [Declared(model) for model in models]
+    kept = [DeclaredPayloads(model) for model in models]
     wrong = []
 
     def work(questions):
         for revision, payload in questions:
-            model = kept[revision].known(payload) or kept[revision].model(payload)
+            model = kept[revision].cached(payload) or kept[revision].model(payload)
             if not np.allclose(model.answer(at)[0], answers[revision, payload[0]], rtol=1e-9):
                 wrong.append((revision, payload))
             if len(kept[revision]._kept) > 2:
                 wrong.append("more are kept than may be")
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(declared, "KEPT", 2)
+        patch.setattr(declared, "MAX_KEPT_MODELS", 2)
         threads = [threading.Thread(target=work, args=(questions,)) for questions in asked]
         for thread in threads:
             thread.start()
@@ -196,32 +196,32 @@ def test_threads_never_get_the_answer_to_another_question(revisions, asked):
 
 
 def test_what_is_asked_for_again_is_kept_and_what_was_not_is_dropped(panda, monkeypatch):
-    monkeypatch.setattr(declared, "KEPT", 2)
-    kept = Declared(panda)
+    monkeypatch.setattr(declared, "MAX_KEPT_MODELS", 2)
+    kept = DeclaredPayloads(panda)
     one, two, three, _ = PAYLOADS
     first, second = kept.model(one), kept.model(two)
     assert kept.model(one) is first
     kept.model(three)
-    assert kept.known(one) is first
-    assert kept.known(two) is None
+    assert kept.cached(one) is first
+    assert kept.cached(two) is None
     assert kept.model(two) is not second
 
 
 def test_refusals_leave_nothing_behind(panda, trained):
-    kept = Declared(panda)
+    kept = DeclaredPayloads(panda)
     with pytest.raises(ValueError, match="mass"):
         kept.model((0.0, (0.0, 0.0, 0.0), None))
     assert not kept._kept
     with pytest.raises(NoArmError):
-        Declared(trained.model).model(PAYLOADS[0])
+        DeclaredPayloads(trained.model).model(PAYLOADS[0])
 
 
 def test_a_revision_has_payloads_of_its_own_which_go_with_it(api):
     served = replace(service_of(api).loaded.get("panda-sim", None))
-    model = weakref.ref(served.declared.model(PAYLOADS[0]))
+    model = weakref.ref(served.declared_payloads.model(PAYLOADS[0]))
     later = replace(served, revision=served.revision + 1)
-    assert later.declared is not served.declared
-    assert later.declared.known(PAYLOADS[0]) is None
+    assert later.declared_payloads is not served.declared_payloads
+    assert later.declared_payloads.cached(PAYLOADS[0]) is None
     gc.disable()  # what is kept is in no cycle: loaded versions are not looked through, see `LoadedModels`
     try:
         del served

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from service.foundation.settings import Settings
-from service.runtime.process import THREAD_VARIABLES, Place, training_cpus, training_place
+from service.runtime.process import THREAD_VARIABLES, ProcessOptions, training_cpus, training_process_options
 from tests.service.data import ENDLESS, queue, running, stream, upload
 from tests.service.server import Server
 
@@ -73,5 +73,7 @@ def test_cpus_of_training(available, most, expected):
 def test_a_place_follows_the_settings(monkeypatch, tmp_path):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2})
     monkeypatch.delenv("LIPSERVE_TRAINING_CPUS")  # which tests set
-    place = training_place(Settings(home=tmp_path, training_threads=3, training_niceness=2, training_policy="idle"))
-    assert place == Place(threads=3, niceness=2, policy="idle", cpus=frozenset({1, 2}))
+    place = training_process_options(
+        Settings(home=tmp_path, training_threads=3, training_niceness=2, training_policy="idle")
+    )
+    assert place == ProcessOptions(threads=3, niceness=2, policy="idle", cpus=frozenset({1, 2}))

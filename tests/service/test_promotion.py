@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 
 from service.contract.models import HeldOutBlocks, Promotion
-from service.models.registry import answering
+from service.models.registry import serving_version
 from service.storage.database import LearnerRow, VersionRow
 from service.training.promotion import settle
 from tests.service.archives.packing import TAR, exported
@@ -201,7 +201,7 @@ def test_scores_of_a_judged_fit_from_elsewhere_are_checked(change):
 
 def test_a_version_waits_where_another_has_begun_to_answer_since_it_was_judged(api, judged):
     with service_of(api).database.session() as session:
-        now = answering(session, "judged")
+        now = serving_version(session, "judged")
         good = Promotion(answers=True, passed=True, serving=now + 1, reason="")
         found = settle(session, "judged", good, "ask")
         assert (found.answers, found.serving) == (False, now)

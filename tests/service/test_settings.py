@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from pydantic import ValidationError
 
-from service.foundation.environment import REMOVED, check_environment
+from service.foundation.environment import REMOVED_VARIABLES, check_environment
 from service.foundation.settings import CHECKOUT_MODELS, Settings, describe, is_loopback
 
 
@@ -147,8 +147,8 @@ def test_variables_of_clients_tests_and_kubernetes_are_known():
 
 def test_removed_variables_are_no_settings_and_what_replaces_them_is_one():
     names = {name.upper() for name in Settings.model_fields}
-    assert names.isdisjoint(REMOVED)
-    replacing = {name for text in REMOVED.values() for name in re.findall("LIPSERVE_([A-Z_]+)", text)}
+    assert names.isdisjoint(REMOVED_VARIABLES)
+    replacing = {name for text in REMOVED_VARIABLES.values() for name in re.findall("LIPSERVE_([A-Z_]+)", text)}
     assert replacing <= names
 
 

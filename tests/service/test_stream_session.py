@@ -9,7 +9,7 @@ import numpy as np
 from lipcore.model.torque_model import Fallback, TorqueAnswer
 from service.api.stream.session import Echo, Session
 from service.foundation.settings import Settings
-from service.models.loads import Carried, Loads
+from service.models.loads import StreamPayload, StreamPayloads
 from service.models.scales import Factor, Scales
 from service.telemetry.meters import Meters
 from tests.service.data import DEADLINE
@@ -64,7 +64,7 @@ def served(version, model, revision=0):
         model=model,
         noise_std=[0.1, 0.2],
         scales=Scales(np.ones(2)),
-        loads=Loads(),
+        payloads=StreamPayloads(),
     )
 
 
@@ -117,19 +117,19 @@ def test_an_answer_carries_the_scale_of_its_stream_as_it_is_then():
         "arm": Factor(np.array([0.5, 3.0]), np.array([0.5, 3.0]), 100.0),
         "other": Factor(np.array([9.0, 2.0]), np.array([0.7, 2.0]), 101.0),
     }
-    loaded.memory[1].scales.take(factors)
+    loaded.memory[1].scales.replace(factors)
     seen = reply(talk)
     assert (seen.tau.tolist(), seen.scale.tolist()) == ([1.0, 2.0], [0.5, 3.0])
     assert reply(asking).scale.tolist() == [1.0, 3.0]
     factors["other"] = Factor(np.array([0.7, 2.0]), np.array([0.7, 2.0]), 200.0)  # by then the first is of long ago
-    loaded.memory[1].scales.take(factors)
+    loaded.memory[1].scales.replace(factors)
     assert reply(asking).scale.tolist() == [1.0, 2.0]
     assert reply(talk).scale.tolist() == [0.5, 3.0]
 
 
 def test_external_torque_is_judged_by_the_scale_of_its_stream():
     loaded = Loaded(v1=Model(2.0))
-    loaded.memory[1].scales.take({"arm": Factor(np.array([0.5, 3.0]), np.array([0.5, 3.0]), 100.0)})
+    loaded.memory[1].scales.replace({"arm": Factor(np.array([0.5, 3.0]), np.array([0.5, 3.0]), 100.0)})
     request = frame([[1.0, 2.0], [0, 0], [0, 0]], flags=ASK_EXTERNAL, tau=[3.0, 1.0], learn=False)
     for options, scale in (({"stream_id": "arm"}, [0.5, 3.0]), ({}, [1.0, 3.0]), ({"stream_id": "new"}, [1.0, 1.0])):
         talk, _ = session(loaded, 1, scale=True, **options)
@@ -258,10 +258,12 @@ def test_others_have_their_turn_between_frames_sent_ahead():
 def test_a_stream_is_answered_with_what_its_arm_carries_until_it_is_put_down():
     loaded = Loaded(v1=Model())
     talk, _ = session(loaded, 1, stream_id="arm", payload=True)
-    loads, answers = loaded.stored[1].loads, [reply(talk)]
-    loads.take({"arm": Carried(Model(3.0), (1.5, 0.1), 0.0), "other": Carried(Model(9.0), (7.0, 0.1), 0.0)})
+    payloads, answers = loaded.stored[1].payloads, [reply(talk)]
+    payloads.replace(
+        {"arm": StreamPayload(Model(3.0), (1.5, 0.1), 0.0), "other": StreamPayload(Model(9.0), (7.0, 0.1), 0.0)}
+    )
     answers.append(reply(talk))
-    loads.take({"arm": Carried(None, None, 0.0)})
+    payloads.replace({"arm": StreamPayload(None, None, 0.0)})
     answers.append(reply(talk))
     first = answers[0].tau
     np.testing.assert_allclose([each.tau for each in answers], [first, 3 * first, first])

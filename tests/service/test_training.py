@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.data.outliers import Corrupt
+from lipcore.data.outliers import CorruptRows
 from service.datasets import staging
 from service.training import worker
-from service.training.pulse import Pulse
+from service.training.pulse import Heartbeat
 from tests.service.data import (
     ENDLESS,
     QUICK,
@@ -66,11 +66,11 @@ def test_the_fraction_done_never_falls_while_a_version_is_judged_and_learns_all_
     service, seen = service_of(api), []
     monkeypatch.setattr(service.jobs, "submit", lambda job: None)
     for name in ("plan", "progress", "last_fit", "share", "stage"):
-        monkeypatch.setattr(Pulse, name, noted(getattr(Pulse, name), seen))
+        monkeypatch.setattr(Heartbeat, name, noted(getattr(Heartbeat, name), seen))
     dataset = upload(api, stream(samples=150, seed=4))["id"]
     options = {**QUICK, "statistics": statistics}
     name = queue(api, f"learns-{statistics}", dataset, options=options, holdout={"share": 0.3})["id"]
-    service.jobs.replicas.take(name, None)
+    service.jobs.replicas.claim(name, None)
     worker.run(service.settings, name)
     assert job(api, name)["state"] == "succeeded"
     fractions = [each["fraction"] for each in seen]
@@ -149,7 +149,9 @@ def test_a_job_learns_nothing_from_corrupt_rows_of_a_data_set(api, monkeypatch):
     sound, row = stream(samples=300, seed=9), 120
     tau = sound.tau.copy()
     tau[row, 0] = 1e12
-    monkeypatch.setattr(staging, "corrupt", lambda t, episode, *_: Corrupt(np.zeros(len(episode), bool), episode))
+    monkeypatch.setattr(
+        staging, "find_corrupt_rows", lambda t, episode, *_: CorruptRows(np.zeros(len(episode), bool), episode)
+    )
     spoilt = upload(api, replace(sound, tau=tau))["id"]
     without = upload(api, sound.rows(np.arange(300) != row))["id"]
     for name, dataset in (("spoilt", spoilt), ("without", without)):

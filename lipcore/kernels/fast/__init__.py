@@ -1,7 +1,7 @@
-"""Kernels compiled with Numba, gradients by hand-written adjoints; the arm, friction and answers likewise.
+"""Kernels compiled with Numba, with gradients by hand-written adjoints; also the arm, friction and predictions.
 
-`lip` and `chain` state the two energy kernels: `joints` and `products` are what both are made of, `lip_kinetic`, and
-`chain_sums` and `chain_kinetic` in the algebra of `jets`, what is their own. Each function stands beside its adjoint.
-`pairs` goes over the pairs of samples; `kernel` is the class that joins it all to PyTorch. All calculate with `lanes`
-in memory laid out by `views`.
+`lip` and `chain` are the two energy kernels. Both use `joints` and `products`. `lip` also uses `lip_kinetic`; `chain`
+uses `chain_sums` and `chain_kinetic`, in the algebra of `jets`. Each function stands beside its adjoint. `pairs` loops
+over the pairs of samples. `kernel` is the class that connects the compiled functions to the fit. All compute with
+`lanes`, in memory laid out by `views`.
 """

@@ -1,9 +1,9 @@
 """Mean and covariance of the torques at a few queries, from their covariances with the anchors (see `Evaluator`).
 
 The inner loop of every standard deviation is a lower triangular matrix times a few columns. BLAS is made for larger
-products and reaches half of what a core can do on these; it also starts threads when it sees fit. Here the matrix lies
-in panels of ROWS rows, each stored column by column up to its diagonal, and one loop over Lanes holds all of
-ROWS × WIDTH sums in registers (12 of AVX2's 16).
+products: here it reaches half of a core's speed, and it may start threads. So the matrix is stored in panels of ROWS
+rows, each column by column up to its diagonal. One loop over Lanes keeps all ROWS × WIDTH sums in registers
+(12 of AVX2's 16).
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ Indices = NDArray[np.int64]
 ROWS = 6
 """Rows of a panel."""
 WIDTH = LANES
-"""Columns that a panel is multiplied with; a robot of more joints takes several rounds."""
+"""Columns that a panel is multiplied with. A robot with more joints needs several rounds."""
 
 
 def pack(matrix: Array, before: int) -> Array:
-    """Panels of `matrix`, (K, M), one after the other, flat; zeros fill the last.
+    """Return the panels of `matrix`, (K, M), one after the other, flat. Zeros fill the last panel.
 
-    before: columns before those of the diagonal; what lies right of each panel's last diagonal element is zero, and
-    left out.
+    before: number of columns before those of the diagonal. Elements to the right of each panel's last diagonal element
+    are zero and are not stored.
     """
     panels = [np.zeros(0)]
     for first in range(0, matrix.shape[0], ROWS):
@@ -41,9 +41,9 @@ def pack(matrix: Array, before: int) -> Array:
 
 @inlined
 def multiply(panels: Array, panel: int, columns: Array, first: int, count: int, out: Array, at: int) -> None:
-    """out[at:] = Σ_k panels[panel + ROWS k + r] columns[first + WIDTH k + c], (ROWS, WIDTH) at (r, c); k < count.
+    """Write Σ_k panels[panel + ROWS k + r] columns[first + WIDTH k + c], (ROWS, WIDTH) at (r, c), to out[at:].
 
-    All arrays are flat; count is the number of the panel's columns.
+    k runs from 0 to count − 1. All arrays are flat; count is the number of the panel's columns.
     """
     (x,), (y,) = lay(columns, first, ((count,),))[0], lay(out, at, ((ROWS,),))[0]
     rows = numbers(panels, panel, (count, ROWS))
@@ -55,22 +55,26 @@ def multiply(panels: Array, panel: int, columns: Array, first: int, count: int, 
     y[0], y[1], y[2], y[3], y[4], y[5] = a, b, c, d, e, f
 
 
-MEAN, STD, COVARIANCE = range(3)  # how much to answer: each takes what is before it, too
+MEAN, STD, COVARIANCE = range(3)  # how much to compute: each value includes the ones before
 FALLBACK_START, FALLBACK_END = 1.0, 3.0
-"""Posterior variance of a torque, as a multiple of its variance in training, where the fallback begins and where it is
-complete. Chosen on ten short recordings of seven real arms: a start at 0.25 to 0.75 made more good joints worse, and no
-more bad joints harmless."""
+"""Posterior variance of a torque, as a multiple of its training variance, at which the fallback starts and is complete.
+
+Tuned on ten short recordings of seven real arms. A start at 0.25 to 0.75 made more good joints worse, and no more bad
+joints harmless.
+"""
 ACCELERATED = 0.1
-"""How much a mean square of accelerations counts beside one of speeds, where motion is beyond the training's: errors of
-inertias grow with the former, of friction with the latter. Chosen on simulated arms with `Dirt` (seeds 50 and 51 of
-`benchmarks/studies/dirty_arms.py`) among 0, 0.02, 0.05, 0.1 and 0.2: of motion three times as fast, 1 to 3 % of the
-arms' joints have a coverage below 85 % with it, 6 to 9 % without."""
+"""Weight of a mean square acceleration relative to a mean square speed, if motion exceeds that of the training.
+
+Errors of inertias grow with acceleration, errors of friction with speed. Tuned on simulated arms with `Dirt` (seeds 50
+and 51 of `benchmarks/studies/dirty_arms.py`) among 0, 0.02, 0.05, 0.1 and 0.2. In motion three times as fast, 1 to 3 %
+of the arms' joints have a coverage below 85 % with it, 6 to 9 % without.
+"""
 
 
 @inlined
 def fallback_share(variance: float, usual: float) -> float:
-    """Return the share of the fallback in an answer, 0 to 1, of its posterior variance and the training's, (N·m)²."""
-    if not variance > FALLBACK_START * usual:  # a joint whose torque has never varied has a `usual` of zero
+    """Return the share of the fallback, 0 to 1, from the posterior variance and the training variance, (N·m)²."""
+    if not variance > FALLBACK_START * usual:  # a joint whose torque never varied has a `usual` of zero
         return 0.0
     return min((variance - FALLBACK_START * usual) / ((FALLBACK_END - FALLBACK_START) * usual), 1.0)
 
@@ -93,17 +97,22 @@ def answer(
     covariance: Array,
     share: Array,
 ) -> bool:
-    """Write the torques of N queries, and as much of their uncertainty as `what` says. Return whether any of `share` is
-    above zero.
+    """Write the torques of N queries and, depending on `what`, their uncertainty.
 
-    fixed: the panel of the mean, those of the root's rows that are subtracted, one an output, then those that are
-    added, one a linear weight; blocks: (N, S + 1, n, n) from `Cross`; features: (N, P, n), Φᵀ; floor: (n,), smallest
-    variance, at least 0;
-    misfit: (5, n), variance at rest, the speed where it has faded to exp(−1), variance that grows with speed and
-    acceleration beyond the usual ones, and those, see `posterior.misfit`; usual: (n,), variance of the torque in
-    training, infinite if unknown; motions: (N, 3, n), of which dq and ddq are read;
-    tau, std: (N, n); covariance: (N, n, n), work unless asked for; share: (N, n), of the fallback, see
-    `fallback_share`, not written for MEAN.
+    Return whether any `share` is above zero.
+
+    - fixed: the panel of the mean, the panels of the root's rows that are subtracted, one for each output, and the
+      panels of the rows that are added, one for each linear weight;
+    - blocks: (N, S + 1, n, n), from `Cross`;
+    - features: (N, P, n), Φᵀ;
+    - floor: (n,), min variance, at least 0;
+    - misfit: (5, n), see `Misfit.packed`: variance at rest, the speed at which it has decayed to exp(−1), variance of
+      faster motion, and the usual speed and acceleration;
+    - usual: (n,), training variance of the torque, infinite if unknown;
+    - motions: (N, 3, n), of which dq and ddq are read;
+    - tau, std: (N, n);
+    - covariance: (N, n, n), work memory unless requested;
+    - share: (N, n), of the fallback, see `fallback_share`; not written for MEAN.
     """
     queries, n = tau.shape
     chosen, linear = outputs.shape[0], features.shape[1]
@@ -161,7 +170,7 @@ def answer_one(
     covariance: Array,
     share: Array,
 ) -> bool:
-    """`answer` of one query."""
+    """Write the torque of one query; see `answer`."""
     return answer(
         fixed,
         outputs,
@@ -183,7 +192,10 @@ def answer_one(
 
 @compiled
 def _gather(rows: Array, outputs: Indices, features: Array, n: int, at: int, memory: Array) -> None:
-    """Covariances of the query's torques with all anchors, (groups, M, WIDTH); columns past the last are never read."""
+    """Write the covariances of the query's torques with all anchors, (groups, M, WIDTH).
+
+    Columns past the last are never read.
+    """
     chosen, linear = outputs.shape[0], features.shape[0]
     for group in range(0, n, WIDTH):
         count = min(WIDTH, n - group)
@@ -199,7 +211,7 @@ def _gather(rows: Array, outputs: Indices, features: Array, n: int, at: int, mem
 
 @compiled
 def _begin(prior: Array, full: bool, out: Array) -> None:
-    """Write minus the nonlinear term's own covariance, (n, n); unless `full` only its diagonal."""
+    """Write the negative covariance of the nonlinear term, (n, n), or only its diagonal unless `full`."""
     out[:] = 0.0
     for i in range(prior.shape[0]):
         for j in range(0 if full else i, i + 1):
@@ -210,12 +222,14 @@ def _begin(prior: Array, full: bool, out: Array) -> None:
 def _add_panels(
     fixed: Array, panel: int, first: int, last: int, size: int, memory: Array, full: bool, out: Array
 ) -> int:
-    """Add the squares of the root's rows from `first` to before `last`, whose panels begin at `panel`, times the
-    columns in memory, to those of N queries, (N, n, n). Return where the next panel begins."""
+    """Add the squares of the root's rows times the columns in memory to the covariances of N queries, (N, n, n).
+
+    The rows are `first` to before `last`; their panels begin at `panel`. Return where the next panel begins.
+    """
     queries, groups = out.shape[0], (out.shape[1] + WIDTH - 1) // WIDTH
     step = groups * size * WIDTH
     products = queries * step
-    for row in range(first, last, ROWS):  # all queries meet a panel while the cache holds it
+    for row in range(first, last, ROWS):  # all queries use a panel while it is in the cache
         reach = min(row + ROWS, last)
         for query in range(queries):
             for group in range(groups):
@@ -228,7 +242,7 @@ def _add_panels(
 
 @compiled
 def _add_squares(memory: Array, products: int, full: bool, out: Array) -> None:
-    """Add Vᵀ V of one panel's products V, (groups, ROWS, WIDTH); unless `full` only its diagonal."""
+    """Add Vᵀ V of one panel's products V, (groups, ROWS, WIDTH), or only its diagonal unless `full`."""
     for i in range(out.shape[0]):
         left = products + (i // WIDTH) * ROWS * WIDTH + i % WIDTH
         for r in range(ROWS):
@@ -242,7 +256,7 @@ def _add_squares(memory: Array, products: int, full: bool, out: Array) -> None:
 
 @compiled
 def _scale(factor: float, full: bool, out: Array) -> None:
-    """Multiply by a factor, both triangles where `full`."""
+    """Multiply the lower triangle by a factor and mirror it, or only the diagonal unless `full`."""
     for i in range(out.shape[0]):
         for j in range(0 if full else i, i + 1):
             out[i, j] = out[j, i] = factor * out[i, j]

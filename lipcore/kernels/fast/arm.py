@@ -1,9 +1,12 @@
-"""What is asked of an arm: torques, features and energies of many motions, and the features of one query.
+"""Torques, features and energies of an arm for many motions, and the features of one query.
 
-The recursion is `arm_recursion`, its derivatives `arm_derivatives`. Arguments that all have in common: constants
-(n, CONSTANTS), of `Geometry.constants`; gravity (3,), m/s² in the base's frame; parameters (n, 10) of the bodies, base
-to tip; order (n,), the data's joint at each place of the chain; motions (N, 3, n), q, dq and ddq in the order of the
-data.
+The recursion is `arm_recursion`, its derivatives are `arm_derivatives`. Common arguments:
+
+- constants: (n, CONSTANTS), from `Geometry.constants`;
+- gravity: (3,), m/s² in the base's frame;
+- parameters: (n, 10) of the bodies, base to tip;
+- order: (n,), the data's joint at each place of the chain;
+- motions: (N, 3, n), q, dq and ddq in the order of the data.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ def arm_rows(
     table: Array,
     out: Array,
 ) -> None:
-    """Features of one query: ∂τ/∂π, ddq of each joint (its rotor), ∂τ/∂θ; (10 n + n + g, n), see `ArmKernel`."""
+    """Write the features of one query, (10 n + n + g, n): ∂τ/∂π, ddq of each joint (its rotor) and ∂τ/∂θ."""
     n = constants.shape[0]
     kinematics(constants, gravity, motion, order, work)
     masses(constants, order, work, table, out)
@@ -51,14 +54,17 @@ def arm_rows(
 
 
 def arm_size(n: int) -> int:
-    """Elements that `arm_query` works in."""
+    """Return the number of elements that `arm_query` works in."""
     return (n + 1) * WORK + TABLE
 
 
 @brief
 def arm_query(memory: Array, order: Indices, motion: Array, out: Array) -> None:
-    """`arm_rows` of one query, with one array for all that taking over nine costs time: `Memory` of constants, gravity
-    and parameters, with `arm_size` elements to work in."""
+    """Write the features of one query, see `arm_rows`.
+
+    memory: `Memory` of constants, gravity and parameters, with `arm_size` elements to work in. Passing nine arrays
+    would cost time.
+    """
     n = order.shape[0]
     place = n * CONSTANTS
     bodies = place + 3
@@ -77,7 +83,7 @@ def arm_query(memory: Array, order: Indices, motion: Array, out: Array) -> None:
 
 @compiled
 def arm_queries(memory: Array, order: Indices, motions: Array, out: Array, first: int, last: int) -> None:
-    """`arm_query` of N queries, (N, 3, n), into rows `first` to `last` of each of `out`, (N, …, n)."""
+    """Write the features of N queries, (N, 3, n), into rows `first` to `last` of each part of `out`, (N, …, n)."""
     for k in range(motions.shape[0]):
         arm_query(memory, order, motions[k], out[k, first:last])
 
@@ -86,7 +92,7 @@ def arm_queries(memory: Array, order: Indices, motions: Array, out: Array, first
 def arm_torques(
     constants: Array, gravity: Array, parameters: Array, order: Indices, motions: Array, out: Array
 ) -> None:
-    """Torque of N queries by recursive Newton–Euler: motions (N, 3, n), out (N, n)."""
+    """Write the torques of N queries, (N, n), by recursive Newton–Euler. motions: (N, 3, n)."""
     work = np.zeros((constants.shape[0] + 1, WORK))
     for k in range(motions.shape[0]):
         kinematics(constants, gravity, motions[k], order, work)
@@ -96,7 +102,7 @@ def arm_torques(
 
 @compiled
 def arm_masses(constants: Array, gravity: Array, order: Indices, motions: Array, out: Array) -> None:
-    """∂τ/∂π of N queries: motions (N, 3, n), out (N, 10 n, n)."""
+    """Write ∂τ/∂π of N queries, (N, 10 n, n). motions: (N, 3, n)."""
     work, table = np.zeros((constants.shape[0] + 1, WORK)), np.zeros(TABLE)
     for k in range(motions.shape[0]):
         kinematics(constants, gravity, motions[k], order, work)
@@ -105,7 +111,7 @@ def arm_masses(constants: Array, gravity: Array, order: Indices, motions: Array,
 
 @compiled
 def arm_shapes(constants: Array, gravity: Array, parameters: Array, order: Indices, motions: Array, out: Array) -> None:
-    """∂τ/∂θ of N queries: motions (N, 3, n), out (N, g, n)."""
+    """Write ∂τ/∂θ of N queries, (N, g, n). motions: (N, 3, n)."""
     work = np.zeros((constants.shape[0] + 1, WORK))
     for k in range(motions.shape[0]):
         kinematics(constants, gravity, motions[k], order, work)
@@ -117,7 +123,10 @@ def arm_shapes(constants: Array, gravity: Array, parameters: Array, order: Indic
 def arm_energies(
     constants: Array, gravity: Array, parameters: Array, order: Indices, motions: Array, out: Array
 ) -> None:
-    """Kinetic and potential energy of N queries by each feature of `arm_rows`: out (N, 2, p), J. ddq is not read."""
+    """Write the kinetic and the potential energy of N queries by each feature of `arm_rows`, (N, 2, p) J.
+
+    ddq is not read.
+    """
     n = constants.shape[0]
     work = np.zeros((n + 1, WORK))
     for k in range(motions.shape[0]):
@@ -137,10 +146,10 @@ def arm_differences(
     features: Array,
     out: Array,
 ) -> None:
-    """Lᵀ δ of N queries, δ the torque of each of K arms less that of the first.
+    """Write Lᵀ δ of N queries, (N, K, n), δ the torque of each of K arms minus that of the first arm.
 
     mixing: L (K, K), lower triangular; constants: (K + 1, n, CONSTANTS); parameters: (K + 1, n, 10); linear:
-    (K + 1, n, l), coefficients of `features` (N, n, l) of each joint; motions (N, 3, n), out (N, K, n).
+    (K + 1, n, l), coefficients of `features` (N, n, l) of each joint; motions: (N, 3, n).
     """
     n = order.shape[0]
     work, first, other = np.zeros((n + 1, WORK)), np.zeros(n), np.zeros(n)
@@ -155,7 +164,7 @@ def arm_differences(
                     out[k, arm - 1, j] = other[j] + added - first[j]
                 else:
                     first[j] += added
-        for row in range(mixing.shape[0]):  # those below are not yet mixed
+        for row in range(mixing.shape[0]):  # the rows below are not mixed yet
             for j in range(n):
                 total = 0.0
                 for arm in range(row, mixing.shape[0]):

@@ -1,13 +1,14 @@
 """Derivatives of an arm's torque by its masses and by its geometry, docs/method.md (12) and (15) to (17).
 
-If the subtree of joint j is displaced by a screw s that is fixed to the body before it (velocity V, acceleration A),
-its bodies see the velocity ψ̇ = V × s and the acceleration ψ̈ = A × s + V × ψ̇ more, and turn the force along with them:
+Let the subtree of joint j be displaced by a screw s that is fixed to the body before it (velocity V, acceleration A).
+Its bodies then have the additional velocity ψ̇ = V × s and acceleration ψ̈ = A × s + V × ψ̇, and the force turns with
+them:
 
     i < j:   ∂τ_i = S_iᵀ (I_j ψ̈ + 2 B_j ψ̇ + s ×* F_j)          i ≥ j:   ∂τ_i = S_iᵀ (I_i ψ̈ + 2 B_i ψ̇)
 
 with 2 B δ = δ ×* (I V) + V ×* (I δ) − I (V × δ) for a change δ of velocity. (This is ∂τ/∂q of Singh, Russell & Wensing
-2022 with any screw in the place of a joint's own.) Written out with Jacobi's identity, only the angular part w of δ is
-left, and sums over bodies stay sums:  2 B δ = (N w, 2 w × p),  N = Σ 2 (ω× Ī − ½ tr Ī ω×) − 2 h× v×.
+2022 with any screw instead of a joint's own.) Written out with Jacobi's identity, only the angular part w of δ remains,
+and sums over bodies stay sums:  2 B δ = (N w, 2 w × p),  N = Σ 2 (ω× Ī − ½ tr Ī ω×) − 2 h× v×.
 """
 
 from __future__ import annotations
@@ -47,15 +48,18 @@ from lipcore.kernels.fast.arm_recursion import (
 )
 from lipcore.kernels.fast.compile import compiled
 
-# where things lie in the table that `masses` works in: 3 × 10 numbers each, and what it needs of a body
+# offsets in the table of `masses`: 3 × 10 numbers for force and for moment, then values of a body
 FORCE_OF, MOMENT_OF, AT_LINK = 0, 30, 60
 TABLE = 80
 
 
 @compiled
 def masses(constants: Array, order: Indices, work: Array, table: Array, out: Array) -> None:
-    """Write ∂τ/∂π after `kinematics`: rows 10 k to 10 k + 9 of `out` belong to the body of the data's joint k, columns
-    to the data's joints; rows of bodies that do not load a joint are zero there. out: (at least 10 n, n)."""
+    """Write ∂τ/∂π after `kinematics`, (at least 10 n, n).
+
+    Rows 10 k to 10 k + 9 of `out` belong to the body of the data's joint k, columns to the data's joints. If a body
+    does not load a joint, its rows are zero there.
+    """
     n = constants.shape[0]
     out[: PARAMETERS * n] = 0.0
     for j in range(n):
@@ -64,13 +68,15 @@ def masses(constants: Array, order: Indices, work: Array, table: Array, out: Arr
 
 @compiled
 def link_masses(order: Indices, work: Array, j: int, table: Array, out: Array, first: int) -> None:
-    """Write ∂τ/∂π of the body at place j of the chain, after `kinematics`, to the ten rows of `out` from `first` on; of
-    joints behind it nothing is written."""
+    """Write ∂τ/∂π of the body at place j of the chain after `kinematics`, to ten rows of `out` from `first` on.
+
+    Columns of joints after place j are not written.
+    """
     row = work[j]
     _link_table(row, table)
     for i in range(j + 1):
         joint, screw = work[i], order[i]
-        # the screw of joint i as the frame of link j sees it
+        # the screw of joint i in the frame of link j
         for c in range(3):
             table[AT_LINK + 3 + c] = joint[S + 3 + c]
         add_cross(joint, S, row, ORIGIN, table, AT_LINK + 3)
@@ -91,10 +97,10 @@ def link_masses(order: Indices, work: Array, j: int, table: Array, out: Array, f
 
 @compiled
 def _link_table(row: Array, t: Array) -> None:
-    """Force and moment about its origin that a body needs, by each of its ten parameters, in its own frame."""
+    """Write the force and moment about its origin that a body needs, by each of its ten parameters, in its frame."""
     t[:AT_LINK] = 0.0
     at = AT_LINK
-    # acceleration of the frame's origin less gravity: A + α × o + ω × (v + ω × o)
+    # acceleration of the frame's origin minus gravity: A + α × o + ω × (v + ω × o)
     for c in range(3):
         t[at + c] = row[V + 3 + c]
         t[at + 3 + c] = row[A + 3 + c]
@@ -130,8 +136,8 @@ def _link_table(row: Array, t: Array) -> None:
 def shapes(constants: Array, order: Indices, work: Array, out: Array) -> None:
     """Write ∂τ/∂θ after `bodies`: a row for each number of the geometry, base to tip, columns as the data's joints.
 
-    A joint's numbers are turns about the two vectors across its axis, then shifts along them, as many as
-    constants[j, SCREWS] says: 4, 2 (no shifts) or 0.
+    A joint's numbers are turns about the two vectors across its axis, then shifts along them. constants[j, SCREWS] is
+    their count: 4, 2 (no shifts) or 0.
     """
     n = constants.shape[0]
     for i in range(n):
@@ -166,13 +172,13 @@ def shapes(constants: Array, order: Indices, work: Array, out: Array) -> None:
 
 @compiled
 def _screw(row: Array, number: int) -> None:
-    """The screw of a joint's number: a turn about, or a shift along, a vector across its axis."""
+    """Write the screw of a joint's number: a turn about, or a shift along, a vector across its axis."""
     vector = E + 3 * (number % 2)
     for c in range(3):
         row[SCREW + c] = row[vector + c] if number < 2 else 0.0
         row[SCREW + 3 + c] = 0.0 if number < 2 else row[vector + c]
     if number < 2:
-        # about the frame's place at zero, which a prismatic joint has left along its axis
+        # the turn is about the frame's place at q = 0, which a prismatic joint has left along its axis
         for c in range(3):
             row[SPARE + 1 + c] = row[ORIGIN + c] - row[SPARE] * row[S + 3 + c]
         add_cross(row, SPARE + 1, row, vector, row, SCREW + 3)
@@ -182,7 +188,7 @@ def _screw(row: Array, number: int) -> None:
 def energies(
     constants: Array, gravity: Array, parameters: Array, order: Indices, motion: Array, work: Array, out: Array
 ) -> None:
-    """Write kinetic and potential energy by masses, rotors and geometry after `kinematics`: (2, 11 n or 11 n + g), J.
+    """Write kinetic and potential energy by masses, rotors and geometry after `kinematics`, (2, 11 n or 11 n + g) J.
 
     ½ (Vᵀ I V) and −g · h are linear in π. A displacement s of a subtree changes them by P · (V × s) and by the work
     −s · (h × g, m g).

@@ -1,8 +1,8 @@
 """Motion and forces of a serial arm of rigid bodies: recursive Newton–Euler, docs/method.md (14).
 
-World coordinates, all spatial vectors about the base's origin: motions (ω, v), forces (n, f). With S_i the screw of
-joint i, V_i and A_i velocity and acceleration of body i (gravity is an acceleration of the base), and for all bodies
-from i to the tip together mass m, first moment h, inertia Ī, momentum P = (L, p) and force F:
+Coordinates are those of the world. All spatial vectors are about the base's origin: motions (ω, v), forces (n, f). S_i
+is the screw of joint i. V_i and A_i are the velocity and acceleration of body i; gravity is an acceleration of the
+base. All bodies from i to the tip together have mass m, first moment h, inertia Ī, momentum P = (L, p) and force F:
 
     τ_i = S_iᵀ F_i                                   F = Σ I A + V ×* I V
 """
@@ -17,12 +17,12 @@ from lipcore.kernels.fast.compile import compiled, inlined
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-PARAMETERS = 10  # of a body: mass, first moment (3), inertia xx, xy, yy, xz, yz, zz, about its joint's frame
-CONSTANTS = 48  # of a joint: three 3×3 matrices of its rotation, its place, two vectors across its axis, all before it
+PARAMETERS = 10  # per body: mass, first moment (3), inertia xx, xy, yy, xz, yz, zz, about its joint's frame
+CONSTANTS = 48  # per joint: three 3×3 matrices of its rotation, its place, its axis, two vectors across it, its type
 
-# where things lie in a joint's row of `constants`
+# offsets in a joint's row of `constants`
 TURN, PLACE, AXIS, ACROSS, KIND, SCREWS = 0, 27, 30, 33, 39, 40
-# and in its row of `work`
+# offsets in a joint's row of `work`
 R, ORIGIN, S, E, V, A, MASS, H, INERTIA, P, N, F, D, G = 0, 9, 12, 18, 24, 30, 36, 37, 40, 49, 52, 61, 67, 73
 WORK = 128
 PSI, PSI2, FORCE, SCREW, SPARE = 76, 82, 88, 94, 100
@@ -30,7 +30,7 @@ PSI, PSI2, FORCE, SCREW, SPARE = 76, 82, 88, 94, 100
 
 @inlined
 def add_cross(a: Array, i: int, b: Array, j: int, out: Array, k: int) -> None:
-    """Add a × b to `out`; each a 3-vector from the element given on."""
+    """Add a × b to `out`. Each is a 3-vector that starts at the given element."""
     out[k] += a[i + 1] * b[j + 2] - a[i + 2] * b[j + 1]
     out[k + 1] += a[i + 2] * b[j] - a[i] * b[j + 2]
     out[k + 2] += a[i] * b[j + 1] - a[i + 1] * b[j]
@@ -58,7 +58,7 @@ def add_force_cross(a: Array, i: int, b: Array, j: int, out: Array, k: int) -> N
 
 @inlined
 def dot(a: Array, i: int, b: Array, j: int, size: int) -> float:
-    """a · b of `size` numbers, each from the element given on."""
+    """Return a · b of `size` numbers, which start at the given elements."""
     total = 0.0
     for k in range(size):
         total += a[i + k] * b[j + k]
@@ -67,7 +67,7 @@ def dot(a: Array, i: int, b: Array, j: int, size: int) -> float:
 
 @inlined
 def momentum(row: Array, motion: Array, i: int, out: Array, k: int) -> None:
-    """Write I x of the bodies whose mass, first moment and inertia are in `row`, for a motion x: a force."""
+    """Write the force I x of a motion x. `row` contains mass, first moment and inertia of the bodies."""
     for c in range(3):
         out[k + c] = dot(row, INERTIA + 3 * c, motion, i, 3)
         out[k + 3 + c] = row[MASS] * motion[i + 3 + c]
@@ -77,11 +77,11 @@ def momentum(row: Array, motion: Array, i: int, out: Array, k: int) -> None:
 
 @compiled
 def kinematics(constants: Array, gravity: Array, motion: Array, order: Indices, work: Array) -> None:
-    """Fill R, ORIGIN, S, E, V and A of each joint, base to tip.
+    """Write R, ORIGIN, S, E, V and A of each joint, base to tip.
 
     constants: (n, CONSTANTS), see `Geometry.constants`; gravity: (3,) m/s² in the base's frame; motion: (3, n), q, dq
     and ddq in the order of the data; order: (n,), the data's joint at each place of the chain; work: (n + 1, WORK),
-    whose last row is the base.
+    with the base in the last row.
     """
     n = constants.shape[0]
     base = work[n]
@@ -114,7 +114,7 @@ def kinematics(constants: Array, gravity: Array, motion: Array, order: Indices, 
         for c in range(6):
             row[A + c] = before[A + c] + row[S + c] * ddq + row[A + c] * dq
             row[V + c] = before[V + c] + row[S + c] * dq
-        row[SPARE] = slide  # the frame's own origin lies there; the screws across the axis act where it is at zero
+        row[SPARE] = slide  # the frame's own origin is here; the screws across the axis act at its place at q = 0
         if not revolute:
             for c in range(3):
                 row[ORIGIN + c] += slide * row[S + 3 + c]
@@ -122,7 +122,7 @@ def kinematics(constants: Array, gravity: Array, motion: Array, order: Indices, 
 
 @compiled
 def bodies(constants: Array, parameters: Array, work: Array) -> None:
-    """Fill MASS, H, INERTIA, P, N and F of each joint with the sums from its body to the tip, after `kinematics`.
+    """Write MASS, H, INERTIA, P, N and F of each joint after `kinematics`: the sums from its body to the tip.
 
     parameters: (n, 10) of the bodies, base to tip.
     """
@@ -144,7 +144,7 @@ def bodies(constants: Array, parameters: Array, work: Array) -> None:
 
 @compiled
 def _place_body(row: Array, body: Array) -> None:
-    """MASS, H and INERTIA of one body about the base's origin."""
+    """Write MASS, H and INERTIA of one body about the base's origin."""
     mass = body[0]
     row[MASS] = mass
     for c in range(3):  # about its own origin first
@@ -168,7 +168,7 @@ def _place_body(row: Array, body: Array) -> None:
 
 @compiled
 def _coriolis(row: Array) -> None:
-    """N of one body: 2 ω× Ī − tr Ī ω× − 2 h× v×."""
+    """Write N of one body: 2 ω× Ī − tr Ī ω× − 2 h× v×."""
     trace = row[INERTIA] + row[INERTIA + 4] + row[INERTIA + 8]
     column = row[SPARE + 1 : SPARE + 10]
     inner = dot(row, H, row, V + 3, 3)
@@ -192,7 +192,10 @@ def torques(order: Indices, work: Array, out: Array) -> None:
 
 @compiled
 def sum_momenta(parameters: Array, work: Array) -> None:
-    """D of each joint: momentum (L, p) of all bodies from its own to the tip; their sums of masses are kept."""
+    """Write D of each joint, the momentum (L, p) of all bodies from its own to the tip.
+
+    The sums of masses are preserved.
+    """
     n = parameters.shape[0]
     for j in range(n - 1, -1, -1):
         row = work[j]

@@ -1,4 +1,4 @@
-"""The serial-chain kernel, docs/method.md section 4: Gram matrix, its derivative, and a query's covariances."""
+"""The serial-chain kernel, docs/method.md section 4: Gram matrix, its derivative, and the covariances of a query."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lipcore.kernels.fast.views import lay
 
 
 class Work(NamedTuple):
-    """What LANES pairs are computed with; Lanes."""
+    """Work memory for LANES pairs, in Lanes."""
 
     total: Array  # (n, n) block of the Gram matrix, or the derivatives by it
     base: Array  # (n, 4) base kernels
@@ -35,7 +35,7 @@ class Work(NamedTuple):
 
 
 class Back(NamedTuple):
-    """Derivatives by it."""
+    """Derivatives by `Work`."""
 
     half: Array  # (n, n) by half the kinetic block
     base: Array
@@ -61,13 +61,13 @@ def _lay_back(m: Array, at: int, n: int) -> tuple[Back, int]:
 
 @compiled
 def chain_size(n: int) -> int:
-    """See `pairs.work_size`."""
+    """Return the number of elements to work in; see `pairs.work_size`."""
     return pairs.work_size(_lay_work, _lay_back, n)
 
 
 @inlined
 def _forward(hyper: Hyper, x: Array, y: Array, s: Work) -> None:
-    """The potential's block and the sums of the kinetic ones'."""
+    """Compute the block of the potential and the sums of the kinetic blocks."""
     n = x.shape[1]
     base_kernels(hyper.shares[0], x, y, s.base)
     prefixes(s.base, n, s.products)
@@ -80,7 +80,7 @@ def _forward(hyper: Hyper, x: Array, y: Array, s: Work) -> None:
 
 @inlined
 def _covariance(hyper: Hyper, x: Array, y: Array, s: Work) -> None:
-    """The block of the Gram matrix of one row sample and LANES columns."""
+    """Compute the block of the Gram matrix for one row sample and LANES columns."""
     n = x.shape[1]
     _forward(hyper, x, y, s)
     couple(x, y, s.base, s.sums, s.total)
@@ -94,7 +94,7 @@ def _covariance(hyper: Hyper, x: Array, y: Array, s: Work) -> None:
 
 @inlined
 def _adjoint(hyper: Hyper, x: Array, y: Array, s: Work, d: Back, dhyper: Hyper) -> None:
-    """Add the derivatives by the hyperparameters, given those by the block."""
+    """Add the derivatives by the hyperparameters, given the derivatives by the block."""
     n = x.shape[1]
     _forward(hyper, x, y, s)
     potential_adjoint(s.base, hyper.scales, s.products, s.total, d.products, d.base, dhyper.scales)
@@ -115,17 +115,17 @@ def _adjoint(hyper: Hyper, x: Array, y: Array, s: Work, d: Back, dhyper: Hyper) 
 
 @compiled
 def chain_gram(m: Array, kernels: int, x: Array, symmetric: bool, out: Array) -> None:
-    """See `pairs.gram`."""
+    """Write the Gram matrix; see `pairs.gram`."""
     pairs.gram(_lay_work, _covariance, m, kernels, x, symmetric, out)
 
 
 @compiled
 def chain_gradient(m: Array, kernels: int, x: Array, weight: Array, sums: Array) -> None:
-    """See `pairs.gradient`."""
+    """Add the derivatives by the hyperparameters; see `pairs.gradient`."""
     pairs.gradient(_lay_work, _lay_back, _adjoint, m, kernels, x, weight, sums)
 
 
 @compiled
 def chain_cross(m: Array, kernels: int, prismatic: Flags, motions: Array, out: Array) -> None:
-    """See `pairs.cross`."""
+    """Write the covariances of queries; see `pairs.cross`."""
     pairs.cross(_lay_work, _covariance, m, kernels, prismatic, motions, out)

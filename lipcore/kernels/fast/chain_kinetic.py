@@ -1,6 +1,7 @@
-"""Kinetic energies of the chain: block of the Gram matrix, docs/method.md (11) summed over links, and the way back.
+"""Kinetic energies of the chain: block of the Gram matrix, docs/method.md (11) summed over links, and its adjoint.
 
-Four rank-one terms a link, and the other terms of all links together, by the sums R, S and C of `chain_sums`.
+Each link has four rank-one terms. The other terms of all links are computed together, from the sums R, S and C of
+`chain_sums`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from lipcore.kernels.fast.lanes import Lanes, spread
 
 @inlined
 def couple(x: Array, y: Array, base: Array, sums: Sums, out: Array) -> None:
-    """Write h X + h' Y + ḣ Z + ḣ' diag(c) of (11), summed over links: half of the block but the rank-one terms."""
+    """Write h X + h' Y + ḣ Z + ḣ' diag(c) of (11), summed over links: half of the block without its rank-one terms."""
     _, r, _, s, c = sums
     for i in range(base.shape[0]):
         left, right, mixed, v, v2 = base[i, LEFT], base[i, RIGHT], base[i, MIXED], x[V, i], y[V, i]
@@ -28,7 +29,10 @@ def couple(x: Array, y: Array, base: Array, sums: Sums, out: Array) -> None:
 
 @inlined
 def couple_adjoint(x: Array, y: Array, base: Array, sums: Sums, dout: Array, dbase: Array, d: Sums) -> None:
-    """Back through `couple`: adds the derivatives by base kernels and sums; it is the first to do so for S and C."""
+    """Add the derivatives by base kernels and sums, given those by the result of `couple`.
+
+    It is the first to add to S and C.
+    """
     _, r, _, s, c = sums
     for i in range(base.shape[0]):
         left, right, mixed, v, v2 = base[i, LEFT], base[i, RIGHT], base[i, MIXED], x[V, i], y[V, i]
@@ -80,7 +84,7 @@ def link_terms(link: int, weights: Array, x: Array, y: Array, base: Array, sums:
 
 @inlined
 def _moved(link: int, i: int, r: Array, b: Array) -> tuple[Lanes, Lanes, Lanes]:
-    """∂h_l/∂p_i = R_{l,i} B_{l,i} and its time derivatives along either argument."""
+    """Return ∂h_l/∂p_i = R_{l,i} B_{l,i} and its time derivatives along either argument."""
     r0, b0 = r[link, i, 0], b[link, i, 0]
     return r0 * b0, r[link, i, 1] * b0 + r0 * b[link, i, 1], r[link, i, 2] * b0 + r0 * b[link, i, 2]
 
@@ -96,7 +100,7 @@ def add_terms(link: int, e: Array, f: Array, out: Array) -> None:
 
 @inlined
 def _terms_adjoint(link: int, i: int, e: Array, f: Array, dout: Array) -> tuple[Four, Four]:
-    """Derivatives by row i of e and of f."""
+    """Return the derivatives by row i of e and of f."""
     e0 = e1 = e2 = e3 = f0 = f1 = f2 = f3 = spread(0.0)
     for j in range(link + 1):
         d = dout[i, j]
@@ -122,18 +126,18 @@ def link_adjoint(
     d: Sums,
     dweights: Array,
 ) -> None:
-    """Back through `add_terms` and `link_terms`: adds the derivatives by base kernels, R, B and weights."""
+    """Add the derivatives by base kernels, R, B and weights: the adjoint of `add_terms` and `link_terms`."""
     _, r, b, _, _ = sums
     for i in range(link + 1):
         (e0, e1, e2, e3), (f0, f1, f2, f3) = _terms_adjoint(link, i, e, f, dout)
         w, v, a, v2, a2 = weights[link, i], x[V, i], x[A, i], y[V, i], y[A, i]
-        # by g = w R and its time derivatives
+        # derivatives by g = w R and its time derivatives
         g = f1 * v + f3 * a + e2 * v2 + e3 * a2
         g1 = f3 * v + e0 * v2 + e1 * a2
         g2 = f0 * v + f2 * a + e3 * v2
         rate = e1 * v2 + f2 * v
         dweights[link, i] += g * r[link, i, 0] + g1 * r[link, i, 1] + g2 * r[link, i, 2] + rate * r[link, i, 3]
-        # by −∂h_l/∂p_i and its time derivatives
+        # derivatives by −∂h_l/∂p_i and its time derivatives
         left, right = base[i, LEFT], base[i, RIGHT]
         h, h1, h2 = e0 * left + f0 * right + base[i, MIXED] * rate, f2 * right, e1 * left
         moved, moved1, moved2 = _moved(link, i, r, b)

@@ -1,6 +1,7 @@
-"""Sums along the chain of docs/method.md (9), each in one step a link, and the way back.
+"""Sums along the chain of docs/method.md (9), each in one step per link, and their adjoints.
 
-With p_b the jet of joint b's base kernel, three recursions give all that the kinetic energies' block is made of:
+With p_b the jet of joint b's base kernel, three recursions give everything that the block of the kinetic energies
+needs:
 
     R_{l,a} = Π_{a<b≤l} p_b                       R_{l,a} = p_l R_{l-1,a},  R_{a,a} = 1
     B_{l,i} = Σ_{a<i} w_{l,a} v_a v'_a R_{i-1,a}  B_{l,i+1} = p_i B_{l,i} + w_{l,i} v_i v'_i,  h_l = B_{l,l+1}
@@ -20,7 +21,7 @@ from lipcore.kernels.fast.views import lay
 
 
 class Sums(NamedTuple):
-    """The sums, or the derivatives by them; Lanes, a last axis of four is a jet."""
+    """The sums, or the derivatives by them, in Lanes. A last axis of four is a jet."""
 
     p: Array  # (n, 4)
     r: Array  # (n, n, 4)
@@ -31,14 +32,14 @@ class Sums(NamedTuple):
 
 @inlined
 def lay_sums(m: Array, at: int, n: int) -> tuple[Sums, int]:
-    """Memory for n joints."""
+    """Lay out memory for n joints."""
     views, at = lay(m, at, ((n, 4), (n, n, 4), (n, n + 1, 4), (n, n, 4), (n, n)))
     return Sums(*views), at
 
 
 @inlined
 def head(weights: Array, x: Array, y: Array, work: Sums) -> None:
-    """R and B, from the base to the tip."""
+    """Compute R and B, from the base to the tip."""
     p, r, b, _, _ = work
     for link in range(weights.shape[0]):
         for j in range(link):
@@ -53,7 +54,7 @@ def head(weights: Array, x: Array, y: Array, work: Sums) -> None:
 
 @inlined
 def head_adjoint(weights: Array, x: Array, y: Array, work: Sums, d: Sums, dweights: Array) -> None:
-    """Back through `head`: adds the derivatives by p and weights."""
+    """Add the derivatives by p and weights: the adjoint of `head`."""
     for link in range(weights.shape[0] - 1, -1, -1):
         by_total = constant(0.0)
         for i in range(link, -1, -1):
@@ -69,7 +70,7 @@ def head_adjoint(weights: Array, x: Array, y: Array, work: Sums, d: Sums, dweigh
 
 @inlined
 def tail(weights: Array, work: Sums) -> None:
-    """S and C, from the tip to the base."""
+    """Compute S and C, from the tip to the base."""
     p, _, b, s, c = work
     last = weights.shape[0] - 1
     for i in range(last, -1, -1):
@@ -85,7 +86,7 @@ def tail(weights: Array, work: Sums) -> None:
 
 @inlined
 def tail_adjoint(weights: Array, work: Sums, d: Sums, dweights: Array) -> None:
-    """Back through `tail`: adds the derivatives by p, B and weights."""
+    """Add the derivatives by p, B and weights: the adjoint of `tail`."""
     last = weights.shape[0] - 1
     for i in range(last + 1):
         h, dh = get(work.b, i, i + 1), constant(0.0)
@@ -105,7 +106,7 @@ def tail_adjoint(weights: Array, work: Sums, d: Sums, dweights: Array) -> None:
 
 @inlined
 def clear(d: Sums) -> None:
-    """Set to zero what the adjoints add to."""
+    """Set the derivatives that the adjoints add to to zero."""
     n, zero = d.p.shape[0], constant(0.0)
     for i in range(n):
         for k in range(4):

@@ -22,16 +22,16 @@ _F = TypeVar("_F", bound=Callable[..., object])
 _FASTMATH = {"contract", "reassoc", "nsz"}
 
 FOLDER = Path(__file__).parent
-"""Where the compiled functions are that those of other files call."""
+"""Folder of the compiled functions that functions of other files call."""
 _IMPORTS = re.compile(rf"^from {re.escape(__package__)}(?:\.(\w+))? import (.+)", re.MULTILINE)
 
 
 def use_cache(environment: MutableMapping[str, str]) -> Path | None:
-    """Let Numba read a cache that cannot be written, as in a container whose file system is read-only.
+    """Let Numba read a cache that is not writable, as in a container with a read-only file system.
 
-    Numba takes no machine code from a folder that it cannot write. So `NUMBA_CACHE_DIR` is copied to a new private
-    folder, which this process and its children use and which goes when it ends. Return that folder, None where nothing
-    was to be done or no temporary folder can be made.
+    Numba reads no machine code from a folder that is not writable. So `NUMBA_CACHE_DIR` is copied to a new private
+    folder. This process and its children use it; it is deleted when the process ends. Return that folder. Return None
+    if no copy is needed or no temporary folder can be created.
     """
     given = environment.get("NUMBA_CACHE_DIR")
     if not given or not Path(given).is_dir() or os.access(given, os.W_OK):
@@ -41,7 +41,7 @@ def use_cache(environment: MutableMapping[str, str]) -> Path | None:
         shutil.copytree(given, folder, dirs_exist_ok=True)
         for each in (folder, *folder.rglob("*")):
             if each.is_dir():
-                each.chmod(0o700)  # copying gave it the mode of its source
+                each.chmod(0o700)  # the copy has the mode of its source
     except OSError:
         return None
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -54,37 +54,42 @@ use_cache(os.environ)
 
 
 def compiled(function: _F) -> _F:
-    """Compile `function` with Numba at its first call, without the GIL; division by zero gives what NumPy gives.
+    """Compile `function` with Numba at its first call, without the GIL. Division by zero behaves as in NumPy.
 
-    The machine code is kept on disk: in `NUMBA_CACHE_DIR`, beside the source, or else below the home directory. Where
-    nothing can be written at all, not even a temporary folder, every process compiles anew.
+    The machine code is stored on disk: in `NUMBA_CACHE_DIR`, beside the source, or below the home directory. If nothing
+    is writable, not even a temporary folder, every process compiles again.
     """
     return _compile(function)
 
 
 def brief(function: _F) -> _F:
-    """Like `compiled`, but with the GIL: who answers one query in microseconds would have to wait for it again, each
-    time, where another thread has taken it meanwhile."""
+    """Compile like `compiled`, but keep the GIL.
+
+    A call takes microseconds. Without the GIL it would have to wait whenever another thread has acquired it meanwhile.
+    """
     return _compile(function, nogil=False)
 
 
 def inlined(function: _F) -> _F:
-    """Like `compiled`, and inlined where another compiled function calls it; Python itself cannot call it."""
+    """Compile like `compiled`, and inline into compiled callers. Python cannot call the function."""
     return _compile(function, forceinline=True, no_cpython_wrapper=True)
 
 
 def template(function: _F) -> _F:
-    """Like `inlined`, of a function that is given compiled functions: its caller alone is kept on disk."""
+    """Compile like `inlined`, for a function with compiled functions as arguments.
+
+    Only its caller is stored on disk.
+    """
     return _compile(function, keep=False, forceinline=True, no_cpython_wrapper=True)
 
 
 @cache
 def source_stamp(path: Path) -> str:
-    """Hash of a source file and of all files of FOLDER that it imports, directly or not.
+    """Return the hash of a source file and of all files in FOLDER that it imports, directly or indirectly.
 
-    Numba takes machine code from disk while the function's own file is unchanged, whatever became of the functions it
-    calls. Here it is taken while this is. (Should a later Numba not know `_source_stamp`: after editing a function that
-    is called from another file, run `make clean` or delete __pycache__.)
+    Numba only checks that the function's own file is unchanged, not the functions that it calls. This hash covers both.
+    (If a later Numba has no `_source_stamp`: run `make clean` or delete __pycache__ after editing a function that other
+    files call.)
     """
     return sha256(b"".join(each.read_bytes() for each in sorted(_imported(path)))).hexdigest()
 
@@ -97,7 +102,7 @@ def _imported(path: Path) -> frozenset[Path]:
 
 
 def _compile(function: _F, keep: bool = True, nogil: bool = True, **options: Any) -> _F:
-    # entry points for C are never used, and take a fifth of the compile time
+    # entry points for C are never used, but cost a fifth of the compile time
     options |= {"fastmath": _FASTMATH, "error_model": "numpy", "no_cfunc_wrapper": True}
     try:
         dispatcher = njit(cache=keep, nogil=nogil, **options)(function)
@@ -106,7 +111,7 @@ def _compile(function: _F, keep: bool = True, nogil: bool = True, **options: Any
         if "no locator available" not in str(error):
             raise
         dispatcher = njit(cache=False, nogil=nogil, **options)(function)
-    # one machine code for all integers, not another one for each constant that a caller names
+    # one machine code serves all integers, instead of one for each constant in a call
     resolve = dispatcher.get_call_template
     dispatcher.get_call_template = lambda given, named: resolve([types.unliteral(each) for each in given], named)  # type: ignore[no-untyped-call]
     with suppress(AttributeError):

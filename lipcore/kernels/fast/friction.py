@@ -1,4 +1,4 @@
-"""Friction's features, see `kernels.friction.FrictionKernel`: of queries, and beside ddq for the arms of a mixture."""
+"""Friction features of queries, see `kernels.friction.FrictionKernel`, and ddq with them for the arms of a mixture."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from lipcore.kernels.fast.joints import Array
 
 @brief
 def friction_query(motion: Array, width: float, speed: float, out: Array) -> None:
-    """Rows f j to f j + f − 1 of `out`, (f n, n), f = 3 or 4: joint j's dq, s = tanh(dq / width), 1 and, where f = 4,
-    s exp(−(dq / speed)²) in column j, else zero."""
+    """Write joint j's features into rows f j to f j + f − 1 of `out`, (f n, n), f = 3 or 4.
+
+    They are dq, s = tanh(dq / width), 1 and, if f = 4, s exp(−(dq / speed)²), in column j. All other elements are zero.
+    """
     out[:] = 0.0
     terms = out.shape[0] // motion.shape[1]
     for joint in range(motion.shape[1]):
@@ -26,14 +28,14 @@ def friction_query(motion: Array, width: float, speed: float, out: Array) -> Non
 
 @compiled
 def friction_queries(motions: Array, width: float, speed: float, out: Array, first: int, last: int) -> None:
-    """`friction_query` of N queries, (N, 3, n), into rows `first` to `last` of each of `out`, (N, …, n)."""
+    """Write the features of N queries, (N, 3, n), into rows `first` to `last` of each part of `out`, (N, …, n)."""
     for k in range(motions.shape[0]):
         friction_query(motions[k], width, speed, out[k, first:last])
 
 
 @compiled
 def linear_features(motions: Array, width: float, speed: float, out: Array) -> None:
-    """ddq and friction's features of each joint, (N, n, 4 or 5), for motions (N, 3, n)."""
+    """Write ddq and the friction features of each joint, (N, n, 4 or 5). motions: (N, 3, n)."""
     for k in range(motions.shape[0]):
         for j in range(motions.shape[2]):
             velocity = motions[k, 1, j]

@@ -1,8 +1,8 @@
-"""A sample as both kernels read it, and the joints' base kernels of two samples.
+"""The samples in the layout of both kernels, and the joints' base kernels of two samples.
 
-Each joint enters by x = (cos q, sin q), or (q, 1) where it is prismatic: with the shares σ, α and β, its base kernel is
-p = σ + α x₁ x₁' + β x₂ x₂' (docs/method.md, eqs. 4 and 10), and nothing after this asks for its type. A prime marks the
-second argument, a lane each.
+Each joint enters as x = (cos q, sin q), or as (q, 1) if it is prismatic. With the shares σ, α and β, its base kernel is
+p = σ + α x₁ x₁' + β x₂ x₂' (docs/method.md, eqs. 4 and 10). The type of a joint is not needed after this. A prime marks
+the second argument, one in each lane.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from lipcore.kernels.fast.lanes import LANES, Lanes
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Four = tuple[Lanes, Lanes, Lanes, Lanes]
-"""p, ∂p/∂q, ∂p/∂q' and ∂²p/∂q∂q', as `polynomial.BaseKernels`; or a jet."""
+"""p, ∂p/∂q, ∂p/∂q' and ∂²p/∂q∂q', as in `polynomial.BaseKernels`; or a jet."""
 
-F, G, DF, DG, V, A = range(6)  # what a sample knows of each joint: x₁, x₂, their derivatives, dq and ddq
+F, G, DF, DG, V, A = range(6)  # rows of a sample: x₁, x₂, their derivatives, dq and ddq
 VALUE, LEFT, RIGHT, MIXED = range(4)
 
 
 @compiled
 def read(motion: Array, prismatic: Flags, x: Array) -> None:
-    """Write what one sample, (3, n) its q, dq and ddq, knows of each joint: (6, n)."""
+    """Write x₁, x₂, their derivatives, dq and ddq of each joint, (6, n), for a sample (3, n)."""
     for b in range(prismatic.shape[0]):
         q, straight = motion[0, b], prismatic[b]
         cos, sin = np.cos(q), np.sin(q)
@@ -38,7 +38,7 @@ def read(motion: Array, prismatic: Flags, x: Array) -> None:
 
 @compiled
 def read_rows(motions: Array, prismatic: Flags) -> Array:
-    """`read` of N samples, (N, 3, n): (N, 6, n)."""
+    """Return the rows of N samples, (N, 3, n) to (N, 6, n); see `read`."""
     x = np.empty((motions.shape[0], 6, motions.shape[2]))
     for k in range(motions.shape[0]):
         read(motions[k], prismatic, x[k])
@@ -46,9 +46,9 @@ def read_rows(motions: Array, prismatic: Flags) -> Array:
 
 
 def columns(x: Array, room: int) -> Array:
-    """Samples as second arguments, LANES at a time: (blocks, 6, n, LANES) with place for `room` more; zeros fill up.
+    """Return samples as second arguments, LANES at a time, (blocks, 6, n, LANES), with space for `room` more.
 
-    x: (M, 6, n) of `read_rows`.
+    Zeros fill the last block. x: (M, 6, n) of `read_rows`.
     """
     size, _, n = x.shape
     blocks = -(-(size + room) // LANES)
@@ -70,7 +70,7 @@ def base_kernels(shares: Array, x: Array, y: Array, base: Array) -> None:
 
 @inlined
 def base_adjoint(x: Array, y: Array, b: int, d: Four, dshares: Array) -> None:
-    """Add the derivatives by joint b's shares, (n, 3), given those by its base kernel."""
+    """Add the derivatives by joint b's shares, (n, 3), given the derivatives by its base kernel."""
     value, left, right, mixed = d
     dshares[b, 0] += value
     dshares[b, 1] += y[F, b] * (x[F, b] * value + x[DF, b] * left) + y[DF, b] * (x[F, b] * right + x[DF, b] * mixed)
@@ -79,7 +79,7 @@ def base_adjoint(x: Array, y: Array, b: int, d: Four, dshares: Array) -> None:
 
 @inlined
 def row(p: Array, b: int) -> Four:
-    """Row b of (n, 4)."""
+    """Return row b of (n, 4)."""
     return p[b, 0], p[b, 1], p[b, 2], p[b, 3]
 
 

@@ -1,4 +1,4 @@
-"""Kernels with compiled code for the CPU, and their covariances with one query."""
+"""Pair kernels with compiled code for the CPU, and their covariances with single queries."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lipcore.vocabulary import JointType
 
 
 class Driver(NamedTuple):
-    """The compiled functions of a kernel, as those of `chain`: their memory and what they take is said in `pairs`."""
+    """Compiled functions of a kernel, for example those of `chain`. `pairs` documents their memory and arguments."""
 
     size: Callable[[int], int]
     gram: Callable[[Array, int, Array, bool, Array], None]
@@ -27,36 +27,39 @@ class Driver(NamedTuple):
 
 
 class CompiledKernel(PairKernel):
-    """A pair kernel whose Gram matrices, gradients and covariances with a query equal its formula, compiled."""
+    """Pair kernel with compiled Gram matrices, gradients and query covariances. They equal its formula."""
 
     driver: ClassVar[Driver]
     joint_types: tuple[JointType, ...]
 
     @abstractmethod
     def hyper(self, params: Params) -> Hyper:
-        """What compiled code takes of the hyperparameters: shares (E, n, 3), scales (n,) and weights (n, n)."""
+        """Return the hyperparameters for compiled code: shares (E, n, 3), scales (n,) and weights (n, n)."""
 
     @abstractmethod
     def hyper_adjoint(self, hyper: Hyper, slopes: Hyper) -> dict[str, Array]:
-        """Derivatives by each hyperparameter. hyper: what `hyper` has made of them; slopes: derivatives by that."""
+        """Return the derivatives by each hyperparameter. hyper: result of `hyper`; slopes: derivatives by it."""
 
     def gram(self, params: Params, x: Motion, y: Motion) -> Array:
-        """Covariance of all torques of x with all of y: (N n, M n)."""
+        """Return the covariance of all torques of x with all torques of y, (N n, M n)."""
         return self._gram(params, x, y, symmetric=False)
 
     def symmetric_gram(self, params: Params, x: Motion) -> Array:
-        """Covariance of all torques of x with each other, (N n, N n), exactly symmetric."""
+        """Return the covariance of all torques of x with each other, (N n, N n), exactly symmetric."""
         return self._gram(params, x, x, symmetric=True)
 
     def variance(self, params: Params, x: Motion) -> Array:
-        """Prior covariance of the torques at each sample, (N, n, n): what `cross` makes of a query with itself."""
+        """Return the prior covariance of the torques at each sample, (N, n, n), as `cross` computes it for a query."""
         cross = self.cross(params, x[:1])
         out = np.empty((len(x), cross.size + 1, self.n_joints, self.n_joints))
         cross.fill_many(x.arrays(), out)
         return out[:, -1]
 
     def gradient(self, params: Params, x: Motion, weight: Array) -> dict[str, Array]:
-        """Derivative of Σ weight ∘ gram(x, x) by each hyperparameter: compiled by `hyper`, the rest by its adjoint."""
+        """Return the derivative of Σ weight ∘ gram(x, x) by each hyperparameter.
+
+        Compiled code differentiates by the result of `hyper`; `hyper_adjoint` does the rest.
+        """
         n, size, hyper = self.n_joints, len(x), self.hyper(params)
         rows = read_rows(x.arrays(), self._prismatic())
         memory = _memory(rows, hyper, self.driver.size(n))
@@ -68,7 +71,7 @@ class CompiledKernel(PairKernel):
         return self.hyper_adjoint(hyper, slopes)
 
     def cross(self, params: Params, inducing: Motion) -> Cross:
-        """Covariance of one query with the inducing samples and itself, for serving."""
+        """Return the covariances of single queries with the inducing samples and with themselves."""
         return CompiledCross(self.driver, self.hyper(params), self._prismatic(), inducing)
 
     def _gram(self, params: Params, x: Motion, y: Motion, symmetric: bool) -> Array:

@@ -1,8 +1,8 @@
-"""Numbers of several pairs of samples, computed together: SIMD vectors that compiled code calculates with.
+"""Numbers of several pairs of samples, computed together: SIMD vectors in compiled code.
 
-`Lanes` are LANES float64 numbers, one a pair. They add, subtract and multiply like one number, with each other and
-with floats, so that a formula is written once for a pair and holds for all of them. In memory they lie in float64
-arrays whose last axis has LANES elements; views of `views.lay` index them by Lanes.
+`Lanes` are LANES float64 numbers, one for each pair. They add, subtract and multiply like one number, with each other
+and with floats. A formula for one pair therefore applies to all of them. In memory they are float64 arrays whose last
+axis has LANES elements; views of `views.lay` index them by Lanes.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic, lower_builtin, register_model
 
 LANES = 8
-"""Pairs of samples computed together: two of AVX2's registers, one of AVX-512's."""
+"""Pairs of samples computed together: two AVX2 registers, or one AVX-512 register."""
 
 Lanes = float
-"""What formulas are annotated with: calculating, Lanes are a number."""
+"""Annotation of Lanes in formulas: they behave like a number."""
 
 _VECTOR = ir.VectorType(ir.DoubleType(), LANES)
 
@@ -47,7 +47,7 @@ def _broadcast(builder: Any, number: Any) -> Any:
 
 
 def _define(operation: Callable[..., Any], instruction: str) -> None:
-    """Let an operator of Python take Lanes on either side, or on both."""
+    """Define a Python operator for Lanes on either side, or on both."""
 
     @infer_global(operation)  # type: ignore[no-untyped-call]
     class _Template(AbstractTemplate):
@@ -74,4 +74,4 @@ def _spread(_typing: Any, number: Any) -> tuple[Any, Callable[..., Any]]:
 
 
 spread: Callable[[float], Lanes] = cast(Any, intrinsic(_spread))
-"""Lanes that are all the same number."""
+"""Lanes that all contain the same number."""

@@ -1,6 +1,6 @@
-"""The paper's kernel, docs/method.md section 3: Gram matrix, its derivative, and a query's covariances.
+"""The paper's kernel, docs/method.md section 3: Gram matrix, its derivative, and the covariances of a query.
 
-Of the E kernels of positions the last is the potential's. The others are the links', or one for all of them.
+Of the E kernels of positions the last is the potential's. The others are those of the links, or one for all links.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from lipcore.kernels.fast.views import lay, numbers
 
 
 class Work(NamedTuple):
-    """What LANES pairs are computed with; Lanes but for `one`."""
+    """Work memory for LANES pairs, in Lanes except for `one`."""
 
     total: Array  # (n, n) block of the Gram matrix, or the derivatives by it
     base: Array  # (n, 4) base kernels
@@ -47,7 +47,7 @@ class Work(NamedTuple):
 
 
 class Back(NamedTuple):
-    """Derivatives by it."""
+    """Derivatives by `Work`."""
 
     base: Array
     products: ProductBack
@@ -72,13 +72,13 @@ def _lay_back(m: Array, at: int, n: int) -> tuple[Back, int]:
 
 @compiled
 def lip_size(n: int) -> int:
-    """See `pairs.work_size`."""
+    """Return the number of elements to work in; see `pairs.work_size`."""
     return pairs.work_size(_lay_work, _lay_back, n)
 
 
 @inlined
 def _potential(hyper: Hyper, x: Array, y: Array, s: Work) -> None:
-    """H of the potential energy's kernel, its torques' covariance (3)."""
+    """Compute H of the potential energy's kernel, the covariance of its torques (3)."""
     n = x.shape[1]
     base_kernels(hyper.shares[-1], x, y, s.base)
     prefixes(s.base, n, s.products)
@@ -87,7 +87,7 @@ def _potential(hyper: Hyper, x: Array, y: Array, s: Work) -> None:
 
 @inlined
 def _kinetic(hyper: Hyper, link: int, x: Array, y: Array, s: Work) -> None:
-    """What the block of a link is made of; links come from the last to the first."""
+    """Compute the terms of a link's block. Links must be called from the last to the first."""
     last, n, m = hyper.shares.shape[0] - 2, x.shape[1], link + 1
     if link == n - 1 or last > 0:
         base_kernels(hyper.shares[min(link, last)], x, y, s.base)
@@ -100,7 +100,7 @@ def _kinetic(hyper: Hyper, link: int, x: Array, y: Array, s: Work) -> None:
 
 @inlined
 def _covariance(hyper: Hyper, x: Array, y: Array, s: Work) -> None:
-    """The block of the Gram matrix of one row sample and LANES columns."""
+    """Compute the block of the Gram matrix for one row sample and LANES columns."""
     n = x.shape[1]
     _potential(hyper, x, y, s)
     for i in range(n):
@@ -113,7 +113,7 @@ def _covariance(hyper: Hyper, x: Array, y: Array, s: Work) -> None:
 
 @inlined
 def _adjoint(hyper: Hyper, x: Array, y: Array, s: Work, d: Back, dhyper: Hyper) -> None:
-    """Add the derivatives by the hyperparameters, given those by the block."""
+    """Add the derivatives by the hyperparameters, given the derivatives by the block."""
     last, n = hyper.shares.shape[0] - 2, x.shape[1]
     _potential(hyper, x, y, s)
     potential_adjoint(s.base, hyper.scales, s.products, s.total, d.products, d.base, dhyper.scales)
@@ -131,17 +131,17 @@ def _adjoint(hyper: Hyper, x: Array, y: Array, s: Work, d: Back, dhyper: Hyper) 
 
 @compiled
 def lip_gram(m: Array, kernels: int, x: Array, symmetric: bool, out: Array) -> None:
-    """See `pairs.gram`."""
+    """Write the Gram matrix; see `pairs.gram`."""
     pairs.gram(_lay_work, _covariance, m, kernels, x, symmetric, out)
 
 
 @compiled
 def lip_gradient(m: Array, kernels: int, x: Array, weight: Array, sums: Array) -> None:
-    """See `pairs.gradient`."""
+    """Add the derivatives by the hyperparameters; see `pairs.gradient`."""
     pairs.gradient(_lay_work, _lay_back, _adjoint, m, kernels, x, weight, sums)
 
 
 @compiled
 def lip_cross(m: Array, kernels: int, prismatic: Flags, motions: Array, out: Array) -> None:
-    """See `pairs.cross`."""
+    """Write the covariances of queries; see `pairs.cross`."""
     pairs.cross(_lay_work, _covariance, m, kernels, prismatic, motions, out)

@@ -1,7 +1,7 @@
 """One link's kinetic energy of the paper's kernel, K h²: block of the Gram matrix, docs/method.md (6), and its adjoint.
 
-K = Π_{b≤l} p_b² and its derivatives are those of `products` with p_b² in the place of p_b. Primes mark the second
-argument; h, ḣ, h', ḣ', A, B and C are those of (6).
+K = Π_{b≤l} p_b² and its derivatives are those of `products` with p_b² instead of p_b. Primes mark the second argument;
+h, ḣ, h', ḣ', A, B and C are those of (6).
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ H, HX, HY, HXY, KX, KY, KXY, K = range(8)  # h, ḣ, h', ḣ', A, B, C and K
 
 
 class Terms(NamedTuple):
-    """What the block of a link with m joints is made of; Lanes."""
+    """Terms of the block of a link with m joints, in Lanes."""
 
     sums: Array  # (8,) the numbers above
     x_mixed: Array  # (n,) Hᵀv
     mixed_y: Array  # (n,) H v'
-    alpha: Array  # (n,) what multiplies w_j a_j in row i of the block
-    gamma: Array  # (n,) and w_j v_j
-    rho: Array  # (n,) ḣ ∂'K + h Hᵀv, what −2 w_i v'_i multiplies
+    alpha: Array  # (n,) factor of w_j a_j in row i of the block
+    gamma: Array  # (n,) factor of w_j v_j
+    rho: Array  # (n,) ḣ ∂'K + h Hᵀv, the factor of −2 w_i v'_i
 
 
 class TermsBack(NamedTuple):
-    """Derivatives by it; Lanes."""
+    """Derivatives by `Terms`, in Lanes."""
 
     rho: Array  # (n,)
     mixed_y: Array  # (n,)
@@ -40,21 +40,21 @@ class TermsBack(NamedTuple):
 
 @inlined
 def lay_terms(m: Array, at: int, n: int) -> tuple[Terms, int]:
-    """Memory for n joints."""
+    """Lay out memory for n joints."""
     views, at = lay(m, at, ((8,), (n,), (n,), (n,), (n,), (n,)))
     return Terms(*views), at
 
 
 @inlined
 def lay_terms_back(m: Array, at: int, n: int) -> tuple[TermsBack, int]:
-    """Memory for n joints."""
+    """Lay out memory for n joints."""
     views, at = lay(m, at, ((n,), (n,), (n,), (n,), (n, n)))
     return TermsBack(*views), at
 
 
 @inlined
 def square(base: Array, power: Array) -> None:
-    """p² and its derivatives from those of p, both (n, 4)."""
+    """Write p² and its derivatives from p and its derivatives, both (n, 4)."""
     for b in range(base.shape[0]):
         value, left, right = base[b, VALUE], base[b, LEFT], base[b, RIGHT]
         power[b, VALUE] = value * value
@@ -65,7 +65,7 @@ def square(base: Array, power: Array) -> None:
 
 @inlined
 def square_adjoint(base: Array, b: int, d: Four) -> Four:
-    """Derivatives by joint b's p and its derivatives, given those by p² and its."""
+    """Return the derivatives by joint b's p and its derivatives, given those by p² and its derivatives."""
     value, left, right, mixed = base[b, VALUE], base[b, LEFT], base[b, RIGHT], base[b, MIXED]
     return (
         2.0 * (d[0] * value + d[1] * left + d[2] * right + d[3] * mixed),
@@ -77,7 +77,7 @@ def square_adjoint(base: Array, b: int, d: Four) -> Four:
 
 @inlined
 def link_terms(w: Array, x: Array, y: Array, m: int, s: Products, t: Terms) -> None:
-    """Everything that the block of a link with m joints is made of. w: (n,), its weights."""
+    """Write the terms of the block of a link with m joints. w: (n,), its weights."""
     h = hx = hy = hxy = kx = ky = kxy = spread(0.0)
     for i in range(m):
         wv, wa, v, v2, a2 = w[i] * x[V, i], w[i] * x[A, i], x[V, i], y[V, i], y[A, i]
@@ -113,7 +113,7 @@ def add_block(w: Array, x: Array, y: Array, m: int, s: Products, t: Terms, out: 
 
 @inlined
 def _diagonal(t: Terms) -> Lanes:
-    """K ḣ' + A h' + B ḣ + C h."""
+    """Return K ḣ' + A h' + B ḣ + C h."""
     s = t.sums
     diagonal: Lanes = s[K] * s[HXY] + s[KX] * s[HY] + s[KY] * s[HX] + s[KXY] * s[H]
     return diagonal
@@ -123,7 +123,10 @@ def _diagonal(t: Terms) -> Lanes:
 def block_adjoint(
     w: Array, x: Array, y: Array, m: int, s: Products, t: Terms, dout: Array, d: TermsBack, dw: Array
 ) -> Given:
-    """Derivatives by K, its slopes and H, given those by the block; adds those by the weights, (n,)."""
+    """Return the derivatives by K, its slopes and H, given those by the block.
+
+    Add the derivatives by the weights, (n,).
+    """
     h, hx, hy, hxy, kx, ky, kxy, k = (
         t.sums[H], t.sums[HX], t.sums[HY], t.sums[HXY], t.sums[KX], t.sums[KY], t.sums[KXY], t.sums[K]
     )  # fmt: skip
@@ -166,7 +169,7 @@ def block_adjoint(
         d.left[i] += dkx * v
         d.right[i] = dky * v2 + hx * d.rho[i]
         d.mixed_y[i] += dkxy * v
-        d.rho[i] = h * d.rho[i]  # from here on by Hᵀv
+        d.rho[i] = h * d.rho[i]  # from here on the derivative by Hᵀv
     for i in range(m):
         mixed_y, v = d.mixed_y[i], x[V, i]
         for j in range(m):

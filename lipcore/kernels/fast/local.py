@@ -1,4 +1,4 @@
-"""The local kernel's covariances of queries with the inducing samples."""
+"""Compiled covariances of queries with the inducing samples, for the local kernel."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from lipcore.kernels.fast.joints import Array
 
 @compiled
 def local_cross(anchors: Array, rate: Array, scale: Array, sign_width: float, motions: Array, out: Array) -> None:
-    """Write what `Cross.fill_many` asks for: equal to the formula of `LocalKernel`, compiled.
+    """Write the covariances of `Cross.fill_many`. They equal the formula of `LocalKernel`.
 
-    anchors: (S, 4 n), inputs of the inducing samples over their lengthscales; rate: (4 n,), one over these; scale:
-    (n,), s² (N·m)².
+    anchors: (S, 4 n), inputs of the inducing samples divided by their lengthscales; rate: (4 n,), inverse lengthscales;
+    scale: (n,), s² (N·m)².
     """
     size, inputs, n = anchors.shape[0], anchors.shape[1], scale.shape[0]
     x = np.empty(inputs)

@@ -1,12 +1,12 @@
-"""How both kernels go over pairs of samples: one of the first argument, LANES of the second at a time.
+"""Loops over pairs of samples for both kernels: one sample of the first argument with LANES of the second at a time.
 
-All that is worked on lies in one flat array, in this order: the samples of the second argument (`joints.columns`), the
-hyperparameters, a query where there is one, the block of the Gram matrix, and what else the kernel lays out.
+All work memory is one flat array, in this order: the samples of the second argument (`joints.columns`), the
+hyperparameters, a query if there is one, the block of the Gram matrix, and any other memory of the kernel.
 
-A kernel is four functions, which the functions here are given:
+A kernel consists of four functions, which are arguments of the functions here:
 
     lay_work(m, at, n)                         memory for LANES pairs, their block first; and its end
-    lay_back(m, at, n)                         memory for the way back, and its end
+    lay_back(m, at, n)                         memory for the adjoint, and its end
     covariance(hyper, x, y, work)              computes the block of row sample x, (6, n), with columns y, (6, n) Lanes
     adjoint(hyper, x, y, work, back, dhyper)   adds the derivatives of Σ block ∘ covariance by the hyperparameters
 """
@@ -27,7 +27,7 @@ Function = Callable[..., Any]
 
 
 class Hyper(NamedTuple):
-    """Hyperparameters, or the sums of the derivatives by them, which are Lanes."""
+    """Hyperparameters, or the sums of the derivatives by them in Lanes."""
 
     shares: Array  # (E, n, 3) σ, α and β of each joint, for E kernels of positions
     scales: Array  # (n,) s_l of the potential
@@ -36,7 +36,7 @@ class Hyper(NamedTuple):
 
 @template
 def work_size(lay_work: Function, lay_back: Function, n: int) -> int:
-    """Elements of work for n joints."""
+    """Return the number of elements to work in, for n joints."""
     m = np.empty(1)
     end: int = lay_back(m, lay_work(m, 0, n)[1], n)[1]
     return end
@@ -46,16 +46,16 @@ def work_size(lay_work: Function, lay_back: Function, n: int) -> int:
 def gram(
     lay_work: Function, covariance: Function, m: Array, kernels: int, x: Array, symmetric: bool, out: Array
 ) -> None:
-    """Write the covariance of torque i of sample k with torque j of sample l: (N, n, M, n) at (k, i, l, j), (N·m)².
+    """Write the covariance of torque i of sample k with torque j of sample l, (N, n, M, n) at (k, i, l, j), (N·m)².
 
-    m: see above; kernels: E of `Hyper`; x: (N, 6, n), rows; symmetric: both arguments are the same samples, half the
-    work and exactly symmetric.
+    m: work memory, see above; kernels: E of `Hyper`; x: (N, 6, n), rows; symmetric: whether both arguments are the same
+    samples, which halves the work and makes the result exactly symmetric.
     """
     rows, n, size = out.shape[0], out.shape[1], out.shape[2]
     blocks = (size + LANES - 1) // LANES
     hyper, at = _hyperparameters(m, blocks, kernels, n)
     block, work = numbers(m, at, (n, n, LANES)), lay_work(m, at, n)[0]
-    # blocks of columns outside: the mirrored blocks then follow each other in memory
+    # columns are the outer loop, so that mirrored blocks follow each other in memory
     for number in range(blocks):
         y, start = _columns(m, number, n), number * LANES
         for k in range(min(rows, start + LANES) if symmetric else rows):
@@ -81,7 +81,7 @@ def gradient(
 ) -> None:
     """Add the derivatives of Σ weight ∘ gram(x, x) by the hyperparameters to `sums`, LANES numbers of each to add up.
 
-    weight: (N, n, N, n), symmetric; all else as of `gram`.
+    weight: (N, n, N, n), symmetric; other arguments as in `gram`.
     """
     rows, n = x.shape[0], x.shape[2]
     blocks = (rows + LANES - 1) // LANES
@@ -99,7 +99,10 @@ def gradient(
 def cross(
     lay_work: Function, covariance: Function, m: Array, kernels: int, prismatic: Flags, motions: Array, out: Array
 ) -> None:
-    """Write what `Cross.fill_many` asks for. m: with the inducing samples, and room for one column more: the query."""
+    """Write the covariances of `Cross.fill_many`.
+
+    m: work memory with the inducing samples, and space for one more column: the query.
+    """
     size, n = out.shape[1] - 1, out.shape[2]
     blocks = size // LANES + 1
     hyper, at = _hyperparameters(m, blocks, kernels, n)
@@ -123,7 +126,7 @@ def cross(
 
 @inlined
 def symmetrise(block: Array) -> None:
-    """Take the rounding errors out of a square matrix that is symmetric but for them."""
+    """Remove the rounding errors from a matrix that is symmetric except for them."""
     for i in range(block.shape[0]):
         for j in range(i):
             block[i, j] = block[j, i] = 0.5 * (block[i, j] + block[j, i])
@@ -145,8 +148,10 @@ def _columns(m: Array, number: int, n: int) -> Array:
 
 @inlined
 def _read(weight: Array, k: int, start: int, block: Array) -> None:
-    """What each element of a block counts in a sum over the symmetric Gram matrix: lanes past its end or below its
-    diagonal nothing, those above it twice."""
+    """Write the weight of each element of a block in a sum over the symmetric Gram matrix.
+
+    Lanes past its end or below its diagonal have zero weight. Those above the diagonal count twice.
+    """
     n = block.shape[0]
     for lane in range(LANES):
         column = start + lane

@@ -1,4 +1,4 @@
-"""What is asked of a payload at the tip of an arm: its features, see `kernels.payload.PayloadKernel`."""
+"""Features of a payload at the tip of an arm, see `kernels.payload.PayloadKernel`."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from lipcore.kernels.fast.views import numbers
 
 
 def payload_size(n: int) -> int:
-    """Elements that `payload_query` works in."""
+    """Return the number of elements that `payload_query` works in."""
     return (n + 1) * WORK + TABLE
 
 
 @brief
 def payload_query(memory: Array, order: Indices, motion: Array, out: Array) -> None:
-    """Features of one query, ∂τ/∂π of the last link, (10, n), with one array for all: `Memory` of the geometry's
-    constants and gravity, with `payload_size` elements to work in."""
+    """Write the features of one query, ∂τ/∂π of the last link, (10, n).
+
+    memory: `Memory` of the geometry's constants and gravity, with `payload_size` elements to work in.
+    """
     n = order.shape[0]
     gravity = n * CONSTANTS
     first = gravity + 3
@@ -27,6 +29,6 @@ def payload_query(memory: Array, order: Indices, motion: Array, out: Array) -> N
 
 @compiled
 def payload_queries(memory: Array, order: Indices, motions: Array, out: Array, first: int) -> None:
-    """`payload_query` of N queries, (N, 3, n), into the rows of each of `out`, (N, …, n), from `first` on."""
+    """Write the features of N queries, (N, 3, n), into the rows of each part of `out`, (N, …, n), from `first` on."""
     for k in range(motions.shape[0]):
         payload_query(memory, order, motions[k], out[k, first : first + PARAMETERS])

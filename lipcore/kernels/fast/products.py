@@ -1,7 +1,7 @@
-"""A position kernel K = Σ_l s_l Π_{b≤l} p_b with its derivatives, and the way back. Nothing is divided by p_b.
+"""A position kernel K = Σ_l s_l Π_{b≤l} p_b with its derivatives, and its adjoint. No formula divides by p_b.
 
 With the scales (0, …, 0, s) it is a product over all joints. Both energies of docs/method.md (5) and the potential of
-section 4 are such sums; `polynomial.chain_sum` is the same in PyTorch.
+section 4 are such sums. `polynomial.Product` is one term of it as a formula.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from lipcore.kernels.fast.views import lay
 
 
 class Products(NamedTuple):
-    """What the derivatives of K are made of; Lanes."""
+    """Products that the derivatives of K need, in Lanes."""
 
     before: Array  # (n + 1,) Π_{c<b} p_c
     after: Array  # (n + 1,) ∂K/∂before: Σ_{l≥b−1} s_l Π_{b≤c≤l} p_c
@@ -25,7 +25,7 @@ class Products(NamedTuple):
 
 
 class Given(NamedTuple):
-    """The derivatives by K, its slopes and H that `product_adjoint` starts from; Lanes."""
+    """Derivatives by K, its slopes and H that `product_adjoint` starts from, in Lanes."""
 
     value: Lanes
     left: Array  # (n,)
@@ -34,7 +34,7 @@ class Given(NamedTuple):
 
 
 class ProductBack(NamedTuple):
-    """What `product_adjoint` remembers; Lanes."""
+    """Intermediate results of `product_adjoint`, in Lanes."""
 
     partial: Array  # (n + 1,) the part of the sum that the first b joints make up
     new_left: Array  # (n,) Σ_{j<b} d_bj ∂'_j before
@@ -46,21 +46,21 @@ class ProductBack(NamedTuple):
 
 @inlined
 def lay_products(m: Array, at: int, n: int) -> tuple[Products, int]:
-    """Memory for n joints."""
+    """Lay out memory for n joints."""
     views, at = lay(m, at, ((n + 1,), (n + 1,), (n + 1, n), (n + 1, n), (n, n)))
     return Products(*views), at
 
 
 @inlined
 def lay_back(m: Array, at: int, n: int) -> tuple[ProductBack, int]:
-    """Memory for n joints."""
+    """Lay out memory for n joints."""
     views, at = lay(m, at, ((n + 1,), (n,), (n,), (n,), (n,), (n,)))
     return ProductBack(*views), at
 
 
 @inlined
 def prefixes(p: Array, n: int, s: Products) -> None:
-    """Products of the first joints, every number of them up to n, with their slopes. p: (n, 4)."""
+    """Write the products of the first b joints for all b up to n, with their slopes. p: (n, 4)."""
     s.before[0] = spread(1.0)
     for b in range(n):
         value, first = p[b, VALUE], s.before[b]
@@ -74,7 +74,7 @@ def prefixes(p: Array, n: int, s: Products) -> None:
 
 @inlined
 def mixed_derivatives(p: Array, scales: Array, n: int, s: Products) -> None:
-    """H of n joints, after `prefixes`: H_ij takes i and j from what comes before the later of them. scales: s, (n,)."""
+    """Write H of n joints after `prefixes`. H_ij uses the product before the later of i and j. scales: s, (n,)."""
     last = spread(scales[n - 1])
     s.after[n] = last
     for b in range(n - 1, -1, -1):
@@ -93,8 +93,8 @@ def mixed_derivatives(p: Array, scales: Array, n: int, s: Products) -> None:
 def product_adjoint(p: Array, scales: Array, n: int, s: Products, d: Given, work: ProductBack, dp: Array) -> None:
     """Write the derivatives of d.value K + Σ d.left ∂_iK + Σ d.right ∂'_jK + Σ d.mixed H by p and its own, (n, 4).
 
-    The part of this sum that the first b joints make up follows a recursion with as many numbers a joint as the joint
-    has rows and columns in H; going back through it costs as much.
+    The part of this sum from the first b joints follows a recursion. Its numbers per joint are as many as the joint has
+    rows and columns in H. The adjoint of the recursion has the same cost.
     """
     work.partial[0] = spread(0.0)
     for b in range(n):

@@ -1,1 +1,1 @@
-"""A robot that is no longer the one that was learnt, and a model that is led away."""
+"""Detect that a robot is no longer the one that was learnt, or that a model is drifting away."""

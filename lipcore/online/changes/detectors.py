@@ -1,4 +1,4 @@
-"""A robot that is no longer the one that was learnt: detectors on prequential records, and their evidence."""
+"""Detect from prequential records that a robot has changed, and give the evidence."""
 
 from __future__ import annotations
 
@@ -29,33 +29,33 @@ class DetectorOptions:
     min_reference_s: float = 10.0
     min_reference_rows: int = 200
     ratio: float = 4.0
-    """Bound of squared errors over those before and as stated: 30 standard errors of the mean of 200 independent
+    """Bound of squared errors over earlier ones and over stated ones: 30 standard errors of the mean of 200 independent
     rows."""
     deviations: float = 5.0
     """Bound in the Gaussian that the tail of the bucket means is mapped to: one chance in 3 million if `ratio` is too
     low."""
     prior_variation: float = 0.5
     prior_buckets: int = 10
-    """Assumed variation of the buckets' means, and how many buckets it counts for."""
+    """Assumed variation of the buckets' means, and the number of buckets that it counts for."""
     share: float = 0.75
-    """Min share of the recent buckets that exceed the bound: 3 of 4, since a collision of 0.5 s touches 2."""
+    """Min share of the recent buckets that exceed the bound: 3 of 4, since a collision of 0.5 s affects 2."""
     allowance: float = float(np.log(2.0))
     """Drift that is ignored: squared errors up to twice those of the best two minutes."""
     max_ratio: float = 8.0
-    """Max ratio of a bucket, so that no single one moves the sum by more than log 4 = 1.4."""
+    """Max ratio of a bucket, so that no single one changes the sum by more than log 4 = 1.4."""
     drift_bound: float = 10.0
-    """Eight buckets of the max step. On independent rows nothing comes near it (a step is −0.7 ± 0.2)."""
+    """Eight buckets of the max step. On independent rows the sum stays far below it (a step is −0.7 ± 0.2)."""
     first_epoch_s: float = 20.0
     epoch_s: float = 120.0
     max_bucket_s: float = 10.0
-    """A bucket that took longer contains a pause, of which no more than this counts as time observed."""
+    """A longer bucket contains a pause, of which only so much counts as time observed."""
 
 
 OPTIONS = DetectorOptions()
 FRICTION_SHARE = 0.6
-"""Between what was measured over 10 s (three simulated arms, three speeds, noise 0.05 N·m): new friction explains 0.98
-or more of the median joint, a payload 0.03 to 0.5. Over 4 s a tenth of the slow motions do not reverse a joint, whose
-friction then looks like a weight (0.5)."""
+"""Min share that suggests friction. Measured over 10 s (three simulated arms, three speeds, noise 0.05 N·m): new
+friction explains 0.98 or more of the median joint, a payload 0.03 to 0.5. Over 4 s a tenth of the slow motions do not
+reverse a joint, whose friction then looks like a weight (0.5)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,23 +69,25 @@ class Bucket:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Errors have grown. at: event time from which on, s; joints: whose; before, after: records of then and now.
-
-    kind: `sudden` within seconds (a payload, a tool), `drift` over longer (friction, wear, temperature), `departure`
-    where errors have not grown but what is learnt has left what was trained on (`lipcore.online.changes.departure`).
-    """
+    """A change of the robot: errors have grown."""
 
     at: float
+    """Event time since when, s."""
     joints: tuple[int, ...]
+    """The joints affected."""
     before: Record
+    """Record of the time before; `after` is that of the time since."""
     after: Record
     kind: Kind
+    """`sudden`: within seconds (a payload, a tool). `drift`: over longer (friction, wear, temperature). `departure`:
+    errors have not grown, but the model has left the trained version (`lipcore.online.changes.departure`)."""
 
     def evidence(self, joint_names: Sequence[str], friction: Array | None = None) -> dict[str, Any]:
-        """What speaks for the change, for JSON. friction: `friction_share` of innovations after it, which adds it.
+        """Return the evidence of the change for JSON. friction: `friction_share` of the innovations after it, which is
+        added.
 
-        Per joint: nmse, rmse (N·m), standardised (mean of e²/s², 1 where intervals are true) and innovation (mean of e,
-        N·m), each before and after; None where not known.
+        Per joint: nmse, rmse (N·m), standardised (mean of e²/s², 1 if intervals are right) and innovation (mean of e,
+        N·m), each before and after; None if unknown.
         """
         figures = [
             (name, getattr(self.before, field), getattr(self.after, field))
@@ -116,23 +118,23 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class ChangeDetector:
-    """Compares the errors of the last seconds with those before them: immutable, of bounded size, per model.
+    """Detector that compares the errors of the last seconds with earlier ones: immutable, of bounded size, per model.
 
-    Records of rows that passed the gates are summed in buckets of at least 0.5 s and 50 rows, by event time. With
-    z² the record's `standardised` of a joint, and ref = max(1, z² of the 20 s before the last 2 s, at least 10 s):
+    Records of rows that passed the gates are summed in buckets of at least 0.5 s and 50 rows, by event time. With z²
+    the record's `standardised` of a joint, and ref = max(1, z² of the 20 s before the last 2 s, at least 10 s):
 
-    - sudden: z² of the last 2 s (at least 2 buckets) exceeds r · ref, as a whole and in three of four of its buckets:
-      after 1 to 2 s, where 50 rows take no longer than 0.5 s. r is 4, or more where errors are not independent from row
-      to row: with c² the squared coefficient of variation of the buckets' z² before, that of χ² of 2/c² degrees of
-      freedom, r = (1 − c²/9 + 5 c/3)³ by Wilson and Hilferty, once in 3 million. Independent rows have c² = 2/rows;
-      a model outside what it was trained on has 1 to 7, where a fixed r of 4 gave ten false alarms in four minutes.
-    - drift: a CUSUM of (log(z² of each bucket / max(1, z² of the best two minutes so far)) − log 2) / (1 + c²)² passes
-      10: on independent rows, squared errors of 3 times their level are found after 34 buckets, of 8 times after 10.
-      The divisor, chosen by measurement, keeps errors that persist for seconds from adding up as if they were many.
+    - sudden: z² of the last 2 s (at least 2 buckets) exceeds r · ref, as a whole and in three of four of its buckets.
+      This takes 1 to 2 s if 50 rows take no longer than 0.5 s. r is 4, or more if errors are not independent from row
+      to row. Let c² be the squared coefficient of variation of the earlier buckets' z², as of χ² with 2/c² degrees of
+      freedom. By Wilson and Hilferty, z² exceeds r = (1 − c²/9 + 5 c/3)³ once in 3 million. Independent rows have c² =
+      2/rows. A model outside its training range has 1 to 7; a fixed r of 4 gave ten false alarms in four minutes there.
+    - drift: a CUSUM of (log(z² of each bucket / max(1, z² of the best two minutes so far)) − log 2) / (1 + c²)² exceeds
+      10. On independent rows, squared errors of 3 times their level are found after 34 buckets, of 8 times after 10.
+      The divisor, chosen by measurement, keeps errors that persist for seconds from adding up like independent ones.
 
-    A ref of less than 1 counts as 1: errors that were smaller than stated may grow to what is stated. Buckets and not
-    the clock delimit the windows, so that a pause, in which a tool may have been changed, is bridged. After an alarm
-    there is none until `acknowledged`.
+    A ref of less than 1 counts as 1: errors that were smaller than stated may grow to the stated size. Buckets and not
+    the clock delimit the windows, so that a pause, in which a tool may have been changed, is bridged. After an alarm no
+    other is raised until `acknowledged`.
     """
 
     buckets: tuple[Bucket, ...] = ()
@@ -145,10 +147,10 @@ class ChangeDetector:
     alarm: Change | None = None
 
     def step(self, record: Record, at: float) -> tuple[ChangeDetector, Change | None]:
-        """Take in a record whose last row has event time `at`, s; return the detector and the change that it detects.
+        """Add a record whose last row has event time `at`, s; return the detector and the change that it detects.
 
-        Records of up to about 0.5 s are kept apart; longer ones are one bucket each. A record that is late counts as of
-        now. Raise ValueError for other joints than before.
+        Records of up to about 0.5 s are merged into buckets; longer ones are one bucket each. A late record counts as
+        of now. Raise ValueError if the joints differ from those before.
         """
         if not record.rows:
             return self, None
@@ -167,7 +169,7 @@ class ChangeDetector:
         return replace(following, alarm=change), change
 
     def moved(self, seconds: float) -> ChangeDetector:
-        """The same with all its times later by so much."""
+        """Return the detector with all its times later by so much."""
 
         def later(bucket: Bucket) -> Bucket:
             return Bucket(bucket.start + seconds, bucket.end + seconds, bucket.record)
@@ -181,13 +183,13 @@ class ChangeDetector:
         )
 
     def acknowledged(self) -> ChangeDetector:
-        """The detector that takes what has arrived since the last alarm for the new reference."""
+        """Return the detector with the records since the last alarm as its new reference."""
         if not self.alarm:
             return self
         return ChangeDetector(tuple(b for b in self.buckets if b.start >= self.alarm.at), self.open)
 
     def _accumulate(self, bucket: Bucket) -> ChangeDetector:
-        """Sum the log-ratio of one more bucket and keep the best epoch."""
+        """Add the log-ratio of one more bucket and store the best epoch."""
         n = bucket.record.n_joints
         excess = np.zeros(n) if self.excess is None else self.excess
         since = np.full(n, bucket.start) if self.since is None else self.since
@@ -198,7 +200,7 @@ class ChangeDetector:
             since = np.where(excess > 0, since, bucket.start)
             excess = np.maximum(excess + step, 0.0)
         epoch = bucket.record if self.epoch is None else self.epoch + bucket.record
-        seconds = self.epoch_s + _observed(bucket)
+        seconds = self.epoch_s + _observed_seconds(bucket)
         best = self.best
         if (
             seconds >= (OPTIONS.first_epoch_s if best is None else OPTIONS.epoch_s)
@@ -211,7 +213,7 @@ class ChangeDetector:
 
     def _sudden(self) -> Change | None:
         recent, used = self._split()
-        seconds, rows = sum(_observed(b) for b in used), sum(b.record.rows for b in used)
+        seconds, rows = sum(_observed_seconds(b) for b in used), sum(b.record.rows for b in used)
         if seconds < OPTIONS.min_reference_s * (1 - 1e-6) or rows < OPTIONS.min_reference_rows:
             return None
         variation = _variation(used)
@@ -237,7 +239,7 @@ class ChangeDetector:
         return Change(float(self.since[joints].min()), _places(joints), self.best, _sum(recent), "drift")
 
     def _split(self) -> tuple[tuple[Bucket, ...], tuple[Bucket, ...]]:
-        """The recent buckets, and those of the 20 s before them."""
+        """Return the recent buckets, and those of the 20 s before them."""
         recent = min(OPTIONS.recent_buckets, len(self.buckets))
         while recent < len(self.buckets) and self.buckets[-1].end - self.buckets[-recent].start < OPTIONS.recent_s * (
             1 - 1e-6
@@ -246,16 +248,16 @@ class ChangeDetector:
         first, seconds = len(self.buckets) - recent, 0.0
         while first and seconds < OPTIONS.reference_s * (1 - 1e-6):
             first -= 1
-            seconds += _observed(self.buckets[first])
+            seconds += _observed_seconds(self.buckets[first])
         return self.buckets[-recent:], self.buckets[first:-recent]
 
 
 def friction_share(dq: Array, error: Array) -> Array:
-    """Share of the variance of each joint's innovations that friction explains: (n,), 0 … 1.
+    """Return the share of the variance of each joint's innovations that friction explains: (n,), 0 … 1.
 
     R² of the least-squares fit of error (N, n) on [dq, sign dq, 1] of the same joint, adjusted for the two slopes. The
-    offset explains no variance: a payload's constant weight does not count as friction. 0 where nothing varies or for
-    fewer than 20 rows.
+    offset explains no variance: a payload's constant weight does not count as friction. 0 if nothing varies or there
+    are fewer than 20 rows.
     """
     rows, n = error.shape
     out = np.zeros(n)
@@ -271,16 +273,17 @@ def friction_share(dq: Array, error: Array) -> Array:
 
 
 def suspect(friction: Array, joints: tuple[int, ...]) -> str:
-    """What a change looks like: `friction` where it explains the median alarmed joint, or `payload or contact`."""
+    """Return what a change looks like: `friction` if that explains the median alarmed joint, or `payload or
+    contact`."""
     return "friction" if np.median(friction[list(joints)]) > FRICTION_SHARE else "payload or contact"
 
 
-def _observed(bucket: Bucket) -> float:
+def _observed_seconds(bucket: Bucket) -> float:
     return min(bucket.end - bucket.start, OPTIONS.max_bucket_s)
 
 
 def _variation(buckets: Sequence[Bucket]) -> Array:
-    """Squared coefficient of variation of the buckets' standardised errors: (n,), or () without buckets."""
+    """Return the squared coefficient of variation of the buckets' standardised errors: (n,), or () without buckets."""
     means = np.array([bucket.record.standardised for bucket in buckets])
     centre = means.mean(axis=0) if len(means) else np.ones(1)
     seen = means.var(axis=0) / np.where(centre > 0, centre, 1.0) ** 2 if len(means) else np.zeros(1)
@@ -290,7 +293,8 @@ def _variation(buckets: Sequence[Bucket]) -> Array:
 
 
 def _mean(buckets: Sequence[Bucket]) -> Array:
-    """Standardised errors of all rows of the buckets; without the rest of their sum, as it is taken twice a second."""
+    """Return the standardised errors of all rows of the buckets. It skips the rest of their sum, as it runs twice a
+    second."""
     rows = [bucket.record.rows for bucket in buckets]
     return np.asarray(np.average([bucket.record.standardised for bucket in buckets], axis=0, weights=rows))
 

@@ -1,1 +1,1 @@
-"""What a stream's arm carries, weighed against contacts and other friction."""
+"""Estimate the payload of a stream's arm, and distinguish it from contacts and changed friction."""

@@ -1,7 +1,7 @@
-"""Bodies that can exist, as ten free numbers, and the one of them that rows speak for.
+"""Parametrise physically possible bodies by ten free numbers, and find the most likely body.
 
-A body has a positive mass and a positive definite second moment: its ten parameters π are a function of ten free
-numbers η, log mass, centre of mass and the Cholesky factor of the spread about it, which have a Gaussian prior.
+A body has a positive mass and a positive definite second moment. Its ten parameters π are a function of ten free
+numbers η: log mass, centre of mass, and the Cholesky factor of the spread about it. η has a Gaussian prior.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from lipcore.data.samples import Array
 from lipcore.model.body import Body
 from lipcore.robots.urdf import PARAMETERS
 
-CENTRE = np.array([0.0, 0, 0, 0, *[np.log(0.04)] * 3, 0, 0, 0])
-WIDTH = np.array([1.2, 0.15, 0.15, 0.15, 0.7, 0.7, 0.7, 0.03, 0.03, 0.03])
-"""Prior of η: log kg; m; log m; m. Nineteen of twenty payloads weigh 0.1 to 10 kg, lie within 0.3 m of the last
-link's frame and spread over 1 to 16 cm."""
-SHAPE = np.array([1.0, *[0.13] * 3, *[0.14**2] * 6])
+ETA_MEAN = np.array([0.0, 0, 0, 0, *[np.log(0.04)] * 3, 0, 0, 0])
+ETA_STD = np.array([1.2, 0.15, 0.15, 0.15, 0.7, 0.7, 0.7, 0.03, 0.03, 0.03])
+"""Prior of η: log kg; m; log m; m. Nineteen of twenty payloads weigh 0.1 to 10 kg, lie within 0.3 m of the last link's
+frame and spread over 1 to 16 cm."""
+UNIT_BODY = np.array([1.0, *[0.13] * 3, *[0.14**2] * 6])
 """Parameters of a body of 1 kg, about 0.13 m away and with a radius of gyration of 0.14 m."""
-CONTACTS = (1.0, 3.0)
-"""Scales of a contact's torque, in units of the usual torque, see `usual`."""
+CONTACT_SCALES = (1.0, 3.0)
+"""Scales of a contact's torque, in units of `typical_torque`."""
 
 
 def body(eta: Array) -> tuple[Array, Array]:
-    """The ten parameters of η, (10,), and their derivative, (10, 10)."""
+    """Return the ten parameters of η, (10,), and their derivative, (10, 10)."""
     mass, com, scale = np.exp(eta[0]), eta[1:4], np.exp(eta[4:7])
     root = np.zeros((3, 3))
     root[DIAGONAL], root[BELOW] = scale, eta[7:]
@@ -35,7 +35,7 @@ def body(eta: Array) -> tuple[Array, Array]:
     slope = np.zeros((PARAMETERS, PARAMETERS))
     slope[:, 0] = out
     slope[[1, 2, 3], [1, 2, 3]] = mass
-    # of C Cᵀ + E Eᵀ, twice the symmetric part of what its left factor changes by
+    # the derivative of C Cᵀ + E Eᵀ is twice the symmetric part of that of its left factor
     slope[4:, 1:4] = 2 * mass * (INERTIA.reshape(6, 3, 3) @ com)
     rows, columns = np.concatenate([DIAGONAL, BELOW], axis=1)
     change = 2 * mass * (INERTIA.reshape(6, 3, 3) @ root)[:, rows, columns]
@@ -48,44 +48,47 @@ DIAGONAL, BELOW = (np.arange(3), np.arange(3)), (np.array([1, 2, 2]), np.array([
 INERTIA = np.array(
     [(np.trace(unit) * np.eye(3) - 0.5 * (unit + unit.T))[np.tril_indices(3)] for unit in np.eye(9).reshape(9, 3, 3)]
 ).T
-"""What makes xx, xy, yy, xz, yz, zz of a second moment, flat: tr(S) 1 − S, symmetrised, (6, 9)."""
+"""Maps a flat second moment to xx, xy, yy, xz, yz, zz: tr(S) 1 − S, symmetrised, (6, 9)."""
 
 
 @dataclass(frozen=True)
-class Known:
-    """What is known of η before the rows: N(centre, precision⁻¹), (10,) and (10, 10)."""
+class PayloadPrior:
+    """Prior of η: N(centre, precision⁻¹), (10,) and (10, 10)."""
 
     centre: Array
     precision: Array
 
 
-ANY = Known(CENTRE, np.diag(WIDTH**-2.0))
-"""Of a payload of which nothing is known."""
+ANY_PAYLOAD = PayloadPrior(ETA_MEAN, np.diag(ETA_STD**-2.0))
+"""Prior of an unknown payload."""
 
 
 def eta_of(carried: Body) -> Array:
-    """η of a body, (10,): one without extent has a little."""
+    """Return η of a body, (10,). A body without extent gets a small one."""
     inertia = np.zeros((3, 3)) if carried.inertia is None else carried.inertia
     spread = (0.5 * np.trace(inertia) * np.eye(3) - inertia) / carried.mass
     root = np.linalg.cholesky(spread + 1e-6 * np.eye(3))  # (1 mm)²
     return np.concatenate([[np.log(carried.mass)], carried.com, np.log(root[DIAGONAL]), root[BELOW]])
 
 
-def most_likely(told: Array, pull: Array, prior: Known, start: Array) -> tuple[Array, Array, Array, float]:
-    """η that minimises ½ πᵀ Λ π − ξᵀ π + prior; its covariance, the slope there, and the evidence gained, nats."""
+def most_likely(
+    information: Array, pull: Array, prior: PayloadPrior, start: Array
+) -> tuple[Array, Array, Array, float]:
+    """Return η that minimises ½ πᵀ Λ π − ξᵀ π + prior; its covariance, the derivative of π there, and the evidence
+    gained, nats. information: Λ; pull: ξ."""
 
     def cost(eta: Array) -> float:
         payload, off = body(eta)[0], eta - prior.centre
-        return float(0.5 * payload @ told @ payload - pull @ payload + 0.5 * off @ prior.precision @ off)
+        return float(0.5 * payload @ information @ payload - pull @ payload + 0.5 * off @ prior.precision @ off)
 
     eta, damping = start, 1e-3
     value = cost(eta)
     payload, slope = body(eta)
     for _ in range(50):
-        gradient = slope.T @ (told @ payload - pull) + prior.precision @ (eta - prior.centre)
-        curvature = slope.T @ told @ slope + prior.precision
+        gradient = slope.T @ (information @ payload - pull) + prior.precision @ (eta - prior.centre)
+        curvature = slope.T @ information @ slope + prior.precision
         step = -np.linalg.solve(curvature + damping * np.diag(np.diagonal(curvature)), gradient)
-        step = step * min(1.0, 2.0 / max(float(np.abs(step / WIDTH).max()), 1e-300))
+        step = step * min(1.0, 2.0 / max(float(np.abs(step / ETA_STD).max()), 1e-300))
         trial = cost(eta + step)
         if trial > value:
             damping *= 10.0
@@ -97,24 +100,28 @@ def most_likely(told: Array, pull: Array, prior: Known, start: Array) -> tuple[A
         payload, slope = body(eta)
         if done:
             break
-    curvature = slope.T @ told @ slope + prior.precision
+    curvature = slope.T @ information @ slope + prior.precision
     volume = np.linalg.slogdet(curvature)[1] - np.linalg.slogdet(prior.precision)[1]
     return eta, inverse(curvature), slope, -value - 0.5 * float(volume)
 
 
 def inverse(matrix: Array) -> Array:
-    """Of a covariance or a precision."""
+    """Return the inverse of a covariance or a precision."""
     return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
-def usual(features: Array) -> float:
-    """What a payload of 1.5 kg makes of the joint where it makes most, N·m. features: of its parameters, (10, n)."""
-    return float(np.sqrt(((features * (1.5 * SHAPE)[:, None]) ** 2).sum(axis=0).max()))
+def typical_torque(features: Array) -> float:
+    """Return the torque of a payload of 1.5 kg on the joint that it loads most, N·m. features: of its parameters, (10,
+    n)."""
+    return float(np.sqrt(((features * (1.5 * UNIT_BODY)[:, None]) ** 2).sum(axis=0).max()))
 
 
 def evidence(gram: Array, pull: Array, scales: Sequence[Array]) -> Array:
-    """Evidence gained by each of K sets of features whose coefficients are N(0, diag scale²), averaged over the scales:
-    (K,) nats. gram: Fᵀ C⁻¹ F, (K, p, p); pull: Fᵀ C⁻¹ r, (K, p), with the covariance C of the residuals r."""
+    """Return the evidence gained by each of K sets of features, (K,) nats.
+
+    The coefficients are N(0, diag scale²); the evidence is averaged over the scales. gram: Fᵀ C⁻¹ F, (K, p, p); pull:
+    Fᵀ C⁻¹ r, (K, p), with the covariance C of the residuals r.
+    """
     scale = np.array(scales)[:, None]  # (S, 1, p)
     total = np.eye(gram.shape[-1]) + scale[..., None] * gram * scale[..., None, :]
     scaled = scale * pull

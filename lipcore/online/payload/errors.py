@@ -1,4 +1,4 @@
-"""How the errors of an arm's rows belong together: new in every row, or alike in motion that is alike."""
+"""Model how the errors of an arm's rows correlate: independent in every row, or similar in similar motion."""
 
 from __future__ import annotations
 
@@ -11,12 +11,15 @@ from lipcore.online.batch import Rows
 from lipcore.posterior.linalg import solve_lower
 
 LIKE = 0.3, 0.3
-"""See `likeness`. Chosen on the dirty Panda of seed 50 among three pairs."""
+"""See `likeness`. Chosen among three pairs on the dirty Panda of seed 50."""
 
 
 def noise_parts(carrier: Carrier, motion: Motion) -> tuple[Array, Array, Array]:
-    """Variance of the torques at N instants, (N·m)²: what is new in every row, (n,); what is not, as errors that last
-    are, and those of faster motion, (N, n); and that of joints at rest, (N, n), which may break away at any time."""
+    """Return the variance of the torques at N instants in three parts, (N·m)².
+
+    The parts are independent noise of every row, (n,); lasting errors and those of faster motion, (N, n); and errors of
+    joints at rest, (N, n), which may break away at any time.
+    """
     posterior = carrier.model.posterior
     noise, misfit = posterior.noise_variance, posterior.misfit
     white = np.maximum(noise - misfit.lasting, 1e-3 * noise)
@@ -25,11 +28,11 @@ def noise_parts(carrier: Carrier, motion: Motion) -> tuple[Array, Array, Array]:
 
 
 def likeness(carrier: Carrier, q: Array, dq: Array, speed: float, pose: float) -> Array:
-    """Correlation of the errors of N instants that are not new in each, joint by joint: (n, N, N).
+    """Return the correlation of the lasting errors of N instants, joint by joint: (n, N, N).
 
-    They are functions of motion, as friction is, and not of time: alike where a joint moves alike in a pose that is
-    alike, whether just before or long ago. q, dq: (N, n); speed, pose: differences over which they become others, of
-    the joint's velocity in units of its usual one, and of the pose, root mean square over joints, rad (m).
+    These errors, such as friction, are functions of motion and not of time: similar if a joint moves similarly in a
+    similar pose, whether just before or long ago. q, dq: (N, n). speed, pose: scales of the correlation, in the joint's
+    velocity over its usual one, and in the root mean square over joints of the pose, rad (m).
     """
     faster = np.abs(dq[:, None] - dq[None]) / carrier.model.posterior.misfit.speed
     apart = np.sqrt(((q[:, None] - q[None]) ** 2).mean(axis=-1, keepdims=True))
@@ -37,7 +40,7 @@ def likeness(carrier: Carrier, q: Array, dq: Array, speed: float, pose: float) -
 
 
 def correlation_roots(carrier: Carrier, rows: Rows) -> Array:
-    """Cholesky roots of the covariance of the errors of N rows, joint by joint: (n, N, N) N·m."""
+    """Return the Cholesky roots of the covariance of the errors of N rows, joint by joint: (n, N, N) N·m."""
     white, lasting, rest = noise_parts(carrier, rows.motion())
     deviation = np.sqrt((lasting + rest).T)
     covariance = deviation[:, :, None] * deviation[:, None, :] * likeness(carrier, rows.q, rows.dq, *LIKE)
@@ -45,8 +48,8 @@ def correlation_roots(carrier: Carrier, rows: Rows) -> Array:
     return np.asarray(np.linalg.cholesky(covariance))
 
 
-def whitened(roots: Array, features: Array, residual: Array) -> tuple[Array, Array]:
-    """Features (M + 10, N n) and residuals (N n,) whose errors are independent, of variance one."""
+def whiten(roots: Array, features: Array, residual: Array) -> tuple[Array, Array]:
+    """Return features (M + 10, N n) and residuals (N n,) with independent errors of variance one."""
     both = np.concatenate([features, residual[None]]).transpose(2, 1, 0)
     solved = np.stack([solve_lower(root, np.ascontiguousarray(each)) for root, each in zip(roots, both, strict=True)])
     flat = solved.reshape(-1, both.shape[2]).T

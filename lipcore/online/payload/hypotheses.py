@@ -1,15 +1,15 @@
-"""What has happened to an arm: nothing, a payload taken up or put down, a contact, other friction. Weighed by evidence.
+"""Weigh by evidence what has happened to an arm: nothing, a payload picked up or put down, a contact, changed friction.
 
-Rows are averaged in cells of 50 ms: torque is linear in what is unknown, so that nothing is lost but what white noise
-there is. Of the last cells, those before an instant and those after it, the residual r has the covariance
+Rows are averaged in cells of 50 ms. Torque is linear in the unknowns, so only white noise is lost. For the last cells,
+before and after an instant, the residual r has the covariance
 
-    C = Φ Σ Φᵀ + errors like in motion that is alike + white noise,
+    C = Φ Σ Φᵀ + errors that are similar in similar motion + white noise,
 
-and a hypothesis adds Y c in the cells after it, c ~ N(0, P). Its evidence over that of nothing is
+and a hypothesis adds Y c in the cells after the instant, c ~ N(0, P). Its evidence over that of nothing is
 
     ½ vᵀ M⁻¹ v − ½ log det M,    M = 1 + P^½ Yᵀ C⁻¹ Y P^½,    v = P^½ Yᵀ C⁻¹ r.
 
-What the arm's model gets wrong is in both kinds of cells alike and cancels: so small payloads show on a dirty arm.
+Errors of the arm's model occur on both sides of the instant and cancel: this reveals small payloads on a dirty arm.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from scipy.linalg import solve_triangular
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.friction import SIGN_WIDTH
-from lipcore.model.payload import Linearised
+from lipcore.model.payload import LinearisedCarrier
 from lipcore.online.batch import Rows
-from lipcore.online.payload.bodies import ANY, CONTACTS, SHAPE, evidence, most_likely, usual
+from lipcore.online.payload.bodies import ANY_PAYLOAD, CONTACT_SCALES, UNIT_BODY, evidence, most_likely, typical_torque
 from lipcore.online.payload.errors import likeness, noise_parts
 from lipcore.robots.urdf import PARAMETERS
 
@@ -34,56 +34,63 @@ Kind = Literal["payload", "contact", "friction"]
 
 
 @dataclass(frozen=True)
-class WindowOptions:
-    """Cells that are compared, and scales of what may have happened."""
+class CellWindowOptions:
+    """Cells that are compared, and scales of possible events."""
 
     cell_s: float = 0.05
     like: tuple[float, float] = (1.0, 0.5)
     rest_s: float = 0.3
-    """Lengths of errors that change with motion, see `errors.likeness`, and of what holds a joint at rest. Tuned on the
-    dirty Panda of seed 50: with those of `errors` 0.5 kg are not seen, with twice as much fast motion looks like a
+    """Scales of errors that change with motion, see `errors.likeness`, and of stiction at rest. Tuned on the dirty
+    Panda of seed 50: with those of `errors`, 0.5 kg are not noticed; with twice these, fast motion looks like a
     payload."""
     min_leap: float = 6.0
-    """Min deviations of the noise by which the residual differs from row to row if something has happened."""
+    """Min jump of the residual from row to row that shows an event, in standard deviations of the noise."""
     before: int = 6
     min_before: int = 4
     """Max and min number of cells before the instant."""
     after: tuple[int, ...] = (1, 2, 3, 4, 5, 6)
     """Numbers of cells after the instant."""
     masses: tuple[float, ...] = (0.5, 1.5, 5.0)
-    """Scales of a payload's mass, kg; first moment and inertia are those of `bodies.SHAPE`."""
+    """Scales of a payload's mass, kg; first moment and inertia are those of `bodies.UNIT_BODY`."""
     frictions: tuple[float, ...] = (0.1, 0.3)
-    """Scales of a change of friction, in units of the usual torque, see `bodies.usual`."""
+    """Scales of a change of friction, in units of `bodies.typical_torque`."""
 
     @property
     def cells(self) -> int:
-        """Cells that are compared together."""
+        """Return the number of cells that are compared together."""
         return self.before + self.after[-1]
 
 
-WINDOW = WindowOptions()
+WINDOW = CellWindowOptions()
 
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """Means over the rows of one stretch of time. end: event time of its last row, s; q, dq, residual:
-    (n,); new, lasting, rest: (n,), variances of the residual, of this cell alone, shared with cells of like motion, and
-    with those before and after;
-    features: (M + K + 10, n), see `Linearised.all_rows`."""
+    """Means over the rows of a short time."""
 
     end: float
+    """Event time of its last row, s."""
     q: Array
+    """Mean position, (n,)."""
     dq: Array
+    """Mean velocity, (n,)."""
     residual: Array
+    """Mean residual, (n,) N·m."""
     new: Array
+    """Variance of the residual of this cell alone, (n,)."""
     lasting: Array
+    """Variance shared with cells of similar motion, (n,)."""
     rest: Array
+    """Variance shared with neighbouring cells, (n,)."""
     features: Array
+    """Mean features, (M + K + 10, n), see `Linearised.all_rows`."""
 
 
-def parted(around: Linearised, parts: Sequence[Rows]) -> tuple[list[Rows], tuple[Cell, ...]]:
-    """Part stretches of rows where the residual leaps; return the parts and their cells. A payload is taken up between
-    two rows, and a mean over both sides fits neither."""
+def split_cells(around: LinearisedCarrier, parts: Sequence[Rows]) -> tuple[list[Rows], tuple[Cell, ...]]:
+    """Split parts of rows where the residual jumps; return the parts and their cells.
+
+    A payload is picked up between two rows, and a mean over both sides fits neither.
+    """
     rows = _joined(parts)
     features, expected = around.all_rows(rows.motion())
     white, lasting, rest = noise_parts(around.carrier, rows.motion())
@@ -95,8 +102,8 @@ def parted(around: Linearised, parts: Sequence[Rows]) -> tuple[list[Rows], tuple
     return parts, _means(around, parts, rows, features, expected)
 
 
-def cells_of(around: Linearised, parts: Sequence[Rows]) -> tuple[Cell, ...]:
-    """The cells of stretches of rows, seen from an arm with the payload that it has, or none."""
+def cells_of(around: LinearisedCarrier, parts: Sequence[Rows]) -> tuple[Cell, ...]:
+    """Return the cells of parts of rows, linearised around an arm with a payload or without."""
     rows = _joined(parts)
     return _means(around, parts, rows, *around.all_rows(rows.motion()))
 
@@ -105,8 +112,11 @@ def _joined(parts: Sequence[Rows]) -> Rows:
     return parts[0] if len(parts) == 1 else Rows.concatenate(parts)
 
 
-def _means(around: Linearised, parts: Sequence[Rows], rows: Rows, features: Array, expected: Array) -> tuple[Cell, ...]:
-    """The cells of parts that are these rows together; features, expected: of each row, see `Linearised.all_rows`."""
+def _means(
+    around: LinearisedCarrier, parts: Sequence[Rows], rows: Rows, features: Array, expected: Array
+) -> tuple[Cell, ...]:
+    """Return the cells of parts, which together are `rows`. features, expected: of each row, see
+    `LinearisedCarrier.all_rows`."""
     counts = np.array([len(each) for each in parts])
     first = np.cumsum(counts) - counts
 
@@ -132,7 +142,7 @@ def _means(around: Linearised, parts: Sequence[Rows], rows: Rows, features: Arra
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class CellWindow:
     """The last cells, whitened: z = L⁻¹ r, (N n,), and the root L of their covariance C, (N n, N n)."""
 
     cells: tuple[Cell, ...]
@@ -140,13 +150,15 @@ class Window:
     residual: Array
 
     @classmethod
-    def of(cls, around: Linearised, cells: Sequence[Cell]) -> Window:
-        """The window of cells, seen around a load, which their residuals and features belong to."""
+    def of(cls, around: LinearisedCarrier, cells: Sequence[Cell]) -> CellWindow:
+        """Return the window of cells whose residuals and features belong to `around`."""
         return cls.among(around, cells, [range(len(cells))])[0]
 
     @classmethod
-    def among(cls, around: Linearised, cells: Sequence[Cell], choices: Sequence[Sequence[int]]) -> list[Window]:
-        """The windows of some of the cells each, by their places, whose covariances are parts of one."""
+    def among(
+        cls, around: LinearisedCarrier, cells: Sequence[Cell], choices: Sequence[Sequence[int]]
+    ) -> list[CellWindow]:
+        """Return the windows of some of the cells each, by their places; their covariances are parts of one."""
         n, count = len(cells[0].q), len(cells)
         features = np.stack([each.features for each in cells], axis=1).reshape(len(cells[0].features), -1)
         covariance = (features.T @ around.covariance @ features).reshape(count, n, count, n)
@@ -171,41 +183,45 @@ class Window:
 
     @property
     def density(self) -> float:
-        """Logarithm of the density of the residuals, but for a constant."""
+        """Return the log density of the residuals, up to a constant."""
         return float(-0.5 * self.residual @ self.residual - np.log(np.diagonal(self.root)).sum())
 
     def of_body(self, after: int, carried: Array) -> float:
-        """Nats by which a body that can exist explains the last cells better than that which is carried, (10,), does:
-        of ten free numbers seven torques are soon explained, of a real mass they are not."""
+        """Return the nats by which a possible body explains the last cells better than the current payload, (10,).
+
+        Ten free numbers easily explain seven torques; a real mass does not.
+        """
         gram, pull = self._of_payload(after)
         total = pull + gram @ carried
-        return most_likely(gram, total, ANY, ANY.centre)[3] + float(0.5 * carried @ gram @ carried - total @ carried)
+        return most_likely(gram, total, ANY_PAYLOAD, ANY_PAYLOAD.centre)[3] + float(
+            0.5 * carried @ gram @ carried - total @ carried
+        )
 
     def past_contact(self) -> float:
-        """Nats by which a contact that began and ended within the cells explains them better than nothing, at most."""
+        """Return the max nats by which a contact within the cells explains them better than nothing."""
         n, count = len(self.cells[0].q), len(self.cells)
         spans = [(begin, end) for begin in range(1, count) for end in range(begin + 1, count)]
         during = np.array([(np.arange(count) >= begin) & (np.arange(count) < end) for begin, end in spans], np.float64)
         columns = np.einsum("sk,ij->kjsi", during, np.eye(n)).reshape(count * n, -1)
         whitened = solve_triangular(self.root, columns, lower=True, check_finite=False)
         blocks = whitened.reshape(-1, len(spans), n).transpose(1, 0, 2)
-        typical = usual(self.cells[-1].features[-PARAMETERS:])
-        return float(self._evidence(blocks, [np.full(n, each * typical) for each in CONTACTS]).max())
+        typical = typical_torque(self.cells[-1].features[-PARAMETERS:])
+        return float(self._evidence(blocks, [np.full(n, each * typical) for each in CONTACT_SCALES]).max())
 
     def mass(self, after: int) -> tuple[float, float]:
-        """Mean and standard deviation, kg, of the mass that is carried more for the last cells, of either sign."""
+        """Return mean and standard deviation of the mass added in the last cells, of either sign, kg."""
         gram, pull = self._of_payload(after)
-        scale = WINDOW.masses[1] * SHAPE
+        scale = WINDOW.masses[1] * UNIT_BODY
         spread = np.linalg.inv(np.eye(PARAMETERS) + scale[:, None] * gram * scale)
         return WINDOW.masses[1] * float(spread[0] @ (scale * pull)), WINDOW.masses[1] * float(np.sqrt(spread[0, 0]))
 
     def _evidence(self, features: Array, scales: Sequence[Array]) -> Array:
-        """Nats gained by each of K sets of whitened features, (K, N n, p), see `bodies.evidence`."""
+        """Return the nats gained by each of K sets of whitened features, (K, N n, p), see `bodies.evidence`."""
         gram, pull = features.transpose(0, 2, 1) @ features, np.einsum("kni,n->ki", features, self.residual)
         return evidence(gram, pull, scales)
 
     def _of_payload(self, after: int) -> tuple[Array, Array]:
-        """Λ (10, 10) and ξ (10,) of what the last cells say of a payload, as in `payload`."""
+        """Return Λ (10, 10) and ξ (10,) of the last cells for a payload, see `payload`."""
         payload = np.stack([each.features[-PARAMETERS:] for each in self.cells], axis=1)
         late = (np.arange(len(self.cells)) >= len(self.cells) - after)[:, None]
         columns = (payload * late).reshape(PARAMETERS, -1).T
@@ -213,18 +229,19 @@ class Window:
         return whitened.T @ whitened, whitened.T @ self.residual
 
     def gains(self, after: Sequence[int] = WINDOW.after) -> dict[int, dict[Kind, float]]:
-        """Nats by which hypotheses explain the cells better than nothing does, by the number of cells that they hold
-        for: of a payload, of a contact, and of other friction. after: numbers that are looked at, where at least
-        `min_before` cells come before, or none does."""
+        """Return the nats by which each hypothesis explains the cells better than nothing, by the number of its cells.
+
+        after: numbers of cells to check. At least `min_before` cells must come before, or none.
+        """
         n, count = len(self.cells[0].q), len(self.cells)
         payload = np.stack([each.features[-PARAMETERS:] for each in self.cells], axis=1)  # (10, N, n)
         contact = np.broadcast_to(np.eye(n)[:, None], (n, count, n))
         turns = np.tanh(np.array([each.dq for each in self.cells]) / SIGN_WIDTH)
         friction = contact * turns
-        typical = usual(self.cells[-1].features[-PARAMETERS:])
+        typical = typical_torque(self.cells[-1].features[-PARAMETERS:])
         scales: dict[Kind, list[Array]] = {
-            "payload": [mass * SHAPE for mass in WINDOW.masses],
-            "contact": [np.full(n, each * typical) for each in CONTACTS],
+            "payload": [mass * UNIT_BODY for mass in WINDOW.masses],
+            "contact": [np.full(n, each * typical) for each in CONTACT_SCALES],
             "friction": [np.full(n, each * typical) for each in WINDOW.frictions],
         }
         kinds: dict[Kind, Array] = {"payload": payload, "contact": contact, "friction": friction}

@@ -1,12 +1,12 @@
-"""A payload estimated with an arm whose geometry is known, or as linear as its posterior takes it.
+"""Estimate a payload on an arm with known geometry, or with a posterior taken as linear.
 
 Given the variables w of the arm, N(ŵ, Σ), torque is linear in the payload's ten parameters π around its mean (see
-`lipcore.model.payload`). With H = [F, b] the features of rows and R their variance, w is integrated out:
+`lipcore.model.payload`). H = [F, b] are the features of rows and R their variance. Integrating w out gives
 
     V = (Σ⁻¹ + Fᵀ R⁻¹ F)⁻¹,    Λ = bᵀ R⁻¹ b − bᵀ R⁻¹ F V Fᵀ R⁻¹ b,    ξ = bᵀ R⁻¹ r − bᵀ R⁻¹ F V Fᵀ R⁻¹ r,
 
-is all that the rows say of π, of which the most likely body is sought (`bodies.most_likely`); the rows are linearised
-anew around it, six times at most, until it stays within 0.05 of its standard deviations.
+all information of the rows about π. `bodies.most_likely` finds the most likely body. The rows are relinearised around
+it, at most six times, until it changes by less than 0.05 of its standard deviations.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import numpy as np
 from scipy.linalg import solve_triangular
 
 from lipcore.data.samples import Array
-from lipcore.model.payload import Carrier, Linearised, Load
+from lipcore.model.payload import Carrier, LinearisedCarrier, PayloadPosterior
 from lipcore.online.batch import Rows
-from lipcore.online.payload.bodies import Known, body, inverse, most_likely
-from lipcore.online.payload.errors import correlation_roots, whitened
-from lipcore.online.payload.estimate import Estimate, alone
+from lipcore.online.payload.bodies import PayloadPrior, body, inverse, most_likely
+from lipcore.online.payload.errors import correlation_roots, whiten
+from lipcore.online.payload.estimate import Estimate, explain_unloaded
 from lipcore.robots.urdf import PARAMETERS
 
 
-def linear(carrier: Carrier, rows: Rows, before: Rows | None, prior: Known, start: Estimate | None) -> Estimate:
-    """The payload that rows carry, arguments as of `payload.estimate`."""
+def linear(carrier: Carrier, rows: Rows, before: Rows | None, prior: PayloadPrior, start: Estimate | None) -> Estimate:
+    """Return the payload of the rows; arguments as of `payload.estimate`."""
     before = before if before is not None and len(before) else None
     both = rows if before is None else Rows.concatenate([before, rows])
     roots, mean, size = correlation_roots(carrier, both), carrier.mean, len(carrier.mean)
@@ -35,13 +35,13 @@ def linear(carrier: Carrier, rows: Rows, before: Rows | None, prior: Known, star
     load = empty if start is None else carrier.known(body(eta)[0])
     root = carrier.covariance_root
     for _ in range(6):
-        features, base = Linearised(carrier, load).rows(*loaded)
+        features, base = LinearisedCarrier(carrier, load).rows(*loaded)
         if free is not None:
-            others, torque = Linearised(carrier, empty).rows(*free)
+            others, torque = LinearisedCarrier(carrier, empty).rows(*free)
             others[size:] = 0.0
             features, base = np.concatenate([others, features], axis=1), np.concatenate([torque, base])
         residual = both.tau - base - np.tensordot(mean, features[:size], axes=1)
-        features, residual = whitened(roots, features, residual)
+        features, residual = whiten(roots, features, residual)
         information, score = features @ features.T, features @ residual
         arm, cross = information[:size, :size], information[:size, size:]
         inner = np.linalg.cholesky(np.eye(size) + root.T @ arm @ root)
@@ -62,8 +62,8 @@ def linear(carrier: Carrier, rows: Rows, before: Rows | None, prior: Known, star
         room = PARAMETERS * np.diagonal(slope @ inverse(prior.precision) @ slope.T)
         w = mean + open_ @ score[:size] + back @ payload
         left = residual - features.T @ np.concatenate([w - mean, payload])
-        load = Load(np.concatenate([w, payload]), joint, room)
+        load = PayloadPosterior(np.concatenate([w, payload]), joint, room)
         if np.sqrt(np.max((eta - last) ** 2 / np.diagonal(spread))) < 0.05:
             break
-    contact = alone(carrier, free, loaded, both.tau, roots)[2]
+    contact = explain_unloaded(carrier, free, loaded, both.tau, roots)[2]
     return Estimate(eta, max(1.0, float((left**2).mean())) * spread, load, gain, contact)

@@ -1,15 +1,15 @@
-"""A payload estimated from the rows since it was taken up, together with what they tell of the arm.
+"""Estimate a payload from the rows since it was picked up, together with what they show about the arm.
 
-What is unknown are the arm's whitened variables w, with its geometry θ, and the payload's η (`bodies`). The most likely
+The unknowns are the arm's whitened variables w, with its geometry θ, and the payload's η (`bodies`). The most likely
 ones minimise
 
     E = ½ |e|² + ½ |m(w, θ)|² + ½ (η − η₀)ᵀ P (η − η₀),
 
-where e is what the rows' torque is off, whitened by the covariance of their errors, and m what the arm's training says
+e is the error of the rows' torque, whitened by its covariance, and m the residual of the arm's training
 (`lipcore.model.memory`). Torque is linearised around each step (`lipcore.model.payload`), steps are Levenberg's and
-Marquardt's, and the covariance is that of the linear model around the last one (Laplace): `estimate`, which takes
-milliseconds. Where few rows leave a bent valley open, that is too sure of itself: `refine` draws from the posterior,
-which takes a hundred times as long.
+Marquardt's, and the covariance is that of the linear model around the last step (Laplace): `estimate`, which takes
+milliseconds. If few rows leave a bent valley open, that is too certain: `refine` draws from the posterior, which takes
+a hundred times as long.
 """
 
 from __future__ import annotations
@@ -23,55 +23,71 @@ from scipy.linalg import qr, solve_triangular
 from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm_prior import Alternative
-from lipcore.model.payload import Carrier, Load
+from lipcore.model.payload import Carrier, PayloadPosterior
 from lipcore.online.batch import Rows
-from lipcore.online.payload.bodies import ANY, Known, body, inverse
-from lipcore.online.payload.draws import DRAWS, Draw, Place, Point, Training, arms, descent, linearised_around, minimum
-from lipcore.online.payload.errors import correlation_roots, whitened
-from lipcore.online.payload.estimate import Estimate, Seen, alone, rows_of
+from lipcore.online.payload.bodies import ANY_PAYLOAD, PayloadPrior, body, inverse
+from lipcore.online.payload.draws import (
+    DRAWS,
+    ArmWithPayload,
+    Draw,
+    Point,
+    Training,
+    descent,
+    draw_arms,
+    linearised_around,
+    minimum,
+)
+from lipcore.online.payload.errors import correlation_roots, whiten
+from lipcore.online.payload.estimate import Estimate, Instants, explain_unloaded, rows_of
 from lipcore.online.payload.linear import linear
 from lipcore.robots.urdf import PARAMETERS
 
 
 @dataclass(frozen=True)
 class EstimateOptions:
-    """Steps of an estimate, and how far its draws and its errors are trusted."""
+    """Steps of an estimate, and the certainty of its draws and its errors."""
 
     first_steps: int = 30
     next_steps: int = 2
     refined_steps: int = 8
     draw_steps: int = 2
-    """Max steps of an estimate from nothing, of one that begins at another, of a refined one, and of a draw from its
+    """Max steps of a first estimate, of one that starts from another, of a refined one, and of a draw from its
     posterior."""
     max_square: float = 2.0
-    """Mean square of draws, in deviations of the linear posterior, up to which that is as good."""
+    """Max mean square of draws, in deviations of the linear posterior, at which the linear one suffices."""
     hot_nats: float = 30.0
-    """Energy by which a draw counts e times less: what the training is taken to say of arms far away is off by as
-    much."""
+    """Energy by which a draw counts e times less: the stored training is as inexact for arms far away."""
     far_nats: float = 100.0
-    """Energy from which on rows have ruled a draw out."""
+    """Energy at which rows have ruled a draw out."""
     doubt: float = 5.0
-    """Factor by which an estimate takes its rows and the arm's training for less exact than they are, without draws and
-    where the last axis is open: linear posteriors of bent valleys are too narrow, and draws come into few valleys.
-    Tuned on simulated arms (seed 1 of `benchmarks.online.arms`): after 10, 30 and 100 rows 95 % intervals hold 98, 96
-    and 80 % of an unseen motion's torques on the worst of three arms (with 1: 89, 77 and 57); those of the next rows
-    are 1.8 to 2.3, 1.5 to 1.7 and 1.2 to 1.3 times as wide."""
+    """Factor on the errors of the rows and of the arm's training, without draws and if the last axis is open. Linear
+    posteriors of bent valleys are too narrow, and draws reach few valleys. Tuned on simulated arms (seed 1 of
+    `benchmarks.online.arms`). After 10, 30 and 100 rows the coverage of the 95 % intervals on an unseen motion is 98,
+    96 and 80 % on the worst of three arms (with 1: 89, 77 and 57). Intervals of the next rows are 1.8 to 2.3, 1.5 to
+    1.7 and 1.2 to 1.3 times as wide."""
 
 
 OPTIONS = EstimateOptions()
 
 
 def estimate(
-    carrier: Carrier, rows: Rows, before: Rows | None = None, prior: Known = ANY, start: Estimate | None = None
+    carrier: Carrier,
+    rows: Rows,
+    before: Rows | None = None,
+    prior: PayloadPrior = ANY_PAYLOAD,
+    start: Estimate | None = None,
 ) -> Estimate:
-    """The payload that rows carry, in a few milliseconds. before: rows that do not, whose errors tell those of the
-    first that do; start: another estimate by the same carrier, or by another revision of its version, to begin at."""
-    if not carrier.bends:
+    """Return the payload of the rows, within a few milliseconds.
+
+    before: rows without it, whose errors correlate with those of the first rows with it; start: another estimate to
+    start from, by the same carrier or another revision of its version.
+    """
+    if not carrier.is_nonlinear:
         return linear(carrier, rows, before, prior, start)
     problem = _Problem.of(carrier, rows, before, prior)
-    start = problem.usable(start)
+    start = problem.select_start(start)
     at = minimum(
-        problem, problem.at(problem.begin(start)), OPTIONS.first_steps if start is None else OPTIONS.next_steps
+        problem, problem.at(problem.make_start(start)), OPTIONS.first_steps if start is None else OPTIONS.next_steps
     )
     return problem.estimate(at)
 
@@ -80,34 +96,36 @@ def refine(
     carrier: Carrier,
     rows: Rows,
     before: Rows | None = None,
-    prior: Known = ANY,
+    prior: PayloadPrior = ANY_PAYLOAD,
     start: Estimate | None = None,
     anew: bool = False,
 ) -> Generator[None, None, Estimate]:
-    """The same estimate with draws from the posterior, for an arm that bends; it yields after each step, so that
-    something else can be done meanwhile. anew: whether draws that rows have ruled out begin again."""
+    """Return the same estimate with draws from the posterior, for an arm that bends; yield after each step.
+
+    anew: whether draws that rows have ruled out start again.
+    """
     problem = _Problem.of(carrier, rows, before, prior)
-    start = problem.usable(start)
+    start = problem.select_start(start)
     at = yield from descent(
-        problem, problem.at(problem.begin(start)), OPTIONS.first_steps if start is None else OPTIONS.refined_steps
+        problem, problem.at(problem.make_start(start)), OPTIONS.first_steps if start is None else OPTIONS.refined_steps
     )
     known = () if start is None else start.draws
-    # another revision of the training may know more, or less
-    known = tuple(each for each in known if each.usable(len(at.residual) - problem.tau.size))
+    # another revision may have another number of residuals
+    known = tuple(each for each in known if each.is_usable(len(at.residual) - problem.tau.size))
     if not known:
-        begun = yield from arms(carrier)
-        known = tuple(_carrying(each, at) for each in begun)
+        begun = yield from draw_arms(carrier)
+        known = tuple(_add_payload(each, at) for each in begun)
     found = []
     for number, each in enumerate(known):
-        point = yield from problem.sought(each, number, OPTIONS.draw_steps)
-        found.append(_Found(point, each.noise))
+        point = yield from problem.follow_draw(each, number, OPTIONS.draw_steps)
+        found.append(_DrawResult(point, each.noise))
     at = min([at, *(each.point for each in found)], key=_energy)
     if anew:
         for number in [number for number, each in enumerate(found) if each.excess(at) > OPTIONS.far_nats]:
             draw = np.random.default_rng([DRAWS.seed, number, len(rows)])
-            again = _carrying((yield from problem.training.begun(number, draw)), at)
-            point = yield from problem.sought(again, number, OPTIONS.first_steps)
-            found[number] = min(found[number], _Found(point, again.noise), key=lambda each: each.point.energy)
+            again = _add_payload((yield from problem.training.start_draw(number, draw)), at)
+            point = yield from problem.follow_draw(again, number, OPTIONS.first_steps)
+            found[number] = min(found[number], _DrawResult(point, again.noise), key=lambda each: each.point.energy)
     # each draw is the minimum for other noise
     other = yield from descent(problem, min((each.point for each in found), key=_energy), OPTIONS.refined_steps)
     return problem.estimate(min(at, other, key=_energy), found)
@@ -117,40 +135,41 @@ def _energy(at: Point) -> float:
     return at.energy
 
 
-def _carrying(arm: Draw, at: Point) -> Draw:
-    """An arm that carries what is most likely."""
+def _add_payload(arm: Draw, at: Point) -> Draw:
+    """Return an arm with the most likely payload."""
     return replace(arm, place=replace(arm.place, eta=at.place.eta))
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
+class _DrawResult:
     """The point that a draw has reached. noise: see `Draw`."""
 
     point: Point
     noise: Array | None
 
     def excess(self, least: Point) -> float:
-        """Energy above the usual one of a draw, nats: that exceeds the least by half the number of unknowns."""
+        """Return the energy above the usual one of a draw, nats. The usual one exceeds the min by half the number of
+        unknowns."""
         usual = 0.0 if self.noise is None else 0.5 * least.derivative.shape[1]
         return self.point.energy - least.energy - usual
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """What is minimised. loaded, free: motions with a payload, and without; tau: of both, the free ones first, (N, n)
-    N·m; roots: see `correlation_roots`, of both."""
+    """The energy of rows with a payload. loaded, free: motions with it and without; tau: of both, the free ones first,
+    (N, n) N·m; roots: see `correlation_roots`, of both."""
 
     carrier: Carrier
     training: Training
-    loaded: Seen
-    free: Seen | None
+    loaded: Instants
+    free: Instants | None
     tau: Array
-    prior: Known
+    prior: PayloadPrior
     roots: Array
 
     @classmethod
-    def of(cls, carrier: Carrier, rows: Rows, before: Rows | None, prior: Known) -> _Problem:
-        def seen(motion: Motion) -> Seen:
+    def of(cls, carrier: Carrier, rows: Rows, before: Rows | None, prior: PayloadPrior) -> _Problem:
+        def seen(motion: Motion) -> Instants:
             return motion, carrier.rest(motion)
 
         before = before if before is not None and len(before) else None
@@ -165,22 +184,22 @@ class _Problem:
             correlation_roots(carrier, both),
         )
 
-    def usable(self, start: Estimate | None) -> Estimate | None:
-        """An estimate to begin at, None where that is of other variables."""
+    def select_start(self, start: Estimate | None) -> Estimate | None:
+        """Return an estimate to start from, None if its variables are others."""
         known = start is not None and len(start.load.mean) == len(self.carrier.mean) + PARAMETERS
         return start if known else None
 
-    def begin(self, start: Estimate | None) -> Place:
-        """Where to begin."""
+    def make_start(self, start: Estimate | None) -> ArmWithPayload:
+        """Return the arm to start from."""
         geometry = None if start is None else start.load.geometry
         if geometry is None:
             geometry = self.carrier.term.arm.geometry.moved(self.carrier.step)
         if start is None:
-            return Place(self.carrier.mean, geometry, self.prior.centre)
-        return Place(start.load.mean[:-PARAMETERS], geometry, start.eta)
+            return ArmWithPayload(self.carrier.mean, geometry, self.prior.centre)
+        return ArmWithPayload(start.load.mean[:-PARAMETERS], geometry, start.eta)
 
-    def at(self, place: Place) -> Point:
-        """The energy of a place."""
+    def at(self, place: ArmWithPayload) -> Point:
+        """Return the point of an arm."""
         trained, size = self.training.at(place), len(place.w)
         payload, slope = body(place.eta)
         features, torque = rows_of(linearised_around(self.carrier, place, payload), *self.loaded)
@@ -189,11 +208,11 @@ class _Problem:
             others[-PARAMETERS:] = 0.0
             features, torque = np.concatenate([others, features], axis=1), np.concatenate([torque_free, torque])
         root = np.linalg.cholesky(self.prior.precision).T
-        _, off = whitened(self.roots, features[:0], torque - self.tau)
+        _, off = whiten(self.roots, features[:0], torque - self.tau)
         first = len(trained.residual) - PARAMETERS
 
         def derivative() -> Array:
-            along, _ = whitened(self.roots, features, torque - self.tau)
+            along, _ = whiten(self.roots, features, torque - self.tau)
             by_rows = np.hstack([along[:size].T @ self.carrier.memory.root, along[size:].T @ slope])
             out = np.concatenate([trained.derivative, by_rows])
             out[first : len(trained.residual), size:] = root
@@ -203,26 +222,29 @@ class _Problem:
         residual[first : len(trained.residual)] = root @ (place.eta - self.prior.centre)
         return Point(place, residual, float((off**2).mean()), derivative)
 
-    def sought(self, begin: Draw, number: int, rounds: int) -> Generator[None, None, Point]:
-        """A draw from the posterior: the minimum for other noise of the training, of what is known of payloads and of
-        the rows (randomised maximum likelihood, Kitanidis 1995, Oliver et al. 1996). number: of the draw, which has the
-        same noise of the same rows each time, and is near where it was."""
+    def follow_draw(self, begin: Draw, number: int, rounds: int) -> Generator[None, None, Point]:
+        """Return the point of a draw from the posterior: the minimum for other noise.
+
+        Noise is added to the training, the prior of payloads and the rows (randomised maximum likelihood, Kitanidis
+        1995, Oliver et al. 1996). number: of the draw. It has the same noise for the same rows each time, so that it
+        stays near its place.
+        """
         of_rows, noise = np.random.default_rng([DRAWS.seed, number]).standard_normal(self.tau.size), begin.noise
         yield
         return (
             yield from descent(self, self.at(begin.place), rounds, 0.0 if noise is None else np.append(noise, of_rows))
         )
 
-    def estimate(self, at: Point, found: Sequence[_Found] = ()) -> Estimate:
-        """What is known with the most likely place, and draws."""
+    def estimate(self, at: Point, found: Sequence[_DrawResult] = ()) -> Estimate:
+        """Return the estimate of the most likely arm, and of draws."""
         carrier, size = self.carrier, len(self.carrier.mean)
         derivative, first = at.derivative, len(at.residual) - self.tau.size
-        sure = bool(found) and not carrier.open_tip
+        sure = bool(found) and not carrier.is_tip_unidentified
         if not sure:
             doubt = np.full(len(derivative), OPTIONS.doubt)
-            doubt[:size] = doubt[first - PARAMETERS : first] = 1.0  # what was expected before anything was seen
+            doubt[:size] = doubt[first - PARAMETERS : first] = 1.0  # the priors
             derivative = derivative / doubt[:, None]
-        # not from the curvature, of whose condition the root is enough: a covariance above the prior's is none
+        # the curvature squares the condition number, and the covariance could exceed the prior's
         root = solve_triangular(qr(derivative, mode="r")[0][: size + PARAMETERS], np.eye(size + PARAMETERS))
         eta = at.place.eta
         payload, slope = body(eta)
@@ -230,35 +252,41 @@ class _Problem:
         outward[:size, :size], outward[size:, size:] = carrier.memory.root, slope
         outward = outward @ root
         room = PARAMETERS * np.diagonal(slope @ inverse(self.prior.precision) @ slope.T)
-        others, bent = _others(carrier, at, root, found)
+        others, bent = _find_alternatives(carrier, at, root, found)
         draws = tuple(Draw(each.point.place, each.noise) for each in found) if bent else ()
-        load = Load(np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry, others)
+        load = PayloadPosterior(
+            np.concatenate([at.place.w, payload]), outward @ outward.T, room, at.place.geometry, others
+        )
         of_eta = max(1.0, at.misfit) * root[size:] @ root[size:].T
         if others:
-            wider = _wider(np.sqrt(np.diagonal(of_eta)), [each.point.place.eta - eta for each in found])
+            wider = _compute_widening(np.sqrt(np.diagonal(of_eta)), [each.point.place.eta - eta for each in found])
             of_eta *= np.outer(wider, wider)
         return Estimate(eta, of_eta, load, *self.gains(at), draws, 1.0 if sure else OPTIONS.doubt)
 
     def gains(self, at: Point) -> tuple[float, float]:
-        """Nats by which a payload, and a contact of constant torque, explain the rows better than the arm does without
-        either, which is linear then."""
-        least, volume, contact = alone(self.carrier, self.free, self.loaded, self.tau, self.roots)
+        """Return the nats by which a payload, and a contact of constant torque, explain the rows better than the arm
+        alone, which is then linear."""
+        least, volume, contact = explain_unloaded(self.carrier, self.free, self.loaded, self.tau, self.roots)
         curved = np.linalg.slogdet(at.derivative.T @ at.derivative)[1] - np.linalg.slogdet(self.prior.precision)[1]
-        return self.training.alone + least - at.energy + 0.5 * (volume - float(curved)), contact
+        return self.training.learnt_energy + least - at.energy + 0.5 * (volume - float(curved)), contact
 
 
-def _wider(std: Array, off: Sequence[Array]) -> Array:
-    """How many times wider than the linear posterior's std, (10,), draws lie about its mean, at least once; by the
-    median, as some have not come far enough yet. off: of each draw, (10,)."""
-    # the median of the absolute value of what has a normal distribution is 0.6745 standard deviations
+def _compute_widening(std: Array, off: Sequence[Array]) -> Array:
+    """Return how many times wider than std, (10,), draws lie about the mean, at least 1. off: of each draw, (10,).
+
+    It uses the median, because some draws have not converged yet.
+    """
+    # the median of the absolute value of a normal variable is 0.6745 standard deviations
     return np.maximum(1.0, np.median(np.abs(off), axis=0) / (0.6745 * std))
 
 
-def _others(carrier: Carrier, at: Point, root: Array, found: Sequence[_Found]) -> tuple[tuple[Alternative, ...], bool]:
-    """Arms all over the posterior where it is far from linear, the most likely one first; and whether it is.
+def _find_alternatives(
+    carrier: Carrier, at: Point, root: Array, found: Sequence[_DrawResult]
+) -> tuple[tuple[Alternative, ...], bool]:
+    """Return arms all over the posterior if that is far from linear, the most likely one first; and whether it is.
 
-    Few rows leave a curved valley open, along which a centre of mass and the geometry make up for each other, and the
-    linear posterior is tangent to it at one place.
+    Few rows leave a curved valley open, along which centre of mass and geometry compensate each other. The linear
+    posterior is tangent to it at one place.
     """
     reached = [each for each in found if each.excess(at) < OPTIONS.far_nats and each.point is not at]
     known = [each.point.place for each in reached]
@@ -268,7 +296,7 @@ def _others(carrier: Carrier, at: Point, root: Array, found: Sequence[_Found]) -
     for each in known:
         w = solve_triangular(carrier.memory.root, each.w - at.place.w, lower=True, check_finite=False)
         off.append(solve_triangular(root, np.append(w, each.eta - at.place.eta), check_finite=False))
-    if np.square(off[1:]).mean() < OPTIONS.max_square and not carrier.open_tip:
+    if np.square(off[1:]).mean() < OPTIONS.max_square and not carrier.is_tip_unidentified:
         return (), False
     shares = np.exp(-np.array([0.0, *(max(0.0, each.excess(at)) for each in reached)]) / OPTIONS.hot_nats)
     return tuple(

@@ -1,4 +1,4 @@
-"""What the evidence of the last cells is enough for: a payload, a contact, other friction, or nothing."""
+"""Decide by the evidence of the last cells: a payload, a contact, changed friction, or nothing."""
 
 from __future__ import annotations
 
@@ -8,57 +8,59 @@ from dataclasses import dataclass
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.online.payload.hypotheses import Kind, Window
+from lipcore.online.payload.hypotheses import CellWindow, Kind
 from lipcore.robots.urdf import PARAMETERS
 from lipcore.vocabulary import PayloadState
 
 
 @dataclass(frozen=True)
 class VerdictOptions:
-    """Evidence that names a payload or a contact.
+    """Evidence required for a payload or a contact.
 
-    In 60 s each of slow and of fast motion of the dirty Panda of seed 50 a payload that was not there explained up to
-    28 nats, and at most 2 at a time.
+    Measured in 60 s each of slow and of fast motion of the dirty Panda of seed 50: a payload that was not there
+    explained up to 28 nats, and at most 2 at a time.
     """
 
     sure_nats: float = 20.0
     better_nats: float = 5.0
-    """Nats by which a payload explains the last cells better than nothing, and than a contact, to be taken for one at
-    once."""
+    """Nats by which a payload must explain the last cells better than nothing, and better than a contact, to be
+    accepted at once."""
     certain_nats: float = 60.0
     alike_share: float = 0.99
-    """What is so certain is taken for a payload if that explains so large a share of what a contact does: the torques
-    of a contact are any, and those of a payload as good as the arm's geometry."""
+    """Above `certain_nats`, a payload must explain at least this share of what a contact explains. A contact may have
+    any torques; those of a payload are only as exact as the arm's geometry."""
     lasting_cells: int = 6
     lasting_share: float = 0.8
-    """What lasts for so many cells, 0.3 s, is no knock, and needs a smaller share; twice as long, its square."""
+    """An event of so many cells, 0.3 s, is no knock, and a smaller share suffices; after twice as long, its square."""
     at_once_nats: float = 3000.0
     precise: float = 0.1
-    """Nats from which on a payload is taken for one before it lasts, and the deviation of the logarithm of its mass
-    then: a push that looks like a body to within some tenths of its torque is no rare chance, to within hundredths it
-    is."""
+    """Min nats of a payload before it lasts, and the max standard deviation of its log mass then. An external torque
+    often looks like a body to within some tenths of the torque, but rarely to within hundredths."""
     likely_nats: float = 10.0
-    """Nats from which on a contact is named. Cells that are as far off as `sure_nats` teach nothing of the payload."""
+    """Min nats of a reported contact. Cells further off than `sure_nats` are not used to estimate the payload."""
     positive: float = 1.5
-    """Standard deviations by which the mass of a payload that is taken up lies above zero."""
+    """Min mass of a payload that is picked up, in its standard deviations."""
     another_nats: float = 200.0
-    """Nats by which another payload has to explain more than the carried one, of which rows go on telling more."""
+    """Nats by which another payload must explain the cells better than the current one, whose estimate still
+    improves."""
 
 
 VERDICT = VerdictOptions()
 PRIOR: Mapping[Kind, float] = {"payload": -12.0, "contact": -7.0, "friction": -16.0}
-"""Logarithm of how probable each is to begin within a cell: a contact once a minute, a payload once in two hours, other
-friction all at once in days."""
+"""Log probability that each begins within a cell: a contact once a minute, a payload once in two hours, a sudden change
+of friction once in days."""
 Gains = Mapping[int, Mapping[Kind, float]]
 
 
-def taken(window: Window, gains: Gains, carried: Array | None = None, every: int = 1) -> int | None:
-    """For how many cells something has been carried, or something else; None where that does not show. carried: the
-    parameters of what is carried as far as is known, (10,); every: of how many cells the window has one."""
+def find_pickup(window: CellWindow, gains: Gains, carried: Array | None = None, every: int = 1) -> int | None:
+    """Return for how many cells the arm has had a new payload; None if the cells show none.
+
+    carried: parameters of the known payload, (10,); every: the window contains one of so many cells.
+    """
     after = max(gains, key=lambda each: gains[each]["payload"])
     contact = gains[after]["contact"]
     best = gains[after]["payload"]
-    # at once, the rows decide with the arm's geometry as they have it; see `Watch._take_up`
+    # at once, the rows decide together with the arm's geometry; see `PayloadTracker._pick_up`
     near = after >= VERDICT.lasting_cells or (carried is None and best >= VERDICT.at_once_nats)
     share = VERDICT.lasting_share**every if near and after < len(window.cells) else VERDICT.alike_share
     sure, certain = (
@@ -74,14 +76,14 @@ def taken(window: Window, gains: Gains, carried: Array | None = None, every: int
         return None
     if carried is None:
         mass, std = window.mass(after)
-        if mass < VERDICT.positive * std:  # something is gone that the arm was trained with, or that was not noticed
+        if mass < VERDICT.positive * std:  # a mass is gone that was there in training, or was not noticed
             return None
     real = window.of_body(after, np.zeros(PARAMETERS) if carried is None else carried)
     return after if shows(real) and min(best, real) - window.past_contact() >= VERDICT.better_nats else None
 
 
-def state_of(gains: Gains) -> PayloadState:
-    """What is named where no payload is taken up or put down."""
+def classify_state(gains: Gains) -> PayloadState:
+    """Return the state if no payload is picked up or put down."""
     best = {kind: max(each[kind] for each in gains.values()) for kind in PRIOR}
     if max(best["contact"], best["friction"]) <= VERDICT.likely_nats:
         return "none"
@@ -89,7 +91,7 @@ def state_of(gains: Gains) -> PayloadState:
 
 
 def probabilities(gains: Gains) -> dict[str, float]:
-    """Of nothing new, and of each hypothesis to hold for one of the numbers of cells."""
+    """Return the probability of nothing new, and of each hypothesis for any number of cells."""
     logs: dict[str, float] = {"none": 0.0}
     for kind, prior in PRIOR.items():
         logs[kind] = prior + float(np.logaddexp.reduce([each[kind] for each in gains.values()]))

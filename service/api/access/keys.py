@@ -24,7 +24,7 @@ from sqlalchemy import select, update
 from service.api.access.scopes import ADMIN, SCOPES
 from service.api.limits.requests import Rate
 from service.foundation.errors import InvalidRequestError, RateLimitedError, UnauthorizedError
-from service.foundation.fields import for_people
+from service.foundation.fields import check_name
 from service.storage.database import ApiKeyRow, Database, now
 from service.storage.files import new_id
 
@@ -97,7 +97,7 @@ def create(
     max_requests_per_s: how often it may ask, instead of what the setting of this name says.
     """
     try:
-        for_people("name", name)
+        check_name("name", name)
     except InvalidRequestError as error:
         raise ValueError(error.message) from error
     allowed = list(dict.fromkeys(scopes))

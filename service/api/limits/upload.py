@@ -17,7 +17,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from service.foundation.errors import InvalidRequestError, UnsupportedMediaTypeError, invalid_request, problem
-from service.foundation.fields import LONGEST, for_people
+from service.foundation.fields import MAX_NAME_CHARS, check_name
 from service.storage.disk import Disk
 
 if TYPE_CHECKING:
@@ -162,7 +162,7 @@ async def receive_to(request: Request, path: Path, kinds: Kinds, disk: Disk) -> 
 
         def write(pieces: list[bytes]) -> None:
             data = b"".join(pieces)
-            disk.take(len(data))
+            disk.reserve(len(data))
             file.write(data)
 
         waiting: list[bytes] = []
@@ -209,7 +209,7 @@ class _Upload:
     def _name(self, given: str) -> None:
         name = Path(given.replace("\\", "/")).name  # some browsers send the whole path
         kind = self.kinds.of_file(name)
-        self.received = Received(kind, for_people("file name", name[:LONGEST]))
+        self.received = Received(kind, check_name("file name", name[:MAX_NAME_CHARS]))
 
 
 def _bare(media_type: str) -> str:

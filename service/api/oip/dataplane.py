@@ -16,14 +16,14 @@ from service.api.route import Reply
 from service.contract.models import ALIAS
 from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVersionError, problem, sentence
 from service.models import registry
-from service.models.loaded import LoadedModels, Served
+from service.models.loaded import LoadedModels, ServedModel
 
 SMALL = 16 * 1024
 """Bytes of a body that is decoded on the event loop: one query of the largest robot fits many times."""
 _LISTED = 20
 
 
-async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> Served:
+async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> ServedModel:
     """Return a version by its number or an alias, the one that serves where None, loaded if need be. turns: of what
     loads. Raise NotFoundError naming those there are."""
     number, alias = (None, None) if version is None else _meant(version)
@@ -33,7 +33,7 @@ async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version:
     return await in_turn(turns, _load, loaded, name, version, number, alias)
 
 
-async def ready(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> Served:
+async def ready(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> ServedModel:
     """Return a version once it is in memory; raise NotFoundError, or NotReadyError where it cannot be read."""
     try:
         return await find(loaded, turns, name, version)
@@ -64,7 +64,7 @@ async def infer(
     return await in_turn(turns, query.respond, served, message, question)
 
 
-def metadata(loaded: LoadedModels, served: Served) -> schema.ModelMetadata:
+def metadata(loaded: LoadedModels, served: ServedModel) -> schema.ModelMetadata:
     """Describe a version and name all of its model; raise NotFoundError. Not for the event loop."""
     model = served.model
     inputs = [schema.TensorMetadata(name=each, shape=[-1, model.n_joints]) for each in schema.INPUTS]
@@ -79,7 +79,7 @@ def metadata(loaded: LoadedModels, served: Served) -> schema.ModelMetadata:
     )
 
 
-def _parameters(served: Served, model: TorqueModel) -> dict[str, str | int]:
+def _parameters(served: ServedModel, model: TorqueModel) -> dict[str, str | int]:
     return {
         "version": str(served.version),
         "revision": served.revision,
@@ -96,7 +96,7 @@ def _meant(version: str) -> tuple[int | None, str | None]:
     return number if str(number) == version else 0, None
 
 
-def _load(loaded: LoadedModels, name: str, version: str | None, number: int | None, alias: str | None) -> Served:
+def _load(loaded: LoadedModels, name: str, version: str | None, number: int | None, alias: str | None) -> ServedModel:
     try:
         return loaded.get(name, number, alias)
     except NotFoundError as error:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lipcore.model.dynamics import available
+from lipcore.model.dynamics import available_components
 from lipcore.model.external import external
 from lipcore.model.torque_model import TorqueAnswer, TorqueModel, TorquePrediction
 from lipcore.vocabulary import COMPONENTS, ComponentName
@@ -19,7 +19,7 @@ from service.api.route import Reply
 from service.foundation.errors import invalid_request
 from service.foundation.settings import Settings
 from service.inference.predicting import FORWARD, QUANTITIES, Query, check_answer, check_count, check_torque
-from service.models.loaded import Served
+from service.models.loaded import ServedModel
 
 Array = NDArray[np.float64]
 Shape = tuple[int, ...]
@@ -59,7 +59,7 @@ NEED_TORQUE = {name for name, part in PARTS.items() if part.component == FORWARD
 
 def shapes(model: TorqueModel) -> dict[str, Shape]:
     """Every tensor that a model can answer, and its shape at N queries; -1 stands for N."""
-    n, offered = model.n_joints, available(model.estimator)
+    n, offered = model.n_joints, available_components(model.estimator)
     tensors: dict[str, Shape] = {"tau": (-1, n), "tau_std": (-1, n), "covariance": (-1, n, n), FALLBACK: (-1, n)}
     tensors |= dict.fromkeys(sorted(OF_MODEL), (n,))
     tensors |= {name: (-1, 1) if name in OF_ARM else (-1, n) for name in EXTERNAL}
@@ -125,7 +125,10 @@ def _outputs(request: schema.InferRequest, model: TorqueModel) -> dict[str, bool
         if name in outputs:
             raise invalid_request(f"{field}.name", name, "each output once")
         part = PARTS.get(name)
-        if (part is None or part.component not in available(model.estimator)) and name not in (*QUICK, "covariance"):
+        if (part is None or part.component not in available_components(model.estimator)) and name not in (
+            *QUICK,
+            "covariance",
+        ):
             expected = f"what a model with the estimator {model.estimator.name} offers: {', '.join(shapes(model))}"
             raise invalid_request(f"{field}.name", name, expected)
         outputs[name] = _binary(output, field, usual)
@@ -186,10 +189,10 @@ def _as_read(values: NDArray[np.floating], dtype: np.dtype[np.floating]) -> Arra
         return values.astype(dtype).astype(np.float64)
 
 
-def compute(served: Served, query: Query, names: frozenset[str]) -> dict[str, Array]:
+def compute(served: ServedModel, query: Query, names: frozenset[str]) -> dict[str, Array]:
     """Tensors by name, their first axis N, but for those OF_MODEL; nothing is computed that they do not need. Raise
     InvalidRequestError where inertia cannot be inverted."""
-    model, scale = served.asked, served.scales.of(None)
+    model, scale = served.default_model, served.scales.of(None)
     compared, of_arm = names & EXTERNAL.keys(), bool(names & OF_ARM.keys())
     needed = {"covariance"} if of_arm else {"tau", "tau_std"} if compared else set()
     tensors = _torques(model, query.values[:3], names | needed)
@@ -233,14 +236,14 @@ def _torques(model: TorqueModel, motion: Array, names: frozenset[str]) -> dict[s
     return {name: each[None] if rows == 1 else each for name, each in tensors.items() if each is not None}
 
 
-def infer(served: Served, decode: Callable[[], Message], settings: Settings) -> Reply:
+def infer(served: ServedModel, decode: Callable[[], Message], settings: Settings) -> Reply:
     """Answer a request that is still to be decoded; raise what decoding raises, or InvalidRequestError. Not for the
     event loop."""
     message = decode()
     return respond(served, message, read_question(served, message, settings))
 
 
-def read_question(served: Served, message: Message, settings: Settings) -> Question:
+def read_question(served: ServedModel, message: Message, settings: Settings) -> Question:
     """Check a request and read its query; raise InvalidRequestError."""
     request = message.request
     for field, value, expected in (
@@ -252,7 +255,7 @@ def read_question(served: Served, message: Message, settings: Settings) -> Quest
     return read(message, served.model, settings)
 
 
-def respond(served: Served, message: Message, question: Question) -> Reply:
+def respond(served: ServedModel, message: Message, question: Question) -> Reply:
     """Compute the answer to a query and encode it; raise InvalidRequestError."""
     values_of = compute(served, question.query, frozenset(question.outputs))
     answers: list[Answer] = []

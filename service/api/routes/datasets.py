@@ -30,7 +30,7 @@ from service.foundation.errors import (
     UnsupportedMediaTypeError,
     invalid_request,
 )
-from service.storage.rows import identity
+from service.storage.rows import identify_request
 
 router = APIRouter(
     prefix="/v1/datasets", tags=["data sets"], responses=responses(InvalidRequestError), route_class=Route
@@ -66,7 +66,7 @@ async def upload(
     try:
         kind, file_name = await receive_to(request, path, Kinds(MEDIA_TYPES, SUFFIXES), storage.disk)
         asked = (sorted(request.query_params.multi_items()), kind, file_name)
-        named = await to_thread.run_sync(partial(identity, idempotency_key, *asked, file=path))
+        named = await to_thread.run_sync(partial(identify_request, idempotency_key, *asked, file=path))
         called = query.name or file_name or "unnamed"
         dataset = await to_thread.run_sync(store.add, storage, path, kind, called, options, named, limiter=turns)
     finally:

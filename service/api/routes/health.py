@@ -8,7 +8,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends
 
-from lipcore.extras import EXTRAS, install_line, installed
+from lipcore.extras import EXTRAS, install_line, is_installed
 from service import __version__
 from service.api.access.scopes import needs
 from service.api.dependencies import ReadinessDep, of_app
@@ -30,7 +30,7 @@ async def health(confined: Annotated[dict[str, bool], Depends(of_app("confined")
 @cache
 def _can() -> tuple[tuple[str, bool], ...]:
     """Of every extra whether it is installed: looked up once, as a running service does not see what is new."""
-    return tuple((name, installed(name)) for name in EXTRAS)
+    return tuple((name, is_installed(name)) for name in EXTRAS)
 
 
 def _missing() -> Iterator[Missing]:

@@ -26,7 +26,7 @@ from service.foundation.errors import (
 )
 from service.models.loaded import LoadedModels
 from service.storage.database import JobRow
-from service.storage.rows import identity
+from service.storage.rows import identify_request
 from service.training import jobs
 from service.training.feed import MAX_FOLLOWERS
 from service.training.queue import JobQueue
@@ -38,7 +38,7 @@ def _row(queue: JobQueueDep, job: str) -> JobRow:
 
 async def _followed(queue: JobQueueDep, row: Annotated[JobRow, Depends(_row)]) -> AsyncIterator[JobRow]:
     """The job at the start; one more is counted while the answer lasts."""
-    with queue.feed.one_more(MAX_FOLLOWERS):
+    with queue.feed.count_one(MAX_FOLLOWERS):
         yield row
 
 
@@ -57,7 +57,7 @@ async def _events(
         job = jobs.represent(now)
         if now.version is not None:  # who sees it succeed is answered by its version from then on
             await to_thread.run_sync(loaded.announce, [now.model])
-            [job] = await to_thread.run_sync(jobs.represented, queue.database, [now])
+            [job] = await to_thread.run_sync(jobs.represent_all, queue.database, [now])
         yield ServerSentEvent(event=kind or "state", data=job)
         if now.state not in ACTIVE:
             return
@@ -85,7 +85,7 @@ router = APIRouter(
 @needs(TRAIN)
 def create(queue: JobQueueDep, request: JobRequest, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a training job. It runs in another process and ends in a new version of the model."""
-    named = identity(idempotency_key, "train", request.model_dump(mode="json", exclude_unset=True))
+    named = identify_request(idempotency_key, "train", request.model_dump(mode="json", exclude_unset=True))
     job = jobs.create(queue, request, named=named)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
     return job
@@ -151,6 +151,6 @@ def cancel(queue: JobQueueDep, job: str) -> Job:
 @needs(TRAIN)
 def retry(queue: JobQueueDep, job: str, response: Response, idempotency_key: KeyHeader = None) -> Job:
     """Queue a new job with the same request; `retry_of` names the old one. What it needs must still be there."""
-    again = jobs.retry(queue, job, identity(idempotency_key, "retry", job))
+    again = jobs.retry(queue, job, identify_request(idempotency_key, "retry", job))
     response.headers["Location"] = f"/v1/jobs/{again.id}"
     return again

@@ -45,14 +45,14 @@ overview_router = APIRouter(
 def show_overview(learners: LearnersDep, page: PageQuery) -> OverviewPage:
     """One page of models, each with all that a card of it shows: the learnt arm and its posture, error and coverage on
     what was held out and on what came in the last hour, what it carries, and its newest alarm. Loads no model."""
-    return overview.page(learners, page)
+    return overview.list_models(learners, page)
 
 
 @router.get("/{model}/quality", summary="How well a model predicts what it has not learnt yet")
 @needs(READ)
 def show_quality(learners: LearnersDep, model: str) -> schema.Quality:
     """Figures over sliding windows: every row is predicted, compared with what was measured, and learnt only then."""
-    return status.quality(learners, model)
+    return status.read_quality(learners, model)
 
 
 @router.get("/{model}/observations", summary="List observation batches, newest first")
@@ -65,7 +65,7 @@ def list_observations(
     rejected: Annotated[bool, Query(description="Only batches with rows that were kept out")] = False,
 ) -> schema.ObservationPage:
     """One page of the log: which batches came and what became of their rows."""
-    return status.page(learners, model, page, stream_id, rejected)
+    return status.list_batches(learners, model, page, stream_id, rejected)
 
 
 @router.get(BATCH, summary="One observation batch")
@@ -78,7 +78,7 @@ def show_observation(
     rows: Annotated[bool, Query(description="Also answer its rows, each with its code")] = False,
 ) -> schema.ObservationDetail:
     """What was said of a batch when it came, how well it was predicted, and what has become of it."""
-    return status.show(learners, model, stream_id, sequence, rows)
+    return status.read_batch(learners, model, stream_id, sequence, rows)
 
 
 @router.delete(BATCH, summary="Unlearn an observation batch", responses=responses(ConflictError))
@@ -120,7 +120,7 @@ def rollback(learners: LearnersDep, model: str, request: schema.RollbackRequest)
 @needs(READ)
 def show_learning(learners: LearnersDep, model: str) -> schema.Learning:
     """What is set, how far learning is, what it waits for, and where it can go back to."""
-    return status.learning(learners, model)
+    return status.read_learning(learners, model)
 
 
 @router.put(
@@ -133,7 +133,7 @@ def show_learning(learners: LearnersDep, model: str) -> schema.Learning:
 def set_learning(learners: LearnersDep, model: str, options: LearningOptions) -> schema.Learning:
     """Set all options, those left out to their defaults. What has been learnt stays."""
     decisions.set_options(learners, model, options)
-    return status.learning(learners, model)
+    return status.read_learning(learners, model)
 
 
 @router.post(
@@ -154,7 +154,7 @@ def show_payload(learners: LearnersDep, model: str) -> Payloads:
 
     A payload is noticed, estimated and answered with by itself, from the rows that streams bring. No safety function.
     """
-    return payload.show(learners, model)
+    return payload.read_payloads(learners, model)
 
 
 @router.put(

@@ -16,7 +16,7 @@ from service.api.route import Route
 from service.foundation.errors import BusyError, InvalidRequestError, NotFoundError
 from service.learning.learners import Learners
 from service.learning.live.feed import MAX_FOLLOWERS
-from service.learning.live.look import LiveLook
+from service.learning.live.look import StatusReader
 from service.telemetry.meters import Meters
 
 
@@ -26,7 +26,7 @@ def _name(learners: LearnersDep, model: str) -> str:
 
 async def _followed(learners: LearnersDep, name: Annotated[str, Depends(_name)]) -> AsyncIterator[str]:
     """The model's name; one more reader is counted while the answer lasts."""
-    with learners.live.one_more(MAX_FOLLOWERS):
+    with learners.live.count_one(MAX_FOLLOWERS):
         yield name
 
 
@@ -38,7 +38,7 @@ async def events(
 ) -> AsyncIterator[ServerSentEvent]:
     """`status` at the start and once a second, `rows` as they come; see `schema`."""
     feed = learners.live
-    async for event in feed.follow(model, LiveLook(learners, meters, model), closing):
+    async for event in feed.follow(model, StatusReader(learners, meters, model), closing):
         yield ServerSentEvent(event=event.event, raw_data=event.data)
 
 

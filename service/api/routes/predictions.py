@@ -25,7 +25,7 @@ from service.foundation.errors import (
 from service.inference import comparison, evaluating, predicting
 from service.inference.predicting import encode, one_motion, queries
 from service.models.loaded import LoadedModels
-from service.models.served import Served, reached
+from service.models.served import ServedModel, wait_for_revision
 
 _CONTENT: dict[str, Any] = {
     "application/json": {"schema": {}, "example": {"q": [0.0, -0.5], "dq": [0.1, 0.0], "ddq": [0.0, 0.5]}},
@@ -85,9 +85,9 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
     model: str = scope["path_params"]["model"]
     served, motion = loaded.hot(model, query.version, query.alias), one_motion(query)
     if query.min_revision is not None:
-        served = await reached(loaded, model, query.version, query.alias, query.min_revision)
+        served = await wait_for_revision(loaded, model, query.version, query.alias, query.min_revision)
     if served is not None and motion is not None:
-        at_once = predicting.at_once(served, motion, loaded.storage.settings.max_position, query.payload)
+        at_once = predicting.predict_now(served, motion, loaded.storage.settings.max_position, query.payload)
         if at_once is not None:
             return Reply(encode(at_once))
     request = queries.request(query)
@@ -95,18 +95,18 @@ async def _answer(scope: Scope, body: bytes) -> Reply | None:
 
 
 async def _in_thread(
-    loaded: LoadedModels, turns: CapacityLimiter, model: str, request: schema.PredictRequest, served: Served | None
+    loaded: LoadedModels, turns: CapacityLimiter, model: str, request: schema.PredictRequest, served: ServedModel | None
 ) -> bytes:
     return await to_thread.run_sync(lambda: encode(predicting.predict(loaded, model, request, served)), limiter=turns)
 
 
 async def _revised(
     loaded: LoadedModels, model: str, request: schema.PredictRequest | schema.EvaluateRequest
-) -> Served | None:
+) -> ServedModel | None:
     """The version that answers, where the request waits for a revision of it; None where it does not."""
     if request.min_revision is None:
         return None
-    return await reached(loaded, model, request.version, request.alias, request.min_revision)
+    return await wait_for_revision(loaded, model, request.version, request.alias, request.min_revision)
 
 
 @needs(PREDICT)

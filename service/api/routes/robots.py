@@ -47,7 +47,7 @@ async def upload(
     """Check a URDF and store it, or say what is wrong with it. No file that it names is opened."""
     kinds = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
     _, content = await receive(request, kinds)
-    await to_thread.run_sync(storage.disk.take, len(content))
+    await to_thread.run_sync(storage.disk.reserve, len(content))
     robot = await to_thread.run_sync(store.add, storage.database, content, name, storage.settings)
     response.headers["Location"] = f"/v1/robots/{robot.id}"
     return robot

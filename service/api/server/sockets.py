@@ -18,7 +18,7 @@ from typing import Any
 import uvicorn
 from uvicorn.config import STARTUP_FAILURE
 
-from service.telemetry.readiness import Stopping
+from service.telemetry.readiness import StopState
 
 logger = logging.getLogger(__name__)
 
@@ -81,7 +81,7 @@ class Server(uvicorn.Server):
     second time, it ends at once.
     """
 
-    def __init__(self, config: uvicorn.Config, unix: UnixSocket | None, stopping: Stopping, notice_s: float) -> None:
+    def __init__(self, config: uvicorn.Config, unix: UnixSocket | None, stopping: StopState, notice_s: float) -> None:
         super().__init__(config)
         self.unix, self.stopping, self.notice_s = unix, stopping, notice_s
 
@@ -120,7 +120,7 @@ class Server(uvicorn.Server):
         super().handle_exit(sig, frame)
 
 
-def serve(config: uvicorn.Config, uds: Path | None, mode: int, stopping: Stopping, notice_s: float = 0.0) -> None:
+def serve(config: uvicorn.Config, uds: Path | None, mode: int, stopping: StopState, notice_s: float = 0.0) -> None:
     """Serve until a signal comes, on the port of the config and on a socket at the path `uds`.
 
     notice_s: how long it still answers after the signal, while `stopping` says that it was told. Raise SocketError

@@ -17,11 +17,11 @@ import numpy as np
 from lipcore.data.samples import Array
 from service.contract.frames import NUMBER, REQUEST
 from service.foundation.errors import ErrorBody, ServiceError, invalid_request
-from service.learning.ingest.clock import SET_S
+from service.learning.ingest.clock import MIN_STEP_S
 from service.learning.ingest.frames import Frames
 from service.learning.learners import Learners
-from service.models.loaded import Served
-from service.storage.errors import translated
+from service.models.loaded import ServedModel
+from service.storage.errors import translate_error
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +31,7 @@ class Taught(NamedTuple):
     `time.perf_counter`. request: the whole frame; answer: bytes of the posterior's mean and standard deviation, (2, n),
     made before it is learnt; factor: (n,), on the half width of its interval."""
 
-    served: Served
+    served: ServedModel
     loaded: bool
     sequence: int
     arrived: float
@@ -134,7 +134,7 @@ class Learning:
         except ServiceError as error:
             refusal = error
         except Exception as error:  # the next block may be logged
-            known = translated(error)
+            known = translate_error(error)
             logger.error(
                 "error while stream %r was learnt from: %s", self._stream_id, error, exc_info=None if known else error
             )
@@ -157,7 +157,7 @@ class Learning:
     def _times(self, block: list[Taught]) -> Array:
         """Times of arrival, Unix time in s, each later than the one before, unless the host's clock was set."""
         clock = time.time() - perf_counter()
-        if abs(clock - self._clock) > SET_S:
+        if abs(clock - self._clock) > MIN_STEP_S:
             self._clock, self._time = clock, -np.inf
         ticks = 1e-6 * np.arange(1, len(block) + 1)  # frames that come in one piece have one time of arrival
         arrived = np.array([each.arrived for each in block]) + self._clock

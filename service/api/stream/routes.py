@@ -18,8 +18,8 @@ from service.contract.models import ALIAS
 from service.contract.predictions import one_choice
 from service.foundation.errors import NotFoundError, NotReadyError, invalid_request
 from service.learning.learners import Learners
-from service.models.served import reached
-from service.runtime.counted import Counted
+from service.models.served import wait_for_revision
+from service.runtime.counted import OpenCounter
 
 STREAM_ID = r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}"
 NUMBER = "[0-9]{1,10}"
@@ -48,7 +48,7 @@ def router() -> APIRouter:
     return router
 
 
-class Streams(Counted):
+class Streams(OpenCounter):
     """How many connections are open."""
 
     too_many = "{} streams are open, the most there may be: close one, or try again later"
@@ -66,7 +66,7 @@ class EchoRoute:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Talk with one client. What is raised before it is accepted is answered in HTTP."""
         learners: Learners = scope["app"].state.learners
-        with self.streams.one_more(learners.settings.max_streams):
+        with self.streams.count_one(learners.settings.max_streams):
             conversation = await self.conversation(learners, scope, receive, send)
             with suppress(ClientDisconnected):  # no error: it went away while it was answered, or its key ended
                 await conversation.run()
@@ -87,7 +87,7 @@ class StreamRoute(EchoRoute):
         asked = _parameters(scope["query_string"])
         model, version, alias = scope["path_params"]["model"], asked.version, asked.alias
         # with 0 it waits for nothing but the model to be in memory
-        served = await reached(learners.loaded, model, version, alias, asked.min_revision)
+        served = await wait_for_revision(learners.loaded, model, version, alias, asked.min_revision)
         pinned = version is not None
         meter = scope["app"].state.meters.stream(served.name)
         given = (served, meter, pinned, asked.std, asked.stream_id, alias, asked.scale, asked.payload)

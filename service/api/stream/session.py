@@ -27,7 +27,7 @@ from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, in
 from service.foundation.settings import Settings
 from service.inference.predicting import Query, check_answer
 from service.learning.learners import Learners
-from service.models.loaded import Served
+from service.models.loaded import ServedModel
 from service.models.registry import SERVING
 from service.telemetry.meters import StreamMeter
 
@@ -190,7 +190,7 @@ class Session(Conversation):
         receive: Receive,
         send: Send,
         learners: Learners,
-        served: Served,
+        served: ServedModel,
         meter: StreamMeter,
         pinned: bool,
         std: bool,
@@ -246,7 +246,7 @@ class Session(Conversation):
             sequence, asked, n, budget = frames.REQUEST.unpack_from(data)
             flags = 0
             current = self._loaded.hot(self._name, self._pin, self._alias)
-            if current is not self._served or self._loads.of(self._stream_id) is not self._carried:
+            if current is not self._served or self._loads.model_for(self._stream_id) is not self._carried:
                 await self._follow(current)
             motion = self._reader.read(data, asked, n, budget)
             if asked & frames.ASK_LEARN:
@@ -348,7 +348,7 @@ class Session(Conversation):
         )
         return header + body.model_dump_json().encode()
 
-    async def _follow(self, current: Served | None) -> None:
+    async def _follow(self, current: ServedModel | None) -> None:
         """Take the version that is current; None: it has been dropped from memory, maybe for a newer one. Raise
         NotFoundError where the version, the alias or the model has been deleted."""
         self._carry()
@@ -362,14 +362,14 @@ class Session(Conversation):
         if current.version != known:
             await self.greet()
 
-    def _take(self, served: Served) -> None:
-        self._served, self._loads, self._noise_std = served, served.loads, np.array(served.noise_std)
+    def _take(self, served: ServedModel) -> None:
+        self._served, self._loads, self._noise_std = served, served.payloads, np.array(served.noise_std)
         self._carry()
         limits = served.model.position_limits(self.settings.max_position)
         self._reader = FrameReader(served.model.joint_names, limits)
 
     def _carry(self) -> None:
         """Answer with what the arm carries, as far as that is known by now."""
-        self._carried = self._loads.of(self._stream_id)
+        self._carried = self._loads.model_for(self._stream_id)
         model = self._carried or self._served.model
         self._answer = model.answer_fully

@@ -11,7 +11,7 @@ from typing import cast
 import numpy as np
 
 from lipcore.data.samples import Array
-from lipcore.extras import need
+from lipcore.extras import import_extra
 from service.datasets.formats.joined import tables_of
 from service.datasets.formats.json import MAX_LINE_BYTES, decode, open_json, open_json_lines
 from service.datasets.formats.npz import open_npz
@@ -202,7 +202,7 @@ def _open(path: Path, kind: str, options: ReadOptions, settings: Settings) -> Ab
     own: dict[str, Opener] = {"npz": open_npz, "json_lines": open_json_lines, "json": open_json}
     if kind in own:
         return own[kind](path, options, settings)
-    need("pyarrow", "ingest")  # what is imported from here on stands on it
+    import_extra("pyarrow", "ingest")  # what is imported from here on stands on it
     if kind in ("csv", "parquet", "lerobot", "joined"):
         opener: Opener = getattr(import_module(f"service.datasets.formats.{kind}"), f"open_{kind}")
         return opener(path, options, settings)

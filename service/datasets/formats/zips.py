@@ -12,7 +12,7 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import IO, Any
 
-from lipcore.extras import need
+from lipcore.extras import import_extra
 from service.datasets.formats.table import first_line
 from service.foundation.errors import ServiceError, TooLargeError, invalid_data
 from service.foundation.settings import Settings
@@ -121,7 +121,7 @@ def _unpack(archive: zipfile.ZipFile, folder: Path, settings: Settings) -> list[
 
 
 def _unpacked(source: IO[bytes]) -> Any:
-    pa = need("pyarrow", "ingest")
+    pa = import_extra("pyarrow", "ingest")
     return pa.CompressedInputStream(pa.PythonFile(source, "r"), "zstd")
 
 

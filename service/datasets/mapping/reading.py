@@ -23,7 +23,7 @@ from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
 from service.foundation.settings import Settings
 from service.foundation.text import counted
-from service.storage.disk import Disk, Room
+from service.storage.disk import Disk, DiskBudget
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def read(
     options: UploadOptions,
     robot: Profile | None,
     settings: Settings,
-    disk: Disk | Room,
+    disk: Disk | DiskBudget,
     min_samples: int = checks.MIN_SAMPLES,
 ) -> Read:
     """Read a table's columns to files in a folder; raise InvalidDataError, StorageFullError.

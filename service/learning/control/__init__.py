@@ -1,1 +1,1 @@
-"""What the owner of a learning model sees and decides: its log, what is undone, how it learns."""
+"""Control of a learning model by its owner: status, log, undoing, options and payloads."""

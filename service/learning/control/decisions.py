@@ -1,5 +1,4 @@
-"""What the owner of a learning model decides: options, the end of a hold, replays, what is taken back (one batch, or
-everything since a revision that can be made again); and the alarms that lead to it."""
+"""The decisions of a model's owner: options, the end of a pause, replays, unlearning and rollbacks."""
 
 from __future__ import annotations
 
@@ -23,49 +22,49 @@ from service.journal import log, undo
 from service.journal.alarms import page as alarms_page
 from service.learning import owner
 from service.learning.control import status
-from service.learning.ingest.observations import state
+from service.learning.ingest.observations import read_state
 from service.learning.learners import Learners
 from service.models import registry
 from service.storage import audit
 from service.storage.database import Database, EventRow, LearnerRow, VersionRow
 from service.storage.rows import Page
 
-WORDS = {"unlearnt": "has been unlearnt", "rolled_back": "was undone by a rollback"}
+UNDONE_TEXTS = {"unlearnt": "has been unlearnt", "rolled_back": "was undone by a rollback"}
 
 
-def serving(database: Database, model: str) -> int:
-    """Return the version that answers where none is named; raise NotFoundError for an unknown model."""
+def find_serving_version(database: Database, model: str) -> int:
+    """Return the serving version; raise NotFoundError for an unknown model."""
     return registry.find(database, model, None).version
 
 
-def revised_now(session: Session, model: str, version: int) -> schema.Revised:
+def read_revision(session: Session, model: str, version: int) -> schema.Revised:
     """Return the revision of a version that contains everything logged so far."""
-    return schema.Revised(model=model, version=version, revision=status.current(session, model, version))
+    return schema.Revised(model=model, version=version, revision=status.read_newest_revision(session, model, version))
 
 
 def find_learnt(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
-    """Return the batch of exactly this sequence; raise NotFoundError, or ConflictError where it was undone."""
-    batch = status.find(session, model, stream_id, sequence)
+    """Return the batch with exactly this sequence; raise NotFoundError, or ConflictError if it was undone."""
+    batch = status.find_batch(session, model, stream_id, sequence)
     if batch.sequence != sequence:
         together = f"{batch.sequence}: frames {batch.sequence} to {batch.last_sequence} were logged together"
         raise invalid_request("sequence", sequence, together)
     if batch.void:
-        raise ConflictError(f"batch {sequence} of stream {stream_id!r} {WORDS[state(session, batch)]}")
+        raise ConflictError(f"batch {sequence} of stream {stream_id!r} {UNDONE_TEXTS[read_state(session, batch)]}")
     return batch
 
 
 def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> schema.Unlearnt:
-    """Take a batch and what was replayed of it out again; raise NotFoundError or ConflictError."""
-    version = serving(learners.database, model)
+    """Unlearn a batch and its replays; raise NotFoundError or ConflictError."""
+    version = find_serving_version(learners.database, model)
     with learners.database.turn(model), learners.database.transaction(model) as session:
         batch = find_learnt(session, model, stream_id, sequence)
         if log.start_of(session, model, version) < batch.number:
             _check_fold(session, model, version, batch)
-        rows = batch.learnt + sum(each.learnt for each in log.about(session, batch, "replay") if not each.void)
+        rows = batch.learnt + sum(each.learnt for each in log.find_related(session, batch, "replay") if not each.void)
         trained = select(LearnerRow.version).where(LearnerRow.model == model, LearnerRow.start >= batch.number)
         versions = list(session.scalars(trained.order_by(LearnerRow.version)))
         undo.unlearn(session, model, batch, time.time())
-        revised = revised_now(session, model, version)
+        revised = read_revision(session, model, version)
         taken = {"stream_id": stream_id, "sequence": sequence, "rows": rows}
         audit.note(session, model, "observations unlearnt", version, before=taken)
     learners.process.wake(model)
@@ -73,7 +72,7 @@ def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> sc
 
 
 def _check_fold(session: Session, model: str, version: int, batch: EventRow) -> None:
-    """Raise ConflictError if what a version has learnt cannot be made again without a batch."""
+    """Raise ConflictError if the state of a version cannot be made again without a batch."""
     if not undo.can_fold_again(session, model, version, batch.number):
         name = f"batch {batch.sequence} of stream {batch.stream_id!r}"
         raise ConflictError(
@@ -83,7 +82,7 @@ def _check_fold(session: Session, model: str, version: int, batch: EventRow) -> 
 
 
 def delete_stream(learners: Learners, model: str, stream_id: str) -> None:
-    """Forget a stream; raise NotFoundError."""
+    """Delete a stream; raise NotFoundError."""
     served = learners.loaded.get(model, None)
     monitor = learners.monitor(model)
     with learners.turn(model):
@@ -95,15 +94,15 @@ def delete_stream(learners: Learners, model: str, stream_id: str) -> None:
             audit.note(session, model, "stream deleted", before={"stream_id": stream_id})
         monitor.streams.forget(stream_id)
         if served.carrier is not None:
-            served.loads.take(monitor.payloads.carried(served.carrier, served.version))
-        served.scales.take(monitor.streams.factors(served.version))
+            served.payloads.replace(monitor.payloads.build_models(served.carrier, served.version))
+        served.scales.replace(monitor.streams.factors(served.version))
 
 
 def rollback(learners: Learners, model: str, request: schema.RollbackRequest) -> schema.RolledBack:
-    """Go back to a revision of the version that serves, or to another version.
+    """Roll back to a revision of the serving version, or to another version.
 
-    Raise NotFoundError, InvalidRequestError where not exactly one of the two is named or it is not older than what
-    serves, ConflictError where nothing reaches back as far.
+    Raise InvalidRequestError unless the request names exactly one of the two, or if the revision is not older than the
+    newest. Raise NotFoundError, and ConflictError if the state cannot be made again.
     """
     if (request.revision is None) == (request.version is None):
         given = "neither" if request.revision is None else "both"
@@ -115,13 +114,13 @@ def rollback(learners: Learners, model: str, request: schema.RollbackRequest) ->
 
 
 def _to_revision(learners: Learners, model: str, revision: int) -> schema.RolledBack:
-    version = serving(learners.database, model)
+    version = find_serving_version(learners.database, model)
     served, monitor = learners.loaded.get(model, version), learners.monitor(model)
     with learners.turn(model), learners.database.transaction(model) as session:
-        newest = status.current(session, model, version)
+        newest = status.read_newest_revision(session, model, version)
         if revision >= newest:
             raise invalid_request("revision", revision, f"one below {newest}, the newest of version {version}")
-        _check_reach(revision, version, status.reachable(session, model, version))
+        _check_reach(revision, version, status.list_reachable(session, model, version))
         to = log.start_of(session, model, version) + revision
         undone = select(func.count()).where(
             EventRow.model == model,
@@ -132,17 +131,17 @@ def _to_revision(learners: Learners, model: str, revision: int) -> schema.Rolled
         count = session.scalar(undone) or 0
         undo.rollback(session, model, to, time.time())
         session.flush()
-        monitor.streams.take_back(session, model, version, served.base.scale)
-        revised = revised_now(session, model, version)
+        monitor.streams.restore_scales(session, model, version, served.base.scale)
+        revised = read_revision(session, model, version)
         audit.note(session, model, "learning rolled back", version, before=newest, after=revision)
-    served.scales.take(monitor.streams.factors(version))
+    served.scales.replace(monitor.streams.factors(version))
     learners.process.wake(model)
     return schema.RolledBack(**revised.model_dump(), undone=count, complete=True)
 
 
 def _check_reach(revision: int, version: int, ranges: list[status.Range]) -> None:
-    """Raise ConflictError, naming the revisions that can be returned to, where this one is none of them."""
-    if status.is_reached(revision, ranges):
+    """Raise ConflictError, naming the revisions that can be restored, if this one cannot."""
+    if status.is_reachable(revision, ranges):
         return
     oldest = next((first for first, last in ranges if last > 0), 0)
     listed = ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in ranges)
@@ -154,23 +153,23 @@ def _check_reach(revision: int, version: int, ranges: list[status.Range]) -> Non
 
 
 def _to_version(learners: Learners, model: str, version: int) -> schema.RolledBack:
-    if version == serving(learners.database, model):
+    if version == find_serving_version(learners.database, model):
         raise ConflictError(f"version {version} of model {model!r} serves already")
-    learners.loaded.get(model, version)  # so that the change costs no query anything, or fails before it is made
+    learners.loaded.get(model, version)  # load first: no request waits for it, and it fails before the change
     with learners.database.transaction() as session:
         manifest = session.get_one(VersionRow, (model, version)).manifest
         registry.check_robot(session, model, RobotKind.of_manifest(manifest))
         registry.serve(session, model, version)
-        revised = revised_now(session, model, version)
-        complete = status.is_reached(revised.revision, status.reachable(session, model, version))
+        revised = read_revision(session, model, version)
+        complete = status.is_reachable(revised.revision, status.list_reachable(session, model, version))
     learners.loaded.adopt(model)
     learners.process.wake(model)
     return schema.RolledBack(**revised.model_dump(), undone=0, complete=complete)
 
 
 CHANGE = "change"
-CHUNK = 50
-"""Batches whose rows are learnt after all in one transaction, so that observations do not wait long for the lock."""
+CHUNK_EVENTS = 50
+"""Events whose rows are replayed in one transaction, so that observations do not wait long for the lock."""
 
 
 def set_options(learners: Learners, model: str, options: LearningOptions) -> None:
@@ -179,37 +178,37 @@ def set_options(learners: Learners, model: str, options: LearningOptions) -> Non
     owner.set_options(learners.database, model, options, len(joints), time.time())
     if not options.adaptive_intervals:
         for scales in learners.loaded.scales(model).values():
-            scales.take({})
+            scales.replace({})
     learners.process.wake(model)
 
 
 def decide(learners: Learners, model: str, request: schema.ChangeRequest) -> schema.Decided:
-    """End a hold; raise NotFoundError, or ConflictError where learning is not held.
+    """End a pause; raise NotFoundError, or ConflictError if learning is not paused.
 
-    The change is logged first and the hold ends last. In between, the rows that were kept out are learnt some batches
-    at a time: interrupted, it goes on where it was when it is asked for again.
+    The change is logged first and the pause ends last. In between, the rows that were kept out are replayed in chunks.
+    An interrupted decision continues when it is requested again.
     """
-    version = serving(learners.database, model)
+    version = find_serving_version(learners.database, model)
     rows, done, ended = 0, None, False
     while not ended:
-        # a batch is judged and logged in its turn: none is judged as held and logged after the hold
+        # a batch is judged and logged in one turn: none is judged in the pause and logged after it
         with learners.turn(model), learners.database.transaction(model) as session:
-            held = _held(session, model)
+            held = _read_pause(session, model)
             if request.decision == "adapt":
                 _log_change(session, model, held)
             done = held["event"] - 1 if done is None else done
-            pending = log.events(session, model, done, CHUNK) if request.replay else []
+            pending = log.events(session, model, done, CHUNK_EVENTS) if request.replay else []
             for event in pending:
                 if event.kind == "batch":
-                    rows += sum(admit(session, event, [CHANGE], time.time()).values())
-            ended = len(pending) < CHUNK
+                    rows += sum(log_replay(session, event, [CHANGE], time.time()).values())
+            ended = len(pending) < CHUNK_EVENTS
             if ended:
-                owner.release(session, model)
+                owner.resume(session, model)
                 decided = {"decision": request.decision, "rows": rows}
                 audit.note(session, model, "change decided", version, before=held, after=decided)
             else:
                 done = pending[-1].number
-            revised = revised_now(session, model, version)
+            revised = read_revision(session, model, version)
     learners.process.wake(model)
     return schema.Decided(**revised.model_dump(), decision=request.decision, at=held["at"], rows=rows)
 
@@ -217,19 +216,19 @@ def decide(learners: Learners, model: str, request: schema.ChangeRequest) -> sch
 def replay(
     learners: Learners, model: str, stream_id: str, sequence: int, request: schema.ReplayRequest
 ) -> schema.Replayed:
-    """Learn rows of a batch after all that were kept out with some codes, once each.
+    """Learn the rows of a batch that were kept out with some codes, once each.
 
-    Raise NotFoundError, InvalidRequestError where the batch has no such rows, ConflictError where it was undone or all
-    of these rows have been replayed.
+    Raise NotFoundError, InvalidRequestError if the batch has no such rows, and ConflictError if it was undone or all of
+    these rows have been replayed.
     """
-    version = serving(learners.database, model)
+    version = find_serving_version(learners.database, model)
     codes = schema.REPLAYABLE if request.codes is None else request.codes
     with learners.database.turn(model), learners.database.transaction(model) as session:
         batch = find_learnt(session, model, stream_id, sequence)
-        learnt = admit(session, batch, codes, time.time())
+        learnt = log_replay(session, batch, codes, time.time())
         if not learnt:
             raise _refusal(session, batch, codes)
-        revised = revised_now(session, model, version)
+        revised = read_revision(session, model, version)
         named = {"stream_id": stream_id, "sequence": sequence, "rows": learnt}
         audit.note(session, model, "observations replayed", version, after=named)
     learners.process.wake(model)
@@ -238,10 +237,12 @@ def replay(
     )
 
 
-def admit(session: Session, batch: EventRow, codes: Collection[str], received: float) -> dict[str, int]:
-    """Log a replay: the rows of a batch with these codes that no earlier replay has learnt; return their counts.
-    Nothing is logged where there are none. Rows whose time was wrong count as of their arrival. Times are those of the
-    model's own clock."""
+def log_replay(session: Session, batch: EventRow, codes: Collection[str], received: float) -> dict[str, int]:
+    """Log a replay of the rows with these codes that no earlier replay has learnt; return their counts.
+
+    Nothing is logged if there are none. Rows with a wrong time count as of their arrival. Times are those of the
+    model's own clock.
+    """
     pending = set(codes) - _replayed(session, batch)
     rows = log.learning_rows(batch)
     chosen = _complete(rows) & np.isin(rows.code, [CODES.index(code) for code in pending])
@@ -257,7 +258,7 @@ def admit(session: Session, batch: EventRow, codes: Collection[str], received: f
 
 
 def alarms(learners: Learners, model: str, part: Page) -> schema.AlarmPage:
-    """List the alarms of a model, newest first; raise NotFoundError where there is no such model."""
+    """Return the alarms of a model, newest first; raise NotFoundError for an unknown model."""
     registry.find(learners.database, model, None)
     with learners.database.session() as session:
         rows, following = alarms_page(session, model, part)
@@ -267,19 +268,19 @@ def alarms(learners: Learners, model: str, part: Page) -> schema.AlarmPage:
 
 
 def _replayed(session: Session, batch: EventRow) -> set[str]:
-    """Codes whose rows are learnt by now; what a rollback has undone can be replayed again."""
-    events = log.about(session, batch, "replay")
+    """Return the codes whose rows have been replayed. Rows that a rollback has undone can be replayed again."""
+    events = log.find_related(session, batch, "replay")
     return {code for event in events if not event.void for code in (event.detail or {})["codes"]}
 
 
 def _complete(rows: Rows) -> NDArray[np.bool_]:
-    """Rows all of whose numbers are known, (N,): where no acceleration could be derived there is none."""
+    """Return which rows have only finite numbers, (N,). Rows whose acceleration could not be derived have not."""
     numbers = np.hstack([rows.time[:, None], rows.q, rows.dq, rows.ddq, rows.tau])
     return np.asarray(np.isfinite(numbers).all(axis=1))
 
 
 def _refusal(session: Session, batch: EventRow, codes: Collection[str]) -> Exception:
-    """Why no row of a batch is left that could be learnt."""
+    """Return the error that explains why no row of a batch is left to replay."""
     rows, name = log.rows_of(batch), f"batch {batch.sequence} of stream {batch.stream_id!r}"
     counts = rows.take(_complete(rows)).rejected()
     offered = [code for code in schema.REPLAYABLE if code in counts]
@@ -289,15 +290,15 @@ def _refusal(session: Session, batch: EventRow, codes: Collection[str]) -> Excep
     return invalid_request("codes", ", ".join(codes), has)
 
 
-def _held(session: Session, model: str) -> dict[str, Any]:
-    held = owner.held(session, model)
+def _read_pause(session: Session, model: str) -> dict[str, Any]:
+    held = owner.read_pause(session, model)
     if held is None:
         raise ConflictError(f"model {model!r} is not held for a change: there is nothing to decide")
     return held
 
 
 def _log_change(session: Session, model: str, held: dict[str, Any]) -> None:
-    """Log the change that learning is held for, unless an interrupted decision has."""
+    """Log the change for which learning is paused, unless an interrupted decision has."""
     query = select(EventRow.seq).where(
         EventRow.model == model, EventRow.number >= held["event"], EventRow.kind == "change", EventRow.void.is_(False)
     )

@@ -1,4 +1,4 @@
-"""What arms carry: shown for each stream of a model, declared by its owner, and said to be gone."""
+"""Payloads of a model's streams: read, declared and removed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.online.payload.bodies import BELOW, DIAGONAL
 from lipcore.online.payload.estimate import Estimate
-from lipcore.online.payload.holding import Watch
+from lipcore.online.payload.holding import PayloadTracker
 from lipcore.online.stream import PayloadRecord
 from lipcore.robots.urdf import RigidBody
 from service.contract.payload import (
@@ -32,27 +32,28 @@ from service.journal import log
 from service.learning import owner
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
-from service.models.served import Served
+from service.models.served import ServedModel
 from service.storage import audit
 
-DRAWS = 500
-"""Of a payload's parameters, for the spread of its inertia."""
+INERTIA_DRAWS = 500
+"""Draws of a payload's parameters for the standard deviation of its inertia."""
 Tip = tuple[str, Array, Array]
+"""Name, rotation (3, 3) and position (3,) of the tip's frame."""
 
 
-def show(learners: Learners, model: str) -> Payloads:
-    """What the arm carries, stream by stream; raise NotFoundError."""
+def read_payloads(learners: Learners, model: str) -> Payloads:
+    """Return the payload of each stream; raise NotFoundError."""
     monitor = learners.monitor(model)
     served = learners.loaded.get(model, None)
     streams, default, carrier = list[StreamPayload](), None, served.carrier
     tip = None if served.model.robot is None else _tip(served.model.robot)
     with learners.database.session() as session:
-        watched = owner.options(session, model).payloads
+        watched = owner.read_options(session, model).payloads
     if carrier is not None:
         known = _watches(monitor, carrier, served.version)
-        streams = [_shown(name, watch, tip) for name, watch in known if watched or watch.held is not None]
-        held = monitor.payloads.watch("", carrier, served.version).held  # no stream has this name
-        default = None if held is None else _of(held.estimate, tip)
+        streams = [_stream_payload(name, watch, tip) for name, watch in known if watched or watch.held is not None]
+        held = monitor.payloads.watch("", carrier, served.version).held  # "" is the name of the default
+        default = None if held is None else _payload_body(held.estimate, tip)
     reason = None
     if carrier is None:
         reason = f"estimator {served.model.estimator.name} knows no arm: train rigid-body or auto"
@@ -70,33 +71,35 @@ def show(learners: Learners, model: str) -> Payloads:
     )
 
 
-def brief(monitor: Monitor, served: Served) -> list[LivePayload] | None:
-    """What each stream's robot carries, as a version sees it; None where it knows no arm."""
+def summarise_payloads(monitor: Monitor, served: ServedModel) -> list[LivePayload] | None:
+    """Return the payload of each stream as a version sees it; None if the version has no arm."""
     if served.carrier is None:
         return None
     watches = _watches(monitor, served.carrier, served.version)
-    return [LivePayload(**_carrying(name, watch), mass=_mass(watch)) for name, watch in watches]
+    return [LivePayload(**_carrying_fields(name, watch), mass=_mass(watch)) for name, watch in watches]
 
 
 def declare(learners: Learners, model: str, request: PayloadRequest) -> Payloads:
-    """Say what an arm carries from now on; raise NotFoundError, also for a stream that is not known,
-    InvalidRequestError or ConflictError."""
+    """Declare the payload of a stream, or of all, from now on.
+
+    Raise NotFoundError, also for an unknown stream, InvalidRequestError or ConflictError.
+    """
     inertia = None if request.inertia is None else np.array(request.inertia)
     try:
-        with np.errstate(over="raise", invalid="raise"):  # numbers near the largest have no sums
+        with np.errstate(over="raise", invalid="raise"):  # sums of huge numbers overflow
             Body(request.mass, np.array(request.com), inertia)
     except (ValueError, FloatingPointError) as error:
         raise invalid_request("inertia", request.inertia, f"that of a body which can exist: {error}") from error
     known = {"mass": request.mass, "com": request.com, "inertia": request.inertia}
-    return _say(learners, model, request.stream_id, known)
+    return _declare(learners, model, request.stream_id, known)
 
 
 def remove(learners: Learners, model: str, stream_id: str | None) -> Payloads:
-    """Say that an arm carries nothing from now on; raise NotFoundError or ConflictError."""
-    return _say(learners, model, stream_id, None)
+    """Declare that there is no payload from now on; raise NotFoundError or ConflictError."""
+    return _declare(learners, model, stream_id, None)
 
 
-def _say(learners: Learners, model: str, stream_id: str | None, known: dict[str, Any] | None) -> Payloads:
+def _declare(learners: Learners, model: str, stream_id: str | None, known: dict[str, Any] | None) -> Payloads:
     served = learners.loaded.get(model, None)
     if served.carrier is None:
         raise ConflictError(
@@ -114,7 +117,7 @@ def _say(learners: Learners, model: str, stream_id: str | None, known: dict[str,
             event = log.append(session, model, "payload", declared, received)
             payload = PayloadRecord(event.number, received, body=known)
             if source is None:
-                owner.declare(session, model, payload.to_json())
+                owner.store_payload(session, model, payload.to_json())
             else:
                 event.stream_id = stream_id
                 source.record = replace(monitor.streams.get(source.stream_id), payload=payload).to_json()
@@ -124,18 +127,18 @@ def _say(learners: Learners, model: str, stream_id: str | None, known: dict[str,
         else:
             monitor.streams.change(stream_id, payload=payload)
         monitor.number = event.number
-        served.loads.take(monitor.payloads.carried(served.carrier, served.version))
+        served.payloads.replace(monitor.payloads.build_models(served.carrier, served.version))
     learners.process.wake(model)
-    return show(learners, model)
+    return read_payloads(learners, model)
 
 
-def _watches(monitor: Monitor, carrier: Carrier, version: int) -> list[tuple[str, Watch]]:
-    """What each stream carries, as a version sees it."""
+def _watches(monitor: Monitor, carrier: Carrier, version: int) -> list[tuple[str, PayloadTracker]]:
+    """Return the payload of each stream as a version sees it."""
     return [(name, monitor.payloads.watch(name, carrier, version)) for name in sorted(monitor.streams.all())]
 
 
 def _tip(robot: RigidBody) -> Tip | None:
-    """Name, rotation and place of the last frame of a URDF in that of its last movable joint."""
+    """Return the last frame of a URDF relative to its last movable joint; None if that has no frame."""
     model = robot.model
     own = [each for each in model.frames if each.parentJoint == model.njoints - 1]
     if not own:
@@ -143,8 +146,8 @@ def _tip(robot: RigidBody) -> Tip | None:
     return own[-1].name, np.array(own[-1].placement.rotation), np.array(own[-1].placement.translation)
 
 
-def _carrying(stream_id: str, watch: Watch) -> dict[str, Any]:
-    """The fields of `Carrying`."""
+def _carrying_fields(stream_id: str, watch: PayloadTracker) -> dict[str, Any]:
+    """Return the fields of `Carrying`."""
     held, since = watch.held, watch.since
     return {
         "stream_id": stream_id,
@@ -155,27 +158,27 @@ def _carrying(stream_id: str, watch: Watch) -> dict[str, Any]:
     }
 
 
-def _mass(watch: Watch) -> Scalar | None:
+def _mass(watch: PayloadTracker) -> Scalar | None:
     if watch.held is None:
         return None
     mean, std = watch.held.estimate.mass
     return Scalar(mean=mean, std=std)
 
 
-def _shown(stream_id: str, watch: Watch, tip: Tip | None) -> StreamPayload:
-    """One stream's payload for JSON."""
+def _stream_payload(stream_id: str, watch: PayloadTracker, tip: Tip | None) -> StreamPayload:
+    """Return one stream's payload for JSON."""
     return StreamPayload(
-        **_carrying(stream_id, watch),
+        **_carrying_fields(stream_id, watch),
         probabilities=dict(watch.probabilities or {"none": 1.0}),
-        payload=None if watch.held is None else _of(watch.held.estimate, tip),
+        payload=None if watch.held is None else _payload_body(watch.held.estimate, tip),
     )
 
 
-def _of(found: Estimate, tip: Tip | None) -> PayloadBody:
-    """Mean and deviation of a payload's figures. Those of its inertia by draws from its parameters, seeded."""
+def _payload_body(found: Estimate, tip: Tip | None) -> PayloadBody:
+    """Return mean and standard deviation of a payload's figures. Those of its inertia come from seeded draws."""
     mass, std = found.mass
     com, spread = found.eta[1:4], found.covariance[1:4, 1:4]
-    drawn = np.random.default_rng(0).multivariate_normal(found.eta, found.covariance, DRAWS)
+    drawn = np.random.default_rng(0).multivariate_normal(found.eta, found.covariance, INERTIA_DRAWS)
     return PayloadBody(
         mass=Scalar(mean=mass, std=std),
         com=_vector(com, spread),
@@ -189,7 +192,7 @@ def _vector(mean: Array, covariance: Array) -> Vector:
 
 
 def _inertias(eta: Array) -> Array:
-    """Inertias about the centre of mass, (N, 3, 3), of η, (N, 10)."""
+    """Return the inertias about the centre of mass, (N, 3, 3), of parameters η, (N, 10)."""
     root = np.zeros((len(eta), 3, 3))
     root[:, *DIAGONAL], root[:, *BELOW] = np.exp(eta[:, 4:7]), eta[:, 7:]
     second = np.exp(eta[:, 0])[:, None, None] * (root @ root.transpose(0, 2, 1))

@@ -1,4 +1,4 @@
-"""Where the learning of a model stands, how well the model predicts, and what its log has of batches and their rows."""
+"""The status of learning, the prediction quality of a model, and the batches of its log."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from service.foundation.fields import finite
 from service.journal import log, snapshots
 from service.journal.arrivals import is_forgotten
 from service.learning import owner
-from service.learning.ingest.observations import state
+from service.learning.ingest.observations import read_state
 from service.learning.learners import Learners
 from service.models import registry
 from service.storage.database import EventRow, StreamRow
 from service.storage.rows import Page
 
 Range = tuple[int, int]
-MOST_GAPS = 20
+MAX_GAPS = 20
 """Gaps of a stream that are listed."""
 
 
-def learning(learners: Learners, model: str) -> schema.Learning:
-    """Return how a model learns and where that stands; raise NotFoundError. Not for the event loop."""
+def read_learning(learners: Learners, model: str) -> schema.Learning:
+    """Return how a model learns and its status; raise NotFoundError. Not for the event loop."""
     served = learners.loaded.get(model, None)
     version = served.version
     latest, lag = learners.status(model, version), learners.lag(served)
@@ -50,20 +50,22 @@ def learning(learners: Learners, model: str) -> schema.Learning:
             novel_share=latest.novel_share,
             linearisation_error=None if latest.published is None else latest.published.linearisation,
             failure=latest.failure,
-            held=owner.held(session, model),
+            held=owner.read_pause(session, model),
             streams=_streams(session, model),
-            reachable=[list(each) for each in reachable(session, model, version)],
+            reachable=[list(each) for each in list_reachable(session, model, version)],
             snapshots=[
                 schema.Snapshot(revision=row.number - start, created_at=row.created_at)
-                for row in snapshots.of(session, model, version)
+                for row in snapshots.list_snapshots(session, model, version)
             ],
         )
-        return schema.Learning(model=model, options=owner.options(session, model), status=status)
+        return schema.Learning(model=model, options=owner.read_options(session, model), status=status)
 
 
-def quality(learners: Learners, model: str) -> schema.Quality:
-    """Return how well a model predicts each row before it is learnt, over the windows of the settings. Raise
-    NotFoundError. Not for the event loop."""
+def read_quality(learners: Learners, model: str) -> schema.Quality:
+    """Return how well a model predicts each row before it is learnt, for each window of `WINDOWS_S`.
+
+    Raise NotFoundError. Not for the event loop.
+    """
     served = learners.loaded.get(model, None)
     now = time.time()
     return schema.Quality(
@@ -71,17 +73,17 @@ def quality(learners: Learners, model: str) -> schema.Quality:
         version=served.version,
         revision=served.revision,
         joint_names=list(served.model.joint_names),
-        windows=[window(each, now) for each in learners.monitor(model).windows],
-        scale=served.scales.asked,
+        windows=[summarise_window(each, now) for each in learners.monitor(model).windows],
+        scale=served.scales.default_factors,
     )
 
 
-def window(sums: Window, now: float) -> schema.QualityWindow:
+def summarise_window(sums: Window, now: float) -> schema.QualityWindow:
     """Return the figures and counts of a window before a Unix time, s."""
     counts = sums.counts(now)
     accepted = counts.pop("learnt", 0)
     return schema.QualityWindow(
-        **figures(sums.record(now)).model_dump(),
+        **summarise_record(sums.record(now)).model_dump(),
         seconds=sums.seconds,
         accepted=accepted,
         rejected=dict(counts),
@@ -98,7 +100,7 @@ def _streams(session: Session, model: str) -> list[schema.Stream]:
             last=row.last,
             last_at=None if row.received is None else _moment(row.received),
             offset_s=row.offset,
-            gaps=row.missing["ranges"][-MOST_GAPS:],
+            gaps=row.missing["ranges"][-MAX_GAPS:],
             missing=sum(last - first + 1 for first, last in row.missing["ranges"]),
             forgotten=row.forgotten,
         )
@@ -106,13 +108,15 @@ def _streams(session: Session, model: str) -> list[schema.Stream]:
     ]
 
 
-FIGURES = ("nmse", "rmse", "coverage", "nlpd")
-ACKNOWLEDGED = ObservationResponse.model_fields
-"""The part of a report that acknowledged a batch; the rest is for judging what follows."""
+FIGURE_NAMES = ("nmse", "rmse", "coverage", "nlpd")
+ACK_FIELDS = ObservationResponse.model_fields
+"""Fields of a report that acknowledged the batch. The others serve the judgement of later batches."""
 
 
-def page(learners: Learners, model: str, part: Page, stream_id: str | None, rejected: bool) -> schema.ObservationPage:
-    """List the batches of a model, newest first; raise NotFoundError where there is no such model."""
+def list_batches(
+    learners: Learners, model: str, part: Page, stream_id: str | None, rejected: bool
+) -> schema.ObservationPage:
+    """Return the batches of a model, newest first; raise NotFoundError for an unknown model."""
     registry.find(learners.database, model, None)
     with learners.database.session() as session:
         events, following = log.page(session, model, part, stream_id, rejected)
@@ -121,29 +125,29 @@ def page(learners: Learners, model: str, part: Page, stream_id: str | None, reje
         )
 
 
-def show(learners: Learners, model: str, stream_id: str, sequence: int, rows: bool) -> schema.ObservationDetail:
-    """Return a batch with all that is known of it; raise NotFoundError."""
+def read_batch(learners: Learners, model: str, stream_id: str, sequence: int, rows: bool) -> schema.ObservationDetail:
+    """Return a batch with its report, figures and replays; raise NotFoundError."""
     registry.find(learners.database, model, None)
     with learners.database.session() as session:
-        event = find(session, model, stream_id, sequence)
+        event = find_batch(session, model, stream_id, sequence)
         return schema.ObservationDetail(
             **_outline(session, event),
-            report=None if event.report is None else {k: v for k, v in event.report.items() if k in ACKNOWLEDGED},
-            figures=None if event.record is None else figures(Record.from_json(event.record)),
-            replays=[_replay(session, event, each) for each in log.about(session, event, "replay")],
+            report=None if event.report is None else {k: v for k, v in event.report.items() if k in ACK_FIELDS},
+            figures=None if event.record is None else summarise_record(Record.from_json(event.record)),
+            replays=[_replay(session, event, each) for each in log.find_related(session, event, "replay")],
             observed=_rows(log.rows_of(event)) if rows else None,
         )
 
 
-def figures(record: Record) -> schema.Figures:
-    """Return the figures of a record, per joint."""
+def summarise_record(record: Record) -> schema.Figures:
+    """Return the figures of a record for each joint."""
     metrics = record.metrics()
-    return schema.Figures(rows=record.rows, **{name: metrics[name] for name in FIGURES})
+    return schema.Figures(rows=record.rows, **{name: metrics[name] for name in FIGURE_NAMES})
 
 
-def find(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
-    """Return the batch of a sequence, its own or that of one of its frames; raise NotFoundError."""
-    event = log.covering(session, model, stream_id, sequence)
+def find_batch(session: Session, model: str, stream_id: str, sequence: int) -> EventRow:
+    """Return the batch that contains a sequence, its own or that of one of its frames; raise NotFoundError."""
+    event = log.find_covering_batch(session, model, stream_id, sequence)
     if event is not None:
         return event
     source = log.stream(session, model, stream_id)
@@ -158,7 +162,7 @@ def _outline(session: Session, event: EventRow) -> dict[str, Any]:
         "sequence": event.sequence,
         "last_sequence": event.last_sequence,
         "event": event.number,
-        "state": state(session, event),
+        "state": read_state(session, event),
         "received_at": _moment(event.received),
         "first_at": None if event.first is None else _moment(event.first),
         "last_at": None if event.last is None else _moment(event.last),
@@ -171,8 +175,8 @@ def _outline(session: Session, event: EventRow) -> dict[str, Any]:
 
 
 def _replay(session: Session, batch: EventRow, event: EventRow) -> schema.Replay:
-    """A replay is unlearnt with its batch; undone in another way it is by a rollback."""
-    undone = state(session, batch) if batch.void else "rolled_back"
+    """Return a replay. It is unlearnt with its batch; if it was undone alone, a rollback did it."""
+    undone = read_state(session, batch) if batch.void else "rolled_back"
     return schema.Replay(
         event=event.number,
         replayed_at=_moment(event.received),
@@ -188,23 +192,25 @@ def _rows(rows: Rows) -> schema.ObservationRows:
 
 
 def _moment(seconds: float) -> str:
-    """Unix seconds as every other answer has times."""
+    """Return Unix seconds as an ISO time, as in all other responses."""
     return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="milliseconds")
 
 
-def current(session: Session, model: str, version: int) -> int:
-    """Return the revision of a version once all of the log is learnt."""
+def read_newest_revision(session: Session, model: str, version: int) -> int:
+    """Return the revision of a version after the whole log is learnt."""
     return log.newest(session, model) - log.start_of(session, model, version)
 
 
-def reachable(session: Session, model: str, version: int) -> list[Range]:
-    """Return the ranges [first, last] of revisions whose state can be made again, rising.
+def list_reachable(session: Session, model: str, version: int) -> list[Range]:
+    """Return the ranges [first, last] of revisions whose state can be made again, in rising order.
 
-    That takes the version as trained, or a snapshot, and all events from there; and no rollback may have gone back
-    behind it since: the events that a rollback has undone teach nothing any more, so that their states are gone.
+    A state needs the version as trained or a snapshot, and all events since. Events that a rollback has undone are not
+    learnt again, so their states are lost.
     """
     start, newest = log.start_of(session, model, version), log.newest(session, model)
-    bases = sorted({start, *(row.number for row in snapshots.of(session, model, version) if row.number > start)})
+    bases = sorted(
+        {start, *(row.number for row in snapshots.list_snapshots(session, model, version) if row.number > start)}
+    )
     ranges: list[Range] = []
     for base, following in zip(bases, [*bases[1:], newest + 1], strict=True):
         last = following - 1
@@ -215,20 +221,20 @@ def reachable(session: Session, model: str, version: int) -> list[Range]:
     return _joined([(first - start, last - start) for first, last in ranges])
 
 
-def is_reached(revision: int, ranges: list[Range]) -> bool:
-    """Whether one of the ranges has a revision."""
+def is_reachable(revision: int, ranges: list[Range]) -> bool:
+    """Return whether a revision lies in one of the ranges."""
     return any(first <= revision <= last for first, last in ranges)
 
 
 def _without(span: Range, first: int, last: int) -> Iterator[Range]:
-    """The parts of a range that are left once first to last are taken out."""
+    """Yield the parts of a range outside first to last."""
     for a, b in ((span[0], min(span[1], first - 1)), (max(span[0], last + 1), span[1])):
         if a <= b:
             yield a, b
 
 
 def _joined(ranges: list[Range]) -> list[Range]:
-    """The same numbers in as few ranges as there can be."""
+    """Return the same numbers in as few ranges as possible."""
     joined: list[Range] = []
     for first, last in sorted(ranges):
         if joined and first <= joined[-1][1] + 1:

@@ -1,1 +1,1 @@
-"""A batch of observations on its way into the log."""
+"""The ingest of observation batches and frames into the log."""

@@ -1,4 +1,4 @@
-"""Where batches and frames are written down: judged in turn, and durable before they are acknowledged."""
+"""The append of batches and frames to the log: judged in turn, and durable before they are acknowledged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 
 from lipcore.online.batch import Placement, Rows
 from lipcore.online.judging import Judgement, JudgeOptions, judge
-from lipcore.online.screening import Screened
+from lipcore.online.screening import PredictedBatch
 from lipcore.online.stream import StreamRecord
 from service.contract.observations import Derivation, LearningOptions, ObservationResponse
 from service.foundation.errors import ConflictError, not_found
@@ -28,57 +28,59 @@ from service.learning.ingest.clock import StreamClocks
 from service.learning.ingest.monitor import Monitor
 from service.learning.weigher.weighing import Weighing
 from service.models import registry
-from service.models.loaded import LoadedModels, Served
+from service.models.loaded import LoadedModels, ServedModel
 from service.storage.database import EventRow, ModelRow
 
 logger = logging.getLogger(__name__)
 
 MAX_STREAMS = 1000
-"""Streams of a model; a new one takes the place of the longest silent."""
+"""Max streams of a model. A new one replaces the one that was silent longest."""
 RETAIN_EVERY = 200
-"""Batches of a model after which its log is brought within its limits."""
+"""Batches of a model between two runs of retention."""
 NUMBERS_PER_ROW = 6
-"""What a row takes of the disk, for each joint: motion and torque, and half as much again for times and indices."""
+"""Disk space of a row for each joint, in numbers: motion and torque, and half as much for times and indices."""
 MAX_GAPS = 100
-"""Gaps that an acknowledgement names."""
+"""Max gaps that an acknowledgement contains."""
 
 
-class Judged(NamedTuple):
-    """A batch that is durable, for those who follow its model live. rows: with their final codes."""
+class LoggedBatch(NamedTuple):
+    """A durable batch, for the live feed. rows: with their final codes."""
 
-    served: Served
+    served: ServedModel
     stream_id: str
     rows: Rows
-    screened: Screened
+    screened: PredictedBatch
 
 
 class Arrival(NamedTuple):
-    """A batch that is yet to be judged. first: whether it is the first of its stream; place: in that; derived: what was
-    not measured, None if all was; leap: how far the stream's clock has leapt ahead, s."""
+    """A batch that is yet to be judged."""
 
     batch: NewBatch
-    predicted: Screened
+    predicted: PredictedBatch
     first: bool
+    """Whether it is the first batch of its stream."""
     place: Placement
+    """Its place in the stream."""
     derived: Derivation | None = None
+    """The quantities that were derived; None if all were measured."""
     leap: float | None = None
+    """Seconds that the stream's clock has leapt ahead; None if it has not."""
 
 
 class ObservationLog:
     """Appends observations to the logs of models; safe from several threads, not for the event loop.
 
-    monitor: gives the monitor of a model that is served; monitors: those that there are. wake: tells the learner
-    process that a model's log has grown. show: called with each batch once it is durable. weighing: follows what arms
-    carry.
+    monitor: returns the monitor of a served model; monitors: returns the existing ones. wake: tells the learner process
+    that a model's log has grown. show: called with each durable batch. weighing: follows payloads.
     """
 
     def __init__(
         self,
         loaded: LoadedModels,
-        monitor: Callable[[Served], Monitor],
+        monitor: Callable[[ServedModel], Monitor],
         monitors: Callable[[], Mapping[str, Monitor]],
         wake: Callable[[str], None],
-        show: Callable[[Judged], None],
+        show: Callable[[LoggedBatch], None],
     ) -> None:
         storage = loaded.storage
         self.settings, self.database, self.disk = storage.settings, storage.database, storage.disk
@@ -88,9 +90,11 @@ class ObservationLog:
 
     @contextmanager
     def turn(self, monitor: Monitor, model: str) -> Iterator[None]:
-        """Have a model's log alone, among all threads and services; its monitor is up to the log by then. Raise
-        StorageUnavailableError where the turn does not come within `database_timeout_s`."""
-        # the turn first: who only looks at the monitor does not wait for other services
+        """Lock a model's log against all threads and services, and update its monitor from the log.
+
+        Raise StorageUnavailableError if the lock is not acquired within `database_timeout_s`.
+        """
+        # the turn first: readers of the monitor then do not wait for other services
         with self.database.turn(model), monitor.lock:
             with self.database.session() as session:
                 if monitor.follow(session, model):
@@ -98,34 +102,36 @@ class ObservationLog:
             yield
 
     def follow(self, monitor: Monitor, model: str) -> None:
-        """Bring a monitor up to the log."""
+        """Update a monitor from the log."""
         with monitor.lock, self.database.session() as session:
             monitor.follow(session, model)
             self._publish(session, monitor, model)
 
     def _publish(self, session: Session, monitor: Monitor, model: str) -> None:
-        """Let all versions of a model answer with what is known of its streams."""
-        adaptive = owner.options(session, model).adaptive_intervals
+        """Set the payloads and interval factors of a model's streams on all of its versions."""
+        adaptive = owner.read_options(session, model).adaptive_intervals
         for version, served in self.loaded.served(model).items():
             if served.carrier is not None:
-                served.loads.take(monitor.payloads.carried(served.carrier, version))
+                served.payloads.replace(monitor.payloads.build_models(served.carrier, version))
         for version, scales in self.loaded.scales(model).items():
-            scales.take(monitor.streams.factors(version) if adaptive else {})
+            scales.replace(monitor.streams.factors(version) if adaptive else {})
 
     def append(
-        self, monitor: Monitor, served: Served, options: LearningOptions, arrival: Arrival
+        self, monitor: Monitor, served: ServedModel, options: LearningOptions, arrival: Arrival
     ) -> ObservationResponse:
-        """Judge a batch and log it with all that follows from it, in one transaction, in a `turn` of its model. The
-        batch is durable once this returns."""
+        """Judge a batch and log it with its consequences in one transaction, in a `turn` of its model.
+
+        The batch is durable once this returns.
+        """
         batch, predicted = arrival.batch, arrival.predicted
         model, stream_id, streams = served.name, batch.stream_id, monitor.streams
-        self.disk.take(NUMBERS_PER_ROW * np.dtype(np.float64).itemsize * predicted.rows.q[predicted.own].size)
+        self.disk.reserve(NUMBERS_PER_ROW * np.dtype(np.float64).itemsize * predicted.rows.q[predicted.own].size)
         watch = None
         if served.carrier is not None and options.payloads:
             watch = monitor.payloads.watch(stream_id, served.carrier, served.version)
         carried = None if watch is None or watch.held is None else watch.since
         with self.database.transaction(model) as session:
-            _check_kept(session, served)
+            _check_exists(session, served)
             monitor.follow_decision(session, model)
             before = monitor.stream(stream_id, arrival.first)
             judgement = judge(
@@ -133,33 +139,35 @@ class ObservationLog:
                 before,
                 monitor.record,
                 _judge_options(options),
-                lambda: monitor.usual(batch.received),
+                lambda: monitor.read_latest_record(batch.received),
                 batch.received,
                 carried,
             )
             event, answer, after = _write(session, served, options, arrival, before, judgement)
             if arrival.first:
                 session.flush()
-                streams.keep(session, model)
-        streams.judged(stream_id, after)
-        monitor.note(event, judgement)
+                streams.drop_deleted(session, model)
+        streams.store_judged(stream_id, after)
+        monitor.add_batch(event, judgement)
         if watch is not None and served.carrier is not None:
-            served.loads.take(monitor.payloads.carried(served.carrier, served.version))
+            served.payloads.replace(monitor.payloads.build_models(served.carrier, served.version))
             self.weighing.follow(monitor, served, batch, predicted)
-        served.scales.take(streams.factors(served.version) if options.adaptive_intervals else {})
-        self._show(Judged(served, stream_id, judgement.rows, predicted))
+        served.scales.replace(streams.factors(served.version) if options.adaptive_intervals else {})
+        self._show(LoggedBatch(served, stream_id, judgement.rows, predicted))
         return answer
 
     def follow_up(self, monitor: Monitor, model: str) -> None:
-        """Wake the learner for a batch that is durable; every RETAIN_EVERY batches, bring the log within its limits and
-        delete streams that have long been silent."""
+        """Wake the learner for a durable batch.
+
+        Every `RETAIN_EVERY` batches, run retention and delete streams that have long been silent.
+        """
         self._wake(model)
         if monitor.due(RETAIN_EVERY):
             try:
                 retain(self.database, self.settings, model, time.time())
                 with self.turn(monitor, model), self.database.transaction(model) as session:
                     monitor.streams.expire(session, model, time.time() - self.settings.observation_retention_s)
-            except Exception as error:  # the batch is logged all the same
+            except Exception as error:  # the batch is logged nevertheless
                 logger.error("the log of model %s was not brought within its limits", model, exc_info=error)
 
 
@@ -167,8 +175,8 @@ def _judge_options(options: LearningOptions) -> JudgeOptions:
     return JudgeOptions(options.enabled, options.on_change, options.contact_threshold, options.adaptive_intervals)
 
 
-def _check_kept(session: Session, served: Served) -> None:
-    """Raise an error where a model, or the version that has predicted a batch, has been deleted meanwhile."""
+def _check_exists(session: Session, served: ServedModel) -> None:
+    """Raise an error if a model, or the version that predicted a batch, has been deleted meanwhile."""
     if registry.exists(session, served.name, served.version):
         return
     if session.scalar(select(ModelRow.name).where(ModelRow.name == served.name)) is None:
@@ -178,22 +186,21 @@ def _check_kept(session: Session, served: Served) -> None:
 
 def _write(
     session: Session,
-    served: Served,
+    served: ServedModel,
     options: LearningOptions,
     arrival: Arrival,
     before: StreamRecord,
     judgement: Judgement,
 ) -> tuple[EventRow, ObservationResponse, StreamRecord]:
-    """Log a batch, the record of its stream, and what follows from its judgement. Return its event, what is answered,
-    and the stream's record."""
+    """Log a batch, its stream's record and its consequences; return the event, the response and the record."""
     batch, logged, model = arrival.batch, judgement.logged, served.name
     if judgement.change is not None and options.on_change == "adapt" and not logged.waited:
         log.append(session, model, "change", {"t": judgement.change.at}, batch.received)
     start = log.start_of(session, model, served.version)
     event, source = log.append_batch(session, model, replace(batch, rows=judgement.rows), MAX_STREAMS)
     event.record = None if judgement.record is None else judgement.record.to_json()
-    event.rows = len(arrival.predicted.rows.q[arrival.predicted.own])  # others count those that had waited
-    consequences.apply(session, served, options, judgement, event)
+    event.rows = len(arrival.predicted.rows.q[arrival.predicted.own])  # adjacent batches count the others
+    consequences.apply_judgement(session, served, options, judgement, event)
     if arrival.leap is not None and not before.leapt:
         consequences.raise_clock_alarm(session, model, batch.stream_id, arrival.leap)
     begun = event.number if arrival.first else before.begun
@@ -220,7 +227,7 @@ def _write(
 
 
 def _effective(rows: Rows, received: float, forgetting_s: float | None) -> float:
-    """Independent samples that rows count as when they come."""
+    """Return the effective samples of rows at their arrival."""
     if forgetting_s is None:
         return float(rows.weight.sum())
     return float((rows.weight * np.exp(np.minimum(rows.time - received, 0.0) / forgetting_s)).sum())

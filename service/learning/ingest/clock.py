@@ -1,5 +1,7 @@
-"""The clock of the host, which may be wrong when the service starts, and set right while it runs; and what is dated by
-it."""
+"""The host's clock, and the times that follow it.
+
+The clock may be wrong when the service starts, and be set while the service runs.
+"""
 
 from __future__ import annotations
 
@@ -16,37 +18,37 @@ from service.storage.database import Database, StreamRow
 
 logger = logging.getLogger(__name__)
 
-SET_S = 1.0
-"""A clock that differs from even time by more than this, s, was set; less is how a clock is kept right."""
-_EVEN = getattr(time, "CLOCK_BOOTTIME", getattr(time, "CLOCK_MONOTONIC", None))
-"""Nobody sets this one, and unlike `time.monotonic` it goes on while the machine sleeps."""
+MIN_STEP_S = 1.0
+"""Min difference to the boot clock, s, that counts as a set clock. Smaller ones are ordinary corrections."""
+_BOOT_CLOCK = getattr(time, "CLOCK_BOOTTIME", getattr(time, "CLOCK_MONOTONIC", None))
+"""A clock that nobody sets. Unlike `time.monotonic`, it also runs while the machine sleeps."""
 
 
 class HostClock:
-    """Tells when the host's clock was set; from one thread at a time."""
+    """Detects that the host's clock was set; from one thread at a time."""
 
     def __init__(self) -> None:
         self._offset = _offset()
 
     def step(self) -> float:
-        """By how much it was set since this was asked last, s; 0 where it was not."""
+        """Return by how much the clock was set since the last call, s; 0 if it was not."""
         offset = _offset()
         step = offset - self._offset
-        if abs(step) <= SET_S:
+        if abs(step) <= MIN_STEP_S:
             return 0.0
         self._offset = offset
         return step
 
 
 def _offset() -> float:
-    """Unix time less even time, s."""
-    return time.time() - (time.monotonic() if _EVEN is None else time.clock_gettime(_EVEN))
+    """Return Unix time minus the boot clock, s."""
+    return time.time() - (time.monotonic() if _BOOT_CLOCK is None else time.clock_gettime(_BOOT_CLOCK))
 
 
 class StreamClocks:
-    """Dates arrivals, and moves what is dated by the host's clock if that was set; safe from several threads.
+    """Dates arrivals, and moves stored times after the host's clock was set; safe from several threads.
 
-    monitors: returns the monitors that there are.
+    monitors: returns the existing monitors.
     """
 
     def __init__(self, database: Database, monitors: Callable[[], Mapping[str, Monitor]]) -> None:
@@ -54,9 +56,11 @@ class StreamClocks:
         self._host, self._lock = HostClock(), threading.Lock()
         self._check_at_start()
 
-    def arrival(self) -> float:
-        """Return the time of a batch that arrives now, Unix time, s. If the host's clock was set, first move what is
-        dated by it."""
+    def date_arrival(self) -> float:
+        """Return the time of a batch that arrives now, Unix time, s.
+
+        If the host's clock was set, move stored times first.
+        """
         with self._lock:
             step = self._host.step()
             if step:
@@ -65,7 +69,7 @@ class StreamClocks:
         return time.time()
 
     def _check_at_start(self) -> None:
-        """Move streams to the host's clock if it was set back while no service ran; before the first batch."""
+        """Move stored times if the host's clock was set back while no service ran. Call it before the first batch."""
         with self._database.session() as session:
             newest = session.scalar(select(func.max(StreamRow.received)))
         if self._database.own_clock and newest is not None and (step := time.time() - newest) < -LEAP_S:
@@ -73,8 +77,10 @@ class StreamClocks:
             self._move(step)
 
     def _move(self, step: float) -> None:
-        """Move what is dated by this machine's clock by `step`, s. Where the clocks of other services date streams,
-        too, these stay as they are."""
+        """Move the times of this machine's clock by `step`, s.
+
+        Times in a shared database stay, because other machines' clocks wrote them too.
+        """
         if self._database.own_clock:
             offset = case((StreamRow.offset == 0, 0.0), else_=StreamRow.offset + step)
             with self._database.transaction() as session:

@@ -1,4 +1,4 @@
-"""What follows from a batch that does not fit: alarms, learning held, and what a stream has taught taken back."""
+"""The consequences of a batch that does not fit: alarms, a pause, unlearning of its stream."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service.foundation.text import percent
 from service.journal import undo
 from service.journal.alarms import raise_alarm
 from service.learning import owner
-from service.models.loaded import Served
+from service.models.loaded import ServedModel
 from service.storage import audit
 from service.storage.database import EventRow
 
@@ -23,17 +23,18 @@ CONSEQUENCES = {
 }
 
 
-def apply(session: Session, served: Served, options: LearningOptions, judgement: Judgement, event: EventRow) -> None:
-    """Do what follows from a judgement: raise the alarm of a change, let learning wait, take back what a stream that
-    does not fit has taught."""
+def apply_judgement(
+    session: Session, served: ServedModel, options: LearningOptions, judgement: Judgement, event: EventRow
+) -> None:
+    """Raise the alarm of a change, pause learning, and unlearn a stream that does not fit, as a judgement demands."""
     if judgement.opened is not None and judgement.logged.held:
-        _take_back(session, event)
+        _unlearn_stream(session, event)
     if judgement.change is not None:
         _alarm(session, served, "waits" if judgement.logged.waited else options.on_change, judgement, event)
 
 
-def _take_back(session: Session, event: EventRow) -> None:
-    """Unlearn what a stream has taught before the batch with which its opening was found not to fit."""
+def _unlearn_stream(session: Session, event: EventRow) -> None:
+    """Unlearn the earlier batches of a stream, after its opening was found not to fit."""
     earlier = select(EventRow).where(
         EventRow.model == event.model,
         EventRow.stream_id == event.stream_id,
@@ -54,11 +55,8 @@ def raise_clock_alarm(session: Session, model: str, stream_id: str, leap: float)
     raise_alarm(session, model, "clock", message, {"stream_id": stream_id, "ahead_s": leap})
 
 
-def _alarm(session: Session, served: Served, follows: str, judgement: Judgement, event: EventRow) -> None:
-    """Raise the alarm of a change, and hold learning where the owner is to decide about it.
-
-    follows: one of CONSEQUENCES.
-    """
+def _alarm(session: Session, served: ServedModel, follows: str, judgement: Judgement, event: EventRow) -> None:
+    """Raise the alarm of a change, and pause learning if the owner is to decide. follows: a key of `CONSEQUENCES`."""
     change, names = judgement.change, served.model.joint_names
     assert change is not None
     evidence = judgement.evidence(names) | {"stream_id": event.stream_id, "sequence": event.sequence}
@@ -78,7 +76,7 @@ def _alarm(session: Session, served: Served, follows: str, judgement: Judgement,
     raise_alarm(session, served.name, "change", message, evidence)
     known = {"at": change.at, "event": event.number}
     if follows == "hold":
-        owner.hold(session, served.name, known | {"evidence": evidence})
+        owner.pause(session, served.name, known | {"evidence": evidence})
         audit.note(session, served.name, "learning held", served.version, after=known)
     elif follows == "adapt":
         audit.note(session, served.name, "change decided", served.version, before=known, after={"decision": "adapt"})

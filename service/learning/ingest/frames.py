@@ -1,4 +1,4 @@
-"""Frames of a stream on their way into the log: rows that are predicted already, one a sequence, in order."""
+"""The ingest of a stream's frames: rows with predictions, one for each sequence, in order."""
 
 from __future__ import annotations
 
@@ -15,79 +15,89 @@ from lipcore.data.samples import Array
 from lipcore.online import screening
 from lipcore.online.batch import Placement, Rows
 from lipcore.online.gates import check_rows
-from lipcore.online.screening import Answered
+from lipcore.online.screening import StreamAnswers
 from service.foundation.errors import ConflictError
 from service.inference.predicting import QUANTITIES
 from service.journal import log
 from service.journal.arrivals import NewBatch, check_kind
 from service.learning import owner
 from service.learning.ingest.append import Arrival, ObservationLog
-from service.learning.ingest.observations import ONCE, check_kept, row_limits
-from service.models.loaded import Served
+from service.learning.ingest.observations import REUSE_HINT, check_not_expired, row_limits
+from service.models.loaded import ServedModel
 from service.storage.database import EventRow
 
 
 @dataclass(frozen=True)
 class Frames:
-    """N frames of one stream with what `served` answered. sequences: (N,), rising; time: (N,) Unix time, s. q, dq, ddq,
-    tau, mean, std: (N, n). factor: (N, n), on the half widths that they were answered with, where that is known.
-    loaded: whether they were answered with a load."""
+    """N frames of one stream, with the answers of `served`."""
 
     model: str
     stream_id: str
-    served: Served
+    served: ServedModel
     sequences: NDArray[np.int64]
+    """Sequence numbers, (N,), rising."""
     time: Array
+    """Event time, (N,), Unix time, s."""
     q: Array
+    """Position, (N, n). `dq`, `ddq`, `tau`, `mean` and `std` have the same shape."""
     dq: Array
     ddq: Array
     tau: Array
     mean: Array
     std: Array
     factor: Array | None = None
+    """Factor on the half widths of the answers' intervals, (N, n); None if unknown."""
     loaded: bool = False
+    """Whether the answers include a payload."""
 
 
 @dataclass(frozen=True)
 class FramesResult:
-    """Durable frames. through: highest sequence of them; accepted, rejected (by code): of those that are new.
-    duplicates: frames that were in the log; revision: answers from it on contain the frames."""
+    """The result of frames that are durable."""
 
     through: int
+    """Highest sequence of the frames."""
     accepted: int
+    """Number of new rows that are learnt."""
     duplicates: int
+    """Number of frames that were in the log already."""
     rejected: dict[str, int]
+    """Number of new rows that are not learnt, by code."""
     revision: int
+    """First revision that contains the frames."""
 
 
 def observe_frames(observed: ObservationLog, frames: Frames) -> FramesResult:
-    """Log frames; once this returns they are durable. All of them or none. Raise ConflictError
-    for a sequence that was used for something else or does not rise, ExpiredError, BusyError or StorageFullError."""
+    """Log frames, all of them or none. They are durable once this returns.
+
+    Raise ConflictError for a sequence that was used otherwise or does not rise, ExpiredError, BusyError or
+    StorageFullError.
+    """
     for before, sequence in pairwise(frames.sequences.tolist()):
         if sequence <= before:
-            raise _order(frames, sequence)
+            raise _sequence_error(frames, sequence)
     monitor = observed.monitor(frames.served)
-    observed.clocks.arrival()
+    observed.clocks.date_arrival()
     with observed.turn(monitor, frames.model):
         with observed.database.session() as session:
-            options = owner.options(session, frames.model)
+            options = owner.read_options(session, frames.model)
             source = log.stream(session, frames.model, frames.stream_id)
             check_kind(source, "frames")
             last = -1 if source is None else source.last
-            before = log.past(session, frames.model, frames.stream_id, last + 1).below
+            before = log.read_history(session, frames.model, frames.stream_id, last + 1).below
             new = frames.sequences > last
-            repeated = Repeated(0) if new.all() else _repeated(session, frames, ~new)
+            repeated = RepeatedFrames(0) if new.all() else _check_repeated(session, frames, ~new)
         monitor.counts["duplicates"] += repeated.frames
         if not new.any():
             return FramesResult(int(frames.sequences[-1]), 0, repeated.frames, {}, repeated.revision)
         bounds = row_limits(frames.served.model, options, observed.settings)
         q, dq, ddq, tau = numbers = [np.ascontiguousarray(getattr(frames, name)[new]) for name in QUANTITIES]
-        # frames are dated by the service as they arrive, so that their times need no check
+        # the service dates frames when they arrive, so their times need no check
         weights = independence.stream_weights(frames.time[new], None if before is None else before.last)
         rows = Rows(frames.time[new], q, dq, ddq, tau, check_rows(None, q, dq, ddq, tau, bounds), weights)
-        carrying = frames.served.loads.of(frames.stream_id)
+        carrying = frames.served.payloads.model_for(frames.stream_id)
         other_load = frames.loaded != (carrying is not None)
-        answered = Answered(frames.mean, frames.std, frames.factor, other_load).take(new)
+        answered = StreamAnswers(frames.mean, frames.std, frames.factor, other_load).take(new)
         screened = screening.predict(rows, frames.served, slice(0, len(rows)), answered, carrying)
         sequences = frames.sequences[new]
         batch = NewBatch(
@@ -109,54 +119,54 @@ def observe_frames(observed: ObservationLog, frames: Frames) -> FramesResult:
 
 
 @dataclass(frozen=True)
-class Repeated:
-    """Frames that are in the log already. revision: from which on answers contain the last of them."""
+class RepeatedFrames:
+    """Frames that are in the log already. revision: the first that contains the last of them."""
 
     frames: int
     revision: int = 0
 
 
-def _repeated(session: Session, frames: Frames, old: NDArray[np.bool_]) -> Repeated:
-    """Compare frames with what the log has under their sequences; raise ConflictError or ExpiredError."""
+def _check_repeated(session: Session, frames: Frames, old: NDArray[np.bool_]) -> RepeatedFrames:
+    """Compare frames with those in the log under their sequences; raise ConflictError or ExpiredError."""
     places = np.flatnonzero(old)
     event: EventRow | None = None
     kept: dict[int, int] = {}
     for place in places.tolist():
         sequence = int(frames.sequences[place])
         if event is None or event.last_sequence is None or sequence > event.last_sequence:
-            event, kept, rows = _logged(session, frames, sequence)
+            event, kept, rows = _read_logged(session, frames, sequence)
         if sequence not in kept:
-            raise _order(frames, sequence)
+            raise _sequence_error(frames, sequence)
         there = kept[sequence]
         for name in QUANTITIES:
             if not np.array_equal(getattr(frames, name)[place], getattr(rows, name)[there], equal_nan=True):
                 raise ConflictError(
-                    f"frame {sequence} of stream {frames.stream_id!r} has come before with another {name}: {ONCE}"
+                    f"frame {sequence} of stream {frames.stream_id!r} has come before with another {name}: {REUSE_HINT}"
                 )
     assert event is not None
     start = log.start_of(session, frames.model, frames.served.version)
-    return Repeated(len(places), max(event.number - start, 0))
+    return RepeatedFrames(len(places), max(event.number - start, 0))
 
 
-def _logged(session: Session, frames: Frames, sequence: int) -> tuple[EventRow, dict[int, int], Rows]:
-    """The batch of frames that a sequence lies in, the place of each of its sequences, and its rows."""
-    event = log.covering(session, frames.model, frames.stream_id, sequence)
+def _read_logged(session: Session, frames: Frames, sequence: int) -> tuple[EventRow, dict[int, int], Rows]:
+    """Return the batch of frames that contains a sequence, the index of each of its sequences, and its rows."""
+    event = log.find_covering_batch(session, frames.model, frames.stream_id, sequence)
     if event is None:
-        check_kept(log.stream(session, frames.model, frames.stream_id), sequence)
-        raise _order(frames, sequence)
+        check_not_expired(log.stream(session, frames.model, frames.stream_id), sequence)
+        raise _sequence_error(frames, sequence)
     ranges = Placement.from_json(event.report or {}).frames
     sequences = [number for first, last in ranges for number in range(first, last + 1)]
     return event, {number: place for place, number in enumerate(sequences)}, log.rows_of(event)
 
 
-def _order(frames: Frames, sequence: int) -> ConflictError:
+def _sequence_error(frames: Frames, sequence: int) -> ConflictError:
     return ConflictError(
         f"frame {sequence} of stream {frames.stream_id!r} comes after one of a higher sequence: sequences must rise"
     )
 
 
 def _ranges(sequences: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
-    """Rising numbers as ranges (first, last)."""
+    """Return rising numbers as ranges (first, last)."""
     parts = np.split(sequences, np.flatnonzero(np.diff(sequences) > 1) + 1)
     return tuple((int(part[0]), int(part[-1])) for part in parts)
 

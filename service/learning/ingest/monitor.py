@@ -1,4 +1,4 @@
-"""What a running service keeps in memory of a model that learns; all of it can be rebuilt from the log."""
+"""The memory of a running service about a model that learns. All of it can be rebuilt from the log."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ from service.learning.streams import Streams
 from service.storage.database import EventRow
 
 WINDOWS_S = (60.0, 600.0, 3600.0)
-"""Windows of the prequential quality, s."""
-MOST_EVENTS = 3000
-"""Events that the windows are rebuilt from after a start, at most: 0.3 ms each."""
+"""Lengths of the windows of prediction quality, s."""
+MAX_EVENTS = 3000
+"""Max events from which the windows are rebuilt after a start: 0.3 ms each."""
 DETECTOR_S = 60.0
-"""Time before a start that the detector of changes is rebuilt from, s: more than it looks back."""
+"""Seconds before a start from which the change detector is rebuilt: more than its memory."""
 
 
 class Monitor:
-    """One model's windows of quality, and what judging knows of it and of its streams.
+    """One model's quality windows, and the records of the model and its streams.
 
-    joint_names: in whose order records are. record: of the model; streams: of each stream; payloads: what they carry,
-    as versions see it; payload_alarm_at: when an alarm was last raised of one, Unix time, s. lock: held while a batch
-    is judged and logged, one at a time; whoever only reads needs none. counts: rows by code and "learnt", "batches" and
-    "duplicates", since the start and that this service has taken. number: of the last event that was taken in.
+    joint_names: their order in records. record: of the model. streams: the records of its streams. payloads: of the
+    streams, as versions see them. payload_alarm_at: Unix time of the last payload alarm, s. lock: locked while a batch
+    is judged and logged; readers do not need it. counts: rows by code and "learnt", "batches" and "duplicates",
+    ingested by this service since its start. number: of the last event that the monitor contains.
 
-    Several services take batches of one model in turn, and each follows the log before it judges: records and windows
-    are then the same to the last bit as if one service had taken all, from the first batch on that all of them know.
+    If several services ingest batches of one model, each follows the log before it judges. Their records and windows
+    are then equal, to the last bit, to those of a single service.
     """
 
     def __init__(self, joint_names: tuple[str, ...]) -> None:
@@ -56,7 +56,7 @@ class Monitor:
 
     @classmethod
     def rebuilt(cls, session: Session, model: str, joint_names: tuple[str, ...], now: float) -> Monitor:
-        """The monitor of a model from its log and its streams' records. now: Unix time, s."""
+        """Return the monitor of a model from its log and its streams' records. now: Unix time, s."""
         made = cls(joint_names)
         made.number = log.newest(session, model)
         made.streams.read(session, model)
@@ -64,12 +64,15 @@ class Monitor:
         since = now - max(*WINDOWS_S, DETECTOR_S)
         lately = (EventRow.received > since, EventRow.received <= now, EventRow.number <= made.number)
         events = list(_batches(session, model, *lately)) or list(_batches(session, model, most=1))
-        for event in events:  # the last one in any case: how far learning has gone is not forgotten in a quiet hour
-            made._remember(event, now - DETECTOR_S < event.received <= now)
+        for event in events:  # at least the last one, so that a quiet hour does not reset the record
+            made._add_logged(event, now - DETECTOR_S < event.received <= now)
         return made
 
     def follow(self, session: Session, model: str) -> bool:
-        """Take in what others have logged since `number`, and return whether that is anything; `lock` is held."""
+        """Add events that other services have logged since `number`; return whether there were any.
+
+        `lock` is locked.
+        """
         newest = log.newest(session, model)
         if newest == self.number:
             return False
@@ -82,17 +85,17 @@ class Monitor:
         streams, decided = {stream_id for stream_id, _ in said}, any(kind == "rollback" for _, kind in said)
         for event in _batches(session, model, *later):
             held = self.record.held
-            logged = self._remember(event, True)
+            logged = self._add_logged(event, True)
             decided |= held and logged is not None and not logged.waited
             streams.add(event.stream_id or "")
-        if streams:  # a decision, and a rollback, is in the records of all
+        if streams:  # a decision or a rollback changes the records of all streams
             self.streams.read(session, model, None if decided else streams)
         self.number = newest
         return True
 
     def follow_decision(self, session: Session, model: str) -> None:
-        """Judge streams anew if the owner has ended a hold; `lock` is held."""
-        held = owner.held(session, model) is not None
+        """Judge streams anew if the owner has ended a pause; `lock` is locked."""
+        held = owner.read_pause(session, model) is not None
         if self.record.held and not held:
             self.record = self.record.decided()
             self.streams.change_all(session, model, StreamRecord.decided)
@@ -100,18 +103,21 @@ class Monitor:
             self.record = replace(self.record, held=True)
 
     def stream(self, stream_id: str, new: bool) -> StreamRecord:
-        """The record of a stream before its next batch; `lock` is held. new: whether none of its rows is known."""
+        """Return the record of a stream before its next batch; `lock` is locked.
+
+        new: whether the stream has no batch yet.
+        """
         if not new:
             return self.streams.get(stream_id)
-        self.streams.forget(stream_id)  # one of this name that has made room for others
+        self.streams.forget(stream_id)  # an earlier stream of this name was deleted
         return StreamRecord.start(len(self.joint_names))
 
-    def usual(self, now: float) -> Record:
-        """Record of the shortest window before a Unix time, s."""
+    def read_latest_record(self, now: float) -> Record:
+        """Return the record of the shortest window before a Unix time, s."""
         return min(self.windows, key=lambda window: window.seconds).record(now)
 
-    def note(self, event: EventRow, judgement: Judgement) -> None:
-        """Take in a batch that this service has judged and logged; `lock` is held."""
+    def add_batch(self, event: EventRow, judgement: Judgement) -> None:
+        """Add a batch that this service has judged and logged; `lock` is locked."""
         counts = _counts(event.report or {})
         self._count(event, judgement.record, counts, judgement.logged)
         self.number, self.record = event.number, judgement.model
@@ -119,7 +125,7 @@ class Monitor:
         self._since_due += 1
 
     def due(self, batches: int) -> bool:
-        """Whether so many batches have been noted since the last time that this was true."""
+        """Return whether so many batches have been added since this last returned True."""
         with self.lock:
             if self._since_due < batches:
                 return False
@@ -127,15 +133,17 @@ class Monitor:
             return True
 
     def set_clock(self, step: float) -> None:
-        """Go with a clock of this machine that was set by `step`, s; `lock` is held."""
+        """Move all times by `step`, s, after the host's clock was set; `lock` is locked."""
         for window in self.windows:
             window.set_clock(step)
         self.streams.set_clock(step)
         self.record = self.record.moved(step)
 
-    def _remember(self, event: EventRow, recent: bool) -> LoggedJudgement | None:
-        """Take in a batch as it was judged when it was logged; None if it has other joints. recent: whether the
-        detector still looks back to it."""
+    def _add_logged(self, event: EventRow, recent: bool) -> LoggedJudgement | None:
+        """Add a batch with its logged judgement and return that; None if the batch has other joints.
+
+        recent: whether the batch is within the detector's memory.
+        """
         record = None if event.record is None else Record.from_json(event.record)
         if record is not None and record.n_joints != len(self.joint_names):
             return None
@@ -153,9 +161,9 @@ class Monitor:
 
 
 def _batches(
-    session: Session, model: str, *conditions: ColumnElement[bool], most: int = MOST_EVENTS
+    session: Session, model: str, *conditions: ColumnElement[bool], most: int = MAX_EVENTS
 ) -> Iterator[EventRow]:
-    """The last batches of a model that meet conditions, as many as are taken in, in order."""
+    """Return the last batches of a model that meet conditions, at most `most`, in order."""
     query = select(EventRow).where(
         EventRow.model == model, EventRow.kind == "batch", EventRow.report.is_not(None), *conditions
     )
@@ -163,5 +171,5 @@ def _batches(
 
 
 def _counts(report: Mapping[str, Any]) -> dict[str, int]:
-    """Rows by code, those that are learnt too."""
+    """Return the number of rows by code, including those learnt."""
     return {"learnt": report["accepted"], **report["rejected"]}

@@ -1,4 +1,4 @@
-"""A batch on its way into the log: in the model's joint order, recognised if repeated, dated and predicted."""
+"""The ingest of an observation batch: check it, detect a repetition, date its rows and predict them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lipcore.model.torque_model import TorqueModel
 from lipcore.online import acceleration, screening
 from lipcore.online.acceleration import DerivationError
 from lipcore.online.batch import Placement, Rows
-from lipcore.online.dating import Dated, Measured, StreamTime, date_rows
+from lipcore.online.dating import DatedRows, MeasuredRows, StreamTime, date_rows
 from lipcore.online.gates import RowLimits
 from service.contract.observations import (
     Derivation,
@@ -30,36 +30,39 @@ from service.foundation.settings import Settings
 from service.inference.predicting import check_shapes
 from service.journal import log
 from service.journal.arrivals import NewBatch, check_kind, is_forgotten
-from service.journal.log import Past
+from service.journal.log import StreamHistory
 from service.learning import owner
 from service.learning.ingest.append import Arrival, ObservationLog
 from service.storage.database import EventRow, StreamRow
 
 MAX_ROWS = 5000
-"""Rows of one observation batch."""
-ONCE = "a sequence is used once, so a new run needs a stream_id of its own, or higher sequences"
+"""Max rows of one observation batch."""
+REUSE_HINT = "a sequence is used once, so a new run needs a stream_id of its own, or higher sequences"
+"""Advice at the end of an error message."""
 
 
 def observe_batch(observed: ObservationLog, model: str, request: ObservationRequest) -> ObservationResponse:
-    """Log a batch; once this returns it is durable. Raise NotFoundError, InvalidRequestError, ConflictError,
-    ExpiredError, BusyError or StorageFullError."""
-    served, received = observed.loaded.get(model, None), observed.clocks.arrival()
-    batch = validated(request, served.model)
-    content = digest(batch)
+    """Log a batch. It is durable once this returns.
+
+    Raise NotFoundError, InvalidRequestError, ConflictError, ExpiredError, BusyError or StorageFullError.
+    """
+    served, received = observed.loaded.get(model, None), observed.clocks.date_arrival()
+    batch = validate_batch(request, served.model)
+    content = compute_digest(batch)
     monitor = observed.monitor(served)
     stream_id, sequence = request.stream_id, request.sequence
     with observed.turn(monitor, model):
         with observed.database.session() as session:
-            past = log.past(session, model, stream_id, sequence)
-            known = acknowledged(session, past, request, content)
+            past = log.read_history(session, model, stream_id, sequence)
+            known = find_acknowledgement(session, past, request, content)
             if known is not None:
                 monitor.counts["duplicates"] += 1
                 return known
-            options = owner.options(session, model)
+            options = owner.read_options(session, model)
             limits = row_limits(served.model, options, observed.settings)
-            dated = _dated(batch, past, sequence, received, limits, options)
-            rows, own, derived = _complete(session, (model, stream_id, sequence), batch, dated, limits)
-        predicted = screening.predict(rows, served, own, carrying=served.loads.of(stream_id))
+            dated = _date_batch(batch, past, sequence, received, limits, options)
+            rows, own, derived = _derive_accelerations(session, (model, stream_id, sequence), batch, dated, limits)
+        predicted = screening.predict(rows, served, own, carrying=served.payloads.model_for(stream_id))
         entry = NewBatch(
             stream_id,
             "batches",
@@ -79,9 +82,14 @@ def observe_batch(observed: ObservationLog, model: str, request: ObservationRequ
     return answer
 
 
-def _dated(
-    batch: Measured, past: Past, sequence: int, received: float, limits: RowLimits, options: LearningOptions
-) -> Dated:
+def _date_batch(
+    batch: MeasuredRows,
+    past: StreamHistory,
+    sequence: int,
+    received: float,
+    limits: RowLimits,
+    options: LearningOptions,
+) -> DatedRows:
     """Date the rows of a new batch by the clock of its stream."""
     below = past.below
     offset = 0.0 if past.source is None else past.source.offset
@@ -91,21 +99,23 @@ def _dated(
     return date_rows(batch, clock, limits, previous, options.forgetting_s)
 
 
-def _complete(
-    session: Session, key: tuple[str, str, int], batch: Measured, dated: Dated, limits: RowLimits
+def _derive_accelerations(
+    session: Session, key: tuple[str, str, int], batch: MeasuredRows, dated: DatedRows, limits: RowLimits
 ) -> tuple[Rows, slice, Derivation | None]:
-    """The rows of a batch, with derived accelerations if none were sent; those of others that it completes; which are
-    its own; and how they were derived."""
+    """Return the rows of a batch, which of them are its own, and how accelerations were derived if none were sent.
+
+    The other rows belong to adjacent batches, whose accelerations this batch completes.
+    """
     if batch.ddq is not None or batch.t is None:
         return dated.rows, slice(0, len(batch)), None
     try:
-        how = acceleration.Derivation.of(batch.t, log.derived_beside(session, *key))
+        how = acceleration.Derivation.of(batch.t, log.find_adjacent_window(session, *key))
     except DerivationError as error:
         raise invalid_request(error.field, error.value, error.expected) from error
-    before, after = (log.rows_beside(session, *key, way, 2 * how.half) for way in (-1, 1))
+    before, after = (log.read_adjacent_rows(session, *key, way, 2 * how.half) for way in (-1, 1))
     found = acceleration.derive_rows(dated.rows, how, before, after, limits)
-    told = DerivedAcceleration(delay_s=how.delay_s, window=how.half, rate_hz=how.rate, carried=found.carried)
-    return found.rows, found.own, Derivation(ddq=told)
+    derived = DerivedAcceleration(delay_s=how.delay_s, window=how.half, rate_hz=how.rate, carried=found.carried)
+    return found.rows, found.own, Derivation(ddq=derived)
 
 
 def _place(event: EventRow | None) -> Placement | None:
@@ -113,7 +123,7 @@ def _place(event: EventRow | None) -> Placement | None:
 
 
 def row_limits(model: TorqueModel, options: LearningOptions, settings: Settings) -> RowLimits:
-    """What a row of a model may hold: its actuators' limits are those of its options, else those of its URDF."""
+    """Return the limits of a row. Torque limits are those of the options, else those of the URDF."""
     torque = None if options.torque_limits is None else np.array(options.torque_limits)
     if torque is None and model.robot is not None:
         effort = np.asarray(model.robot.model.effortLimit, np.float64)[list(model.robot.order)]
@@ -127,8 +137,8 @@ def row_limits(model: TorqueModel, options: LearningOptions, settings: Settings)
     )
 
 
-def validated(request: ObservationRequest, model: TorqueModel) -> Measured:
-    """Check a request's shapes and joints and bring its columns in order; raise InvalidRequestError."""
+def validate_batch(request: ObservationRequest, model: TorqueModel) -> MeasuredRows:
+    """Check the shapes and joints of a request and order its columns; raise InvalidRequestError."""
     check_shapes(request, model)
     rows = 1 if request.q.ndim == 1 else len(request.q)
     if rows > MAX_ROWS:
@@ -137,17 +147,20 @@ def validated(request: ObservationRequest, model: TorqueModel) -> Measured:
         raise invalid_request("t", f"{len(request.t)} numbers long", f"{rows}, one a row of q")
     if request.t is None and request.ddq is None:
         raise invalid_request("ddq", "missing, and t too", "accelerations, or times to derive them from dq with")
-    order = slice(None) if request.joint_names is None else columns(request.joint_names, model.joint_names)
+    order = slice(None) if request.joint_names is None else find_columns(request.joint_names, model.joint_names)
     q, dq, tau = (_ordered(values, order) for values in (request.q, request.dq, request.tau))
-    return Measured(request.t, q, dq, None if request.ddq is None else _ordered(request.ddq, order), tau)
+    return MeasuredRows(request.t, q, dq, None if request.ddq is None else _ordered(request.ddq, order), tau)
 
 
 def _ordered(values: Array, order: slice | list[int]) -> Array:
     return np.ascontiguousarray(np.atleast_2d(values)[:, order])
 
 
-def columns(given: Sequence[str], joints: Sequence[str]) -> list[int]:
-    """Place of each of the model's joints among those given; raise InvalidRequestError naming what does not fit."""
+def find_columns(given: Sequence[str], joints: Sequence[str]) -> list[int]:
+    """Return the index of each of the model's joints in the given names.
+
+    Raise InvalidRequestError if a name is unknown, repeated or missing.
+    """
     for index, name in enumerate(given):
         if name not in joints:
             raise invalid_request(f"joint_names[{index}]", name, f"one of the model's joints: {', '.join(joints)}")
@@ -158,39 +171,41 @@ def columns(given: Sequence[str], joints: Sequence[str]) -> list[int]:
     return [given.index(name) for name in joints]
 
 
-def digest(rows: Measured) -> str:
-    """Sha256 over shapes and numbers: equal for equal content, whatever its JSON or joint order."""
+def compute_digest(rows: MeasuredRows) -> str:
+    """Return the SHA-256 of shapes and numbers. It does not depend on the JSON or the joint order."""
     content = hashlib.sha256(pack("<2Q", *rows.q.shape))
     for values in (rows.t, rows.q, rows.dq, rows.ddq, rows.tau):
         content.update(b"-" if values is None else b"+")
         if values is not None:
-            # one zero and one NaN of the several that there are
+            # there are several bit patterns of zero and NaN
             canonical = np.where(np.isnan(values), np.nan, values + 0.0)
             content.update(canonical.astype("<f8").tobytes())
     return content.hexdigest()
 
 
-def acknowledged(session: Session, past: Past, request: ObservationRequest, content: str) -> ObservationResponse | None:
-    """The first acknowledgement of a batch that is in the log, with its state now; None for one that is new.
+def find_acknowledgement(
+    session: Session, past: StreamHistory, request: ObservationRequest, content: str
+) -> ObservationResponse | None:
+    """Return the first acknowledgement of a batch in the log, with its current state; None for a new batch.
 
-    Raise ConflictError where the log has another content under its sequence, or frames under its stream; ExpiredError
-    where the log no longer reaches back to it.
+    Raise ConflictError if the log has other content under its sequence, or frames under its stream. Raise ExpiredError
+    if the log no longer reaches back to it.
     """
     check_kind(past.source, "batches")
     event = past.same
     if event is None:
-        check_kept(past.source, request.sequence)
+        check_not_expired(past.source, request.sequence)
         return None
     if event.digest != content:
         name = f"batch {request.sequence} of stream {request.stream_id!r}"
-        raise ConflictError(f"{name} has come before with other content: {ONCE}")
+        raise ConflictError(f"{name} has come before with other content: {REUSE_HINT}")
     return ObservationResponse.model_validate(
-        {**(event.report or {}), "duplicate": True, "state": state(session, event)}
+        {**(event.report or {}), "duplicate": True, "state": read_state(session, event)}
     )
 
 
-def check_kept(source: StreamRow | None, sequence: int) -> None:
-    """Raise ExpiredError where a batch that is not in the log may have been there."""
+def check_not_expired(source: StreamRow | None, sequence: int) -> None:
+    """Raise ExpiredError if a batch that is not in the log may have been deleted from it."""
     if source is not None and is_forgotten(source, sequence):
         raise ExpiredError(
             f"it is not known any more whether batch {sequence} of stream {source.stream_id!r} has come before: "
@@ -198,8 +213,8 @@ def check_kept(source: StreamRow | None, sequence: int) -> None:
         )
 
 
-def state(session: Session, event: EventRow) -> State:
-    """Whether a batch of the log still teaches, and if not, why."""
+def read_state(session: Session, event: EventRow) -> State:
+    """Return whether a batch of the log is still learnt and, if not, why."""
     if not event.void:
         return "learnt"
-    return "unlearnt" if log.about(session, event, "unlearn") else "rolled_back"
+    return "unlearnt" if log.find_related(session, event, "unlearn") else "rolled_back"

@@ -1,1 +1,1 @@
-"""The learner process: it follows the log and publishes what it says."""
+"""The learner process: it follows the logs and publishes revisions."""

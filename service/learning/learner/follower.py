@@ -1,4 +1,4 @@
-"""One version that follows the log of its model: learns page by page, solves, stores its state."""
+"""A version that follows the log of its model: it learns page by page, solves and stores its state."""
 
 from __future__ import annotations
 
@@ -22,35 +22,35 @@ from service.journal import log, snapshots
 from service.journal.floor import error_floor_of
 from service.journal.restore import advance, restore
 from service.learning.learner import publication
-from service.learning.learner.publication import Published
+from service.learning.learner.publication import Publication
 from service.storage.database import Database
 from service.storage.disk import Disk
-from service.storage.errors import translated
+from service.storage.errors import translate_error
 from service.storage.files import Files
 
 logger = logging.getLogger(__name__)
 
 NOVELTY_ROWS = 2000
-"""Rows that the share of rows beyond the basis is taken over."""
+"""Rows over which the share beyond the basis is taken."""
 SNAPSHOT_PERIODS = 60
-"""Time between two snapshots of a version's state, in times of `publish_every_s`: 30 s by default."""
+"""Time between two snapshots of a version's state, in units of `publish_every_s`: 30 s by default."""
 
 
 class Novelty:
-    """Counts the rows learnt that lie beyond a version's basis. window: number of rows that `share` is taken over."""
+    """Counts the learnt rows beyond a version's basis. window: number of rows for `share`."""
 
     def __init__(self, window: int) -> None:
         self.rows = 0
         self._flags: deque[bool] = deque(maxlen=window)
 
     def add(self, novel: NDArray[np.bool_]) -> None:
-        """Count rows, each of which lies beyond the basis or not, (N,)."""
+        """Count rows. novel: whether each lies beyond the basis, (N,)."""
         self._flags.extend(novel.tolist())
         self.rows += int(novel.sum())
 
     @property
     def share(self) -> float:
-        """Share of the last rows that do; 0 before there are enough to fill the window."""
+        """Share of the last rows beyond the basis; 0 until the window is full."""
         full = len(self._flags) == self._flags.maxlen
         return sum(self._flags) / len(self._flags) if full else 0.0
 
@@ -58,7 +58,7 @@ class Novelty:
 class Follower:
     """A version in the learner process. Times are seconds of `time.monotonic`.
 
-    base: the version as trained; known: what it has learnt, and up to which event.
+    base: the version as trained. known: its learnt state.
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class Follower:
         self.snapshot_every_s = SNAPSHOT_PERIODS * settings.publish_every_s
         with database.session() as session:
             self.start = log.start_of(session, model, version)
-        # only what needs no learning: pages are taken one by one, and others have their turn in between
+        # loads the snapshot only: pages are learnt one by one, and other versions advance in between
         self.known = restore(database, files, model, version, base, pages=0)
         self.novelty = Novelty(NOVELTY_ROWS)
         self.woken, self.behind = True, True
@@ -89,7 +89,7 @@ class Follower:
         return self.known.number
 
     def step(self) -> None:
-        """Learn the next page, if there is one; `behind` says whether there may be more."""
+        """Learn the next page, if there is one. `behind` is whether there may be more."""
         began = time.monotonic()
         following = advance(self.database, self.files, self.known, novel=self.novelty.add)
         self.behind = self.woken = following is not self.known
@@ -98,17 +98,17 @@ class Follower:
 
     @property
     def unpublished(self) -> bool:
-        """Whether there is something that the service does not know."""
+        """Whether the state contains events that are not published."""
         return self.known.number > self._published
 
-    def publish(self) -> Published:
-        """Solve, write the arrays for the service, and return the message that goes with them."""
+    def publish(self) -> Publication:
+        """Solve, write the arrays for the service, and return the message about them."""
         began = time.monotonic()
         variance = error_floor_of(self.database, self.model, self.version, self.number, self.base.n_joints)
         revision = self._solve(variance)
         path = publication.write(publication.folder(self.files), revision)
         ended = time.monotonic()
-        message = Published(
+        message = Publication(
             model=self.model,
             version=self.version,
             revision=self.number - self.start,
@@ -122,38 +122,42 @@ class Follower:
             linearisation=self._linearisation,
         )
         self._published, self._seconds = self.number, 0.0
-        # at most half of the time goes into solving
+        # at most half of the time is for solving
         self.due = max(began + self.settings.publish_every_s, ended + (ended - began))
         return message
 
     @property
     def snapshot_due(self) -> float:
-        """When the state is to be stored; infinity where it is stored or cannot be yet."""
+        """When the state is to be stored; infinity if it is stored."""
         if self.number == self._stored:
             return np.inf
         return self._stored_at + self.snapshot_every_s
 
     def store_in_turn(self) -> None:
-        """Store the state, unless another service has stored what this version has learnt since it was due last. The
-        first one does it for all: they learn the same."""
+        """Store the state unless another service has stored one within `snapshot_every_s`.
+
+        One service stores for all of them, because they learn the same.
+        """
         with self.database.session() as session:
-            last = snapshots.last_stored(session, self.model, self.version)
+            last = snapshots.find_last_stored(session, self.model, self.version)
         since = None if last is None or last[0] == self._snapshot else time.time() - last[1]
-        # one from the future shows that clocks differ, or that one was set back: it says nothing of when
+        # a time in the future means that clocks differ or that one was set back: ignored
         if since is not None and 0 <= since < self.snapshot_every_s:
             self._stored_at = time.monotonic()
             return
         self.store()
 
     def store(self) -> None:
-        """Store the state, unless it is stored, or a later one. Where there
-        is no room for it, learning goes on all the same: the log has everything."""
+        """Store the state, unless it or a later one is stored.
+
+        Learning continues if the disk is full, because the log has everything.
+        """
         if self.number == self._stored or self._is_stored():
             return
         self._stored_at = time.monotonic()
         payload = state.dump(self.known.online)
         try:
-            self.disk.take(len(payload))
+            self.disk.reserve(len(payload))
             self._snapshot = snapshots.save(
                 self.database,
                 self.files,
@@ -165,7 +169,7 @@ class Follower:
                 most=self.settings.max_snapshots,
             )
         except (StorageFullError, OSError, DBAPIError) as error:
-            reason = translated(error)
+            reason = translate_error(error)
             if reason is None:
                 raise
             logger.warning("what version %d of model %s has learnt is not stored: %s", self.version, self.model, reason)
@@ -173,19 +177,19 @@ class Follower:
         self._stored = self.number
 
     def _is_stored(self) -> bool:
-        """Whether this state or a later one is stored."""
+        """Return whether this state or a later one is stored."""
         with self.database.session() as session:
-            row = snapshots.latest(session, self.model, self.version, None)
+            row = snapshots.find_latest(session, self.model, self.version, None)
         return row is not None and row.number >= self.number
 
     def _solve(self, floor: Array) -> Revision:
-        """The arrays of the state; those of the last time where nothing but the number has changed."""
+        """Return the arrays of the state; the last ones if nothing but the number has changed."""
         online = self.known.online
         known, at = self._solved or (None, floor)
         if self._revision is None or known is not online or not np.array_equal(at, floor):
             answering = online.model(floor)
             self._revision, self._solved = Revision.of(answering), (online, floor)
             error = linearisation_error(answering)
-            # a joint whose errors are no larger than stated needs nothing mended
+            # a joint whose errors are no larger than stated needs no refresh
             self._linearisation = None if error is None else tuple(np.where(floor > 0, error, 0.0).tolist())
         return self._revision

@@ -1,4 +1,4 @@
-"""What the learner process does: the version of each model that serves has a follower, and they take turns."""
+"""The work of the learner process: each serving version has a follower, and the followers take turns."""
 
 from __future__ import annotations
 
@@ -13,22 +13,24 @@ from service.foundation.settings import Settings
 from service.journal import snapshots
 from service.learning.learner import publication
 from service.learning.learner.follower import Follower
-from service.learning.learner.publication import Failed, Message
+from service.learning.learner.publication import LearningFailure, Message
 from service.models import registry
-from service.runtime.companion import BEAT, BEAT_S, received
+from service.runtime.companion import BEAT, BEAT_S, receive_work
 from service.storage.database import Database
 from service.storage.files import Files
 
 logger = logging.getLogger(__name__)
 
 Key = tuple[str, int]
-FIRST_PAUSE, LONGEST_PAUSE = 1.0, 60.0
-"""Seconds until a version that failed is tried again; each time twice as long."""
+MIN_PAUSE_S, MAX_PAUSE_S = 1.0, 60.0
+"""Seconds until a version that failed is tried again. The pause doubles each time, up to the max."""
 
 
 def run(settings: Settings, connection: Connection) -> None:
-    """Follow the models whose names come over the connection, until it ends or None comes; tell of each step that it is
-    done, and at rest every BEAT_S."""
+    """Follow the models whose names arrive over the connection, until it ends or None arrives.
+
+    Send a heartbeat after each step, at most every `BEAT_S`, and every `BEAT_S` while idle.
+    """
     database, files = Database.of(settings), Files.of(settings)
     publication.clear(files)
     snapshots.sweep(database, files)
@@ -36,11 +38,11 @@ def run(settings: Settings, connection: Connection) -> None:
     try:
         with suppress(EOFError, BrokenPipeError):  # the service is gone
             beaten = time.monotonic()
-            while (work := received(connection, min(learner.pause(), BEAT_S))) is not None:
+            while (work := receive_work(connection, min(learner.pause(), BEAT_S))) is not None:
                 learner.wake({str(model) for model in work})
                 for message in learner.turn():
                     connection.send(message)
-                if time.monotonic() - beaten >= BEAT_S:  # by this thread, which does the work: no other one knows
+                if time.monotonic() - beaten >= BEAT_S:  # from the working thread, so that a hang stops the heartbeat
                     connection.send(BEAT)
                     beaten = time.monotonic()
         learner.close()
@@ -49,21 +51,21 @@ def run(settings: Settings, connection: Connection) -> None:
 
 
 class Learner:
-    """The followers of all versions that learn, at most as many as the settings allow."""
+    """The followers of all versions that learn, at most `max_loaded_models`."""
 
     def __init__(self, database: Database, files: Files, settings: Settings) -> None:
         self.database, self.files, self.settings = database, files, settings
         self.followers: dict[Key, Follower] = {}  # in the order in which they were woken last
         self._woken: set[str] = set()
-        self._unread: dict[str, float] = {}  # when models are looked up again, where the database was away
+        self._unread: dict[str, float] = {}  # when to look models up again after a database failure
         self._failed: dict[Key, tuple[float, float]] = {}
 
     def wake(self, models: set[str]) -> None:
-        """Look at these models in the next turn: their logs have grown, or other versions of them learn."""
+        """Check these models in the next turn: their logs have grown, or other versions learn."""
         self._woken |= models
 
     def pause(self) -> float:
-        """Seconds until there is something to do, if nothing happens."""
+        """Return the seconds until there is work, if no message arrives."""
         times = [*self._unread.values(), *(at for at, _ in self._failed.values())]
         for follower in self.followers.values():
             if follower.behind:
@@ -74,25 +76,25 @@ class Learner:
         return max(0.0, min(times, default=inf) - time.monotonic()) if not self._woken else 0.0
 
     def turn(self) -> Iterator[Message]:
-        """Let every follower do the next thing that is to be done; yield the messages to the service."""
+        """Let every follower advance by one step, and yield the messages to the service."""
         now = time.monotonic()
         again = {model for (model, _), (at, _) in self._failed.items() if now >= at}
         again |= {model for model, at in self._unread.items() if now >= at}
         woken, self._woken = self._woken | again, set()
         for model in sorted(woken):
-            yield from self._enlist(model)
+            yield from self._update_followers(model)
         for key, follower in list(self.followers.items()):
             try:
-                yield from self._serve(follower)
-            except Exception as error:  # the others learn all the same
+                yield from self._advance(follower)
+            except Exception as error:  # the others still learn
                 yield self._fail(key, error)
 
     def close(self) -> None:
-        """Store what has been learnt."""
+        """Store the learnt states."""
         for key in list(self.followers):
             self._drop(key)
 
-    def _serve(self, follower: Follower) -> Iterator[Message]:
+    def _advance(self, follower: Follower) -> Iterator[Message]:
         now = time.monotonic()
         if follower.behind or (follower.woken and now >= follower.due):
             follower.step()
@@ -102,14 +104,14 @@ class Learner:
         if time.monotonic() >= follower.snapshot_due:
             follower.store_in_turn()
 
-    def _enlist(self, model: str) -> Iterator[Message]:
-        """Wake the follower of the version that serves, and drop that of one that no longer does."""
+    def _update_followers(self, model: str) -> Iterator[Message]:
+        """Wake the follower of the serving version and drop those of other versions."""
         try:
             with self.database.session() as session:
-                version = registry.answering(session, model)
-        except Exception:  # of the database; the follower keeps what it has learnt meanwhile
+                version = registry.serving_version(session, model)
+        except Exception:  # a database error: the follower keeps its state
             logger.exception("which version of model %r learns cannot be read: tried again", model)
-            self._unread[model] = time.monotonic() + FIRST_PAUSE
+            self._unread[model] = time.monotonic() + MIN_PAUSE_S
             return
         self._unread.pop(model, None)
         for key in [key for key in self.followers if key[0] == model and key[1] != version]:
@@ -142,12 +144,12 @@ class Learner:
         follower = self.followers.pop(key)
         try:
             follower.store()
-        except Exception:  # the log has it all the same
+        except Exception:  # the log still has everything
             logger.exception("version %d of model %r could not be stored", key[1], key[0])
 
-    def _fail(self, key: Key, error: Exception) -> Failed:
+    def _fail(self, key: Key, error: Exception) -> LearningFailure:
         logger.error("version %d of model %r cannot learn", key[1], key[0], exc_info=error)
         self.followers.pop(key, None)
-        pause = min(2 * self._failed[key][1], LONGEST_PAUSE) if key in self._failed else FIRST_PAUSE
+        pause = min(2 * self._failed[key][1], MAX_PAUSE_S) if key in self._failed else MIN_PAUSE_S
         self._failed[key] = (time.monotonic() + pause, pause)
-        return Failed(*key, f"{type(error).__name__}: {error}")
+        return LearningFailure(*key, f"{type(error).__name__}: {error}")

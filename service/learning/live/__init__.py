@@ -1,1 +1,1 @@
-"""What a model's streams measure and what it predicted, for people who watch."""
+"""The live feed of models: measured and predicted rows, and status, for people who watch."""

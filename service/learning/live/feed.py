@@ -1,5 +1,7 @@
-"""Models as they predict and learn, for any number of readers: each model is looked at once for all of its readers, and
-of the batches of a moment few rows are shown, but all of them counted."""
+"""The live feed of models for any number of readers.
+
+Each model is read once for all of its readers. Of the batches of a tick, few rows are shown, but all are counted.
+"""
 
 from __future__ import annotations
 
@@ -24,47 +26,54 @@ from lipcore.online.learner import uncovered
 from lipcore.vocabulary import CODES, Code
 from service.contract.learning import DECIMALS, LiveLost, LiveNovelty, LivePart, LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
-from service.learning.ingest.append import Judged
-from service.models.loaded import Served
-from service.runtime.counted import Counted
+from service.learning.ingest.append import LoggedBatch
+from service.models.loaded import ServedModel
+from service.runtime.counted import OpenCounter
 
 logger = logging.getLogger(__name__)
 
-MOST_LOOKED = 20
-"""Rows of a stream that are looked at for one status: 14 ms of a thread at a thousand inducing outputs."""
+MAX_NOVELTY_ROWS = 20
+"""Max rows of a stream that are tested for one status: 14 ms of a thread at a thousand inducing outputs."""
 MAX_FOLLOWERS = 20
-"""Readers that follow models live; more are answered 429."""
+"""Max readers of live feeds. More are answered 429."""
 ROWS_PER_S = 50
-"""Rows a second that those who follow a model are shown; all are counted."""
+"""Rows a second that readers are shown. All rows are counted."""
 
 
-FARTHEST = 1e6
-"""rad or m: beyond it no robot is; nor is one where a number is none."""
+MAX_POSITION = 1e6
+"""Max position of a robot, rad or m. A row beyond it, or one that is not finite, is not a position."""
 
 
 @dataclass(frozen=True)
-class Picked:
-    """The rows that are shown, (N,), and their predictions before they were learnt, (N, n), NaN where there are none.
-    bare: the standard deviation without the floor of past errors, as `Screened` has it."""
+class ShownRows:
+    """The rows that are shown, with their predictions before they were learnt."""
 
     stream_id: str
-    served: Served
+    served: ServedModel
     rows: Rows
+    """Shown rows, (N,)."""
     mean: Array
+    """Predicted torque, (N, n), NaN for rows without a prediction. `std` and `bare` have the same shape."""
     std: Array
     bare: Array
+    """Standard deviation without the floor of past errors, as in `Screened`."""
 
 
-def thinned(batches: Iterable[Judged], most: int) -> list[tuple[LivePart, Picked]]:
-    """Show batches in their order, by stream and revision, with about `most` rows in all, one a part at least."""
+def thin_batches(batches: Iterable[LoggedBatch], most: int) -> list[tuple[LivePart, ShownRows]]:
+    """Return the parts to show, by stream and revision, in order.
+
+    They have about `most` rows in total, and at least one each.
+    """
     groups = [list(group) for _, group in groupby(batches, lambda each: (each.stream_id, id(each.served)))]
     total = sum(len(batch.rows) for group in groups for batch in group)
     return [_part(group, most, total) for group in groups]
 
 
-def pick(code: NDArray[np.uint8], most: int) -> NDArray[np.int64]:
-    """Places of at most so many rows (at least one) of these codes, in order, those at an edge left out. One of each
-    stretch: the first that was kept out where there is one, so that no stretch looks calmer than it was."""
+def choose_rows(code: NDArray[np.uint8], most: int) -> NDArray[np.int64]:
+    """Return the indices of at most `most` rows (at least one) with these codes, in order, without those at an edge.
+
+    Each stretch contributes one row: the first that was kept out, if any, so that no stretch looks calmer than it was.
+    """
     places = np.flatnonzero(code != Code.EDGE)
     if len(places) <= most:
         return places
@@ -74,14 +83,14 @@ def pick(code: NDArray[np.uint8], most: int) -> NDArray[np.int64]:
     return places[chosen]
 
 
-def _part(group: Sequence[Judged], most: int, total: int) -> tuple[LivePart, Picked]:
+def _part(group: Sequence[LoggedBatch], most: int, total: int) -> tuple[LivePart, ShownRows]:
     served, stream_id = group[0].served, group[0].stream_id
     rows = Rows.concatenate([batch.rows for batch in group])
     mean, std, bare = (np.concatenate([_spread(batch, name) for batch in group]) for name in ("mean", "std", "bare"))
     noise = served.model.noise_std
     count = np.bincount(rows.code, minlength=len(CODES))
-    chosen = pick(rows.code, max(most * len(rows) // max(total, 1), 1))
-    picked = Picked(stream_id, served, rows.take(chosen), mean[chosen], std[chosen], bare[chosen])
+    chosen = choose_rows(rows.code, max(most * len(rows) // max(total, 1), 1))
+    picked = ShownRows(stream_id, served, rows.take(chosen), mean[chosen], std[chosen], bare[chosen])
     part = LivePart(
         stream_id=stream_id,
         version=served.version,
@@ -100,15 +109,15 @@ def _part(group: Sequence[Judged], most: int, total: int) -> tuple[LivePart, Pic
     return part, picked
 
 
-def _spread(batch: Judged, name: str) -> Array:
-    """Numbers of the rows that were predicted, (P, n), as those of all rows, (N, n), NaN where there are none."""
+def _spread(batch: LoggedBatch, name: str) -> Array:
+    """Return numbers of the predicted rows, (P, n), as those of all rows, (N, n), NaN without a prediction."""
     values = np.full(batch.rows.q.shape, np.nan)
     values[batch.screened.predicted] = getattr(batch.screened, name)
     return values
 
 
 def _worst(error: Array, total: Array) -> list[float | None]:
-    """Largest |error| / total of each joint, None where no row was predicted."""
+    """Return the largest |error| / total of each joint; None if no row was predicted."""
     known = np.isfinite(error).all(axis=1)
     if not known.any():
         return [None] * error.shape[1]
@@ -116,21 +125,21 @@ def _worst(error: Array, total: Array) -> list[float | None]:
     return worst
 
 
-def beyond(picked_rows: Iterable[Picked]) -> list[LiveNovelty]:
-    """Which of the rows picked lie beyond their versions' bases, stream by stream."""
-    streams: dict[str, list[Picked]] = defaultdict(list)
+def find_novel_rows(picked_rows: Iterable[ShownRows]) -> list[LiveNovelty]:
+    """Return which of the shown rows lie beyond their versions' bases, for each stream."""
+    streams: dict[str, list[ShownRows]] = defaultdict(list)
     for picked in picked_rows:
         streams[picked.stream_id].append(picked)
-    return [_look(stream_id, parts) for stream_id, parts in streams.items()]
+    return [_find_novel_in_stream(stream_id, parts) for stream_id, parts in streams.items()]
 
 
-def _look(stream_id: str, parts: list[Picked]) -> LiveNovelty:
+def _find_novel_in_stream(stream_id: str, parts: list[ShownRows]) -> LiveNovelty:
     times: list[float] = []
     unknown = 0
     share = 1.0
-    doubtful = [_doubtful(picked) for picked in parts]
-    if (total := sum(len(places) for places in doubtful)) > MOST_LOOKED:
-        share = MOST_LOOKED / total
+    doubtful = [_find_uncertain(picked) for picked in parts]
+    if (total := sum(len(places) for places in doubtful)) > MAX_NOVELTY_ROWS:
+        share = MAX_NOVELTY_ROWS / total
     for picked, places in zip(parts, doubtful, strict=True):
         few = places[:: int(np.ceil(1 / share))]
         unknown += len(places) - len(few)
@@ -140,27 +149,36 @@ def _look(stream_id: str, parts: list[Picked]) -> LiveNovelty:
     return LiveNovelty(stream_id=stream_id, times=times, unknown=unknown)
 
 
-def _doubtful(picked: Picked) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    """Places of rows that may lie beyond the basis. What the basis leaves open is part of the variance of every answer:
-    where that is below the noise's, nothing more needs to be computed."""
+def _find_uncertain(picked: ShownRows) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    """Return the indices of rows that may lie beyond the basis.
+
+    The variance that the basis leaves open is part of every answer's variance. If that is below the noise, no further
+    computation is needed.
+    """
     with np.errstate(invalid="ignore"):
         doubtful = (picked.bare > picked.served.model.noise_std).any(axis=1)
     return np.flatnonzero(doubtful)
 
 
 TICK_S = 0.1
-"""Seconds between two looks at the rows of a model: so many `rows` events there may be."""
+"""Seconds between two reads of a model's rows, and so between two `rows` events."""
 STATUS_S = 1.0
 """Seconds between two `status` events."""
-MOST_WAITING = 1000
-"""Batches that may wait for a look; beyond it the oldest are not shown."""
-MOST_UNREAD = 50
-"""Events that wait for a slow reader, some five seconds; beyond it the oldest are lost, and a `lost` event says so."""
-LONGEST_S = 2.0
-"""Rows are shown as if they had arrived within this time at most, s: a batch may bring many seconds of them."""
+MAX_WAITING_BATCHES = 1000
+"""Batches that may wait for a tick. Beyond it, the oldest are not shown."""
+MAX_UNREAD_EVENTS = 50
+"""Max events that wait for a slow reader: about five seconds.
 
-Look = Callable[[list[LiveNovelty], float | None], LiveStatus]
-"""Makes a status. Given which rows shown are novel, and how many seconds ago the last status was, None at first."""
+Beyond it, the oldest are lost, and a `lost` event reports how many.
+"""
+MAX_SHOWN_S = 2.0
+"""Max seconds between two ticks that count for the number of rows: one batch may contain many seconds of them."""
+
+ReadStatus = Callable[[list[LiveNovelty], float | None], LiveStatus]
+"""Function that returns a status.
+
+Its arguments are the novel rows among those shown, and the seconds since the last status, None at first.
+"""
 
 
 class FeedEvent(NamedTuple):
@@ -170,10 +188,10 @@ class FeedEvent(NamedTuple):
     data: str
 
 
-class Feed(Counted):
-    """Followers of models. It belongs to the event loop, but for `note` and `forget`.
+class Feed(OpenCounter):
+    """The live feeds of models. It belongs to the event loop, but for `add_batch` and `forget`.
 
-    positions: of the last row of each model that was finite, rad (m).
+    positions: the last finite position of each model's robot, rad (m).
     """
 
     too_many = "models are followed {} times, the most there may be: close one, or try again later"
@@ -181,13 +199,12 @@ class Feed(Counted):
 
     def __init__(self) -> None:
         super().__init__()
-        self._followed: dict[str, Followed] = {}
+        self._followed: dict[str, FollowedModel] = {}
         self.positions: dict[str, list[float]] = {}
 
-    def note(self, batch: Judged) -> None:
-        """Take note of a batch that was logged: where its robot is, and what it shows to those who follow the model.
-        From any thread."""
-        known = batch.rows.q[(np.abs(batch.rows.q) < FARTHEST).all(axis=1)]
+    def add_batch(self, batch: LoggedBatch) -> None:
+        """Add a logged batch: store the robot's position, and show rows to readers of the model. From any thread."""
+        known = batch.rows.q[(np.abs(batch.rows.q) < MAX_POSITION).all(axis=1)]
         if len(known):
             self.positions[batch.served.name] = np.round(known[-1], DECIMALS).tolist()
         followed = self._followed.get(batch.served.name)
@@ -195,15 +212,15 @@ class Feed(Counted):
             followed.waiting.append(batch)
 
     def forget(self, model: str) -> None:
-        """Keep nothing of a model that has been deleted. From any thread."""
+        """Delete everything about a model that has been deleted. From any thread."""
         self.positions.pop(model, None)
 
-    async def follow(self, model: str, look: Look, closing: asyncio.Event) -> AsyncIterator[FeedEvent]:
-        """Events of a model until the service closes or the model is deleted; a status comes first."""
+    async def follow(self, model: str, read_status: ReadStatus, closing: asyncio.Event) -> AsyncIterator[FeedEvent]:
+        """Yield the events of a model until the service closes or the model is deleted. A status comes first."""
         followed = self._followed.get(model)
         if followed is None or followed.over:
-            followed = self._followed[model] = Followed(model, look, ROWS_PER_S)
-            # in a context of its own, not that of the request that happens to be the first
+            followed = self._followed[model] = FollowedModel(model, read_status, ROWS_PER_S)
+            # in a context of its own, not in that of the first request
             run = followed.run(closing)
             followed.task = asyncio.get_running_loop().create_task(run, context=Context())
         reader = followed.join()
@@ -217,7 +234,7 @@ class Feed(Counted):
 
 
 class Reader:
-    """The events that one reader has not read yet. closed: there will be no more."""
+    """The events that one reader has not read yet. closed: whether there will be no more."""
 
     def __init__(self) -> None:
         self.closed = False
@@ -226,20 +243,20 @@ class Reader:
         self._woken = asyncio.Event()
 
     def put(self, event: FeedEvent) -> None:
-        """Put an event at the end; the oldest goes where there are too many."""
-        if len(self._unread) >= MOST_UNREAD:
+        """Append an event; drop the oldest if there are too many."""
+        if len(self._unread) >= MAX_UNREAD_EVENTS:
             self._unread.popleft()
             self._lost += 1
         self._unread.append(event)
         self._woken.set()
 
     def close(self) -> None:
-        """End after what is left."""
+        """End after the remaining events."""
         self.closed = True
         self._woken.set()
 
     async def read(self) -> AsyncIterator[FeedEvent]:
-        """The events, as they are put in."""
+        """Yield the events as they are appended."""
         while True:
             if self._lost:
                 lost, self._lost = self._lost, 0
@@ -253,29 +270,29 @@ class Reader:
                 await self._woken.wait()
 
 
-class Followed:
-    """One model while it has readers. waiting: batches that are not shown yet. over: it has no readers any more."""
+class FollowedModel:
+    """A model that has readers. waiting: batches that are not shown yet. over: whether its last reader has left."""
 
-    def __init__(self, model: str, look: Look, rows_per_s: float) -> None:
-        self.model, self._look, self._rows_per_s = model, look, rows_per_s
-        self.waiting: deque[Judged] = deque(maxlen=MOST_WAITING)
+    def __init__(self, model: str, read_status: ReadStatus, rows_per_s: float) -> None:
+        self.model, self._read_status, self._rows_per_s = model, read_status, rows_per_s
+        self.waiting: deque[LoggedBatch] = deque(maxlen=MAX_WAITING_BATCHES)
         self.readers: list[Reader] = []
         self.over = False
         self.task: asyncio.Task[None] | None = None
-        self._picked: list[Picked] = []  # since the last status
+        self._shown: list[ShownRows] = []  # since the last status
         self._status_at: float | None = None
         self._shown_at = monotonic()
-        self._asked = True
+        self._is_status_due = True
 
     def join(self) -> Reader:
-        """Add a reader, who gets a status at once."""
+        """Add a reader, which gets a status at once."""
         reader = Reader()
         self.readers.append(reader)
-        self._asked = True
+        self._is_status_due = True
         return reader
 
     async def run(self, closing: asyncio.Event) -> None:
-        """Look and pass on events until there is no reader left, or the model is deleted, or the service closes."""
+        """Send events to the readers until none is left, the model is deleted, or the service closes."""
         try:
             while self.readers and not closing.is_set():
                 try:
@@ -284,7 +301,7 @@ class Followed:
                             reader.put(event)
                 except NotFoundError:  # it was deleted
                     return
-                except Exception:  # of the database: the next look may find it well again
+                except Exception:  # a database error, which may be over at the next tick
                     logger.exception("model %s, which is followed, could not be looked at", self.model)
                 with suppress(TimeoutError):
                     await asyncio.wait_for(closing.wait(), TICK_S)
@@ -294,22 +311,22 @@ class Followed:
                 reader.close()
 
     def _events(self) -> list[FeedEvent]:
-        """The events of this moment. For a thread."""
+        """Return the events of this tick. For a thread."""
         now = monotonic()
-        events = self._status(now) if self._asked or now - (self._status_at or 0.0) >= STATUS_S else []
+        events = self._status(now) if self._is_status_due or now - (self._status_at or 0.0) >= STATUS_S else []
         return events + self._rows(now)
 
     def _rows(self, now: float) -> list[FeedEvent]:
         batches = [self.waiting.popleft() for _ in range(len(self.waiting))]
         if not batches:
             return []
-        passed, self._shown_at = min(now - self._shown_at, LONGEST_S), now
-        parts = thinned(batches, max(round(self._rows_per_s * passed), 1))
-        self._picked += [picked for _, picked in parts]
+        passed, self._shown_at = min(now - self._shown_at, MAX_SHOWN_S), now
+        parts = thin_batches(batches, max(round(self._rows_per_s * passed), 1))
+        self._shown += [picked for _, picked in parts]
         return [FeedEvent("rows", LiveRows(parts=[part for part, _ in parts]).model_dump_json())]
 
     def _status(self, now: float) -> list[FeedEvent]:
         passed = None if self._status_at is None else now - self._status_at
-        self._asked, self._status_at = False, now
-        picked, self._picked = self._picked, []
-        return [FeedEvent("status", self._look(beyond(picked), passed).model_dump_json())]
+        self._is_status_due, self._status_at = False, now
+        picked, self._shown = self._shown, []
+        return [FeedEvent("status", self._read_status(find_novel_rows(picked), passed).model_dump_json())]

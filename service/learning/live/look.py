@@ -1,4 +1,4 @@
-"""The status that a follower of a model is sent once a second."""
+"""The status in the live feed of a model, once a second."""
 
 from __future__ import annotations
 
@@ -13,26 +13,28 @@ from service.learning.learners import Learners
 from service.storage.rows import Page
 from service.telemetry.meters import OTHER, Meters, StreamMeter
 
-MOST_ALARMS = 5
+MAX_ALARMS = 5
+"""Newest alarms in a status."""
 COUNTS = (*CODES, "batches", "duplicates")
+"""Names of the monitor's counts in a status."""
 
 
-class LiveLook:
-    """Makes the statuses of one model; not for the event loop."""
+class StatusReader:
+    """Reads the status of one model; not for the event loop."""
 
     def __init__(self, learners: Learners, meters: Meters, model: str) -> None:
         self.learners, self.model = learners, model
-        self._answers = Answers(meters, model)
+        self._answers = AnswerCounter(meters, model)
 
     def __call__(self, novel: list[LiveNovelty], passed: float | None) -> LiveStatus:
-        """Return how it stands; raise NotFoundError where it was deleted. passed: s since the last time."""
+        """Return the status; raise NotFoundError if the model was deleted. passed: seconds since the last status."""
         learners, model = self.learners, self.model
         served, now = learners.loaded.get(model, None), time.time()
         monitor, latest = learners.monitor(model), learners.status(model, served.version)
         lag = learners.lag(served)
         with learners.database.session() as session:
             events = log.newest(session, model) - log.start_of(session, model, served.version)
-            options, held = owner.options(session, model), owner.held(session, model)
+            options, held = owner.read_options(session, model), owner.read_pause(session, model)
         return LiveStatus(
             model=model,
             at=now,
@@ -52,24 +54,24 @@ class LiveLook:
             novel_share=latest.novel_share,
             novel=novel,
             counts={name: monitor.counts[name] for name in COUNTS},
-            windows=[status.window(each, now) for each in monitor.windows],
-            scale=served.scales.asked,
-            payloads=payload.brief(monitor, served),
+            windows=[status.summarise_window(each, now) for each in monitor.windows],
+            scale=served.scales.default_factors,
+            payloads=payload.summarise_payloads(monitor, served),
             answers=self._answers.since(passed),
-            alarms=decisions.alarms(learners, model, Page(after=None, limit=MOST_ALARMS)).items,
+            alarms=decisions.alarms(learners, model, Page(after=None, limit=MAX_ALARMS)).items,
         )
 
 
-class Answers:
-    """Answers of a model's streams, from one look to the next."""
+class AnswerCounter:
+    """Counts the answers of a model's streams between two statuses."""
 
     def __init__(self, meters: Meters, model: str) -> None:
         self._meters, self._model = meters, model
         self._before: tuple[list[int], int, int] | None = None
 
     def since(self, passed: float | None) -> LiveAnswers | None:
-        """Answers since the last look, `passed` s ago; None at the first one."""
-        # read only: meters belong to the event loop, which makes them
+        """Return the answers since the last call, `passed` seconds ago; None at the first call."""
+        # only read, because meters belong to the event loop
         meter = self._meters.streams().get(self._model)
         if meter is None and OTHER in self._meters.streams():
             return None
@@ -84,13 +86,16 @@ class Answers:
             count=sum(counts),
             refused=now[1] - before[1],
             late=now[2] - before[2],
-            p50_at_most_s=at_most(counts, bounds, 0.5),
-            p99_at_most_s=at_most(counts, bounds, 0.99),
+            p50_at_most_s=find_quantile_bound(counts, bounds, 0.5),
+            p99_at_most_s=find_quantile_bound(counts, bounds, 0.99),
         )
 
 
-def at_most(counts: list[int], bounds: tuple[float, ...], share: float) -> float | None:
-    """The least bound below which this share of what was counted lies, None where there is none. counts: by bucket."""
+def find_quantile_bound(counts: list[int], bounds: tuple[float, ...], share: float) -> float | None:
+    """Return the smallest bound with this share of the counts below it; None if there is none.
+
+    counts: one number for each bucket.
+    """
     total, below = sum(counts), 0
     if not total:
         return None

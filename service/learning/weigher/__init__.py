@@ -1,1 +1,1 @@
-"""The weigher process: it follows what streams carry, beside the service and at its priority."""
+"""The weigher process: it follows the payloads of streams, beside the service and at its priority."""

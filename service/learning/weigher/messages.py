@@ -1,4 +1,4 @@
-"""What the weigher process is given, and what it answers."""
+"""Messages between the service and the weigher process."""
 
 from __future__ import annotations
 
@@ -6,51 +6,55 @@ from dataclasses import dataclass
 
 from lipcore.data.samples import Array
 from lipcore.online.batch import Rows
-from lipcore.online.payload.holding import Watch
+from lipcore.online.payload.holding import PayloadTracker
 
 Stream = tuple[str, int, str]
-"""A model, the version that answers, and one of its streams."""
-MOST_STREAMS = 1000
-"""Streams that the process knows; the one that was silent for longest is forgotten, and asked for again."""
+"""A model, its serving version and one of its streams."""
+MAX_STREAMS = 1000
+"""Streams that the process stores. It drops the one that was silent longest, and asks for it again."""
 
 
 @dataclass(frozen=True)
-class Revised:
-    """What a version has learnt: weights and root of its posterior, see `CompactPosterior`."""
+class PosteriorUpdate:
+    """Learnt posterior of a version: its weights and root, see `CompactPosterior`."""
 
     weights: Array
     root: Array
 
 
 @dataclass(frozen=True)
-class Unweighed:
-    """Rows of a stream that have an answer. received: Unix time, s; said: see `Payloads.said`.
-
-    What the process may not know yet: revised: what the version has learnt; known: what the stream carries.
-    """
+class StreamRows:
+    """Rows of a stream that have predictions, with updates that the process may lack."""
 
     rows: Rows
     received: float
-    said: int
-    revised: Revised | None = None
-    known: Watch | None = None
+    """Unix time of the arrival, s."""
+    event: int
+    """Event that set the payload, see `Payloads.find_event`."""
+    posterior: PosteriorUpdate | None = None
+    """Learnt posterior of the version; None if the process has it."""
+    watch: PayloadTracker | None = None
+    """Payload of the stream; None if the process has it."""
 
 
 @dataclass(frozen=True)
-class Weighed:
-    """What a stream carries after its latest rows. watch: without these rows; received, said: of them."""
+class WatchUpdate:
+    """The payload of a stream after its latest rows."""
 
     stream: Stream
-    watch: Watch
+    watch: PayloadTracker
+    """The payload, without the rows that show it."""
     received: float
-    said: int
+    """Unix time at which the latest rows arrived, s."""
+    event: int
+    """Event that set the payload before these rows, see `StreamRows`."""
 
 
 @dataclass(frozen=True)
-class Asked:
-    """The process does not know a stream, whose rows have come."""
+class UnknownStream:
+    """Request for the payload of a stream that is unknown to the process."""
 
     stream: Stream
 
 
-Message = Weighed | Asked
+Message = WatchUpdate | UnknownStream

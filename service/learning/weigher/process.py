@@ -1,4 +1,4 @@
-"""The weigher process as the service sees it: given rows, listened to. Nothing here imports numerics."""
+"""The weigher process as the service sees it. Nothing here imports numerics."""
 
 from __future__ import annotations
 
@@ -8,23 +8,26 @@ from typing import TYPE_CHECKING
 
 from service.foundation.settings import Settings
 from service.runtime.companion import Companion
-from service.runtime.process import Place, training_place
+from service.runtime.process import ProcessOptions, training_process_options
 
 if TYPE_CHECKING:  # numerics
     from service.learning.weigher.messages import Message
 
-MOST_WAITING = 20
-"""Batches of a stream that wait for the process; the oldest of more are passed over, as a payload shows in new ones."""
+MAX_WAITING_BATCHES = 20
+"""Batches of a stream that wait for the process. The oldest are dropped: new ones show the payload too."""
 
 
-def weigher_place(settings: Settings) -> Place:
-    """The place of the weigher process: at the service's priority, one thread, anywhere."""
-    return replace(training_place(settings), threads=1, niceness=0, policy="other", cpus=None)
+def weigher_place(settings: Settings) -> ProcessOptions:
+    """Return the place of the weigher process: the service's priority, one thread, any CPU."""
+    return replace(training_process_options(settings), threads=1, niceness=0, policy="other", cpus=None)
 
 
 class WeigherProcess(Companion):
-    """Started with the service if a version in memory knows an arm, else with the first rows of one. epoch: how often a
-    process was started, each of which knows nothing. on_message: see `Companion`."""
+    """The weigher process.
+
+    It starts with the service if a version in memory has an arm, else with the first rows of one. epoch: how often a
+    process was started; a new one has no streams. on_message: see `Companion`.
+    """
 
     def __init__(self, settings: Settings, on_message: Callable[[Message], None]) -> None:
         self.epoch = 0

@@ -1,5 +1,7 @@
-"""What streams carry, as the service sees it: rows go to the weigher process, and what it notices is answered with at
-once, then logged."""
+"""The payloads of streams as the service sees them.
+
+Rows go to the weigher process. A payload that it notices is used for answers at once, then logged.
+"""
 
 from __future__ import annotations
 
@@ -11,28 +13,38 @@ from dataclasses import replace
 
 from sqlalchemy import select
 
-from lipcore.online.payload.holding import Watch
-from lipcore.online.screening import Screened
+from lipcore.online.payload.holding import PayloadTracker
+from lipcore.online.screening import PredictedBatch
 from lipcore.online.stream import PayloadRecord
 from service.foundation.errors import ServiceError
 from service.journal import log, undo
 from service.journal.alarms import raise_alarm
 from service.journal.arrivals import NewBatch
 from service.learning.ingest.monitor import Monitor
-from service.learning.weigher.messages import MOST_STREAMS, Asked, Message, Revised, Stream, Unweighed, Weighed
-from service.learning.weigher.process import MOST_WAITING, WeigherProcess
-from service.models.loaded import LoadedModels, Served
+from service.learning.weigher.messages import (
+    MAX_STREAMS,
+    Message,
+    PosteriorUpdate,
+    Stream,
+    StreamRows,
+    UnknownStream,
+    WatchUpdate,
+)
+from service.learning.weigher.process import MAX_WAITING_BATCHES, WeigherProcess
+from service.models.loaded import LoadedModels, ServedModel
 from service.storage.database import EventRow
 
 logger = logging.getLogger(__name__)
 
-ALARM_S = 60.0
-"""A robot that picks and places does so all day: of a model, payloads raise no more than one alarm in so long, s; and
-a machine that is too slow is told of as often."""
+MIN_ALARM_PAUSE_S = 60.0
+"""Min seconds between two payload alarms of a model, and between two warnings that the process is behind.
+
+A robot that picks and places would raise alarms all day.
+"""
 
 
 class Weighing:
-    """Follows what the streams of all models carry; safe from several threads.
+    """Follows the payloads of the streams of all models; safe from several threads.
 
     process: the weigher process. monitor, turn: see `ObservationLog`.
     """
@@ -40,68 +52,70 @@ class Weighing:
     def __init__(
         self,
         loaded: LoadedModels,
-        monitor: Callable[[Served], Monitor],
+        monitor: Callable[[ServedModel], Monitor],
         turn: Callable[[Monitor, str], AbstractContextManager[None]],
     ) -> None:
         self.loaded, self.database = loaded, loaded.storage.database
         self._monitor, self._turn = monitor, turn
-        self.process = WeigherProcess(loaded.storage.settings, self.take)
+        self.process = WeigherProcess(loaded.storage.settings, self.handle_message)
         self._lock = threading.Lock()
-        self._behind_at = -ALARM_S  # Unix time, s, when it was last said that the process is behind
-        self._knows: dict[Stream, tuple[int, int]] = {}  # which process, and up to which declaration
-        self._revisions: dict[tuple[str, int], tuple[int, int]] = {}  # which process, and which revision
+        self._behind_at = -MIN_ALARM_PAUSE_S  # Unix time of the last warning that the process is behind, s
+        self._sent: dict[Stream, tuple[int, int]] = {}  # epoch of the process and event of the payload sent to it
+        self._revisions: dict[tuple[str, int], tuple[int, int]] = {}  # epoch of the process and revision sent to it
 
     def close(self) -> None:
         """End the process."""
         self.process.close()
 
     def expect(self) -> None:
-        """Have the process ready for streams of the versions that answer: started with their first rows, it would come
-        seconds late."""
+        """Prepare the process for streams of the serving versions.
+
+        A process that starts with their first rows is seconds late.
+        """
         for model, version in self.loaded.held():
             served = self.loaded.peek(model)
             if served is not None and served.version == version and served.carrier is not None:
                 self.process.give((model, version, ""))
 
-    def follow(self, monitor: Monitor, served: Served, batch: NewBatch, screened: Screened) -> None:
-        """Hand over a batch that is logged; its model's turn is held. Never waits for the process."""
+    def follow(self, monitor: Monitor, served: ServedModel, batch: NewBatch, screened: PredictedBatch) -> None:
+        """Send a logged batch to the process, in the model's turn. Never waits for the process."""
         assert served.carrier is not None
-        rows = screened.rows.take(screened.asked)
+        rows = screened.rows.take(screened.answerable)
         if not len(rows):
             return
         stream, version = (served.name, served.version, batch.stream_id), (served.name, served.version)
-        said, epoch = monitor.payloads.event(batch.stream_id), self.process.epoch
+        event, epoch = monitor.payloads.find_event(batch.stream_id), self.process.epoch
         with self._lock:
-            if len(self._knows) > MOST_STREAMS:  # what the process has not forgotten is told again
-                self._knows.clear()
-            knows = self._knows.get(stream) == (epoch, said)
-            same = self._revisions.get(version) == (epoch, served.revision)
-            self._knows[stream], self._revisions[version] = (epoch, said), (epoch, served.revision)
-        known = revised = None
-        if not knows:
-            known = monitor.payloads.watch(batch.stream_id, served.carrier, served.version).outline()
-        if not same:
+            if len(self._sent) > MAX_STREAMS:  # resends what the process may still know
+                self._sent.clear()
+            has_payload = self._sent.get(stream) == (epoch, event)
+            has_posterior = self._revisions.get(version) == (epoch, served.revision)
+            self._sent[stream], self._revisions[version] = (epoch, event), (epoch, served.revision)
+        watch = update = None
+        if not has_payload:
+            watch = monitor.payloads.watch(batch.stream_id, served.carrier, served.version).outline()
+        if not has_posterior:
             posterior = served.model.posterior
-            revised = Revised(posterior.weights, posterior.root)
-        if self.process.give(stream, Unweighed(rows, batch.received, said, revised, known), most=MOST_WAITING):
-            self._ask(stream)  # what was dropped may have said what was not known
-            if batch.received - self._behind_at >= ALARM_S:
+            update = PosteriorUpdate(posterior.weights, posterior.root)
+        if self.process.give(stream, StreamRows(rows, batch.received, event, update, watch), most=MAX_WAITING_BATCHES):
+            self._forget_sent(stream)  # the dropped batch may have carried the state
+            if batch.received - self._behind_at >= MIN_ALARM_PAUSE_S:
                 self._behind_at = batch.received
                 text = "rows come faster than payloads are weighed: the oldest are passed over, now of %r of %s"
                 logger.warning(text, batch.stream_id, served.name)
 
     def forget(self, model: str) -> None:
-        """Keep nothing of a model that has been deleted."""
+        """Delete everything about a model that has been deleted."""
         with self._lock:
-            self._knows = {stream: each for stream, each in self._knows.items() if stream[0] != model}
+            self._sent = {stream: each for stream, each in self._sent.items() if stream[0] != model}
             self._revisions = {version: each for version, each in self._revisions.items() if version[0] != model}
-        if self.process.needed:
+        if self.process.is_needed:
             self.process.give(model)
 
-    def take(self, message: Message) -> None:
-        """Act on a message of the process; called in its reader's thread."""
-        if isinstance(message, Asked):
-            self._ask(message.stream)
+    def handle_message(self, message: Message) -> None:
+        """Act on a message of the process, in its reader's thread."""
+        if isinstance(message, UnknownStream):
+            self._forget_sent(message.stream)
             return
         model, version, stream_id = message.stream
         served = self.loaded.served(model).get(version)
@@ -109,28 +123,28 @@ class Weighing:
             return
         monitor = self._monitor(served)
         before = monitor.payloads.watch(stream_id, served.carrier, version)
-        if not monitor.payloads.take(stream_id, message.watch, version, message.received, message.said):
+        if not monitor.payloads.store(stream_id, message.watch, version, message.received, message.event):
             return
-        served.loads.take(monitor.payloads.carried(served.carrier, version))
+        served.payloads.replace(monitor.payloads.build_models(served.carrier, version))
         if (before.held is None, before.since) == (message.watch.held is None, message.watch.since):
             return
         try:
-            self._note(monitor, served, message)
-        except ServiceError as error:  # it is answered with, and the next batch's report says so
+            self._log_payload(monitor, served, message)
+        except ServiceError as error:  # answers use the payload all the same, and the next batch's report contains it
             logger.error("what stream %r of model %r carries is not logged: %s", stream_id, model, error)
 
-    def _ask(self, stream: Stream) -> None:
-        """Say all of a stream with its next rows."""
+    def _forget_sent(self, stream: Stream) -> None:
+        """Mark a stream as not sent, so that its next rows carry its payload and posterior."""
         with self._lock:
-            self._knows.pop(stream, None)
+            self._sent.pop(stream, None)
             self._revisions.pop(stream[:2], None)
 
-    def _note(self, monitor: Monitor, served: Served, message: Weighed) -> None:
-        """Log what was taken up or put down, and take back what the rows since then have taught."""
+    def _log_payload(self, monitor: Monitor, served: ServedModel, message: WatchUpdate) -> None:
+        """Log a payload that was picked up or put down. Unlearn the rows since a pick-up."""
         model, _, stream_id = message.stream
         watch, database = message.watch, self.database
         with self._turn(monitor, model):
-            if monitor.payloads.event(stream_id) != message.said:
+            if monitor.payloads.find_event(stream_id) != message.event:
                 return
             with database.transaction(model) as session:
                 detail = {"stream_id": stream_id, "watch": watch.to_json()}
@@ -150,18 +164,18 @@ class Weighing:
                 if (source := log.stream(session, model, stream_id)) is not None:
                     payload = PayloadRecord(event.number, message.received, watch.to_json(), served.version)
                     source.record = replace(monitor.streams.get(stream_id), payload=payload, scale=None).to_json()
-                if message.received - monitor.payload_alarm_at >= ALARM_S:
+                if message.received - monitor.payload_alarm_at >= MIN_ALARM_PAUSE_S:
                     monitor.payload_alarm_at = message.received
-                    text, mass = _told(stream_id, watch)
+                    text, mass = _describe_watch(stream_id, watch)
                     evidence = {"stream_id": stream_id, "at": watch.since, **mass}
                     raise_alarm(session, model, "payload", text, evidence)
             monitor.number = event.number
-            monitor.streams.change(stream_id, scale=None)  # its errors on the way say nothing of its intervals
-            served.scales.take(monitor.streams.factors(served.version))
+            monitor.streams.change(stream_id, scale=None)  # errors during the change do not calibrate its intervals
+            served.scales.replace(monitor.streams.factors(served.version))
 
 
-def _told(stream_id: str, watch: Watch) -> tuple[str, dict[str, object]]:
-    """What an alarm says, and its evidence."""
+def _describe_watch(stream_id: str, watch: PayloadTracker) -> tuple[str, dict[str, object]]:
+    """Return the text of an alarm and its evidence."""
     if watch.held is None:
         return f"stream {stream_id} has put its payload down", {}
     mean, std = watch.held.estimate.mass

@@ -1,4 +1,4 @@
-"""The database: tables, sessions, and migrations of what earlier releases stored."""
+"""The database: tables, sessions, and migrations from earlier releases."""
 
 from service.storage.database.engine import Database, fetch
 from service.storage.database.tables import (

@@ -1,7 +1,8 @@
 """Sessions on the database: SQLite below the home, or a PostgreSQL server that several services share.
 
-There a transaction tells the others of which model it has changed what: PostgreSQL sends notices with the commit
-(`NOTIFY`), and of what was rolled back nobody hears. Who was not connected then has missed it, and looks for itself.
+On PostgreSQL a transaction notifies the other services which models it changed. The server sends notices with the
+commit (`NOTIFY`), and none after a rollback. A service that was not connected missed them, and reads the tables
+instead.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from urllib.parse import quote
 from sqlalchemy import Connection, CursorResult, Select, create_engine, event, text
 from sqlalchemy.orm import Session, sessionmaker
 
-from lipcore.extras import need
+from lipcore.extras import import_extra
 from lipcore.files.durable import make_folder
 from service.foundation.settings import CONNECTIONS, Settings
 from service.storage.database import tables
@@ -33,7 +34,7 @@ logger = logging.getLogger(__name__)
 
 FILE = "lipserve.sqlite3"
 LOG_BYTES = 4 * 1024 * 1024
-"""Of SQLite's log, which by itself it brings into the database every 1000 pages."""
+"""Max size of SQLite's log after a restart of it; SQLite copies the log into the database every 1000 pages."""
 
 
 class Sqlite:
@@ -44,7 +45,7 @@ class Sqlite:
     def __init__(self, home: Path, timeout_s: float) -> None:
         make_folder(home, 0o700)
         self.path = home / FILE
-        self.path.touch(0o600)  # for its owner alone, as what SQLite puts beside it
+        self.path.touch(0o600)  # readable by its owner only, like the files that SQLite puts beside it
         self.engine = create_engine(
             f"sqlite:///{self.path}",
             connect_args={"timeout": timeout_s},
@@ -56,8 +57,10 @@ class Sqlite:
 
     @contextmanager
     def queue(self) -> Iterator[None]:
-        """Wait for the other writers of this process. SQLite by itself tries again only after up to 0.1 s, and then
-        another one may have come first. After `timeout_s` it is SQLite that refuses."""
+        """Wait for the other writers of this process, up to `timeout_s`; then SQLite rejects the write.
+
+        SQLite's own wait retries only every 0.1 s, and another writer may be first each time.
+        """
         held = self._writers.acquire(timeout=self._timeout_s)
         try:
             yield
@@ -66,34 +69,34 @@ class Sqlite:
                 self._writers.release()
 
     def lock(self, connection: Connection, model: str | None = None) -> None:
-        """Take the write lock, of which there is one: what is read from now on cannot change before it is written."""
+        """Acquire the only write lock: later reads of the transaction cannot change before its writes."""
         connection.execute(text("BEGIN IMMEDIATE"))
 
     def pin(self, connection: Connection) -> None:
-        """Let all that is read from now on be of the moment of the first look; writers are not kept."""
+        """Make all reads of the transaction see the moment of its first read; writers do not wait for it."""
         connection.execute(text("BEGIN"))
 
     @contextmanager
     def turn(self, model: str) -> Iterator[None]:
-        """Nothing to wait for: no other service has this file."""
+        """Do nothing: no other service uses this file."""
         yield
 
     def changes_of_others(self, pause_s: float) -> Iterator[str | None]:
-        """Nothing, at once: nobody else writes to this file."""
+        """Return no changes: no other service writes to this file."""
         return iter(())
 
     def check(self, seconds: float) -> None:
-        """Raise an error unless a transaction can be begun within so many seconds."""
-        # a connection of its own: requests wait longer for each other than this should
+        """Raise an error unless a transaction can begin within `seconds`."""
+        # a connection of its own: requests may wait longer for each other than this check
         with closing(connect(f"file:{quote(str(self.path))}?mode=rw", seconds, isolation_level=None, uri=True)) as own:
             own.execute("BEGIN IMMEDIATE")
             own.execute("ROLLBACK")
 
     def settle(self) -> None:
-        """Bring what an earlier run has left in SQLite's log into the database and begin the log anew, on the disk.
+        """Copy the log that an earlier run left into the database, and start a new log on the disk.
 
-        What is read of a log need not be on the disk: a sync may have failed. Commits that were added behind such a gap
-        would be lost with it at the next power cut. To be called by the first process, before it answers.
+        The readable log may not be on the disk, if a sync failed. Commits appended after such a gap would be lost with
+        it at the next power cut. Call it in the first process, before it answers.
         """
         with self.engine.connect() as connection:
             busy, _, _ = connection.execute(text("PRAGMA wal_checkpoint(TRUNCATE)")).one()
@@ -105,11 +108,11 @@ class Sqlite:
         self.engine.dispose()
 
     def damage(self) -> list[str]:
-        """What `quick_check` finds wrong; takes about 0.3 s for each GB."""
+        """Return the faults that `quick_check` finds; takes about 0.3 s per GB."""
         return self._faults("quick_check", 1)
 
     def inconsistencies(self, most: int) -> list[str]:
-        """What `integrity_check` finds wrong, and rows that refer to none; several times as long as `damage`."""
+        """Return the faults of `integrity_check` and broken references; takes several times as long as `damage`."""
         with self.engine.connect() as connection:
             rows = list(connection.execute(text("PRAGMA foreign_key_check")))
         return [*self._faults("integrity_check", most), *(f"a row of {r[0]} refers to no row of {r[2]}" for r in rows)]
@@ -121,21 +124,20 @@ class Sqlite:
 
 
 def _configure(connection: Any, _: object) -> None:
-    connection.isolation_level = None  # transactions are begun by `lock`, not by the driver
+    connection.isolation_level = None  # `lock` begins transactions, not the driver
     cursor = connection.cursor()
     cursor.execute("PRAGMA journal_mode=WAL")
     cursor.execute("PRAGMA synchronous=FULL")
     cursor.execute("PRAGMA foreign_keys=ON")
-    # a log that has grown while somebody read for long, as a backup does, is cut to this when it begins anew
+    # a log that grew during a long read, such as a backup, is cut to this size when it restarts
     cursor.execute(f"PRAGMA journal_size_limit={LOG_BYTES}")
     cursor.close()
 
 
 def fetch(session: Session, statement: Select[Any], **parameters: object) -> CursorResult[Any]:
-    """Rows of a statement that is made once, with parameters (`bindparam`); what the session has changed is in them.
+    """Return the rows of a prepared statement with parameters (`bindparam`), including the session's own changes.
 
-    For columns that are read for every batch: to make a statement each time, and an object of each row, takes six times
-    as long.
+    For columns that are read for every batch: a new statement each time, and an object per row, take six times as long.
     """
     session.flush()
     return session.connection().execute(statement, parameters)
@@ -155,20 +157,21 @@ _KEY = "notices"
 
 
 class Notice(NamedTuple):
-    """kind: `log` of a model that has grown, `model` whose versions, aliases or roles have changed or that is gone;
-    origin: who has changed it."""
+    """A change of a model by another service."""
 
     kind: Kind
+    """`log` if its log grew, `model` if its versions, aliases or roles changed or it was deleted."""
     model: str
     origin: str
+    """The `origin` of the database object that made the change."""
 
     def payload(self) -> str:
-        """What is sent; `read` is its inverse."""
+        """Return the text to send; `read_notice` is its inverse."""
         return f"{self.kind} {self.origin} {self.model}"
 
 
 def read_notice(payload: str) -> Notice | None:
-    """A notice that was sent; None for what is none of this release."""
+    """Return the notice of a received text; None if it is from another release."""
     kind, _, rest = payload.partition(" ")
     origin, _, model = rest.partition(" ")
     if kind == "log":
@@ -177,9 +180,9 @@ def read_notice(payload: str) -> Notice | None:
 
 
 def collect_notices(session: Session, _: Any) -> None:
-    """Note what is written to a session; to be called after each flush of it.
+    """Record the models that a session writes; call it after each flush.
 
-    Rows that are changed by a statement alone pass unseen: each such change comes with a row that does not.
+    Changes made by a statement alone are not seen: each of them comes with a row that is.
     """
     changes = session.info.setdefault(_KEY, set())
     row: Any
@@ -190,7 +193,7 @@ def collect_notices(session: Session, _: Any) -> None:
 
 
 def send_notices(session: Session, origin: str) -> None:
-    """Tell with the commit of a session what it has changed."""
+    """Send the session's notices with its commit."""
     session.flush()
     for kind, model in sorted(session.info.pop(_KEY, ())):
         payload = Notice(kind, model, origin).payload()
@@ -198,14 +201,16 @@ def send_notices(session: Session, origin: str) -> None:
 
 
 PATIENCE_S = 30.0
-"""Longest wait for another writer, of processes that nobody waits for."""
+"""Max wait for another writer in processes that no request waits for, s."""
 
 
 class Database:
-    """Sessions on one database; safe to share between threads. timeout_s: longest wait for another writer.
+    """Sessions on one database; safe to share between threads.
 
-    url: of a PostgreSQL server, None for SQLite below the home. connections: most that are open at a time there.
-    origin: by which others know who has changed something.
+    - timeout_s: max wait for another writer, s.
+    - url: of a PostgreSQL server, None for SQLite below the home.
+    - connections: max open connections to PostgreSQL.
+    - origin: random id of this object in the notices to others.
     """
 
     def __init__(
@@ -221,38 +226,38 @@ class Database:
 
     @classmethod
     def of(cls, settings: Settings, timeout_s: float = PATIENCE_S) -> Database:
-        """The database that the settings name."""
+        """Return the database that the settings name."""
         return cls(settings.home, timeout_s, settings.database_url, settings.database_connections)
 
     @property
     def shared(self) -> bool:
-        """Whether other services may write to it too."""
+        """Return whether other services may write to the same database."""
         return self.adapter.shared
 
     @property
     def own_clock(self) -> bool:
-        """Whether this machine's clock alone dates what is stored."""
+        """Return whether only this machine's clock dates the stored rows."""
         return not self.shared
 
     @contextmanager
     def session(self) -> Iterator[Session]:
-        """Session for reading: every statement sees what was committed before it."""
+        """Yield a session for reading: every statement sees the commits before it."""
         with self._sessions() as session:
             yield session
 
     @contextmanager
     def moment(self) -> Iterator[Session]:
-        """Session for reading: everything as of one moment. Nobody waits for it."""
+        """Yield a session for reading at one moment. No writer waits for it."""
         with self._sessions() as session:
             self.adapter.pin(session.connection())
             yield session
 
     @contextmanager
     def transaction(self, model: str | None = None) -> Iterator[Session]:
-        """Session whose changes are committed at the end, all or none; what is read inside cannot change before.
+        """Yield a session that commits all changes at the end, or none; what it reads cannot change before.
 
-        model: where given, only rows of this model are written, so that those of other models need not wait (which
-        SQLite's writers do all the same); else it is the only writer.
+        model: write only rows of this model, so that PostgreSQL's writers of other models need not wait. None makes it
+        the only writer.
         """
         with self.adapter.queue(), self._sessions() as session:
             self.adapter.lock(session.connection(), model)
@@ -262,16 +267,16 @@ class Database:
             session.commit()
 
     def turn(self, model: str) -> AbstractContextManager[None]:
-        """Be the only one, of all services that share the database, that takes something for a model meanwhile.
+        """Wait to be the only service that runs such a block for a model.
 
-        For what is read before the transaction that writes it down. Nothing needs it where there is one service.
+        For reads before the transaction that records them. A service alone needs no turn.
         """
         return self.adapter.turn(model)
 
     def changes_of_others(self, pause_s: float) -> Generator[Notice | None, None, None]:
-        """What is changed from the first None on that this yields, as it is committed; and None after each pause, s.
+        """Yield the commits of others after the first None, and None after each pause, s.
 
-        Ends with an error where the connection does. Where there is one service, nothing is told and this ends at once.
+        It raises an error if the connection is lost. It ends at once if no other service shares the database.
         """
         for payload in self.adapter.changes_of_others(pause_s):
             notice = None if payload is None else read_notice(payload)
@@ -279,7 +284,7 @@ class Database:
                 yield notice
 
     def follow_others(self, start: Callable[[], Callable[[], None]]) -> Callable[[], None]:
-        """Start what follows the changes of others, and return what stops it. A service alone starts nothing."""
+        """Start following the changes of others; return the function that stops it. A service alone starts nothing."""
         return start() if self.shared else lambda: None
 
     def close(self) -> None:
@@ -290,7 +295,7 @@ class Database:
 def _adapter(home: Path, timeout_s: float, url: str | None, connections: int) -> Sqlite | Postgresql:
     if url is None:
         return Sqlite(home, timeout_s)
-    need("psycopg", "cluster", "LIPSERVE_DATABASE_URL is set")
+    import_extra("psycopg", "cluster", "LIPSERVE_DATABASE_URL is set")
     from service.storage.database.postgresql import Postgresql  # noqa: PLC0415 - its driver is an extra
 
     return Postgresql(url, timeout_s, connections)

@@ -10,7 +10,7 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 
 def now() -> str:
-    """Current time, ISO 8601 in UTC."""
+    """Return the current time, ISO 8601 in UTC."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
@@ -18,7 +18,7 @@ class Base(DeclarativeBase):
     """Base of all tables."""
 
     type_annotation_map = {  # noqa: RUF012 - SQLAlchemy's own form
-        # a fleet writes 2**31 batches in weeks; SQLite's INTEGER has as many digits, and numbers rows only so
+        # a fleet writes 2**31 batches in weeks; SQLite's INTEGER is as large, and auto-increments only as such
         int: BigInteger().with_variant(Integer(), "sqlite"),
         dict[str, Any]: JSON,
         list[str]: JSON,
@@ -28,10 +28,7 @@ class Base(DeclarativeBase):
 
 
 class DatasetRow(Base):
-    """An uploaded data set; its samples lie in the file store under the same id.
-
-    idempotency_key, request_digest: see `service.storage.rows`; None where the client has given none.
-    """
+    """An uploaded data set; the file store keeps its samples under the same id."""
 
     __tablename__ = "datasets"
     __table_args__ = (Index("datasets_idempotency_key", "idempotency_key", unique=True),)
@@ -46,6 +43,7 @@ class DatasetRow(Base):
     rows: Mapped[int]
     report: Mapped[dict[str, Any]]
     idempotency_key: Mapped[str | None] = mapped_column(String(100))
+    """This and `request_digest`: see `service.storage.rows`; None if the client sent no key."""
     request_digest: Mapped[str | None] = mapped_column(String(64))
 
 
@@ -64,12 +62,7 @@ class RobotRow(Base):
 
 
 class JobRow(Base):
-    """A training job: all of its state, written by the service and by the worker.
-
-    history: what happened to it, oldest first, each {at, state, message}; retry_of: id of the job that it repeats;
-    request_id: of the request that queued it; owner: id of the service that has it run, None where none does yet;
-    idempotency_key, request_digest: `service.storage.rows`; key: id of the API key that queued it, None without keys.
-    """
+    """A training job with its whole state, written by the service and by the worker."""
 
     __tablename__ = "jobs"
     __table_args__ = (Index("jobs_idempotency_key", "idempotency_key", unique=True),)
@@ -89,16 +82,22 @@ class JobRow(Base):
     version: Mapped[int | None]
     error: Mapped[dict[str, Any] | None]
     history: Mapped[list[dict[str, Any]]] = mapped_column(default=list, server_default="[]")
+    """Events of the job as {at, state, message}, oldest first."""
     retry_of: Mapped[str | None] = mapped_column(String(40))
+    """Id of the job that this one repeats."""
     request_id: Mapped[str | None] = mapped_column(String(64))
+    """Id of the request that queued it."""
     owner: Mapped[str | None] = mapped_column(String(40))
+    """Id of the service that runs it, None if there is none yet."""
     idempotency_key: Mapped[str | None] = mapped_column(String(100))
+    """This and `request_digest`: see `service.storage.rows`; None if the client sent no key."""
     request_digest: Mapped[str | None] = mapped_column(String(64))
     key: Mapped[str | None] = mapped_column(String(40))
+    """Id of the API key that queued it, None without keys."""
 
 
 class ReplicaRow(Base):
-    """A service that shares the database with others. seen_at: its last sign of life, Unix s (database's clock)."""
+    """A service that shares the database with others."""
 
     __tablename__ = "replicas"
 
@@ -106,10 +105,11 @@ class ReplicaRow(Base):
     host: Mapped[str]
     started_at: Mapped[str]
     seen_at: Mapped[float]
+    """Time of its last heartbeat by the database's clock, Unix s."""
 
 
 class ModelRow(Base):
-    """A named model. last_version: the highest number that a version of it was ever given; none is given twice."""
+    """A named model."""
 
     __tablename__ = "models"
 
@@ -117,10 +117,11 @@ class ModelRow(Base):
     name: Mapped[str] = mapped_column(String(64), unique=True)
     created_at: Mapped[str]
     last_version: Mapped[int] = mapped_column(default=0, server_default="0")
+    """Highest version number given so far; no number is given twice."""
 
 
 class DeletedModelRow(Base):
-    """A model that was deleted: one of the same name goes on with the numbers after `last_version`."""
+    """A deleted model: a new one of the same name continues with the numbers after `last_version`."""
 
     __tablename__ = "deleted_models"
 
@@ -130,10 +131,7 @@ class DeletedModelRow(Base):
 
 
 class VersionRow(Base):
-    """An immutable trained version of a model; its files lie in the file store under `folder`.
-
-    checksums: sha256 of each of these files by name, None of versions from before they were kept.
-    """
+    """An immutable trained version of a model; the file store keeps its files under `folder`."""
 
     __tablename__ = "versions"
 
@@ -144,10 +142,11 @@ class VersionRow(Base):
     job: Mapped[str | None]
     manifest: Mapped[dict[str, Any]]
     checksums: Mapped[dict[str, Any] | None]
+    """sha256 of each file by name; None for versions stored before checksums existed."""
 
 
 class AliasRow(Base):
-    """A name that the owner of a model has given to one of its versions, and may move to another one."""
+    """A name that the owner of a model gave to one of its versions, and may move to another one."""
 
     __tablename__ = "aliases"
 
@@ -158,8 +157,7 @@ class AliasRow(Base):
 
 
 class AliasMoveRow(Base):
-    """One move of an alias, so that it can be taken back. version: where to, None where it was removed; before: where
-    from, None where it was new; takes_back: `seq` of the move that this one has taken back."""
+    """One move of an alias, so that it can be undone."""
 
     __tablename__ = "alias_moves"
     __table_args__ = (Index("alias_moves_alias", "model", "alias"),)
@@ -168,16 +166,18 @@ class AliasMoveRow(Base):
     model: Mapped[str] = mapped_column(ForeignKey("models.name"))
     alias: Mapped[str] = mapped_column(String(64))
     version: Mapped[int | None]
+    """Version it moved to, None if the alias was removed."""
     before: Mapped[int | None]
+    """Version it moved from, None if the alias was new."""
     takes_back: Mapped[int | None]
+    """`seq` of the move that this one undid."""
     at: Mapped[str]
 
 
 class ServingRow(Base):
-    """Which version of a model answers where none is named: the last that was trained, promoted or rolled back to. None
-    does of a model without such a row: all of its versions are candidates.
+    """The serving version of a model: the last that was trained, promoted or rolled back to.
 
-    change: goes up by one whenever that changes.
+    A model without such a row has no serving version: all of its versions are candidates.
     """
 
     __tablename__ = "serving"
@@ -185,12 +185,13 @@ class ServingRow(Base):
     model: Mapped[str] = mapped_column(ForeignKey("models.name"), primary_key=True)
     version: Mapped[int]
     change: Mapped[int]
+    """Number of changes of the serving version."""
 
 
 class LearnerRow(Base):
-    """How a version learns: it contains the model's events up to number `start` by training, later ones by updates.
+    """State of a version's learning: it contains events up to number `start` by training, later ones by updates.
 
-    role: "serving", or "dismissed" for one that does not learn. A version without such a row starts at 0.
+    A version without such a row starts at 0.
     """
 
     __tablename__ = "learners"
@@ -199,53 +200,48 @@ class LearnerRow(Base):
     version: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     start: Mapped[int]
     role: Mapped[str]
+    """`serving`, or `dismissed` for a version that does not learn."""
 
 
 class LearningRow(Base):
-    """How a model learns, as its owner has set it, whether it holds still after a change, and the payload that was
-    declared for all of its streams (see `lipcore.online.stream.PayloadRecord`)."""
+    """Learning settings of a model."""
 
     __tablename__ = "learning"
 
     model: Mapped[str] = mapped_column(ForeignKey("models.name"), primary_key=True)
     options: Mapped[dict[str, Any]]
+    """Options that the owner set."""
     held: Mapped[dict[str, Any] | None]
+    """Why learning is paused after a change, None if it is not."""
     payload: Mapped[dict[str, Any] | None]
+    """Payload declared for all of its streams, see `lipcore.online.stream.PayloadRecord`."""
 
 
 class StreamRow(Base):
-    """A source of observations. Event time = its own time + offset, s.
-
-    kind: "batches" or "frames"; last: highest sequence seen; missing: ranges [first, last] of sequences below it that
-    have not come; forgotten: highest sequence whose batch is no longer kept, so that it cannot be known again;
-    received: when the last one came, Unix time, s; record: see `lipcore.online.stream.StreamRecord`; both are None
-    for what an earlier release has written.
-    """
+    """A stream of observations. Event time = its own time + offset, s."""
 
     __tablename__ = "streams"
 
     model: Mapped[str] = mapped_column(ForeignKey("models.name"), primary_key=True)
     stream_id: Mapped[str] = mapped_column(String(64), primary_key=True)
     kind: Mapped[str]
+    """`batches` or `frames`."""
     offset: Mapped[float]
     last: Mapped[int] = mapped_column(BigInteger)
+    """Highest sequence number received."""
     missing: Mapped[dict[str, Any]]
+    """Ranges [first, last] of missing sequence numbers below `last`."""
     forgotten: Mapped[int | None] = mapped_column(BigInteger)
+    """Highest sequence number whose batch was deleted, so that a repetition is not recognised."""
     created_at: Mapped[str]
     received: Mapped[float | None]
+    """Time of the last batch, Unix s; None for rows of earlier releases."""
     record: Mapped[dict[str, Any] | None] = mapped_column(deferred=True)  # written with each batch, but rarely read
+    """See `lipcore.online.stream.StreamRecord`; None for rows of earlier releases."""
 
 
 class EventRow(Base):
-    """One entry of a model's log: what came, and what became of it. The posterior is a function of these rows.
-
-    number: 1, 2, 3 … of its model, in the order of commits; kind: "batch", "replay", "unlearn", "rollback", "change" or
-    "settings"; sequence, last_sequence: of a batch, and of its last frame; digest: sha256 of what was sent; received:
-    Unix time, s; clock: that of the model's own clock, see `service.journal.log.clock`, None where an earlier release
-    has logged it; version, revision: that predicted the rows; rows, learnt: how many came and how many teach; first,
-    last: event times, s; void: unlearnt or rolled back; report: what the acknowledgement said; record: prequential
-    sums; detail: of the other kinds; payload: the rows.
-    """
+    """One event of a model's log: an input and its effect. The posterior is a function of these rows."""
 
     __tablename__ = "events"
     __table_args__ = (
@@ -257,28 +253,46 @@ class EventRow(Base):
     seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
     model: Mapped[str] = mapped_column(ForeignKey("models.name"))
     number: Mapped[int]
+    """1, 2, 3 … per model, in the order of commits."""
     kind: Mapped[str]
+    """`batch`, `replay`, `unlearn`, `rollback`, `change` or `settings`."""
     stream_id: Mapped[str | None] = mapped_column(String(64))
     sequence: Mapped[int | None] = mapped_column(BigInteger)
+    """Sequence number of a batch."""
     last_sequence: Mapped[int | None] = mapped_column(BigInteger)
+    """Sequence number of a batch's last frame."""
     digest: Mapped[str | None]
+    """sha256 of the sent batch."""
     received: Mapped[float]
+    """Unix time, s."""
     clock: Mapped[float | None]
+    """Time of the model's own clock, see `service.journal.log.clock`; None for events of earlier releases."""
     version: Mapped[int | None]
+    """Version that predicted the rows."""
     revision: Mapped[int | None]
+    """Revision that predicted the rows."""
     rows: Mapped[int] = mapped_column(default=0)
+    """Number of received rows."""
     learnt: Mapped[int] = mapped_column(default=0)
+    """Number of learnt rows."""
     first: Mapped[float | None]
+    """Event time of the first row, s."""
     last: Mapped[float | None]
+    """Event time of the last row, s."""
     void: Mapped[bool] = mapped_column(default=False)
+    """Whether it was unlearnt or rolled back."""
     report: Mapped[dict[str, Any] | None]
+    """Content of the acknowledgement."""
     record: Mapped[dict[str, Any] | None]
+    """Prequential sums."""
     detail: Mapped[dict[str, Any] | None]
-    payload: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)  # read only by who needs the rows
+    """Content of an event that is no batch."""
+    payload: Mapped[bytes | None] = mapped_column(LargeBinary, deferred=True)  # most readers do not need the rows
+    """The rows."""
 
 
 class SnapshotRow(Base):
-    """What a version had learnt after event `number`; its file lies in the file store under `id`."""
+    """The learnt state of a version after event `number`; the file store keeps its file under `id`."""
 
     __tablename__ = "snapshots"
 
@@ -292,7 +306,7 @@ class SnapshotRow(Base):
 
 
 class AlarmRow(Base):
-    """Something about a learning model that its owner should know, with the evidence."""
+    """An alarm of a learning model for its owner, with the evidence."""
 
     __tablename__ = "alarms"
 
@@ -305,32 +319,33 @@ class AlarmRow(Base):
 
 
 class ApiKeyRow(Base):
-    """An API key: what it may do and until when. The key itself is not kept.
-
-    id: shown in lists and logs; hash: sha256 of the key; scopes: see `web.access.scopes`; expires_at, revoked_at:
-    None where it never does, or has not been; used_at: when it was seen last, to about a minute; max_requests_per_s:
-    None where the setting of this name holds.
-    """
+    """An API key with its scopes and expiry. The key itself is not stored."""
 
     __tablename__ = "api_keys"
 
     seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
     id: Mapped[str] = mapped_column(String(40), unique=True)
+    """Shown in lists and logs."""
     name: Mapped[str]
     hash: Mapped[str] = mapped_column(String(64), unique=True)
+    """sha256 of the key."""
     scopes: Mapped[list[str]]
+    """See `service.api.access.scopes`."""
     created_at: Mapped[str]
     expires_at: Mapped[str | None]
+    """None if it never expires."""
     revoked_at: Mapped[str | None]
+    """None if it is not revoked."""
     used_at: Mapped[str | None]
+    """Time of its last use, to about a minute."""
     max_requests_per_s: Mapped[float | None]
+    """None if the setting of this name applies."""
 
 
 class AuditRow(Base):
-    """One change of a model, see `service.storage.audit`. No line refers to a model's row: it outlives that.
+    """One change of a model, see `service.storage.audit`.
 
-    key, key_name: API key of who did it, None without keys; what: method and route, or `job` and its id, or `service`;
-    before, after: what was and what is, as JSON. The database refuses to change a line.
+    A line does not refer to the row of the model, because it outlives that row. The database rejects changes of a line.
     """
 
     __tablename__ = "audit"
@@ -339,12 +354,17 @@ class AuditRow(Base):
     seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=True)
     at: Mapped[str]
     key: Mapped[str | None] = mapped_column(String(40))
+    """Id of the API key of the request, None without keys."""
     key_name: Mapped[str | None]
+    """Name of that key."""
     what: Mapped[str]
+    """Method and route; `job` and its id; or `service`."""
     request_id: Mapped[str | None] = mapped_column(String(64))
     model: Mapped[str] = mapped_column(String(64))
     change: Mapped[str]
     version: Mapped[int | None]
     alias: Mapped[str | None] = mapped_column(String(64))
     before: Mapped[Any | None] = mapped_column(JSON)
+    """JSON before the change."""
     after: Mapped[Any | None] = mapped_column(JSON)
+    """JSON after the change."""

@@ -1,6 +1,6 @@
-"""A bucket of an S3-compatible service as a store of objects, by s3fs (fsspec).
+"""A bucket of an S3-compatible service as an object store, by s3fs (fsspec).
 
-Credentials, region and endpoint come from the usual AWS_ variables, files or roles; none of them is ever logged here.
+Credentials, region and endpoint come from the usual AWS_ variables, files or roles. They are never logged here.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from service.storage.files.objects import Entry, FilesUnreachableError, unreacha
 
 @dataclass(frozen=True)
 class BucketOptions:
-    """How objects are sent and fetched."""
+    """Options of requests to a bucket."""
 
     connect_s: int = 5
-    """Max wait in s for a connection."""
+    """Max wait for a connection, s."""
     read_s: int = 30
-    """Max wait in s for the next bytes."""
+    """Max wait for the next bytes, s."""
     attempts: int = 2
     """Max times that a request is sent."""
     part_bytes: int = 16 << 20
     """Bytes of a part of a large object."""
     max_parts: int = 2
-    """Max parts that are on their way, and in memory, at a time."""
+    """Max parts that are in transfer, and in memory, at a time."""
 
 
 BUCKET = BucketOptions()
@@ -43,13 +43,13 @@ NO_BUCKET = "there is no such bucket"
 
 
 class Bucket:
-    """Objects of a bucket whose keys begin with a prefix; safe from several threads, of one process."""
+    """Objects of a bucket whose keys begin with a prefix; safe from several threads of one process."""
 
     def __init__(self, bucket: str, prefix: str) -> None:
         self._bucket, self._prefix = bucket, prefix
         self._root = f"{bucket}/{prefix}".rstrip("/")
         self._system = s3fs.S3FileSystem(
-            skip_instance_cache=True,  # one of a forked parent would speak through the parent's connections
+            skip_instance_cache=True,  # a forked parent's instance would use the parent's connections
             use_listings_cache=False,
             config_kwargs={
                 "connect_timeout": BUCKET.connect_s,
@@ -57,33 +57,33 @@ class Bucket:
                 "retries": {"total_max_attempts": BUCKET.attempts, "mode": "standard"},
             },
         )
-        self._system.retries = 1  # of its own, on top of the library's
+        self._system.retries = 1  # s3fs retries on top of the library's retries
 
     def put(self, path: Path, key: str) -> None:
-        """Store a file; a large one goes in parts, and is there once all of them are."""
+        """Store a file; a large one is sent in parts and appears after the last one."""
         with _of_store(missing=NO_BUCKET):
             self._system.put_file(
                 str(path), self._path(key), chunksize=BUCKET.part_bytes, max_concurrency=BUCKET.max_parts
             )
 
     def get(self, key: str, path: Path) -> None:
-        """Copy an object into a new file; raise FileNotFoundError where there is none."""
+        """Copy an object into a new file; raise FileNotFoundError if there is none."""
         with _of_store():
             try:
                 self._system.get_file(
                     self._path(key), str(path), chunksize=BUCKET.part_bytes, max_concurrency=BUCKET.max_parts
                 )
             except FileNotFoundError:
-                self.check()  # a bucket that is gone is no reason to take what lay there for lost
+                self.check()  # a missing bucket does not mean that its objects are lost
                 raise
 
     def delete(self, key: str) -> None:
-        """Delete an object; nothing happens where there is none."""
+        """Delete an object; do nothing if there is none."""
         with _of_store(missing=NO_BUCKET):
             self._system.rm_file(self._path(key))
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Objects whose keys begin so."""
+        """Yield objects whose keys begin with `prefix`."""
         parent, _, beginning = prefix.rpartition("/")
         with _of_store(missing=NO_BUCKET):
             objects: dict[str, Any] = self._system.find(self._path(parent), detail=True, prefix=beginning)
@@ -92,7 +92,7 @@ class Bucket:
                 yield Entry(path.removeprefix(f"{self._root}/"), about["LastModified"].timestamp())
 
     def check(self) -> None:
-        """See that the bucket is there and can be listed."""
+        """Check that the bucket exists and can be listed."""
         with _of_store(missing=NO_BUCKET):
             prefix = f"{self._prefix}/" if self._prefix else ""
             asked = {"Bucket": self._bucket, "Prefix": prefix, "MaxKeys": 1}
@@ -104,7 +104,7 @@ class Bucket:
 
 @contextmanager
 def _of_store(missing: str | None = None) -> Iterator[None]:
-    """Let errors of the store be FilesUnreachableError, without the address and what else the library says."""
+    """Translate errors of the store into FilesUnreachableError, without the address and the library's text."""
     try:
         yield
     except FilesUnreachableError:
@@ -122,7 +122,7 @@ def _of_store(missing: str | None = None) -> Iterator[None]:
     except BotoCoreError as error:
         raise unreachable(f"the store does not answer ({type(error).__name__})") from None
     except OSError as error:
-        # of this host, while an object was fetched
+        # an error of this host's disk while an object was fetched
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
         raise unreachable(f"the store refuses ({type(error).__name__}: {error.strerror or error})") from None

@@ -1,4 +1,4 @@
-"""Files that outlive a power cut, whole or not at all; and those below the home of the only service that there is."""
+"""Durable files that are written whole or not at all; and the files below the home of a single service."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, TypeVar
 
-from lipcore.files.durable import make_folder, sync
+from lipcore.files.durable import make_folder, sync_folder
 from service.storage import sample_file
 
 Result = TypeVar("Result")
 
 
 class DamagedFileError(ValueError):
-    """A file does not have the sha256 that was kept of it, or is not there."""
+    """A file is missing, or does not have its stored sha256."""
 
 
 def check_sha256(path: Path, sha256: str) -> None:
-    """Raise DamagedFileError unless a file is there and has this sha256."""
+    """Raise DamagedFileError unless a file exists and has this sha256."""
     try:
         digest = sample_file.sha256(path)
     except FileNotFoundError:
@@ -31,9 +31,9 @@ def check_sha256(path: Path, sha256: str) -> None:
 
 
 def write_durably(path: Path, write: Callable[[IO[bytes]], Result], draft: Path | None = None) -> Result:
-    """Write a file that outlives a power cut, whole or not at all; return what `write` does.
+    """Write a file that survives a power cut, whole or not at all; return the result of `write`.
 
-    draft: what it is called until it is whole; beside it by default.
+    draft: temporary path of the unfinished file; beside it by default.
     """
     draft = path.with_suffix(".draft") if draft is None else draft
     try:
@@ -43,14 +43,14 @@ def write_durably(path: Path, write: Callable[[IO[bytes]], Result], draft: Path 
             os.fsync(file.fileno())
         draft.rename(path)
     except (OSError, ValueError):
-        draft.unlink(missing_ok=True)  # on a full disk, room for what comes next
+        draft.unlink(missing_ok=True)  # frees space on a full disk
         raise
-    sync(path.parent)  # the new name, before a row tells of it
+    sync_folder(path.parent)  # syncs the new name before a row refers to it
     return result
 
 
-class Local:
-    """Keys name files: `datasets/ds_1.safetensors` lies there below the home, for good.
+class LocalFiles:
+    """Files below the home: `datasets/ds_1.safetensors` is both a key and a path.
 
     shared: whether other services write too.
     """
@@ -65,32 +65,35 @@ class Local:
 
     @property
     def kinds(self) -> Mapping[str, Path]:
-        """Folders on the disk of the home, by what is in them."""
+        """Folders on the disk of the home, by their content."""
         return {"datasets": self.datasets, "versions": self.versions, "snapshots": self.snapshots}
 
     def file(self, key: str, again: bool = False) -> Path:
-        """Where a file lies, or would; raise FileNotFoundError where its folder is gone: that is no damaged file."""
+        """Return the path of a file, which may not exist.
+
+        Raise FileNotFoundError if its folder is missing; this is no damaged file.
+        """
         return _in_place(self._home / key)
 
     def write(self, key: str, write: Callable[[IO[bytes]], Result]) -> Result:
-        """Store a file durably, whole or not at all; return what `write` does."""
+        """Store a file durably, whole or not at all; return the result of `write`."""
         return write_durably(self._home / key, write)
 
     def delete(self, key: str) -> None:
-        """Delete a file; nothing happens where there is none."""
+        """Delete a file; do nothing if there is none."""
         (self._home / key).unlink(missing_ok=True)
 
     def version(self, name: str, again: bool = False) -> Path:
-        """Folder of a version; raise as `file` does."""
+        """Return the folder of a version; raise as `file` does."""
         return _in_place(self.versions / name)
 
     def has_version(self, name: str) -> bool:
-        """Whether the files of a version are there, as far as can be told at once."""
+        """Return whether the files of a version exist, by its manifest."""
         return (self.versions / name / "manifest.json").is_file()
 
     @contextmanager
     def new_version(self, name: str) -> Iterator[Path]:
-        """Give a folder to be made, and written durably, in the block; where that fails, nothing is left of it."""
+        """Yield a folder for the block to create durably; delete it if the block fails."""
         folder = self.versions / name
         try:
             yield folder
@@ -99,19 +102,19 @@ class Local:
             raise
 
     def delete_version(self, name: str) -> None:
-        """Delete a version's folder; raise FileNotFoundError where there is none."""
+        """Delete a version's folder; raise FileNotFoundError if there is none."""
         shutil.rmtree(self.versions / name)
 
     def versions_marked(self, mark: str, ended: bool = True) -> list[str]:
-        """Names of folders of versions, and of drafts of such, that have `mark` in them."""
+        """Return names of version folders, and of their drafts, that contain `mark`."""
         return [path.name for path in self.versions.glob(f"*{mark}*") if path.is_dir()]
 
     def drafts(self) -> Iterable[Path]:
-        """What earlier processes had begun to write elsewhere than at its place: nothing."""
+        """Return nothing: drafts lie beside their files."""
         return ()
 
     def sweep(self, datasets: Collection[str], versions: Collection[str], snapshots: Collection[str]) -> int:
-        """Delete what is none of these; return how many."""
+        """Delete all files but these; return the number of deleted ones."""
         left = [path for path in self.datasets.iterdir() if path.name.removesuffix(".safetensors") not in datasets]
         left += [path for path in self.versions.iterdir() if path.name not in versions]
         for path in left:
@@ -119,7 +122,7 @@ class Local:
         return len(left) + self.sweep_snapshots(snapshots)
 
     def sweep_snapshots(self, named: Collection[str]) -> int:
-        """Delete all snapshots but those named; return how many."""
+        """Delete all snapshots but those named; return the number of deleted ones."""
         stored = (path for path in self.snapshots.iterdir() if path.is_file())
         left = [path for path in stored if path.name.removesuffix(".safetensors") not in named]
         for path in left:
@@ -127,15 +130,15 @@ class Local:
         return len(left)
 
     @contextmanager
-    def fresh(self) -> Iterator[Local]:
-        """What reads no copies: this, which has none."""
+    def fresh(self) -> Iterator[LocalFiles]:
+        """Yield these files: there is no cache to avoid."""
         yield self
 
     def check(self) -> None:
-        """Nothing: the home is looked at by others."""
+        """Do nothing: `probe_home` of `service.storage.storage` checks the home."""
 
     def try_out(self) -> None:
-        """Nothing, as `check`."""
+        """Do nothing, as `check`."""
 
 
 def _in_place(path: Path) -> Path:
@@ -145,7 +148,7 @@ def _in_place(path: Path) -> Path:
 
 
 def remove(path: Path) -> None:
-    """Delete a file or a folder with all that is in it."""
+    """Delete a file, or a folder with its content."""
     if path.is_dir():
         shutil.rmtree(path)
     else:

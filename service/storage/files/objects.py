@@ -1,6 +1,7 @@
-"""Stores of whole objects that several services share: a bucket, or a folder that all hosts mount.
+"""Object stores that several services share: a bucket, or a folder that all hosts mount.
 
-An object is immutable, and there whole or not at all. Keys are relative: `datasets/ds_1.safetensors`, as below a home.
+An object is immutable, and is stored whole or not at all. Keys are relative, such as `datasets/ds_1.safetensors`, as
+below a home.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol, TypeVar
 from urllib.parse import unquote, urlsplit
 
-from lipcore.extras import need
+from lipcore.extras import import_extra
 from lipcore.files.durable import make_folder
 from service.storage.files import local
 
@@ -26,7 +27,7 @@ logger = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 FIRST_PAUSE_S = 0.5
-"""Pauses before a store is asked again: each time twice as long."""
+"""First pause before a retry, s; doubled each time."""
 
 
 class FilesUnreachableError(OSError):
@@ -34,40 +35,46 @@ class FilesUnreachableError(OSError):
 
 
 def unreachable(reason: str) -> FilesUnreachableError:
-    """The error for a store that cannot be used; reason: for people, without addresses and secrets."""
+    """Return the error for an unusable store. reason: for people, without addresses and secrets."""
     return FilesUnreachableError(errno.EIO, f"the shared files: {reason}")
 
 
 class Entry(NamedTuple):
-    """An object of a listing. modified: s since 1970, by the clock of the store."""
+    """An object of a listing. modified: Unix time by the clock of the store, s."""
 
     key: str
     modified: float
 
 
-class Objects(Protocol):
-    """What a store does. All but FileNotFoundError of `get` is FilesUnreachableError, or of the disk of this host."""
+class ObjectStore(Protocol):
+    """Operations of a store.
+
+    Its errors are FilesUnreachableError, FileNotFoundError of `get`, and errors of this host's disk.
+    """
 
     def put(self, path: Path, key: str) -> None:
-        """Store a file durably; once this returns everybody sees it."""
+        """Store a file durably; after the return all services see it."""
 
     def get(self, key: str, path: Path) -> None:
-        """Copy an object into a new file; raise FileNotFoundError where there is none."""
+        """Copy an object into a new file; raise FileNotFoundError if there is none."""
 
     def delete(self, key: str) -> None:
-        """Delete an object; nothing happens where there is none."""
+        """Delete an object; do nothing if there is none."""
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Objects whose keys begin so: the name of a folder, a slash, and maybe the beginning of a name in it."""
+        """Yield objects whose keys begin with `prefix`.
+
+        prefix: a folder's name, a slash, and optionally the beginning of a name in the folder.
+        """
 
     def check(self) -> None:
-        """See that the store answers, in a few seconds at most."""
+        """Check that the store answers, within a few seconds."""
 
 
-class Patient:
-    """A store that is asked again for so many seconds while it cannot be reached: for work that nobody waits for."""
+class RetryingStore:
+    """A store that retries for `seconds` if it cannot be reached, for work that no request waits for."""
 
-    def __init__(self, objects: Objects, seconds: float) -> None:
+    def __init__(self, objects: ObjectStore, seconds: float) -> None:
         self._objects, self._seconds = objects, seconds
 
     def put(self, path: Path, key: str) -> None:
@@ -75,19 +82,19 @@ class Patient:
         self._ask(lambda: self._objects.put(path, key))
 
     def get(self, key: str, path: Path) -> None:
-        """Copy an object into a new file; raise FileNotFoundError where there is none."""
+        """Copy an object into a new file; raise FileNotFoundError if there is none."""
         self._ask(lambda: self._objects.get(key, path))
 
     def delete(self, key: str) -> None:
-        """Delete an object; nothing happens where there is none."""
+        """Delete an object; do nothing if there is none."""
         self._objects.delete(key)
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Objects whose keys begin so."""
+        """Yield objects whose keys begin with `prefix`."""
         return iter(self._ask(lambda: builtins.list(self._objects.list(prefix))))
 
     def check(self) -> None:
-        """See that the store answers, in a few seconds at most."""
+        """Check that the store answers, within a few seconds."""
         self._objects.check()
 
     def _ask(self, question: Callable[[], Result]) -> Result:
@@ -103,22 +110,22 @@ class Patient:
             pause = min(2 * pause, 8.0)
 
 
-def store_of(url: str) -> Objects:
-    """The store that a `files_url` names, checked by the settings; nothing is asked of it yet.
+def make_store(url: str) -> ObjectStore:
+    """Return the store of a valid `files_url`, without a request to it.
 
-    Raise MissingExtraError where what speaks to it is not installed.
+    Raise MissingExtraError if its library is not installed.
     """
     parts = urlsplit(url)
     if parts.scheme == "file":
-        return Mounted(Path(unquote(parts.path)))
-    need("s3fs", "cluster", "LIPSERVE_FILES_URL is set")
+        return FolderStore(Path(unquote(parts.path)))
+    import_extra("s3fs", "cluster", "LIPSERVE_FILES_URL is set")
     from service.storage.files.bucket import Bucket  # noqa: PLC0415 - its library is an extra
 
     return Bucket(parts.netloc, parts.path.strip("/"))
 
 
-class Mounted:
-    """Objects are files below a folder, which has to be there: one that is not mounted is not made in its place."""
+class FolderStore:
+    """Objects as files below a folder that must exist: a folder that is not mounted is not created instead."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
@@ -135,7 +142,7 @@ class Mounted:
                 local.write_durably(target, lambda out: shutil.copyfileobj(file, out, 1 << 20), draft)
 
     def get(self, key: str, path: Path) -> None:
-        """Copy an object into a new file; raise FileNotFoundError where there is none."""
+        """Copy an object into a new file; raise FileNotFoundError if there is none."""
         with _of_folder():
             try:
                 shutil.copyfile(self.root / key, path)
@@ -144,18 +151,18 @@ class Mounted:
                 raise
 
     def delete(self, key: str) -> None:
-        """Delete an object, and its folder below the first one where it was the last."""
+        """Delete an object, and its subfolder if it was the last object there."""
         path = self.root / key
         with _of_folder():
             path.unlink(missing_ok=True)
             if path.parent.parent != self.root:
                 try:
                     path.parent.rmdir()
-                except OSError:  # not empty, or gone
+                except OSError:  # not empty, or already deleted
                     return
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Objects whose keys begin so; what an interrupted `put` left is among them."""
+        """Yield objects whose keys begin with `prefix`, with leftovers of an interrupted `put`."""
         parent, _, beginning = prefix.rpartition("/")
         with _of_folder():
             self.check()
@@ -170,14 +177,14 @@ class Mounted:
                 yield Entry(each.relative_to(self.root).as_posix(), each.stat().st_mtime)
 
     def check(self) -> None:
-        """See that the folder is there."""
+        """Check that the folder exists."""
         if not self.root.is_dir():
             raise unreachable(f"there is no folder {str(self.root)!r}: is it mounted?")
 
 
 @contextmanager
 def _of_folder() -> Iterator[None]:
-    """Let errors of the folder be those of a store; a full disk stays one."""
+    """Translate errors of the folder into those of a store; a full disk stays one."""
     try:
         yield
     except (FileNotFoundError, FilesUnreachableError):

@@ -1,7 +1,7 @@
-"""Files in a store that several services share, with copies below the home of what was used here last.
+"""Files in a store that several services share, with a cache of recently used copies below the home.
 
-Everything is immutable under a random name, so that a copy is right for ever. Copies lie below `cache` under the keys
-of their objects. A copy comes by renaming one that is whole, so that processes of one home may fetch at once.
+All files are immutable under random names, so that a copy is valid for ever. Copies lie below `cache` under the keys of
+their objects. A complete copy is renamed into its place, so that several processes of one home may fetch it at once.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from typing import IO, TypeVar
 
 from lipcore.files.manifest import MANIFEST
 from service.storage.files.local import remove
-from service.storage.files.objects import Entry, Objects
+from service.storage.files.objects import Entry, ObjectStore
 
 logger = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 
 GRACE_S = 600.0
-"""Seconds since its last use for which a copy is kept in any case: whoever was given its path may still open it."""
+"""Min seconds since its last use for which a copy is kept: a caller that has its path may still open it."""
 DAY_S = 86400.0
-"""Age in s from which on an object that no row names has been left: before, its row may still be to come."""
+"""Age from which an object without a row counts as left over, s: before, its row may not be written yet."""
 SUFFIX = ".safetensors"
 
 
-class Shared:
-    """Files of all services. home: of this one; most: bytes of copies that it keeps, those in use aside."""
+class SharedFiles:
+    """Files of all services. home: of this service. most: max bytes of cached copies, apart from those in use."""
 
     shared = True
 
-    def __init__(self, home: Path, objects: Objects, most: int) -> None:
+    def __init__(self, home: Path, objects: ObjectStore, most: int) -> None:
         self.objects, self._most = objects, most
         self._cache, self._drafts = home / "cache", home / "cache" / "drafts"
         self.datasets, self.versions = self._cache / "datasets", self._cache / "versions"
@@ -47,13 +47,13 @@ class Shared:
 
     @property
     def kinds(self) -> Mapping[str, Path]:
-        """Folders on the disk of the home, by what is in them."""
+        """Folders on the disk of the home, by their content."""
         return {"cache": self._cache}
 
     def file(self, key: str, again: bool = False) -> Path:
-        """Where a copy of a file lies, fetched if need be; no file is there where none is stored.
+        """Return the path of a copy, fetched if needed; no file is there if none is stored.
 
-        again: another copy than the one before, which is damaged.
+        again: fetch it again, as the copy is damaged.
         """
         target = self._cache / key
         if not again and _used(target):
@@ -65,7 +65,7 @@ class Shared:
         return target
 
     def write(self, key: str, write: Callable[[IO[bytes]], Result]) -> Result:
-        """Store a file for all, whole or not at all, and keep a copy; return what `write` does."""
+        """Store a file for all services, whole or not at all, and keep a copy; return the result of `write`."""
         target = self._cache / key
         with self._draft(target.name) as draft:
             path = draft / target.name
@@ -77,12 +77,12 @@ class Shared:
         return result
 
     def delete(self, key: str) -> None:
-        """Delete a file for all; nothing happens where there is none."""
+        """Delete a file for all services; do nothing if there is none."""
         self.objects.delete(key)
         (self._cache / key).unlink(missing_ok=True)
 
     def version(self, name: str, again: bool = False) -> Path:
-        """Folder of a copy of a version, fetched if need be; see `file`."""
+        """Return the folder of a copy of a version, fetched if needed; see `file`."""
         target = self.versions / name
         if not again and _used(target):
             return target
@@ -97,17 +97,17 @@ class Shared:
         return target
 
     def has_version(self, name: str) -> bool:
-        """Whether the files of a version are there, as far as can be told at once: those who load it find out."""
+        """Return True without a check, which would need the store; loading a missing version fails."""
         return True
 
     @contextmanager
     def new_version(self, name: str) -> Iterator[Path]:
-        """Give a folder to be made in the block, which is stored for all at its end."""
+        """Yield a folder for the block to create; store it for all services at the end."""
         with self._draft(name) as draft:
             folder = draft / name
             yield folder
             try:
-                for path in sorted(folder.iterdir(), key=lambda each: each.name == MANIFEST):  # that one last
+                for path in sorted(folder.iterdir(), key=lambda each: each.name == MANIFEST):  # the manifest last
                     self.objects.put(path, f"versions/{name}/{path.name}")
             except BaseException:
                 self._withdraw(name)
@@ -116,26 +116,29 @@ class Shared:
         self._trim()
 
     def delete_version(self, name: str) -> None:
-        """Delete a version's files for all, and what was begun of it here."""
+        """Delete a version's files for all services, and its drafts here."""
         objects = sorted(self.objects.list(f"versions/{name}/"), key=lambda each: not each.key.endswith(MANIFEST))
-        for each in objects:  # the manifest first: what is left is no version
+        for each in objects:  # the manifest first: files without it are no version
             self.objects.delete(each.key)
         for path in (self.versions / name, *self._drafts.glob(f"{name}-*")):
             shutil.rmtree(path, ignore_errors=True)
 
     def versions_marked(self, mark: str, ended: bool = True) -> list[str]:
-        """Names of versions, also of those begun here, that begin with `mv_` and `mark`; once their job has ended."""
+        """Return names of versions and local drafts that begin with `mv_` and `mark`.
+
+        ended: whether their job has ended; no name is returned before.
+        """
         if not ended:
             return []
         names = {each.key.split("/")[1] for each in self.objects.list(f"versions/mv_{mark}")}
         return sorted(names | {path.name.rpartition("-")[0] for path in self._drafts.glob(f"mv_{mark}*")})
 
     def drafts(self) -> Iterable[Path]:
-        """What earlier processes had begun to fetch or to write."""
+        """Return unfinished downloads and writes of earlier processes."""
         return [path for used, _, path in _entries(self._drafts) if used < time.time() - GRACE_S]
 
     def sweep(self, datasets: Collection[str], versions: Collection[str], snapshots: Collection[str]) -> int:
-        """Delete what is none of these and a day old, in one place for all services; return how many."""
+        """Delete files that are none of these and a day old, for all services; return their number."""
         old = partial(self._old, self._now() - DAY_S)
         left = [each for each in old("datasets/") if _name(each).removesuffix(SUFFIX) not in datasets]
         left += [each for each in old("versions/") if each.key.split("/")[1] not in versions]
@@ -145,21 +148,21 @@ class Shared:
         return len(left)
 
     def sweep_snapshots(self, named: Collection[str]) -> int:
-        """Nothing: another service may be about to name the others."""
+        """Delete nothing: another service may be about to name a snapshot."""
         return 0
 
     @contextmanager
-    def fresh(self) -> Iterator[Shared]:
-        """The same files without the copies: each is fetched when it is asked for, and gone when another one is."""
+    def fresh(self) -> Iterator[SharedFiles]:
+        """Yield the same files without a cache: each file is fetched, and deleted when the next one is."""
         with self._draft("fresh") as folder:
-            yield _Fresh(folder, self.objects, self._most)
+            yield _UncachedFiles(folder, self.objects, self._most)
 
     def check(self) -> None:
-        """See that the store answers; raise FilesUnreachableError."""
+        """Check that the store answers; raise FilesUnreachableError."""
         self.objects.check()
 
     def try_out(self) -> None:
-        """See that objects can be written, read, listed and deleted; raise FilesUnreachableError or OSError."""
+        """Check that objects can be written, read, listed and deleted; raise FilesUnreachableError or OSError."""
         self.objects.check()
         with self._draft("probe") as draft:
             path, key = draft / "probe", f"probes/{draft.name}"
@@ -175,7 +178,7 @@ class Shared:
 
     @contextmanager
     def _draft(self, name: str) -> Iterator[Path]:
-        """An empty folder of its own, which tells by its name whose it is; gone after the block."""
+        """Yield an empty temporary folder whose name begins with `name`; it is deleted after the block."""
         path = Path(tempfile.mkdtemp(prefix=f"{name}-", dir=self._drafts))
         try:
             yield path
@@ -183,7 +186,7 @@ class Shared:
             shutil.rmtree(path, ignore_errors=True)
 
     def _fetch(self, name: str, folder: Path) -> bool:
-        """Copy all files of a version into a new folder; return False where it is not stored, or not any more."""
+        """Copy all files of a version into a new folder; return False if it is not stored."""
         keys = [each.key for each in self.objects.list(f"versions/{name}/")]
         if f"versions/{name}/{MANIFEST}" not in keys:
             return False
@@ -205,7 +208,10 @@ class Shared:
         return (each for each in self.objects.list(prefix) if each.modified < before)
 
     def _now(self) -> float:
-        """The time by the clock of the store, s, which has dated its objects: this host's may be days ahead of it."""
+        """Return the time by the clock of the store, s.
+
+        That clock dates the objects; this host's clock may be days ahead of it.
+        """
         with self._draft("probe") as draft:
             key = f"probes/{draft.name}"
             (draft / "probe").touch()
@@ -216,22 +222,22 @@ class Shared:
                 self.objects.delete(key)
 
     def _trim(self) -> None:
-        """Delete the copies that were not used for the longest time, down to the bytes allowed; and old drafts."""
+        """Delete the least recently used copies down to the max size, and old drafts."""
         now, copies = time.time(), [entry for folder in self._copies for entry in _entries(folder)]
         size = sum(each for _, each, _ in copies)
         for used, each, path in sorted(copies):
             if size <= self._most or used > now - GRACE_S:
                 break
             with self._draft(path.name) as draft, suppress(FileNotFoundError):
-                path.rename(draft / path.name)  # so that nobody finds half of it
+                path.rename(draft / path.name)  # renamed first, so that no process finds half of it
             size -= each
         for used, _, path in _entries(self._drafts):
             if used < now - DAY_S:
                 shutil.rmtree(path, ignore_errors=True)
 
 
-class _Fresh(Shared):
-    """For one thread that looks at one file after the other."""
+class _UncachedFiles(SharedFiles):
+    """Files for one thread that reads one file after the other."""
 
     def file(self, key: str, again: bool = False) -> Path:
         self._forget()
@@ -242,14 +248,14 @@ class _Fresh(Shared):
         return super().version(name, again)
 
     def _forget(self) -> None:
-        os.utime(self._cache.parent)  # it is in use
+        os.utime(self._cache.parent)  # marks the folder as in use
         for folder in self._copies:
             for path in folder.iterdir():
                 remove(path)
 
 
 def _used(path: Path) -> bool:
-    """Whether there is a copy; it counts as used."""
+    """Return whether there is a copy, and mark it as used."""
     try:
         os.utime(path)
     except FileNotFoundError:
@@ -258,7 +264,7 @@ def _used(path: Path) -> bool:
 
 
 def _entries(folder: Path) -> Iterator[tuple[float, int, Path]]:
-    """When each copy in a folder was used last, its bytes, and where it is."""
+    """Yield the time of last use, the bytes and the path of each copy in a folder."""
     for path in folder.iterdir():
         with suppress(FileNotFoundError):
             about = path.stat()

@@ -1,7 +1,7 @@
-"""What the service keeps in files: samples of data sets, folders of versions, snapshots of what was learnt, uploads.
+"""The file store of the service: samples of data sets, folders of versions, snapshots of learning, uploads.
 
-A file is visible only once a database row names it, and the row is written after the file is complete: below the home,
-or in the store that several services share.
+A file becomes visible when a database row names it. The row is written after the file is complete, below the home or in
+the store that several services share.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from service.foundation.settings import Settings
 from service.storage import sample_file
 from service.storage.database import Database, DatasetRow, SnapshotRow, VersionRow
 from service.storage.files import local
-from service.storage.files.local import DamagedFileError, Local, remove
-from service.storage.files.objects import FilesUnreachableError, Patient, store_of
-from service.storage.files.shared import Shared
+from service.storage.files.local import DamagedFileError, LocalFiles, remove
+from service.storage.files.objects import FilesUnreachableError, RetryingStore, make_store
+from service.storage.files.shared import SharedFiles
 from service.storage.sample_file import ArrayOf, PartOf
 
 logger = logging.getLogger(__name__)
@@ -40,46 +40,48 @@ logger = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 PATIENCE_S = 60.0
-"""How long training asks again for shared files that cannot be reached, before it is given up."""
+"""Max time for which training retries an unreachable shared store before it fails, s."""
 
 
 def new_id(prefix: str) -> str:
-    """Return a fresh random id such as `ds_5f0c…`."""
+    """Return a new random id such as `ds_5f0c…`."""
     return f"{prefix}_{secrets.token_hex(8)}"
 
 
 class Files:
     """The file store of one service. Ids come from `new_id`, never from a client. Safe from several threads.
 
-    home: of this service, whose uploads and publications always lie below it. url: of the store that it shares with
-    others, see `Settings.files_url`; None where all is below the home. cache_bytes: copies of shared files kept there.
-    patience_s: how long it is asked again where it cannot be reached; then methods raise FilesUnreachableError, an
-    OSError. What cannot be deleted there now is when a service starts, a day later or more.
+    - home: of this service; uploads and publications always lie below it.
+    - url: of the shared store, see `Settings.files_url`; None if all files lie below the home.
+    - cache_bytes: max size of the cache of shared files.
+    - patience_s: max time of retries if the store cannot be reached. Then methods raise FilesUnreachableError, an
+      OSError.
+    - datasets, versions: folders below the home, of the files themselves or of copies, for tests and tools.
 
-    datasets, versions: folders below the home, of the files themselves or of copies, for tests and tools.
+    Files that cannot be deleted in the store now are deleted at a start of a service, a day later or more.
     """
 
     def __init__(self, home: Path, url: str | None = None, cache_bytes: int = 4 << 30, patience_s: float = 0.0) -> None:
         self.uploads, self.learning = home / "uploads", home / "learning"
         for folder in (self.uploads, self.learning):
             make_folder(folder)
-        self._place: Local | Shared
+        self._place: LocalFiles | SharedFiles
         if url is None:
-            self._place = Local(home)
+            self._place = LocalFiles(home)
         else:
-            objects = store_of(url)
-            self._place = Shared(home, Patient(objects, patience_s) if patience_s else objects, cache_bytes)
+            objects = make_store(url)
+            self._place = SharedFiles(home, RetryingStore(objects, patience_s) if patience_s else objects, cache_bytes)
         self.datasets, self.versions = self._place.datasets, self._place.versions
 
     @classmethod
     def of(cls, settings: Settings, patience_s: float = 0.0) -> Files:
-        """The file store that the settings name."""
+        """Return the file store that the settings name."""
         return cls(settings.home, settings.files_url, settings.files_cache_bytes, patience_s)
 
     @classmethod
     @contextmanager
     def fresh(cls, settings: Settings) -> Iterator[Files]:
-        """For who verifies what is stored: no copy is read, and no more than one file at a time takes space here."""
+        """Yield a store for verification: it reads no cached copy, and at most one file at a time needs space here."""
         files = cls.of(settings)
         with files._place.fresh() as place:
             files._place = place
@@ -87,45 +89,44 @@ class Files:
 
     @property
     def shared(self) -> bool:
-        """Whether other services write to the same store."""
+        """Return whether other services write to the same store."""
         return self._place.shared
 
     @property
     def folders(self) -> Mapping[str, Path]:
-        """Folders on the disk of the home that grow, by what is in them."""
+        """Folders on the disk of the home that grow, by their content."""
         return self._place.kinds
 
     def in_place(self) -> bool:
-        """Whether the folders of the home are still there: somebody may have deleted it under a running service."""
+        """Return whether the folders of the home still exist: someone may have deleted them under a running service."""
         return all(each.is_dir() for each in (self.uploads, self.learning, *self.folders.values()))
 
     def write_samples(self, dataset: str, rows: int, n_joints: int, array: ArrayOf) -> str:
-        """Store samples durably under a new id, asking for one array after the other; return their sha256."""
+        """Store samples durably under a new id, one array after the other; return their sha256."""
         return self._place.write(_samples(dataset), lambda file: sample_file.write(file, rows, n_joints, array))
 
     def read_samples(
         self, dataset: str, joint_names: list[str], sha256: str, most: int | None = None, part: PartOf | None = None
     ) -> Samples:
-        """Read samples stored under `dataset`, or part of them, evenly thinned to `most`.
+        """Return the samples stored under `dataset`, or part of them, evenly thinned to `most`.
 
-        Raise DamagedDataError unless they are those that were stored.
+        Raise DamagedDataError if the file is missing or changed.
         """
         path = self.samples_file(dataset, sha256)
         chosen = None
         if part is not None:
             episode, t = (sample_file.read_array(path, name) for name in ("episode", "t"))
             chosen = np.flatnonzero(part(episode, t))
-        count = sample_file.rows_of(path) if chosen is None else len(chosen)
+        count = sample_file.count_rows(path) if chosen is None else len(chosen)
         if most is not None and count > most:
             thinned = np.linspace(0, count - 1, most).round().astype(np.int64)
             chosen = thinned if chosen is None else chosen[thinned]
         return Samples(joint_names=tuple(joint_names), **sample_file.read(path, chosen))
 
     def samples_file(self, dataset: str, sha256: str) -> Path:
-        """Where the samples of a data set lie, see sample_file.py; raise DamagedDataError as `read_samples`.
+        """Return the path of a data set's samples, see sample_file.py; raise DamagedDataError as `read_samples`.
 
-        In a shared store it is a copy, to be opened within minutes: whoever reads on after that has it open, or asks
-        again.
+        In a shared store it is a copy: open it within minutes. A later reader keeps it open, or calls this again.
         """
         try:
             return self._checked(_samples(dataset), sha256)
@@ -133,17 +134,17 @@ class Files:
             raise DamagedDataError(f"data set {dataset!r} is damaged: {error}. Upload it again") from error
 
     def delete_samples(self, dataset: str) -> None:
-        """Delete samples; nothing happens where there are none."""
+        """Delete samples; do nothing if there are none."""
         with _forgiven():
             self._place.delete(_samples(dataset))
 
     def write_snapshot(self, snapshot: str, payload: bytes) -> str:
-        """Store what a version has learnt durably under a new id; return its sha256."""
+        """Store the learnt state of a version durably under a new id; return its sha256."""
         self._place.write(_snapshot(snapshot), lambda file: file.write(payload))
         return hashlib.sha256(payload).hexdigest()
 
     def read_snapshot(self, snapshot: str, sha256: str | None = None) -> bytes:
-        """Read what is stored under `snapshot`; raise DamagedFileError unless it has the sha256, where known."""
+        """Return the content of a snapshot; raise DamagedFileError unless it has the sha256, if given."""
         key = _snapshot(snapshot)
         path = self._place.file(key) if sha256 is None else self._checked(key, sha256)
         try:
@@ -152,29 +153,28 @@ class Files:
             raise DamagedFileError(f"{path.name} is missing") from None
 
     def delete_snapshot(self, snapshot: str) -> None:
-        """Delete a snapshot; nothing happens where there is none."""
+        """Delete a snapshot; do nothing if there is none."""
         with _forgiven():
             self._place.delete(_snapshot(snapshot))
 
     def new_version(self, name: str) -> AbstractContextManager[Path]:
-        """Give the path of a folder that the block makes, as `lipcore.save` does; whoever leaves it has stored it.
+        """Yield the path of a folder for the block to create, as `lipcore.save` does; store it at the end of the block.
 
-        Where the block fails, or storing does, nothing is left. Its row is to be written afterwards; where that fails
-        in turn, `delete_version`.
+        If the block or storing fails, nothing is left. Write the row afterwards; if that fails, call `delete_version`.
         """
         return self._place.new_version(name)
 
     def version_folder(self, name: str) -> Path:
-        """Where the files of a version lie, for `lipcore.load` and the like, which say so where there are none.
+        """Return the folder of a version, for `lipcore.load` and the like, which report a missing one.
 
-        In a shared store it is a copy, which may go after some minutes; `read_version` is surer.
+        In a shared store it is a copy that may be deleted after some minutes; `read_version` is safer.
         """
         return self._place.version(name)
 
     def read_version(self, name: str, read: Callable[[Path], Result]) -> Result:
-        """Return what `read` makes of the folder of a version, and raises where that is damaged: ModelFormatError.
+        """Return the result of `read` on the folder of a version; raise ModelFormatError if that is damaged.
 
-        A copy that is damaged, or was deleted meanwhile, is fetched again, once.
+        A damaged or deleted copy is fetched again, once.
         """
         try:
             return _read_in(self._place.version(name), read)
@@ -184,60 +184,63 @@ class Files:
         return _read_in(self._place.version(name, again=True), read)
 
     def load_version(self, name: str, checksums: Mapping[str, str] | None) -> TorqueModel:
-        """Load a version, see `lipcore.load`; raise ModelFormatError where it is damaged or missing."""
+        """Load a version, see `lipcore.load`; raise ModelFormatError if it is damaged or missing."""
         return self.read_version(name, lambda folder: persistence.load(folder, checksums))
 
     def has_version(self, name: str) -> bool:
-        """Whether the files of a version are there, as far as can be told at once."""
+        """Return whether the files of a version exist, without a request to a shared store."""
         return self._place.has_version(name)
 
     def delete_version(self, name: str) -> None:
-        """Delete a version's files; raise OSError where the disk of the home does not let it."""
+        """Delete a version's files; raise OSError if the disk of the home refuses."""
         with _forgiven():
             self._place.delete_version(name)
 
     def versions_marked(self, mark: str, ended: bool = True) -> list[str]:
-        """Names of versions, be they complete or not, that begin with `mv_` and `mark`.
+        """Return names of versions, complete or not, that begin with `mv_` and `mark`.
 
-        ended: whether their job has ended. Until then those of a shared store are left out: another service may be
+        ended: whether their job has ended. If not, versions of a shared store are left out: another service may be
         about to publish them.
         """
         return self._place.versions_marked(mark, ended)
 
     def upload(self) -> Path:
-        """Create an empty temporary file for an upload; the caller deletes it."""
+        """Create an empty temporary file for an upload and return its path; the caller deletes it."""
         handle, name = tempfile.mkstemp(dir=self.uploads)
         os.close(handle)
         return Path(name)
 
     def clear(self) -> int:
-        """Delete what an earlier run of the service of this home was about to store or to fetch. Return how many."""
+        """Delete unfinished uploads and downloads of an earlier run on this home; return their number."""
         left = [*self.uploads.iterdir(), *self._place.drafts()]
         for path in left:
             remove(path)
         return len(left)
 
     def sweep(self, datasets: Collection[str], versions: Collection[str], snapshots: Collection[str]) -> int:
-        """Delete what an interrupted write left: files that no row names. Return how many.
+        """Delete files that no row names, left by interrupted writes; return their number.
 
-        In a shared store, where others are writing, only what is a day old.
+        In a shared store, only files that are a day old: other services are writing.
         """
         return self._place.sweep(datasets, versions, snapshots)
 
     def sweep_snapshots(self, named: Collection[str]) -> int:
-        """Delete all snapshots but those named, at once; return how many. None in a shared store, see `sweep`."""
+        """Delete all snapshots but those named at once; return their number.
+
+        It deletes none in a shared store, see `sweep`.
+        """
         return self._place.sweep_snapshots(named)
 
     def check(self) -> None:
-        """See that a shared store answers, in seconds; raise FilesUnreachableError. Nothing where all is local."""
+        """Check that a shared store answers within seconds; raise FilesUnreachableError. Do nothing without one."""
         self._place.check()
 
     def try_out(self) -> None:
-        """See that a shared store can be written, read and listed; raise OSError. Nothing where all is local."""
+        """Check that a shared store can be written, read and listed; raise OSError. Do nothing without one."""
         self._place.try_out()
 
     def _checked(self, key: str, sha256: str) -> Path:
-        """Where a file lies that has the sha256; raise DamagedFileError."""
+        """Return the path of a file with this sha256; raise DamagedFileError."""
         path = self._place.file(key)
         try:
             local.check_sha256(path, sha256)
@@ -250,7 +253,7 @@ class Files:
 
 
 def _read_in(folder: Path, read: Callable[[Path], Result]) -> Result:
-    """What `read` makes of a folder. Where that is damaged, the error tells no client where it lies."""
+    """Return the result of `read` on a folder. An error about damage shows no path to the client."""
     try:
         return read(folder)
     except ModelFormatError as error:
@@ -260,7 +263,7 @@ def _read_in(folder: Path, read: Callable[[Path], Result]) -> Result:
 
 @contextmanager
 def _forgiven() -> Iterator[None]:
-    """Let what a shared store does not delete now be: it is swept."""
+    """Ignore files that a shared store cannot delete now: they are swept later."""
     try:
         yield
     except FilesUnreachableError as error:
@@ -276,9 +279,9 @@ def _snapshot(snapshot: str) -> str:
 
 
 def start_sweeping(database: Database, files: Files) -> None:
-    """Delete files that no row names: before the service starts, or beside it where a store is shared.
+    """Delete files that no row names: before the service starts, or in a thread if the store is shared.
 
-    To list a large store takes minutes, and who starts then may be needed.
+    Listing a large store takes minutes, and the service may be needed at once.
     """
     if cleared := files.clear():
         logger.warning("removed %d unfinished uploads of an earlier run", cleared)
@@ -289,7 +292,7 @@ def start_sweeping(database: Database, files: Files) -> None:
 
 
 def sweep_unnamed(database: Database, files: Files) -> int:
-    """Delete files that no row names; return how many."""
+    """Delete files that no row names; return their number."""
     with database.session() as session:
         datasets = set(session.scalars(select(DatasetRow.id)))
         versions = set(session.scalars(select(VersionRow.folder)))
@@ -303,5 +306,5 @@ def sweep_unnamed(database: Database, files: Files) -> int:
 def _beside(database: Database, files: Files) -> None:
     try:
         sweep_unnamed(database, files)
-    except Exception as error:  # it will be done at another start
+    except Exception as error:  # retried at the next start
         logger.warning("what interrupted writes have left is not swept now: %s", error)

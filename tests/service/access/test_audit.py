@@ -122,7 +122,7 @@ def remove_alias(api):
 def decide(api):
     service = service_of(api)
     with service.database.transaction() as session:
-        owner.hold(session, "arm", {"at": 1.0, "event": 4})
+        owner.pause(session, "arm", {"at": 1.0, "event": 4})
     good(api.post("/v1/models/arm/learning/change", json={"decision": "ignore"}))
 
 

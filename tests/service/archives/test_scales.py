@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 import lipcore
 from lipcore import Samples
-from lipcore.data.outliers import CorruptError
+from lipcore.data.outliers import CorruptRowsError
 from lipcore.files import persistence
 from lipcore.files.probing import probe
 from lipcore.vocabulary import JOINT_TYPES, ROBOT_ESTIMATORS
@@ -61,7 +61,7 @@ def test_whatever_trains_is_read_again_and_taken_in(
     samples = recording(seed, joint_types, position, torque, uneven, slow, aside)
     try:
         model = lipcore.train(samples, joint_types, estimator, QUICK)
-    except CorruptError:  # no robot has such torques
+    except CorruptRowsError:  # no robot has such torques
         assert max(torque, position * 2.0 / slow) > 1e4
         return
     manifest, files = persistence.encode(model, {})

@@ -52,7 +52,7 @@ def test_options_of_the_simulator_matter(lipserve, tmp_path):
     dirty = ("--samples", 20, "--rate", 20, "--course", "rests", "--dirt", 0.5)
     assert lipserve("simulate", "double-pendulum", tmp_path / "dirty.npz", *dirty)[0] == 0
     columns = read(tmp_path / "dirty.npz")[1]
-    expected = stream(samples=20, seed=0, rate=20.0, speed=1.0, course="rests", dirt=Dirt().times(0.5))
+    expected = stream(samples=20, seed=0, rate=20.0, speed=1.0, course="rests", dirt=Dirt().scaled(0.5))
     np.testing.assert_array_equal(np.column_stack([columns["tau1"], columns["tau2"]]), expected.tau)
 
 

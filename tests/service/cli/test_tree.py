@@ -8,7 +8,7 @@ import pytest
 
 from lipcore.estimators.catalogue import ESTIMATORS
 from lipcore.robots.library import ROBOTS
-from lipcore.vocabulary import AUTO, CHOICES
+from lipcore.vocabulary import AUTO, ESTIMATOR_CHOICES
 from lipserve import ApiError
 from service import __version__
 from service.cli import consoles, options
@@ -27,7 +27,7 @@ def test_reference_is_up_to_date():
 
 def test_names_that_help_lists_are_those_that_there_are():
     assert list(ROBOTS) == options.ROBOTS
-    assert [AUTO, *ESTIMATORS] == list(CHOICES)
+    assert [AUTO, *ESTIMATORS] == list(ESTIMATOR_CHOICES)
 
 
 def test_version_and_help(lipserve):

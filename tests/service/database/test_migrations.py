@@ -95,7 +95,7 @@ def test_what_reports_and_events_said_of_streams_becomes_their_records(tmp_path)
     report = {
         "accepted": 4,
         "rejected": {},
-        "gate": ContactGate.start(0.5).stand_back().to_json(),
+        "gate": ContactGate.start(0.5).let_all_pass().to_json(),
         "opening": None,
         "doubted": True,
     }

@@ -21,7 +21,7 @@ from service.foundation.settings import Settings
 from service.learning.weigher.weighing import Weighing
 from service.storage.database import Database
 from service.storage.database.engine import FILE
-from service.storage.errors import translated
+from service.storage.errors import translate_error
 from service.storage.files import Files
 from service.storage.storage import HomeError, check_home
 from tests.service.data import ADDRESS, DEADLINE, arrays, error, npz, service_of, stream, upload
@@ -87,7 +87,7 @@ def no_database(path: Path) -> DBAPIError:
 def test_errors_of_the_database(tmp_path, fail: Callable, expected: type[ServiceError] | None, said: str):
     with closing(sqlite3.connect(tmp_path / "database")) as database:
         database.executescript(TABLE)
-    found = translated(fail(tmp_path / "database"))
+    found = translate_error(fail(tmp_path / "database"))
     assert type(found) is (expected or type(None))
     assert found is None or said in found.message
 
@@ -95,7 +95,7 @@ def test_errors_of_the_database(tmp_path, fail: Callable, expected: type[Service
 def test_a_device_without_space_is_a_full_disk():
     with pytest.raises(OSError, match="No space left") as found, open("/dev/full", "wb", buffering=0) as file:
         file.write(b"0")
-    assert type(translated(found.value)) is StorageFullError
+    assert type(translate_error(found.value)) is StorageFullError
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_a_device_without_space_is_a_full_disk():
     ],
 )
 def test_errors_of_the_operating_system(number, expected):
-    assert type(translated(OSError(number, os.strerror(number)))) is (expected or type(None))
+    assert type(translate_error(OSError(number, os.strerror(number)))) is (expected or type(None))
 
 
 @pytest.fixture(scope="module")

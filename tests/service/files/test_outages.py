@@ -110,7 +110,7 @@ def test_a_disk_without_room_for_a_copy_is_a_full_disk(bucket, tmp_path, monkeyp
     monkeypatch.setattr(files._place.objects._system, "get_file", full)
     with pytest.raises(OSError, match="No space left") as caught:
         files.samples_file("ds_one", digest)
-    assert isinstance(storage_errors.translated(caught.value), StorageFullError)
+    assert isinstance(storage_errors.translate_error(caught.value), StorageFullError)
 
 
 def test_no_credentials_are_named(bucket, tmp_path, monkeypatch):
@@ -125,7 +125,7 @@ def test_no_credentials_are_named(bucket, tmp_path, monkeypatch):
 def test_clients_are_asked_to_come_again(tmp_path):
     with pytest.raises(FilesUnreachableError) as caught:
         Files(tmp_path / "home", (tmp_path / "gone").as_uri()).check()
-    told = storage_errors.translated(caught.value)
+    told = storage_errors.translate_error(caught.value)
     assert isinstance(told, StorageUnavailableError)
     assert told.headers == storage_errors.RETRY_AFTER
     again = pickle.loads(pickle.dumps(caught.value))  # a worker on another host says it too

@@ -211,7 +211,7 @@ def test_a_host_whose_clock_is_ahead_sweeps_nothing_that_is_young(one, monkeypat
 
 @ANY_STORE
 def test_copies_that_were_not_used_for_long_make_room(host, monkeypatch):
-    one, size = host("one"), sample_file.size(10, 2)
+    one, size = host("one"), sample_file.count_bytes(10, 2)
     samples = stream(samples=10)
     digests = {name: put(one, samples, name) for name in ("ds_1", "ds_2", "ds_3", "ds_4")}
     other = host("other", cache_bytes=3 * size)
@@ -241,7 +241,7 @@ def test_threads_that_fetch_at_once_all_read_it_whole(one, other, publish):
         loaded = [pool.submit(other.read_version, "mv_one", persistence.read_files) for _ in range(8)]
     assert len({each.result() for each in found}) == 1
     for each in loaded:
-        persistence.check(each.result(), sums)
+        persistence.check_checksums(each.result(), sums)
     assert not list(other._place._drafts.iterdir())
 
 

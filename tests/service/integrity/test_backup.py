@@ -20,7 +20,7 @@ from service.models import registry
 from service.storage import backup as backups
 from service.storage.backup import BackupError, backup, restore
 from service.storage.database import LearnerRow, SnapshotRow, VersionRow
-from service.storage.storage import HomeError, hold_home
+from service.storage.storage import HomeError, lock_home
 from tests.service.archives.packing import TAR, exported, pack, unpack
 from tests.service.data import QUICK, arrays, eventually, npz, queue, stream
 from tests.service.faults.damage import flip
@@ -160,7 +160,7 @@ def busy(tmp_path):
     [pytest.param(20, id="most files before"), pytest.param(0, id="all at the moment", marks=pytest.mark.slow)],
 )
 def test_what_was_acknowledged_before_a_backup_under_load_is_restored(busy, tmp_path, monkeypatch, rounds):
-    monkeypatch.setattr(backups, "MOST_ROUNDS", rounds)
+    monkeypatch.setattr(backups, "MAX_ROUNDS", rounds)
     for number in range(ROUNDS):
         busy.come_round()
         there, gone, taught = set(busy.there) - busy.gone, set(busy.gone), len(busy.taught)
@@ -232,7 +232,7 @@ def test_what_is_deleted_after_the_moment_is_copied_and_nothing_is_committed_at_
         write(*arguments)
 
     added, write = [], backups._add
-    monkeypatch.setattr(backups, "MOST_ROUNDS", 0)
+    monkeypatch.setattr(backups, "MAX_ROUNDS", 0)
     monkeypatch.setattr(backups, "now", moment)
     monkeypatch.setattr(backups, "_add", add)
     made = backup(home, tmp_path / "b.tar")
@@ -313,7 +313,7 @@ def test_a_damaged_home_is_not_copied_as_if_it_were_whole(arm, tmp_path):
 
 def test_nothing_is_restored_below_a_service(saved, tmp_path):
     target = tmp_path / "used"
-    with hold_home(target), pytest.raises(HomeError, match="another service uses"):
+    with lock_home(target), pytest.raises(HomeError, match="another service uses"):
         restore(target, saved)
 
 

@@ -17,7 +17,7 @@ from service.foundation.settings import Settings
 from service.models import registry
 from service.storage.database import DatasetRow, EventRow, RobotRow, SnapshotRow, VersionRow
 from service.storage.files import Files
-from service.training.material import recorded
+from service.training.material import load_datasets
 from tests.service.data import error, service_of, stream, upload
 from tests.service.faults.damage import empty, flip, remove
 from tests.service.learning.pendulums import ARM, Arm
@@ -31,7 +31,7 @@ def test_damaged_data_set_is_not_evaluated_and_not_trained_on(api, trained, spoi
     answer = api.post(f"/v1/models/{trained.name}/evaluate", json={"dataset": dataset["id"]})
     assert dataset["id"] in error(answer, 500, "damaged_data")["message"]
     with pytest.raises(DamagedDataError, match="Upload it again"):
-        recorded(service.database, service.files, {"datasets": [dataset["id"]]})
+        load_datasets(service.database, service.files, {"datasets": [dataset["id"]]})
     assert api.get(f"/v1/datasets/{dataset['id']}").status_code == 200
     assert api.delete(f"/v1/datasets/{dataset['id']}").status_code == 204
 

@@ -10,7 +10,7 @@ from sqlalchemy import select
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.training import feed
-from service.training.feed import MAX_FOLLOWERS, Feed
+from service.training.feed import MAX_FOLLOWERS, JobEventStream
 from tests.service.data import error, queue, service_of, stream, upload
 from tests.service.jobs.conftest import new_row
 from tests.service.learning.following import followed
@@ -96,7 +96,7 @@ def row_of(database):
 
 def test_many_readers_cost_one_look(job_row, monkeypatch):
     """Each sees every change that lasts, also one who came late or whose first look is stale."""
-    following, looks = Feed(job_row), []
+    following, looks = JobEventStream(job_row), []
     look = following._look
     monkeypatch.setattr(following, "_look", lambda jobs: (looks.append(jobs), look(jobs))[1])
 
@@ -130,7 +130,7 @@ def test_many_readers_cost_one_look(job_row, monkeypatch):
 def test_readers_end_when_the_service_closes(job_row):
     async def story():
         closing = asyncio.Event()
-        following = Feed(job_row)
+        following = JobEventStream(job_row)
 
         async def everything():
             return [seen.state async for seen in following.follow(row_of(job_row), closing)]

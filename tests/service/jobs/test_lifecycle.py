@@ -7,18 +7,18 @@ from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.storage.files import Files
 from service.training import lifecycle
-from service.training.lifecycle import LIMITS, Ended, Facts, Hand, Settled, Settler
+from service.training.lifecycle import LIMITS, JobEnd, JobOutcome, JobStatus, Settler, WatchedJob
 from tests.service.jobs.conftest import new_row
 
 SETTINGS = Settings(max_job_s=1000.0)
 
 
 def hand():
-    return Hand("job_x", slot=None, future=None, since=100.0)
+    return WatchedJob("job_x", slot=None, future=None, since=100.0)
 
 
 def facts(state="running", heartbeat="a", cancel=False):
-    return Facts(state, heartbeat, cancel)
+    return JobStatus(state, heartbeat, cancel)
 
 
 def verdict(given, clock):
@@ -90,7 +90,7 @@ def settle(store, why="ended", message="the training process ended", **values):
     database, files = store
     with database.transaction() as session:
         session.add(new_row("x", **{"state": "running", "attempts": 1, **values}))
-    settled = Settler(database, files).settle(Ended("job_x", why, message))
+    settled = Settler(database, files).settle(JobEnd("job_x", why, message))
     with database.session() as session:
         return settled, session.scalar(select(JobRow).where(JobRow.id == "job_x"))
 
@@ -98,12 +98,12 @@ def settle(store, why="ended", message="the training process ended", **values):
 @pytest.mark.parametrize(
     ("values", "settled", "state", "code"),
     [
-        ({}, Settled(again=True), "queued", None),
-        ({"attempts": 3}, Settled(), "failed", "interrupted"),
-        ({"why": "too_long"}, Settled(), "failed", "too_long"),
-        ({"why": "cancelled"}, Settled(), "cancelled", None),
-        ({"cancel_requested": True}, Settled(), "cancelled", None),
-        ({"why": "too_long", "cancel_requested": True}, Settled(), "cancelled", None),
+        ({}, JobOutcome(again=True), "queued", None),
+        ({"attempts": 3}, JobOutcome(), "failed", "interrupted"),
+        ({"why": "too_long"}, JobOutcome(), "failed", "too_long"),
+        ({"why": "cancelled"}, JobOutcome(), "cancelled", None),
+        ({"cancel_requested": True}, JobOutcome(), "cancelled", None),
+        ({"why": "too_long", "cancel_requested": True}, JobOutcome(), "cancelled", None),
     ],
 )
 def test_what_becomes_of_a_job_that_ran(store, values, settled, state, code):
@@ -118,10 +118,10 @@ def test_what_becomes_of_a_job_that_ran(store, values, settled, state, code):
 @pytest.mark.parametrize(
     ("values", "settled"),
     [
-        ({"state": "succeeded", "version": 3}, Settled(made=("x", 3))),  # before its process died
-        ({"why": "cancelled", "state": "failed", "finished_at": "then"}, Settled()),
-        ({"why": "cancelled", "state": "cancelled", "finished_at": "then"}, Settled()),
-        ({"why": "returned", "state": "queued"}, Settled(again=True)),  # meanwhile, and without blame
+        ({"state": "succeeded", "version": 3}, JobOutcome(made=("x", 3))),  # before its process died
+        ({"why": "cancelled", "state": "failed", "finished_at": "then"}, JobOutcome()),
+        ({"why": "cancelled", "state": "cancelled", "finished_at": "then"}, JobOutcome()),
+        ({"why": "returned", "state": "queued"}, JobOutcome(again=True)),  # meanwhile, and without blame
     ],
 )
 def test_a_job_that_does_not_run_stays_as_it_is(store, values, settled):
@@ -131,7 +131,7 @@ def test_a_job_that_does_not_run_stays_as_it_is(store, values, settled):
 
 def test_one_that_is_not_there_is_nobody_s(store):
     database, files = store
-    assert Settler(database, files).settle(Ended("job_y", "ended", "")) == Settled()
+    assert Settler(database, files).settle(JobEnd("job_y", "ended", "")) == JobOutcome()
 
 
 def test_what_a_job_did_not_publish_is_deleted_and_nothing_else(store):
@@ -146,8 +146,8 @@ def test_what_a_job_did_not_publish_is_deleted_and_nothing_else(store):
 
 def test_a_history_keeps_its_first_and_its_newest_entries():
     row = new_row("x")
-    for number in range(lifecycle.MOST_ENTRIES + 5):
+    for number in range(lifecycle.MAX_ENTRIES + 5):
         lifecycle.enter(row, "queued", str(number))
     messages = [entry["message"] for entry in row.history]
-    assert len(messages) == lifecycle.MOST_ENTRIES
-    assert (messages[0], messages[1], messages[-1]) == ("0", "6", str(lifecycle.MOST_ENTRIES + 4))
+    assert len(messages) == lifecycle.MAX_ENTRIES
+    assert (messages[0], messages[1], messages[-1]) == ("0", "6", str(lifecycle.MAX_ENTRIES + 4))

@@ -10,7 +10,7 @@ from lipcore.estimators.hyperparameters import FitProgress
 from service.foundation.settings import Settings
 from service.storage.database import Database, JobRow
 from service.training import pulse
-from service.training.pulse import PACE, Pulse, Remaining, SupersededError
+from service.training.pulse import PACE, Heartbeat, RemainingTime, SupersededError
 from tests.service.data import eventually
 from tests.service.jobs.conftest import new_row
 
@@ -22,7 +22,7 @@ def beating(home, monkeypatch):
     database = Database.of(Settings(home=home))
     with database.transaction() as session:
         session.add(new_row("x", state="running", attempts=1))
-    with Pulse(database, own, "arm") as talk:
+    with Heartbeat(database, own, "arm") as talk:
         yield database, talk
     database.close()
 
@@ -127,7 +127,7 @@ def at(iteration, stage="hyperparameters", most=50):
 
 
 def test_it_is_not_told_before_the_pace_is_known():
-    left = Remaining(100, 100)
+    left = RemainingTime(100, 100)
     assert left.seconds(0.0) is None
     for iteration in (1, 2):
         left.step(at(iteration), 2.0 * iteration)
@@ -139,7 +139,7 @@ def test_it_is_not_told_before_the_pace_is_known():
 @pytest.mark.parametrize("ratio", [1, 2, 4])
 def test_a_steady_search_counts_down_to_the_end(ratio):
     """The steps that follow the search cost as the cube of their samples."""
-    left, after = Remaining(100, 100 * ratio), PACE.posterior_iterations * ratio**3
+    left, after = RemainingTime(100, 100 * ratio), PACE.posterior_iterations * ratio**3
     for iteration in range(1, 51):
         left.step(at(iteration), 10.0 + 2.0 * iteration)
         if iteration >= 3:
@@ -150,7 +150,7 @@ def test_a_steady_search_counts_down_to_the_end(ratio):
 
 def test_a_second_search_begins_anew():
     """As where an arm is learnt before the hyperparameters of what it leaves: both count from their own start."""
-    left = Remaining(100, 100)
+    left = RemainingTime(100, 100)
     for iteration in (3, 4, 5):
         left.step(at(iteration), 10.0 * iteration)
     for iteration in (1, 2, 3, 4):
@@ -159,7 +159,7 @@ def test_a_second_search_begins_anew():
 
 
 def test_the_time_that_is_left_of_several_fits_is_that_of_their_share():
-    left = Remaining(100, 500)
+    left = RemainingTime(100, 500)
     left.step(FitProgress("geometry", 1, 150, 0.0, PACE.min_fraction / 2, 1.0, "rigid-body"), 11.0)
     assert left.seconds(11.0) is None
     left.step(FitProgress("hyperparameters", 3, 150, 0.0, 0.25, 20.0, "lip-chain"), 30.0)
@@ -167,7 +167,7 @@ def test_the_time_that_is_left_of_several_fits_is_that_of_their_share():
 
 
 def test_what_was_told_too_low_is_no_longer_told():
-    left = Remaining(100, 100)
+    left = RemainingTime(100, 100)
     for iteration in range(1, 5):
         left.step(at(iteration), float(iteration))
     left.step(at(4, "posterior"), 4.0)

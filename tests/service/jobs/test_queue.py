@@ -30,7 +30,7 @@ def test_a_cancel_ends_a_suspended_process_that_holds_the_lock_of_the_database(b
     job = jobs.submit("locked")
     eventually((jobs.settings.home / "locked").exists)
     jobs.running(job)  # reading needs no lock
-    eventually(lambda: jobs.queue._hands[0].ran)
+    eventually(lambda: jobs.queue._watched_jobs[0].ran)
     jobs.queue.stop(job)  # what the service does first: writing the wish would have to wait
     assert jobs.ended(job).state == "cancelled"
 
@@ -80,7 +80,7 @@ def test_where_the_system_starts_no_process_the_job_waits_for_one(bench, monkeyp
 
 def test_what_becomes_of_a_job_is_written_once_the_database_can_be(bench, monkeypatch):
     """Its process dies while another program has locked the database for longer than the service waits."""
-    monkeypatch.setattr(queue, "AGAIN_S", 0.05)
+    monkeypatch.setattr(queue, "RETRY_S", 0.05)
     jobs = bench(workers.frail)
     tried, settle = [], jobs.queue._settler.settle
     monkeypatch.setattr(jobs.queue._settler, "settle", lambda ended: (tried.append(ended), settle(ended))[1])
@@ -119,7 +119,7 @@ def test_jobs_are_handed_out_once_and_in_their_order(bench, monkeypatch):
     assert [row.attempts for row in rows] == [1, 1, 1]
     assert sorted(rows, key=lambda row: row.finished_at) == rows
     eventually(lambda: len(jobs.made) >= 3)
-    eventually(lambda: not jobs.queue._hands and not jobs.queue._settling and not jobs.queue._waiting)
+    eventually(lambda: not jobs.queue._watched_jobs and not jobs.queue._settling and not jobs.queue._waiting)
     assert sorted(jobs.made) == [(f"number{number}", 1) for number in range(3)]
 
     monkeypatch.setattr(queue, "WATCH_S", 0.0)

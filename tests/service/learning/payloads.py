@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 from tests.service.data import eventually
 
 MASS = 1.5
@@ -22,7 +22,9 @@ def lifting(stream_id: str, mass: float = MASS, push: float = 0.0) -> list[dict[
     """Batches of a Panda like the shipped model's that takes up a mass, kg, after TAKEN; push: N·m on its first and
     last joint at the end, as no payload does."""
     load = Payload(mass, TAKEN, OFFSET) if mass else None
-    seen = simulate(load_robot("panda"), Stream(n_samples=ROWS, rate=RATE, noise=0.05, speed=5.0, payload=load), seed=3)
+    seen = simulate(
+        load_robot("panda"), Simulation(n_samples=ROWS, rate=RATE, noise=0.05, speed=5.0, payload=load), seed=3
+    )
     tau = seen.tau.copy()
     tau[-PUSHED:, [0, 6]] += push
     parts = [slice(at, at + BATCH) for at in range(0, ROWS, BATCH)]

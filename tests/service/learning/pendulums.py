@@ -23,9 +23,9 @@ from lipcore.posterior.statistics import collect, merge
 from service.foundation.settings import Settings
 from service.journal import log, snapshots, undo
 from service.journal.arrivals import NewBatch
-from service.journal.restore import Restored, advance, restore
+from service.journal.restore import RestoredState, advance, restore
 from service.learning.learner import publication
-from service.learning.learner.publication import Published
+from service.learning.learner.publication import Publication
 from service.models import registry
 from service.models.loaded import LoadedModels
 from service.storage.database import Database, EventRow
@@ -99,7 +99,7 @@ class Arm:
         """The version as trained, as the service loads it."""
         return lipcore.load(self.files.version_folder(registry.find(self.database, self.model, 1).folder))
 
-    def followed(self, known: Restored) -> Restored:
+    def followed(self, known: RestoredState) -> RestoredState:
         """Advance a state until there is nothing new."""
         while (following := advance(self.database, self.files, known)) is not known:
             known = following
@@ -206,6 +206,6 @@ def record(error: float, count: int = 100) -> dict[str, Any]:
     return Record.of(tau, np.zeros((count, 2)), np.full((count, 2), 1e-3), trained().noise_std).to_json()
 
 
-def adopt(loaded: LoadedModels, message: Published) -> bool:
+def adopt(loaded: LoadedModels, message: Publication) -> bool:
     """Let answers follow what the learner has published, as the service does."""
     return loaded.revise(message.model, message.version, message.revision, publication.read(message.path))

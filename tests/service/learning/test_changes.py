@@ -13,7 +13,7 @@ from lipcore.online.gates import ContactGate
 from lipcore.online.judgement import Innovations, ModelRecord
 from lipcore.online.judging import JudgeOptions
 from lipcore.online.record import Record
-from lipcore.online.screening import Screened
+from lipcore.online.screening import PredictedBatch
 from lipcore.online.stream import StreamRecord
 from service.journal import log
 from service.learning.ingest.monitor import Monitor
@@ -183,7 +183,7 @@ def test_errors_below_a_contact_are_a_change_too(school, monkeypatch):
     """
     pupil = school.enrol("rattling", **WATCHFUL, on_change="hold")
     arrivals = (time.time() + 0.5 * number for number in range(80))  # as late as the rows were measured
-    monkeypatch.setattr(school.service.learners._log.clocks, "arrival", lambda: next(arrivals))
+    monkeypatch.setattr(school.service.learners._log.clocks, "date_arrival", lambda: next(arrivals))
     pupil.settled(drive(pupil, range(60))[-1]["revision"])
     for number in range(60, 80):
         (said,) = drive(pupil, range(number, number + 1), noise=RATTLE)
@@ -268,16 +268,16 @@ def screened(count, push, first=0.0):
     zeros = np.zeros((count, 1))
     rows = Rows(time, zeros, zeros + 0.1, zeros, tau, np.zeros(count, np.uint8))
     every = np.ones(count, np.bool_)
-    return Screened(rows, slice(0, count), every, every, zeros, zeros, zeros, np.ones(1), 1, np.ones(1))
+    return PredictedBatch(rows, slice(0, count), every, every, zeros, zeros, zeros, np.ones(1), 1, np.ones(1))
 
 
 def test_a_gate_that_stood_back_returns_once_rows_fit():
     options = JudgeOptions(on_change="learn")
-    stream, model, opened = StreamRecord(ContactGate.start().stand_back()), ModelRecord(Innovations.empty(1)), []
+    stream, model, opened = StreamRecord(ContactGate.start().let_all_pass()), ModelRecord(Innovations.empty(1)), []
     for second in range(5):
         judgement = judging.judge(screened(100, 0.0, second), stream, model, options, nothing, second + 1.0)
         stream, model = judgement.stream, judgement.model
-        opened.append(stream.gate.open)
+        opened.append(stream.gate.is_open)
     assert opened == [True, True, False, False, False]
     hit = judging.judge(screened(10, 20.0, 5.0), stream, model, options, nothing, 5.1)
     assert hit.rows.rejected() == {"contact": 10}
@@ -342,7 +342,7 @@ def test_a_collision_a_change_and_a_decision(beside):
     pupil.post("learning/change", {"decision": "adapt"})
     drive(pupil, range(8, 10), stream_id="other")  # its gate stands back too, and no batch of "arm" has come since
     assert beside.agree()
-    assert beside.follower.streams.get("arm").gate.open
+    assert beside.follower.streams.get("arm").gate.is_open
     drive(pupil, range(16, 19), push=PUSH)
     drive(pupil, range(19, 25))
     assert beside.agree()
@@ -364,7 +364,7 @@ def test_a_monitor_of_a_service_that_starts_again_has_the_gates_as_they_were(bes
 )
 def test_of_a_fast_stream_a_few_rows_are_compared_with_the_version_as_trained(rows, rate, compared):
     """Ten a second count (`data.independence`): at least four for each of these, and ten of a batch."""
-    places = screening.evenly(np.full(rows, 10.0 / rate))
+    places = screening.choose_compared(np.full(rows, 10.0 / rate))
     assert len(places) == len(set(places.tolist())) == compared
     if rows:
         assert (places[0], places[-1]) == (0, rows - 1)

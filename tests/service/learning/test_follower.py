@@ -13,7 +13,7 @@ from service.journal import log
 from service.learning.learner import follower as following
 from service.learning.learner import publication
 from service.learning.learner.follower import Follower, Novelty
-from service.learning.learner.publication import Failed, Published
+from service.learning.learner.publication import LearningFailure, Publication
 from service.learning.learner.worker import Learner
 from service.storage.database import SnapshotRow
 from tests.service.learning.pendulums import ARM, QUERIES, Arm, at_once, rows, same, trained
@@ -242,9 +242,9 @@ def test_a_version_that_cannot_learn_does_not_keep_others_from_it(arm, learner, 
     with arm.database.transaction() as session:
         session.connection().exec_driver_sql("UPDATE events SET payload = x'00' WHERE model = 'arm'")
     failed, learnt = turns(learner, ARM, "other")
-    assert isinstance(failed, Failed)
+    assert isinstance(failed, LearningFailure)
     assert (failed.model, failed.version) == (ARM, 1)
-    assert isinstance(learnt, Published)
+    assert isinstance(learnt, Publication)
     assert learnt.model == "other"
     assert 0.0 < learner.pause() <= 1.0
     assert turns(learner, ARM) == []  # not at once

@@ -142,7 +142,7 @@ def test_frames_that_are_no_longer_kept_are_not_taken_for_new(school, pupil, obs
         observe(range(first, first + 5))
     with school.service.database.transaction() as session:
         event = log.find_batch(session, pupil.model, "socket", 0)
-        snapshots._forget(session, event)
+        snapshots._note_forgotten(session, event)
         session.delete(event)
     with pytest.raises(ExpiredError, match="whether batch 3 of stream"):
         observe([3])

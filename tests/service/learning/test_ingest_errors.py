@@ -97,7 +97,7 @@ def test_batches_that_are_no_longer_kept_are_not_taken_for_new(school, body):
     with school.service.database.transaction() as session:
         for sequence in (0, 1, 3):
             event = log.find_batch(session, pupil.model, "arm", sequence)
-            snapshots._forget(session, event)
+            snapshots._note_forgotten(session, event)
             session.delete(event)
     for sequence in (0, 1, 3):
         said = refused(pupil, batch(sequence, parts[sequence]), 409, "expired")

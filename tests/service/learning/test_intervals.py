@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lipcore
-from lipcore.online.adaptive import Adaptive
+from lipcore.online.adaptive import AdaptiveScale
 from lipcore.online.record import Record
 from service.journal import log
 from tests.service.learning.lessons import lesson
@@ -154,7 +154,7 @@ def test_it_survives_a_restart_to_the_last_bit(school, tmp_path):
         total = 1.959963984540054 * np.sqrt(np.square(answer["tau_std"]) + np.square(answer["noise_std"]))
         with again.service.database.session() as session:
             time = log.rows_of(log.find_batch(session, "lasting", "arm", 2)).time
-        expected = Adaptive.from_json(known).step(time, error / total)
+        expected = AdaptiveScale.from_json(known).step(time, error / total)
         assert state(again, pupil)["log"] == pytest.approx(expected.log.tolist(), rel=1e-9)
 
 

@@ -14,7 +14,7 @@ from sqlalchemy import select
 from service.learning.learner import publication
 from service.learning.learner.learnt import LearntVersions
 from service.learning.learner.process import LearnerProcess, learner_place
-from service.learning.learner.publication import Published
+from service.learning.learner.publication import Publication
 from service.models.loaded import LoadedModels
 from service.runtime import companion
 from service.storage.database import SnapshotRow
@@ -36,7 +36,7 @@ class Serving:
 
     def take(self, message):
         self.messages.append(message)
-        if isinstance(message, Published):
+        if isinstance(message, Publication):
             adopt(self.loaded, message)
 
     def teach(self, *numbers):

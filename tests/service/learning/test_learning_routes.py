@@ -39,7 +39,7 @@ def hold(school, pupil):
     at = offset(pupil) + rows * 0.01 - 0.005
     with school.service.database.transaction() as session:
         number = log.newest(session, pupil.model) + 1
-        owner.hold(session, pupil.model, {"at": at, "event": number, "evidence": {"joints": ["joint1"]}})
+        owner.pause(session, pupil.model, {"at": at, "event": number, "evidence": {"joints": ["joint1"]}})
     return at
 
 
@@ -96,10 +96,10 @@ def test_stored_states_are_listed(school):
     assert [each["revision"] for each in status["snapshots"]] == [2]
 
 
-@pytest.mark.parametrize("chunk", [decisions.CHUNK, 1])
+@pytest.mark.parametrize("chunk", [decisions.CHUNK_EVENTS, 1])
 def test_adapting_learns_what_was_held_in_a_new_regime(school, monkeypatch, chunk):
     """In one transaction, or in as many as there are batches."""
-    monkeypatch.setattr(decisions, "CHUNK", chunk)
+    monkeypatch.setattr(decisions, "CHUNK_EVENTS", chunk)
     held, told = school.enrol(f"held-{chunk}"), school.enrol(f"told-{chunk}")
     held.teach(0)
     at = hold(school, held)
@@ -158,7 +158,7 @@ def test_there_is_nothing_to_decide_without_a_hold(school):
 
 def given(database, model=MODEL):
     with database.session() as session:
-        return owner.options(session, model)
+        return owner.read_options(session, model)
 
 
 def put(database, model=MODEL, **fields):

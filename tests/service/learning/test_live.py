@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from lipcore.online.batch import Rows
-from lipcore.online.screening import Screened
+from lipcore.online.screening import PredictedBatch
 from lipcore.vocabulary import Code
 from service.contract.learning import LiveRows, LiveStatus
 from service.foundation.errors import NotFoundError
-from service.learning.ingest.append import Judged
+from service.learning.ingest.append import LoggedBatch
 from service.learning.live import feed
-from service.learning.live.feed import MAX_FOLLOWERS, MOST_UNREAD, Feed, FeedEvent, pick, thinned
-from service.learning.live.look import at_most
+from service.learning.live.feed import MAX_FOLLOWERS, MAX_UNREAD_EVENTS, Feed, FeedEvent, choose_rows, thin_batches
+from service.learning.live.look import find_quantile_bound
 from tests.service.data import error, eventually, service_of
 from tests.service.learning.batches import rows
 from tests.service.learning.following import following
@@ -122,16 +122,16 @@ def judged(count=4, codes=(), stream_id="one", of=None, seed=0, bare=0.05):
     mean = found.tau[predicted] - 0.5
     std = np.full(mean.shape, 0.3)
     noise = np.array([0.1, 0.2])
-    screened = Screened(
+    screened = PredictedBatch(
         found, slice(0, count), predicted, predicted, mean, std, np.full(mean.shape, bare), noise, 1, np.ones(2)
     )
-    return Judged(of or served(), stream_id, found, screened)
+    return LoggedBatch(of or served(), stream_id, found, screened)
 
 
 def test_a_row_that_was_kept_out_stands_for_its_stretch():
     code = np.zeros(100, np.uint8)
     code[[37, 38, 80]] = Code.CONTACT
-    chosen = pick(code, 10)
+    chosen = choose_rows(code, 10)
     assert len(chosen) == 10
     assert {37, 80} <= set(chosen.tolist())
     assert 38 not in chosen
@@ -145,14 +145,14 @@ def test_parts_are_of_one_stream_and_revision_and_count_all_rows():
         judged(20, of=second, seed=2),
         judged(40, stream_id="two", of=second),
     ]
-    parts = thinned(batches, 10)
+    parts = thin_batches(batches, 10)
     said = [(part.stream_id, part.revision, part.rows, len(part.time)) for part, _ in parts]
     assert said == [("one", 0, 40, 4), ("one", 1, 20, 2), ("two", 1, 40, 4)]
     assert all(np.allclose(part.q, shown.rows.q[-1], atol=1e-6) for part, shown in parts)
     assert parts[0][0].counts == {"learnt": 37, "limit": 1, "contact": 1, "edge": 1}
     assert np.allclose(parts[0][0].worst, 0.5 / np.hypot(0.3, [0.1, 0.2]), atol=1e-3)
-    assert sum(len(part.time) for part, _ in thinned(batches, 1000)) == 99
-    ((part, _),) = thinned([judged(2, ("limit", "limit"))], 10)
+    assert sum(len(part.time) for part, _ in thin_batches(batches, 1000)) == 99
+    ((part, _),) = thin_batches([judged(2, ("limit", "limit"))], 10)
     assert (part.worst, np.isnan(part.mean).all()) == ([None, None], True)  # of rows that were not predicted
 
 
@@ -166,24 +166,24 @@ def test_only_doubtful_rows_are_looked_at_and_not_too_many(monkeypatch):
     monkeypatch.setattr(feed, "uncovered", uncovered)
     gathered = []
     for seed in range(4):
-        gathered.append(thinned([judged(20, seed=seed, bare=0.05)], 100)[0][1])
-    gathered.append(thinned([judged(4, stream_id="two", bare=0.15)], 100)[0][1])
-    gathered.append(thinned([judged(50, stream_id="three", bare=0.15)], 100)[0][1])
-    one, two, three = feed.beyond(gathered)
+        gathered.append(thin_batches([judged(20, seed=seed, bare=0.05)], 100)[0][1])
+    gathered.append(thin_batches([judged(4, stream_id="two", bare=0.15)], 100)[0][1])
+    gathered.append(thin_batches([judged(50, stream_id="three", bare=0.15)], 100)[0][1])
+    one, two, three = feed.find_novel_rows(gathered)
     assert looked == [4, 17]
     assert (one.stream_id, one.times, one.unknown) == ("one", [], 0)
     assert (two.stream_id, len(two.times), two.unknown) == ("two", 2, 0)
     assert (len(three.times), three.unknown) == (9, 33)
-    assert feed.beyond([]) == []
+    assert feed.find_novel_rows([]) == []
 
 
 def test_latency_is_told_by_the_bound_of_its_bucket():
     bounds = (0.001, 0.01, 0.1)
-    assert at_most([0, 0, 0, 0], bounds, 0.5) is None
-    assert at_most([99, 1, 0, 0], bounds, 0.5) == 0.001
-    assert at_most([99, 1, 0, 0], bounds, 0.99) == 0.001
-    assert at_most([98, 1, 1, 0], bounds, 0.99) == 0.01
-    assert at_most([0, 0, 0, 5], bounds, 0.5) is None
+    assert find_quantile_bound([0, 0, 0, 0], bounds, 0.5) is None
+    assert find_quantile_bound([99, 1, 0, 0], bounds, 0.5) == 0.001
+    assert find_quantile_bound([99, 1, 0, 0], bounds, 0.99) == 0.001
+    assert find_quantile_bound([98, 1, 1, 0], bounds, 0.99) == 0.01
+    assert find_quantile_bound([0, 0, 0, 5], bounds, 0.5) is None
 
 
 class Look:
@@ -218,12 +218,12 @@ def test_a_slow_reader_loses_the_oldest_and_is_told(quick):
         first = await anext(events)
         assert first == FeedEvent("status", '{"call":1}')
         (reader,) = quick._followed["arm"].readers
-        for number in range(MOST_UNREAD + 5):
+        for number in range(MAX_UNREAD_EVENTS + 5):
             reader.put(FeedEvent("rows", str(number)))
         assert await anext(events) == FeedEvent("lost", '{"events":5}')
         assert (await anext(events)).data == "5"
         closing.set()
-        assert [said.data async for said in events if said.event == "rows"][-1] == str(MOST_UNREAD + 4)
+        assert [said.data async for said in events if said.event == "rows"][-1] == str(MAX_UNREAD_EVENTS + 4)
         assert not quick._followed
 
     asyncio.run(story())

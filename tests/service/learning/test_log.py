@@ -15,7 +15,7 @@ from lipcore.online.batch import Rows
 from lipcore.vocabulary import CODES
 from service.foundation.errors import ConflictError
 from service.journal import log
-from service.journal.arrivals import MOST_RANGES, Gaps
+from service.journal.arrivals import MAX_RANGES, Gaps
 from service.journal.log import decode, encode
 from service.storage.database import SnapshotRow, now
 from tests.service.learning.batches import (
@@ -142,7 +142,7 @@ def test_the_gaps_are_right_after_every_arrival_in_any_order(sequences):
         known = Gaps.from_json(known.arrived(sequence, sequence).to_json(), known.arrived(sequence, sequence).last)
         seen = set(sequences[:count])
         assert known.to_json() == {"first": min(seen), "ranges": misses(seen)}
-        assert [s for s in range(-1, 27) if known.may_hold(s)] == sorted(seen)
+        assert [s for s in range(-1, 27) if known.may_contain(s)] == sorted(seen)
 
 
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 5)), min_size=1, max_size=10))
@@ -157,11 +157,11 @@ def test_the_gaps_of_ranges_are_right_even_where_they_overlap(spans):
 
 def test_only_the_newest_of_very_many_gaps_are_remembered():
     known = Gaps(0, 0)
-    for sequence in range(2, 2 * MOST_RANGES + 6, 2):
+    for sequence in range(2, 2 * MAX_RANGES + 6, 2):
         known = known.arrived(sequence, sequence)
-    assert len(known.ranges) == MOST_RANGES
+    assert len(known.ranges) == MAX_RANGES
     assert (known.ranges[0], known.ranges[-1]) == ((5, 5), (2003, 2003))
-    assert known.may_hold(3)  # it may have, for all that is known
+    assert known.may_contain(3)  # it may have, for all that is known
 
 
 ANY = st.floats(width=64, allow_nan=True, allow_infinity=True)

@@ -30,7 +30,7 @@ def test_rows_count_as_far_as_they_are_independent():
         opening = opening.step(time[rows], weight[rows], error[rows], spread[rows])
     first = slice(0, 100)  # a second
     held = np.abs(error[first]) <= OPENING.band * spread[first]
-    assert opening.over
+    assert opening.is_complete
     np.testing.assert_allclose(opening.coverage, held.mean(axis=0))
     assert (opening.rows, opening.since) == (pytest.approx(OPENING.rows), 0.0)
     assert Opening.from_json(opening.to_json()).to_json() == opening.to_json()
@@ -40,16 +40,16 @@ def test_only_what_is_known_to_be_far_outside_is_a_misfit():
     """Known: where the intervals hold the min share, so few or fewer come once in forty streams at most."""
     for hits in range(11):
         chance = binom.cdf(hits, 10, OPENING.min_share)
-        assert opened(hits / 10).misfit == (chance < 0.025)
+        assert opened(hits / 10).is_misfit == (chance < 0.025)
     assert opened(0.0).joints == (0, 1, 2)
-    assert not opened(0.0, rows=OPENING.rows - 1).misfit  # it has not been a second yet
+    assert not opened(0.0, rows=OPENING.rows - 1).is_misfit  # it has not been a second yet
 
 
 def test_joints_are_no_witnesses_of_their_own():
     """One joint of three that is off is told by other means: its errors may last for a second."""
     error = np.ones((10, 3)) * [9.0, 1.0, 1.0]
     opening = Opening.start(3).step(np.arange(10) / 10, np.ones(10), error, np.ones((10, 3)))
-    assert (opening.misfit, opening.joints) == (False, (0,))
+    assert (opening.is_misfit, opening.joints) == (False, (0,))
 
 
 @pytest.fixture(scope="module")

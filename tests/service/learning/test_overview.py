@@ -75,7 +75,7 @@ def test_no_model_is_loaded_to_be_shown(school):
 def test_what_needs_a_decision_is_shown(school):
     pupil = school.enrol("hesitant")
     with school.service.database.transaction("hesitant") as session:
-        owner.hold(session, "hesitant", {"at": 1.0})
+        owner.pause(session, "hesitant", {"at": 1.0})
         raise_alarm(session, "hesitant", "novelty", "the first", {})
         raise_alarm(session, "hesitant", "change", "the newest", {"joint": 1})
     seen = glance(school.client, "hesitant")

@@ -8,7 +8,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families as parse
 
 from lipcore.model.body import Body
-from lipcore.online.payload.bodies import CENTRE, WIDTH
+from lipcore.online.payload.bodies import ETA_MEAN, ETA_STD
 from lipcore.online.payload.bodies import body as parameters_of
 from lipserve import ApiError, AsyncClient, Client
 from service.learning.control import payload
@@ -112,7 +112,7 @@ def test_the_asynchronous_client_does_the_same(server):
 
 
 def test_inertias_of_draws_are_those_of_bodies():
-    drawn = np.random.default_rng(4).multivariate_normal(CENTRE, np.diag(WIDTH**2), 20)
+    drawn = np.random.default_rng(4).multivariate_normal(ETA_MEAN, np.diag(ETA_STD**2), 20)
     expected = [Body.of(parameters_of(eta)[0]).inertia for eta in drawn]
     np.testing.assert_allclose(payload._inertias(drawn), expected, rtol=1e-6, atol=1e-9)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 from tests.service.data import error, eventually
 from tests.service.server import Server
 from tests.service.streams import PAYLOAD, ask, dial, frame, hello
@@ -18,7 +18,7 @@ UP, DOWN, RATE = 20.0, 21.0, 100.0
 @pytest.fixture(scope="module")
 def robot_stream():
     """Rows of a Panda from 19 s on that carries 1.5 kg from UP to DOWN."""
-    asked = Stream(2200, RATE, speed=5.0, noise=0.05)
+    asked = Simulation(2200, RATE, speed=5.0, noise=0.05)
     free = simulate(load_robot("panda"), asked, 300)
     full = simulate(load_robot("panda"), replace(asked, payload=Payload(1.5, 0.0, (0.02, 0.02, 0.08))), 300)
     carried = ((free.t >= UP) & (free.t < DOWN))[:, None]

@@ -14,9 +14,9 @@ from lipcore.online.learner import OnlineModel
 from lipcore.online.transfer import Revision
 from service.learning.learner import learnt, publication
 from service.learning.learner.learnt import LearntVersions
-from service.learning.learner.publication import Published
+from service.learning.learner.publication import Publication
 from service.models.loaded import LoadedModels
-from service.models.served import Waiting
+from service.models.served import RevisionWaiters
 from service.storage.files import Files
 from tests.service.data import error, service_of
 from tests.service.learning.lessons import QUERIES as ASKED
@@ -45,7 +45,7 @@ def published(arm, batches, number=None, **fields):
     path = publication.write(publication.clear(arm.files), revision(batches))
     number = batches if number is None else number
     usual = {"model": ARM, "version": 1, "revision": number, "number": number, "path": path, "samples": 10.0 * batches}
-    return Published(**usual | {"novel_rows": 0, "novel_share": 0.0, "seconds": 0.1, "at": 0.0} | fields)
+    return Publication(**usual | {"novel_rows": 0, "novel_share": 0.0, "seconds": 0.1, "at": 0.0} | fields)
 
 
 def test_arrays_come_back_as_they_were_and_their_files_are_gone(arm):
@@ -53,7 +53,7 @@ def test_arrays_come_back_as_they_were_and_their_files_are_gone(arm):
     path = publication.write(publication.clear(arm.files), written)
     found = publication.read(path)
     assert not path.exists()
-    for name in publication.NAMES:
+    for name in publication.ARRAY_NAMES:
         np.testing.assert_array_equal(getattr(found, name), getattr(written, name))
     assert found.floor[0] == 0.5
 
@@ -128,7 +128,7 @@ def test_what_is_learnt_while_a_version_is_being_loaded_is_not_lost(arm, loaded,
 
 
 def test_a_learner_is_woken_for_what_was_loaded_without_all_of_its_log(arm, monkeypatch):
-    monkeypatch.setattr(learnt, "PAGES", 0)
+    monkeypatch.setattr(learnt, "MAX_PAGES", 0)
     woken = []
     started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
     arm.batches(*range(4))
@@ -256,7 +256,7 @@ def test_what_is_not_there_is_not_waited_for(school, pupil):
 
 
 def test_a_waiter_misses_nothing_and_leaves_nothing():
-    waiting = Waiting()
+    waiting = RevisionWaiters()
 
     async def wait() -> None:
         with waiting.waiter("arm") as first, waiting.waiter("arm") as second:

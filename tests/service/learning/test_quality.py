@@ -60,7 +60,7 @@ def test_windows_slide():
     for at, value in ((1000.0, 1.0), (1050.0, 3.0)):
         record = Record.of(np.full((4, 1), value), np.zeros((4, 1)), np.zeros((4, 1)), np.ones(1))
         seen.add(record, {"learnt": 4, "contact": 1}, at)
-    whole, half, none = (status.window(seen, now) for now in (1055.0, 1065.0, 1200.0))
+    whole, half, none = (status.summarise_window(seen, now) for now in (1055.0, 1065.0, 1200.0))
     assert (whole.rows, whole.accepted, whole.rejected) == (8, 8, {"contact": 2})
     assert whole.rmse == pytest.approx([math.sqrt((1 + 9) / 2)])
     assert (half.rows, half.rmse, half.nmse) == (4, [3.0], [None])

@@ -10,7 +10,7 @@ from sqlalchemy import select
 from lipserve.states import CANCELLED, FAILED, RUNNING
 from service.journal import log
 from service.learning import refresh
-from service.learning.learner.publication import Published
+from service.learning.learner.publication import Publication
 from service.learning.refresh import RefreshRule
 from service.storage.database import AlarmRow, JobRow, VersionRow, now
 from service.training import planned_fit, worker
@@ -165,13 +165,13 @@ def test_a_refresh_goes_on_after_the_service_was_killed(tmp_path):
 
 
 def published(pupil, share=0.5, version=1, errors=None):
-    return Published(pupil.model, version, 3, 3, None, 30.0, 900, share, 0.1, time.time(), errors)
+    return Publication(pupil.model, version, 3, 3, None, 30.0, 900, share, 0.1, time.time(), errors)
 
 
 def consider(school, pupil, **changes):
     service = school.service
     with patch.object(refresh, "RULE", RefreshRule(pause_s=changes.pop("pause", 0.0))):
-        return refresh.consider(service.database, service.jobs, published(pupil, **changes))
+        return refresh.queue_refresh(service.database, service.jobs, published(pupil, **changes))
 
 
 def alarms(pupil):
@@ -181,7 +181,7 @@ def alarms(pupil):
 @pytest.fixture(autouse=True)
 def soon(monkeypatch):
     """Few rows are enough to be refreshed by itself."""
-    monkeypatch.setattr(refresh, "LEAST_S", 0.0)
+    monkeypatch.setattr(refresh, "MIN_OBSERVED_S", 0.0)
 
 
 @pytest.fixture
@@ -230,15 +230,15 @@ def test_an_arm_that_has_left_its_linearisation_is_refreshed(ready):
 def test_a_model_that_is_held_is_not_refreshed(ready):
     school, pupil = ready
     with school.service.database.transaction() as session:
-        refresh.owner.hold(session, pupil.model, {"at": 0.0, "event": 1})
+        refresh.owner.pause(session, pupil.model, {"at": 0.0, "event": 1})
     assert consider(school, pupil) is None
     with school.service.database.transaction() as session:
-        refresh.owner.release(session, pupil.model)
+        refresh.owner.resume(session, pupil.model)
     assert consider(school, pupil) is not None
 
 
 def test_a_version_that_has_observed_too_little_to_be_compared_is_not_refreshed(ready, monkeypatch):
-    monkeypatch.setattr(refresh, "LEAST_S", 60.0)
+    monkeypatch.setattr(refresh, "MIN_OBSERVED_S", 60.0)
     assert consider(*ready) is None
 
 

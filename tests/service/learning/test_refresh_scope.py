@@ -98,11 +98,11 @@ def test_what_is_taken_back_is_seen_only_where_it_matters(database):
     write(database, *(batches.batch(number) for number in range(4)))
     newest = len(everything(database))
 
-    def taken_back(through):
+    def is_taken_back(through):
         with database.session() as session:
-            return refresh_data.taken_back(session, MODEL, through, newest)
+            return refresh_data.is_taken_back(session, MODEL, through, newest)
 
     take_back(database, 3)
-    assert [taken_back(through) for through in (2, 3, 4)] == [False, True, True]
+    assert [is_taken_back(through) for through in (2, 3, 4)] == [False, True, True]
     roll_back(database, 2)
-    assert [taken_back(through) for through in (1, 2, 3)] == [False, False, True]
+    assert [is_taken_back(through) for through in (1, 2, 3)] == [False, False, True]

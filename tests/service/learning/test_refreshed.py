@@ -9,7 +9,7 @@ from lipcore.data.samples import Samples
 from lipcore.online.learner import OnlineModel
 from service.models import registry
 from service.training import refresh_data, refreshed
-from service.training.refresh_data import Unlearnt
+from service.training.refresh_data import ComparisonRows
 from tests.service.learning.pendulums import ARM, Arm, rows, trained
 
 SECOND = 100
@@ -27,12 +27,12 @@ def arm(tmp_path_factory):
     arm.database.close()
 
 
-def unlearnt(*numbers: int) -> Unlearnt:
+def unlearnt(*numbers: int) -> ComparisonRows:
     """Rows of these seconds, in one stream."""
     every = rows(0).concatenate([rows(number, SECOND) for number in numbers])
     episode = np.zeros(len(every), np.int64)
     samples = Samples(trained().joint_names, every.time, episode, every.q, every.dq, every.ddq, every.tau)
-    return Unlearnt(AFTER, samples)
+    return ComparisonRows(AFTER, samples)
 
 
 def learnt(seconds: int):

@@ -59,7 +59,7 @@ def test_a_damaged_snapshot_gives_way_to_the_one_before(arm, caplog, harm):
     arm.batches(2, 3)
     arm.snapshot()
     with arm.database.session() as session:
-        newest = snapshots.latest(session, ARM, 1, None)
+        newest = snapshots.find_latest(session, ARM, 1, None)
     harm(arm.files.learning / f"{newest.id}.safetensors")
     same(arm.restored().online, at_once(range(4)))
     assert f"snapshot {newest.id} of version 1 of model 'arm' cannot be used" in caplog.text
@@ -96,7 +96,7 @@ def test_little_is_learnt_where_a_version_is_loaded_and_the_rest_is_left_to_the_
     assert (found.revision, found.behind) == (6, False)
     same(found.model, at_once(range(6)))
     monkeypatch.setattr(restoring, "PAGE_ROWS", 10)
-    monkeypatch.setattr(learnt, "PAGES", 2)
+    monkeypatch.setattr(learnt, "MAX_PAGES", 2)
     found = LearntVersions(arm.database, arm.files).find(ARM, 1, arm.base)
     assert (found.revision, found.behind) == (2, True)
     same(found.model, at_once(range(2)))

@@ -57,7 +57,7 @@ def test_those_that_are_too_old_go(database):
 
 
 def test_more_go_than_one_transaction_deletes(database, monkeypatch):
-    monkeypatch.setattr(snapshots, "CHUNK", 3)
+    monkeypatch.setattr(snapshots, "CHUNK_EVENTS", 3)
     write(database, *(batch(k) for k in range(12)))
     snapshot(database, 12)
     assert retain(database, batches=1) == 11
@@ -129,7 +129,7 @@ def test_every_run_has_a_stream_of_its_own_and_the_longest_silent_makes_room(dat
     def run(number, received, **fields):
         with database.transaction() as session:
             arrived = batch(0, stream_id=f"run-{number}", received=received, **fields)
-            log.append_batch(session, MODEL, arrived, most_streams=20)
+            log.append_batch(session, MODEL, arrived, max_streams=20)
 
     for number in range(runs):
         run(number, 1000.0 + number)
@@ -165,8 +165,8 @@ def test_streams_in_use_make_no_room(database):
     for number in range(3):
         write(database, batch(0, stream_id=f"robot-{number}", received=1000.0 + number))
     with database.transaction() as session, pytest.raises(BusyError, match="3 sources of observations in use"):
-        log.append_batch(session, MODEL, batch(0, stream_id="new", received=1009.0), most_streams=3)
+        log.append_batch(session, MODEL, batch(0, stream_id="new", received=1009.0), max_streams=3)
     with database.transaction() as session:
-        log.append_batch(session, MODEL, batch(0, stream_id="new", received=1011.0), most_streams=3)
+        log.append_batch(session, MODEL, batch(0, stream_id="new", received=1011.0), max_streams=3)
     assert source(database, "robot-0") is None
     assert source(database, "robot-1") is not None

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sqlalchemy import select
 
 from service.journal import snapshots
-from service.journal.snapshots import thinned
+from service.journal.snapshots import choose_kept
 from service.storage.database import SnapshotRow, VersionRow, now
 from service.storage.files import Files
 from tests.service.learning.batches import MODEL, OTHER, batch, roll_back, write
@@ -36,7 +36,7 @@ def save(database, files, number, version=1, most=20, model=MODEL, seen=None):
 
 def latest(database, version=1, at_most=None, model=MODEL):
     with database.session() as session:
-        return snapshots.latest(session, model, version, at_most)
+        return snapshots.find_latest(session, model, version, at_most)
 
 
 def numbers(database):
@@ -96,7 +96,7 @@ def test_no_more_than_the_most_are_kept_for_each_version(database, files):
 @given(st.lists(st.integers(0, 1000), unique=True, max_size=40), st.integers(2, 12))
 def test_thinning_keeps_the_newest_half_and_the_oldest(numbers, most):
     falling = sorted(numbers, reverse=True)
-    kept = [falling[place] for place in thinned(falling, most)]
+    kept = [falling[place] for place in choose_kept(falling, most)]
     assert len(kept) == min(len(falling), most)
     assert kept == sorted(kept, reverse=True)
     assert kept[: most // 2] == falling[: most // 2]
@@ -107,7 +107,7 @@ def test_old_snapshots_stay_evenly_apart_however_long_it_goes_on():
     most, kept = 10, []
     for number in range(1, 1001):
         before = [number, *kept]
-        kept = [before[place] for place in thinned(before, most)]
+        kept = [before[place] for place in choose_kept(before, most)]
     old = kept[(most + 1) // 2 - 1 :]
     steps = [newer - older for newer, older in pairwise(old)]
     even = (old[0] - old[-1]) / len(steps)

@@ -89,11 +89,11 @@ def test_reach_follows_snapshots_and_what_is_left_of_the_log(database):
         for event in log.events(session, MODEL, 0, 5):
             session.delete(event)
     with database.session() as session:
-        assert status.reachable(session, MODEL, 1) == [(0, 0), (2, 2), (4, 6), (8, 10)]
-        assert status.current(session, MODEL, 1) == 10
+        assert status.list_reachable(session, MODEL, 1) == [(0, 0), (2, 2), (4, 6), (8, 10)]
+        assert status.read_newest_revision(session, MODEL, 1) == 10
     note(database, "settings", {"forgetting_s": 5.0})
     with database.session() as session:
-        assert status.reachable(session, MODEL, 1)[-1] == (8, 11)
+        assert status.list_reachable(session, MODEL, 1)[-1] == (8, 11)
 
 
 def test_another_version_serves_by_one_call(school):

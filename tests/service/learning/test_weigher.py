@@ -15,13 +15,13 @@ import lipcore
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
 from lipcore.online.batch import Rows
-from lipcore.online.payload.holding import Watch
+from lipcore.online.payload.holding import PayloadTracker
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Payload, Stream, simulate
+from lipcore.robots.simulation import Payload, Simulation, simulate
 from service.foundation.settings import Settings
 from service.journal.snapshots import retain
 from service.learning.weigher import worker
-from service.learning.weigher.messages import Asked, Revised, Unweighed, Weighed
+from service.learning.weigher.messages import PosteriorUpdate, StreamRows, UnknownStream, WatchUpdate
 from service.learning.weigher.worker import Weigher
 from service.storage.database import Database, EventRow
 from tests.choosing import slow
@@ -42,7 +42,7 @@ def model():
 @pytest.fixture(scope="module")
 def batches():
     """Ten rows each, of a Panda that takes 1.5 kg up at UP."""
-    seen = simulate(load_robot("panda"), Stream(300, RATE, speed=5.0, noise=0.05, payload=Payload(1.5, UP)), 7)
+    seen = simulate(load_robot("panda"), Simulation(300, RATE, speed=5.0, noise=0.05, payload=Payload(1.5, UP)), 7)
     rows = Rows(seen.t, seen.q, seen.dq, seen.ddq, seen.tau, np.zeros(len(seen), np.uint8))
     return [rows.take(slice(at, at + 10)) for at in range(0, 300, 10)]
 
@@ -61,12 +61,12 @@ def weigher(model):
 
 
 def follow(weigher, rows, said=0, **more):
-    return list(weigher.follow(KEY, [Unweighed(rows, float(rows.time[-1]), said, **more)]))
+    return list(weigher.follow(KEY, [StreamRows(rows, float(rows.time[-1]), said, **more)]))
 
 
 def told(weigher, batches):
     """What is told of batches, the first of which come from a stream that is known to carry nothing."""
-    out = follow(weigher, batches[0], known=Watch(7))
+    out = follow(weigher, batches[0], watch=PayloadTracker(7))
     for rows in batches[1:]:
         out += follow(weigher, rows)
     return out
@@ -83,14 +83,14 @@ def settle(weigher, monkeypatch):
 
 
 def test_a_stream_is_asked_for_where_it_is_not_known(weigher, batches):
-    assert follow(weigher, batches[0]) == [Asked(KEY)]
-    assert [each.watch.state for each in follow(weigher, batches[0], known=Watch(7))] == ["none"]
+    assert follow(weigher, batches[0]) == [UnknownStream(KEY)]
+    assert [each.watch.state for each in follow(weigher, batches[0], watch=PayloadTracker(7))] == ["none"]
     assert follow(weigher, batches[1]) == []  # nothing new
 
 
 def test_what_is_taken_up_is_told_at_once_then_refined(weigher, batches, model, monkeypatch):
     first = told(weigher, batches[:11])[-1]
-    assert isinstance(first, Weighed)
+    assert isinstance(first, WatchUpdate)
     assert (first.stream, first.received) == (KEY, batches[10].time[-1])
     assert first.watch.since == pytest.approx(UP, abs=0.011)
     assert len(first.watch.held.rows) == 0
@@ -100,7 +100,7 @@ def test_what_is_taken_up_is_told_at_once_then_refined(weigher, batches, model, 
     assert better.watch.held.refined == first.watch.held.count
     assert better.watch.held.estimate.draws == ()  # nobody else needs them
     asked = batches[20]
-    answer = Carrier(model).carrying(better.watch.load).predict(asked.q, asked.dq, asked.ddq)
+    answer = Carrier(model).with_payload(better.watch.load).predict(asked.q, asked.dq, asked.ddq)
     inside = np.abs(answer.tau - asked.tau) < 1.96 * np.sqrt(answer.tau_std**2 + answer.noise_std**2)
     assert inside.mean() > 0.9
 
@@ -123,17 +123,17 @@ def test_refining_leaves_most_of_the_time_to_rows(weigher, batches, monkeypatch)
 def test_what_the_owner_says_counts_from_then_on(weigher, batches, model):
     told(weigher, batches[:11])
     carrier = Carrier(model)
-    declared = Watch(7).declare(carrier, Body(1.5, np.array([0.0, 0.0, 0.0])), UP).outline()
-    late = [Unweighed(batches[11], 0.0, 0), Unweighed(batches[12], 1.0, 5, known=declared)]
+    declared = PayloadTracker(7).declare(carrier, Body(1.5, np.array([0.0, 0.0, 0.0])), UP).outline()
+    late = [StreamRows(batches[11], 0.0, 0), StreamRows(batches[12], 1.0, 5, watch=declared)]
     said = list(weigher.follow(KEY, late))[-1]
-    assert (said.said, said.watch.held.count) == (5, 10)  # of the rows since
+    assert (said.event, said.watch.held.count) == (5, 10)  # of the rows since
     assert said.watch.held.estimate.mass[0] == pytest.approx(1.5, abs=0.1)
 
 
 def test_a_revision_is_followed_with(weigher, batches, model):
     told(weigher, batches[:11])
     weights, root = model.posterior.weights * 1.001, model.posterior.root
-    follow(weigher, batches[11], revised=Revised(weights, root))
+    follow(weigher, batches[11], posterior=PosteriorUpdate(weights, root))
     assert weigher._streams[KEY].carrier.model.posterior.weights is weights
     follow(weigher, batches[12])
     assert weigher._streams[KEY].carrier.model.posterior.weights is weights
@@ -142,25 +142,25 @@ def test_a_revision_is_followed_with(weigher, batches, model):
 def test_a_stream_that_cannot_be_followed_is_asked_for_and_others_go_on(weigher, batches, monkeypatch, caplog):
     told(weigher, batches[:2])
     with monkeypatch.context() as patch:
-        patch.setattr(Watch, "step", lambda *_: 1 / 0)
+        patch.setattr(PayloadTracker, "step", lambda *_: 1 / 0)
         assert follow(weigher, batches[2]) == []
     assert "is not followed" in caplog.text
-    assert follow(weigher, batches[3]) == [Asked(KEY)]
+    assert follow(weigher, batches[3]) == [UnknownStream(KEY)]
 
 
 def test_the_stream_that_was_silent_for_longest_is_forgotten(weigher, batches, monkeypatch):
-    monkeypatch.setattr(worker, "MOST_STREAMS", 1)
+    monkeypatch.setattr(worker, "MAX_STREAMS", 1)
     told(weigher, batches[:2])
     other = (*KEY[:2], "other")
-    list(weigher.follow(other, [Unweighed(batches[0], 0.0, 0, known=Watch(7))]))
-    assert follow(weigher, batches[2]) == [Asked(KEY)]
+    list(weigher.follow(other, [StreamRows(batches[0], 0.0, 0, watch=PayloadTracker(7))]))
+    assert follow(weigher, batches[2]) == [UnknownStream(KEY)]
 
 
 def test_nothing_is_kept_of_a_model_that_was_deleted(weigher, batches):
     told(weigher, batches[:11])
     weigher.forget(KEY[0])
     assert weigher.pause() == np.inf
-    assert follow(weigher, batches[11]) == [Asked(KEY)]
+    assert follow(weigher, batches[11]) == [UnknownStream(KEY)]
 
 
 def test_another_model_of_the_same_name_is_another(panda):

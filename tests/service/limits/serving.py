@@ -17,7 +17,7 @@ from service.api.limits.requests import PATIENCE, ClientPatience
 from service.api.server.connections import guarded
 from service.api.server.sockets import DRAIN_S, Server
 from service.foundation.settings import Settings
-from service.telemetry.readiness import Stopping
+from service.telemetry.readiness import StopState
 from tests.service.data import DEADLINE, eventually
 from tests.service.server import free_port
 
@@ -66,7 +66,7 @@ class Serving:
     def __init__(
         self, notice_s: float = 0.0, drain_s: int = DRAIN_S, patience: ClientPatience = PATIENCE, **limits: Any
     ) -> None:
-        self.app, self.stopping, self.port = SmallApp(), Stopping(), free_port()
+        self.app, self.stopping, self.port = SmallApp(), StopState(), free_port()
         settings = Settings(**limits)
         config = uvicorn.Config(
             self.app,

@@ -51,13 +51,13 @@ def test_a_home_is_measured_with_all_below_it_but_not_what_links_lead_to(tmp_pat
 
 
 def test_a_quota_is_kept_between_measurements(disk, clock):
-    disk.take(300)
-    disk.take(200)
+    disk.reserve(300)
+    disk.reserve(200)
     disk.require()
     with pytest.raises(StorageFullError, match=r"1000 bytes of 1000 bytes \(LIPSERVE_MAX_HOME_BYTES\)"):
-        disk.take(1)
+        disk.reserve(1)
     clock.now = 2.0  # what was announced was not written, as a measurement shows
-    disk.take(500)
+    disk.reserve(500)
     with pytest.raises(StorageFullError):
         disk.require(1)
 
@@ -72,7 +72,7 @@ def test_what_others_write_is_seen_after_a_while_and_what_they_delete_soon(disk,
     (tmp_path / "other").unlink()
     with pytest.raises(StorageFullError):
         disk.require(500)
-    clock.now += 2 * measuring.AGAIN_S
+    clock.now += 2 * measuring.RECHECK_S
     disk.require(500)
 
 

@@ -20,7 +20,7 @@ GET = b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n"
 HELD = GET.replace(b"/ ", b"/held ", 1)
 HOLD = """
 import asyncio, sys, uvicorn
-from service.telemetry.readiness import Stopping
+from service.telemetry.readiness import StopState
 from service.api.server.sockets import serve
 
 async def app(scope, receive, send):
@@ -28,7 +28,7 @@ async def app(scope, receive, send):
     await asyncio.Event().wait()
 
 config = uvicorn.Config(app, port=0, lifespan="off", timeout_graceful_shutdown=600)
-serve(config, None, 0, Stopping())
+serve(config, None, 0, StopState())
 """
 """A server whose answer never comes."""
 

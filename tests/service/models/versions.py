@@ -71,7 +71,7 @@ def publish_arm(database: Database, files: Files, model: str, **changed: Any) ->
     manifest["warnings"] = [WARNING] if "geometry" in manifest["parameters"] else []
     source[MANIFEST] = persistence.manifest_bytes(manifest)
     with files.new_version(folder) as target:
-        persistence.write(target, source)
+        persistence.write_folder(target, source)
     with database.transaction() as session:
         registry.publish(session, model, folder, read_manifest_bytes(source[MANIFEST]), None)
     return manifest

@@ -9,7 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from service.runtime.process import Place, start_process
+from service.runtime.process import ProcessOptions, start_process
 from service.telemetry import logs
 from service.telemetry.logs import LogOptions, job_id, request_id
 
@@ -105,11 +105,11 @@ def test_a_process_logs_everything_once_and_no_headers():
 
 
 def _options():
-    return logs.current(), logging.getLogger("service").level
+    return logs.current_options(), logging.getLogger("service").level
 
 
 def test_processes_that_are_started_log_as_their_parent_does():
     options = LogOptions("error", "json")
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(1, context, start_process, (Place(threads=1, log=options),)) as pool:
+    with ProcessPoolExecutor(1, context, start_process, (ProcessOptions(threads=1, log=options),)) as pool:
         assert pool.submit(_options).result() == (options, logging.ERROR)

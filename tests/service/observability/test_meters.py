@@ -5,7 +5,7 @@ from time import perf_counter
 import pytest
 
 from service.foundation.settings import Settings
-from service.telemetry.meters import BOUNDS, OTHER, Durations, Kind, Meters, RequestMeter, merged
+from service.telemetry.meters import BUCKET_BOUNDS_S, OTHER, Durations, Kind, Meters, RequestMeter, merge_durations
 from tests.service.streams import LATE, frame
 from tests.service.test_stream_session import Loaded, Model, reply, session
 
@@ -20,10 +20,10 @@ def test_a_duration_counts_up_to_its_bound():
 
 def test_merged_durations_are_those_of_all():
     one, two = Durations(), Durations()
-    one.add(BOUNDS[0])
-    two.add(BOUNDS[0])
+    one.add(BUCKET_BOUNDS_S[0])
+    two.add(BUCKET_BOUNDS_S[0])
     two.add(1e9)
-    both = merged([one, two])
+    both = merge_durations([one, two])
     assert (both.counts[0], both.counts[-1], both.total) == (2, 1, pytest.approx(1e9))
 
 

@@ -10,9 +10,9 @@ from service import __version__
 from service.journal import log
 from service.learning.learner.process import LearnerProcess
 from service.learning.learners import MAX_LAG_S, RESTART_S
-from service.learning.metrics import Learning
+from service.learning.metrics import LearningCollector
 from service.storage import storage
-from service.telemetry.readiness import KEPT_S, Readiness
+from service.telemetry.readiness import MAX_REPORT_AGE_S, Readiness
 from service.training.metrics import START_S
 from tests.service.data import QUICK, error, queue, service_of, stream, upload
 
@@ -52,7 +52,7 @@ def look(clock):
     kept = {}
 
     def look(service):
-        seen = kept.setdefault(id(service.readiness), Readiness(service.readiness.looks, service.stopping, clock))
+        seen = kept.setdefault(id(service.readiness), Readiness(service.readiness.probes, service.stopping, clock))
         seen.forget()
         return {check.name: (check.state, check.message) for check in seen.report()}
 
@@ -95,14 +95,14 @@ def test_a_look_leaves_nothing_behind_and_like_a_scrape_does_not_count_as_using_
     api, trained, look, monkeypatch
 ):
     service = service_of(api)
-    monkeypatch.setattr(LearnerProcess, "needed", True)
+    monkeypatch.setattr(LearnerProcess, "is_needed", True)
     monkeypatch.setattr(LearnerProcess, "pid", 1)
     service.learners.monitor(trained.name)  # what has one is looked at
     files, uses = list(service.files.uploads.iterdir()), Uses(service.loaded._clock)
     monkeypatch.setattr(service.loaded, "_clock", uses)
     assert look(service)["learner"] == ("ok", "runs")
     assert list(service.files.uploads.iterdir()) == files
-    assert list(Learning(service.learners).collect())
+    assert list(LearningCollector(service.learners).collect())
     assert get_ident() not in uses.threads
     service.loaded.get(trained.name, 1)
     assert get_ident() in uses.threads  # as whoever asks does use it
@@ -125,7 +125,7 @@ def test_versions_that_cannot_be_read_are_a_warning_while_others_can(api, traine
 
 def test_a_learner_that_is_gone_for_long_is_found(api, look, clock, monkeypatch):
     service = service_of(api)
-    monkeypatch.setattr(LearnerProcess, "needed", True)
+    monkeypatch.setattr(LearnerProcess, "is_needed", True)
     monkeypatch.setattr(LearnerProcess, "pid", None)
     assert look(service)["learner"][0] == "warning"
     clock.now += RESTART_S
@@ -140,7 +140,7 @@ def test_a_learner_that_is_gone_for_long_is_found(api, look, clock, monkeypatch)
 
 def test_a_learner_that_hangs_is_found(api, look, monkeypatch):
     service = service_of(api)
-    monkeypatch.setattr(LearnerProcess, "needed", True)
+    monkeypatch.setattr(LearnerProcess, "is_needed", True)
     monkeypatch.setattr(LearnerProcess, "pid", 1)
     monkeypatch.setattr(LearnerProcess, "silent_s", RESTART_S)
     assert look(service)["learner"] == ("ok", "runs")
@@ -152,7 +152,7 @@ def test_a_learner_that_hangs_is_found(api, look, monkeypatch):
 def test_observations_that_wait_for_long_are_found(api, trained, look, clock, monkeypatch):
     service = service_of(api)
     learners, limit = service.learners, MAX_LAG_S
-    monkeypatch.setattr(LearnerProcess, "needed", True)
+    monkeypatch.setattr(LearnerProcess, "is_needed", True)
     monkeypatch.setattr(LearnerProcess, "pid", 1)
     service.loaded.get(trained.name, None)
     monkeypatch.setattr(learners, "monitors", lambda: {trained.name: None})
@@ -193,6 +193,6 @@ def test_a_report_is_kept_for_a_moment(api, clock):
     for _ in range(5):
         seen.report()
     assert len(looked) == 1
-    clock.now += KEPT_S
+    clock.now += MAX_REPORT_AGE_S
     seen.report()
     assert len(looked) == 2

@@ -20,7 +20,7 @@ from service.foundation.settings import Settings
 from service.inference import predicting as inference
 from service.learning.learners import IngestThreads
 from service.telemetry import logs
-from service.telemetry.logs import KEY_ID, given_request_id, new_request_id, request_id
+from service.telemetry.logs import KEY_ID, new_request_id, read_request_id, request_id
 from service.telemetry.meters import Kind, Meters
 from tests.service.data import ADDRESS, error, stream, upload
 
@@ -72,9 +72,9 @@ def test_an_id_that_was_given_comes_back(api, given):
 )
 def test_an_id_that_could_do_harm_is_replaced(given):
     made = new_request_id()
-    assert given_request_id([(b"x-request-id", made.encode())]) == made
-    assert given_request_id([(b"x-request-id", given), (b"x-request-id", b"two")]) is None  # the first one counts
-    assert given_request_id([(b"x-request-id", b"one"), (b"x-request-id", given)]) == "one"
+    assert read_request_id([(b"x-request-id", made.encode())]) == made
+    assert read_request_id([(b"x-request-id", given), (b"x-request-id", b"two")]) is None  # the first one counts
+    assert read_request_id([(b"x-request-id", b"one"), (b"x-request-id", given)]) == "one"
 
 
 def test_an_unexpected_error_is_answered_and_logged_with_its_id_and_goes_on_to_the_server(api, monkeypatch):

@@ -92,7 +92,7 @@ def facts(session: Session) -> dict[str, Any]:
         found[f"version/{model}/{version}"] = made
         models.add(model)
     for model in models:
-        found[f"alias/{model}/serving"] = registry.answering(session, model)
+        found[f"alias/{model}/serving"] = registry.serving_version(session, model)
     for model, alias, version in session.execute(select(AliasRow.model, AliasRow.alias, AliasRow.version)):
         found[f"alias/{model}/{alias}"] = version
     jobs = select(JobRow.model, func.count(), func.count().filter(JobRow.state == "succeeded")).group_by(JobRow.model)
@@ -158,7 +158,7 @@ def _numbers(session: Session, model: str) -> Iterable[int]:
 def _learns_on(database: Database, files: Files, settings: Settings, model: str) -> list[str]:
     """Follow the log as the learner process does, and compare with learning all of it at once; store, and restore."""
     with database.session() as session:
-        version = registry.answering(session, model)
+        version = registry.serving_version(session, model)
         row = session.get_one(VersionRow, (model, version))
         newest = log.newest(session, model)
     base = files.load_version(row.folder, row.checksums)
@@ -176,7 +176,7 @@ def _learns_on(database: Database, files: Files, settings: Settings, model: str)
         return [f"version {version} of {model} has learnt something else than its log"]
     follower.store()
     with database.session() as session:
-        stored = snapshots.latest(session, model, version, None)
+        stored = snapshots.find_latest(session, model, version, None)
     if follower.number > follower.start and (stored is None or stored.number != newest):
         return [f"version {version} of {model} could not be stored"]
     return []

@@ -28,7 +28,7 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 from service.storage.database import Database, SnapshotRow, now
 from service.storage.files import Files
-from service.storage.errors import undecided
+from service.storage.errors import is_undecided
 home = Path(sys.argv[1])
 database = Database(home)
 files = Files(home)
@@ -70,10 +70,10 @@ def stored(home: Path) -> dict[str, bytes]:
 COPIES = """
 store("snap_1")
 from service.storage.backup import backup, restore
-from service.storage.files.objects import Mounted
+from service.storage.files.objects import FolderStore
 root = home.parents[2]
 (root / "file").write_bytes(b"shared")
-Mounted(root).put(root / "file", "store/versions/mv_1/file")
+FolderStore(root).put(root / "file", "store/versions/mv_1/file")
 backup(home, root / "backup")
 restore(home.parents[1] / "again" / "home", root / "backup")
 """
@@ -96,7 +96,7 @@ REFUSED = """
 try:
     store("snap_2")
 except SQLAlchemyError as error:
-    assert undecided(error)
+    assert is_undecided(error)
 else:
     raise AssertionError("what could not be synced was taken")
 """

@@ -15,7 +15,7 @@ import pytest
 from lipcore import profiles
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import FAST, Stream, inverse_dynamics, simulate
+from lipcore.robots.simulation import FAST_SPEED, Simulation, inverse_dynamics, simulate
 from service.contract.datasets import DatasetReport
 from service.contract.uploads import UploadQuery
 from service.datasets.formats.opening import open_table
@@ -41,7 +41,7 @@ ARMS = (
     "baxter-right",
     "tiago",
 )
-COURSES = (("sinusoids", FAST), ("periodic", 1.0), ("rests", 1.0))
+COURSES = (("sinusoids", FAST_SPEED), ("periodic", 1.0), ("rests", 1.0))
 RECORDINGS = [(arm, *COURSES[place % 3], dirty) for place, arm in enumerate(ARMS) for dirty in (False, True)]
 QUICK = ("talos-left", "periodic", 1.0, True)
 
@@ -49,7 +49,7 @@ QUICK = ("talos-left", "periodic", 1.0, True)
 @cache
 def recording(arm: str, course: str, speed: float, dirty: bool, seconds: float = 40.0) -> dict[str, np.ndarray]:
     friction = {"dirt": Dirt(seed=len(arm))} if dirty else {"viscous": 0.2, "coulomb": 0.3}
-    stream = Stream(n_samples=int(100 * seconds), rate=100, course=course, speed=speed, **friction)
+    stream = Simulation(n_samples=int(100 * seconds), rate=100, course=course, speed=speed, **friction)
     made = simulate(load_robot(arm), stream, seed=200 + len(arm))
     return {"t": made.t, "q": made.q, "dq": made.dq, "tau": made.tau}
 
@@ -202,7 +202,7 @@ def test_work_that_comes_back_has_no_trend() -> None:
 
 def test_negative_friction_is_implausible(tmp_path: Path) -> None:
     robot = load_robot("finger-edu")
-    made = simulate(robot, Stream(n_samples=3000, rate=100, speed=FAST, noise=0.001), seed=5)
+    made = simulate(robot, Simulation(n_samples=3000, rate=100, speed=FAST_SPEED, noise=0.001), seed=5)
     friction = np.array([0.02, -0.02, 0.02]) * made.dq
     columns = {"t": made.t, "q": made.q, "dq": made.dq, "tau": made.tau + friction}
     report = report_on(tmp_path, robot.joint_names, columns, profiles.profile("finger-edu"))

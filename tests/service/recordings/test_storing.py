@@ -36,7 +36,7 @@ def test_the_library_reads_what_was_written_array_by_array(tmp_path):
         np.testing.assert_array_equal(values, getattr(SAMPLES, name))
         assert values.dtype == getattr(SAMPLES, name).dtype
     assert digest == hashlib.sha256(path.read_bytes()).hexdigest() == sample_file.sha256(path)
-    assert sample_file.rows_of(path) == len(SAMPLES)
+    assert sample_file.count_rows(path) == len(SAMPLES)
     chosen = np.array([0, 7, 599])
     for name, values in sample_file.read(path, chosen).items():
         np.testing.assert_array_equal(values, getattr(SAMPLES, name)[chosen])

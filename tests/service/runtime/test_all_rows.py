@@ -11,13 +11,13 @@ from lipcore.data import independence
 from lipcore.data.samples import Samples
 from lipcore.training.conditioning import SHARD, condition
 from service.foundation.settings import Settings
-from service.runtime.executors import Inline, shard_executor, summed
+from service.runtime.executors import Inline, shard_executor, sum_shards
 from service.storage.database import DatasetRow
 from service.storage.files import Files, new_id
 from service.storage.sample_file import Reader
-from service.training.material import CANDIDATES
+from service.training.material import MAX_CANDIDATE_ROWS
 from service.training.summing import Context, packed, read, shard_statistics
-from service.training.table import STRETCHES, Table, TablePart, opened
+from service.training.table import STRETCHES, Table, TablePart, open_parts
 from tests.service.data import QUICK, stream
 
 ROWS = SHARD + 700
@@ -43,7 +43,7 @@ def parts(settings):
         sha256 = files.write_samples(name, ROWS, 2, partial(getattr, samples))
         joints = list(samples.joint_names)
         rows.append(DatasetRow(id=name, sha256=sha256, joint_names=joints, report={"rate_hz": rate}))
-    return opened(files, rows)
+    return open_parts(files, rows)
 
 
 @pytest.fixture(scope="module")
@@ -83,7 +83,7 @@ def test_a_table_is_its_parts_in_order(parts):
 
 def test_stretches_are_contiguous(parts):
     found = Table(parts).stretches()
-    assert len(found) <= min(2 * ROWS, STRETCHES * 500) < CANDIDATES + 1
+    assert len(found) <= min(2 * ROWS, STRETCHES * 500) < MAX_CANDIDATE_ROWS + 1
     for each in found.episodes():
         np.testing.assert_allclose(np.diff(found.t[each]), 0.01, rtol=1e-6)
 
@@ -129,9 +129,9 @@ def test_the_pass_is_the_same_in_processes_and_here(settings, parts, model):
     table = Table([masked(parts[0]), parts[0]])
     context = Context(settings, packed(model), model.joint_names, "cpu")
     work, shards = partial(shard_statistics, context), table.shards()
-    here = summed(Inline(), work, shards, lambda: False)
+    here = sum_shards(Inline(), work, shards, lambda: False)
     with shard_executor(settings) as executor:
-        there = summed(executor, work, shards, lambda: False)
+        there = sum_shards(executor, work, shards, lambda: False)
     assert here.a.tobytes() == there.a.tobytes()
     assert here.b.tobytes() == there.b.tobytes()
 

@@ -13,8 +13,8 @@ glibc = pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_info"), reason
 THREADS = 8
 SCRIPT = f"""
 import ctypes, threading
-from service.runtime.allocator import keep_little
-print(keep_little())
+from service.runtime.allocator import limit_free_memory
+print(limit_free_memory())
 library = ctypes.CDLL(None)
 library.malloc.restype = library.fopen.restype = ctypes.c_void_p
 library.malloc.argtypes = [ctypes.c_size_t]

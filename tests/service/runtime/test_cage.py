@@ -16,8 +16,8 @@ from service.foundation.errors import InvalidDataError, NotReadyError, TooLargeE
 from service.foundation.settings import Settings
 from service.runtime import cage
 from service.runtime.cage import start
-from service.runtime.confinement import FORBIDDEN, OF_ITSELF, calls, protections
-from service.runtime.reader_messages import ANSWER_BYTES, OUTPUT_BYTES, Failure
+from service.runtime.confinement import FORBIDDEN_CALLS, SELF_ONLY_CALLS, build_filter, protections
+from service.runtime.reader_messages import MAX_ANSWER_BYTES, MAX_OUTPUT_BYTES, Failure
 from tests.service.data import eventually
 from tests.service.server import children
 
@@ -64,8 +64,8 @@ def test_a_value_comes_back_and_is_of_the_type_that_was_asked_for(settings, tmp_
 
 
 def test_an_answer_that_is_too_large_is_none(settings):
-    assert len(call("long_text", str, ANSWER_BYTES - 100, settings=settings)) == ANSWER_BYTES - 100
-    assert "exit code 0" in refused("long_text", ANSWER_BYTES, settings=settings)
+    assert len(call("long_text", str, MAX_ANSWER_BYTES - 100, settings=settings)) == MAX_ANSWER_BYTES - 100
+    assert "exit code 0" in refused("long_text", MAX_ANSWER_BYTES, settings=settings)
 
 
 def test_errors_that_a_reader_may_raise_come_back_as_they_are(settings):
@@ -90,7 +90,7 @@ def test_what_libraries_write_is_kept_short_and_printable(settings, caplog, capf
     assert record.levelno == logging.WARNING
     assert record.fields["reader"] == f"{HERE}:noise"
     assert record.fields["output"].startswith("out\\n\\x1b[2Jxxx")
-    assert len(record.fields["output"]) <= OUTPUT_BYTES
+    assert len(record.fields["output"]) <= MAX_OUTPUT_BYTES
     assert capfd.readouterr() == ("", "")
 
 
@@ -255,7 +255,7 @@ def test_a_missing_extra_is_told(settings):
 @pytest.mark.parametrize(("machine", "place"), [(0xC000003E, 0), (0xC00000B7, 1)])
 def test_a_filter_answers_each_call_as_its_tables_say(machine, place):
     """The program, interpreted here, for each call that it knows and some that it does not."""
-    program = calls(machine, place, 4242)
+    program = build_filter(machine, place, 4242)
 
     def answer(number, first=0, seen=machine):
         at = accumulator = 0
@@ -270,10 +270,10 @@ def test_a_filter_answers_each_call_as_its_tables_say(machine, place):
                 at += yes if true else no
             at += 1
 
-    for numbers in FORBIDDEN.values():
+    for numbers in FORBIDDEN_CALLS.values():
         if numbers[place] is not None:
             assert answer(numbers[place]) == "error 1"
-    for numbers in OF_ITSELF.values():
+    for numbers in SELF_ONLY_CALLS.values():
         assert [answer(numbers[place], pid) for pid in (4242, 0, 1)] == ["allow", "allow", "error 1"]
     clone = (56, 220)[place]
     assert [answer(clone, flags) for flags in (0x10000 | 0x100, 17)] == ["allow", "error 1"]

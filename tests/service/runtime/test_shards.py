@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from lipcore.estimators.hyperparameters import FitCancelledError
 from service.foundation.settings import Settings
 from service.runtime import executors
-from service.runtime.executors import AHEAD, Inline, ShardFailedError, shard_executor, summed
+from service.runtime.executors import MAX_SHARDS_AHEAD, Inline, ShardFailedError, shard_executor, sum_shards
 from tests.service.runtime.work import dying, freezing, numbers
 
 SHARDS = list(range(37))
@@ -71,42 +71,42 @@ class Shuffled(Executor):
 def test_the_sum_does_not_depend_on_the_order(count, seed):
     executor = Shuffled(seed)
     shards = list(range(count))
-    found = summed(executor, numbers, shards, executor.one, attempts=1000)
-    assert found.tobytes() == summed(Inline(), numbers, shards, never).tobytes()
+    found = sum_shards(executor, numbers, shards, executor.one, attempts=1000)
+    assert found.tobytes() == sum_shards(Inline(), numbers, shards, never).tobytes()
     assert found.tobytes() == tree([numbers(each) for each in shards]).tobytes()
 
 
 def test_a_lost_process_costs_its_shard_another_attempt(tmp_path):
-    expected = summed(Inline(), numbers, SHARDS, never)
+    expected = sum_shards(Inline(), numbers, SHARDS, never)
     with shard_executor(Settings(home=tmp_path, statistics_workers=2, training_cpus=2)) as executor:
-        found = summed(executor, partial(dying, str(tmp_path)), SHARDS, never)
+        found = sum_shards(executor, partial(dying, str(tmp_path)), SHARDS, never)
     assert found.tobytes() == expected.tobytes()
     assert {"3", "20"} <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_a_process_that_hangs_costs_its_shard_another_attempt(tmp_path, monkeypatch):
     monkeypatch.setattr(executors, "HEARTBEAT_S", 3.0)
-    expected = summed(Inline(), numbers, SHARDS, never)
+    expected = sum_shards(Inline(), numbers, SHARDS, never)
     with shard_executor(Settings(home=tmp_path, statistics_workers=2, training_cpus=2)) as executor:
-        found = summed(executor, partial(freezing, str(tmp_path)), SHARDS, never)
+        found = sum_shards(executor, partial(freezing, str(tmp_path)), SHARDS, never)
     assert found.tobytes() == expected.tobytes()
     assert (tmp_path / "3").exists()
 
 
 def test_progress_counts_what_is_added():
     seen = []
-    summed(Inline(), numbers, SHARDS, never, done=seen.append)
+    sum_shards(Inline(), numbers, SHARDS, never, done=seen.append)
     assert seen == [each + 1 for each in SHARDS]
 
 
 def test_a_shard_that_loses_every_worker_fails():
     with pytest.raises(ShardFailedError, match="shard 1 of 37: its worker was lost 3 times"):
-        summed(Inline(), deadly, SHARDS, never)
+        sum_shards(Inline(), deadly, SHARDS, never)
 
 
 def test_an_error_of_the_work_is_raised():
     with pytest.raises(TypeError):
-        summed(Inline(), len, SHARDS, never)
+        sum_shards(Inline(), len, SHARDS, never)
 
 
 def test_a_sum_can_be_cancelled():
@@ -120,7 +120,7 @@ def test_a_sum_can_be_cancelled():
     try:
         with ThreadPoolExecutor(1) as pool:
             with pytest.raises(FitCancelledError):
-                summed(pool, slow, SHARDS, lambda: bool(begun))
+                sum_shards(pool, slow, SHARDS, lambda: bool(begun))
             release.set()
         assert len(begun) <= 2  # what waited was taken back
     finally:
@@ -136,15 +136,15 @@ def test_no_more_results_wait_than_may():
             begun.append(args[0])
             return first if args[0] == 0 else super().submit(fn, *args, **kwargs)
 
-    looks = iter(range(3 * AHEAD))
+    looks = iter(range(3 * MAX_SHARDS_AHEAD))
 
     def look() -> bool:
-        if next(looks, None) == 3 * AHEAD - 1:
-            assert len(begun) == AHEAD
+        if next(looks, None) == 3 * MAX_SHARDS_AHEAD - 1:
+            assert len(begun) == MAX_SHARDS_AHEAD
             first.set_result(numbers(0))
         return False
 
-    shards = list(range(2 * AHEAD))
-    found = summed(Late(), numbers, shards, look)
-    assert found.tobytes() == summed(Inline(), numbers, shards, never).tobytes()
+    shards = list(range(2 * MAX_SHARDS_AHEAD))
+    found = sum_shards(Late(), numbers, shards, look)
+    assert found.tobytes() == sum_shards(Inline(), numbers, shards, never).tobytes()
     assert sorted(begun) == shards

@@ -24,7 +24,7 @@ from fastapi.testclient import TestClient
 
 import lipserve
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Stream, simulate
+from lipcore.robots.simulation import Simulation, simulate
 from service.app import create_app
 from service.foundation.settings import Settings
 
@@ -39,7 +39,7 @@ TAUGHT, LESSONS, ROWS, RATE = 4, 8, 10, 100.0
 
 def recording(samples: int, seed: int) -> Any:
     """A simulated recording of a double pendulum."""
-    return simulate(load_robot("double-pendulum"), Stream(n_samples=samples, speed=5.0), seed)
+    return simulate(load_robot("double-pendulum"), Simulation(n_samples=samples, speed=5.0), seed)
 
 
 def lesson(number: int) -> dict[str, Any]:

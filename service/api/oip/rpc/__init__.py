@@ -15,7 +15,7 @@ def check_installed(settings: Settings) -> bool:
     """Whether the service shall listen for gRPC; raise MissingExtraError."""
     if settings.grpc_port is None:
         return False
-    extras.check("grpc", "LIPSERVE_GRPC_PORT is set")
+    extras.check_extra("grpc", "LIPSERVE_GRPC_PORT is set")
     return True
 
 

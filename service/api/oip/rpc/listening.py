@@ -22,7 +22,7 @@ from service.api.oip.rpc.messages import PROTOBUF
 from service.api.oip.rpc.methods import CALL, METHODS
 from service.api.server.sockets import DRAIN_S
 from service.foundation.settings import Settings
-from service.telemetry.readiness import Stopping
+from service.telemetry.readiness import StopState
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ ERROR_CODE = "lipserve-error-code"
 
 
 @asynccontextmanager
-async def listening(app: ASGIApp, settings: Settings, stopping: Stopping) -> AsyncIterator[int]:
+async def listening(app: ASGIApp, settings: Settings, stopping: StopState) -> AsyncIterator[int]:
     """Take calls while the context lasts, and give the port. Where the service stops, no more are taken, and those
     begun have the time that requests have. Raise PortError."""
     handlers = {
@@ -72,7 +72,7 @@ async def listening(app: ASGIApp, settings: Settings, stopping: Stopping) -> Asy
         await server.stop(DRAIN_S)
 
 
-async def _stop(server: grpc.aio.Server, stopping: Stopping) -> None:
+async def _stop(server: grpc.aio.Server, stopping: StopState) -> None:
     await stopping.closing.wait()
     await server.stop(DRAIN_S)
 
