@@ -76,6 +76,7 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/codespell lipcore service clients benchmarks tests docs *.md Makefile
 
 serve: $(VENV)/.running
 	$(BIN)/lipserve serve
