@@ -9,7 +9,7 @@ from pydantic import BaseModel, Field
 from lipcore.vocabulary import JointType, TorqueConvention
 
 Verdict = Literal["well", "poorly", "not determined"]
-"""How well the data tell a weight, see `DETERMINED` in excitation.py for the thresholds."""
+"""How well the data tell a weight, see `FrictionOptions` for the thresholds."""
 
 Share = float
 

@@ -83,7 +83,7 @@ class Cell:
     rest: Array
     """Variance shared with neighbouring cells, (n,)."""
     features: Array
-    """Mean features, (M + K + 10, n), see `Linearised.all_rows`."""
+    """Mean features, (M + K + 10, n), see `LinearisedCarrier.all_rows`."""
 
 
 def split_cells(around: LinearisedCarrier, parts: Sequence[Rows]) -> tuple[list[Rows], tuple[Cell, ...]]:

@@ -92,7 +92,7 @@ class ObservationLog:
     def turn(self, monitor: Monitor, model: str) -> Iterator[None]:
         """Lock a model's log against all threads and services, and update its monitor from the log.
 
-        Raise StorageUnavailableError if the lock is not acquired within `database_timeout_s`.
+        Raise StorageUnavailableError if the lock is not acquired in time.
         """
         # the turn first: readers of the monitor then do not wait for other services
         with self.database.turn(model), monitor.lock:

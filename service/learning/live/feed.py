@@ -56,7 +56,7 @@ class ShownRows:
     """Predicted torque, (N, n), NaN for rows without a prediction. `std` and `bare` have the same shape."""
     std: Array
     bare: Array
-    """Standard deviation without the floor of past errors, as in `Screened`."""
+    """Standard deviation without the floor of past errors, as in `PredictedBatch`."""
 
 
 def thin_batches(batches: Iterable[LoggedBatch], most: int) -> list[tuple[LivePart, ShownRows]]:
