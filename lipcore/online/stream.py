@@ -1,5 +1,4 @@
-"""Store what is known of a stream after its last batch, across restarts, other versions, rollbacks and log
-retention."""
+"""The record of a stream after its last batch. It outlives restarts, other versions, rollbacks and log retention."""
 
 from __future__ import annotations
 

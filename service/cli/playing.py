@@ -261,7 +261,7 @@ def play(
     begin, second = time.perf_counter(), 1
     for row in range(len(motion)):
         while (wait := begin + due[row] - time.perf_counter()) > 0 and not stop.asked:
-            time.sleep(min(wait, 0.05))  # so soon a Ctrl-C is heard
+            time.sleep(min(wait, 0.05))  # a Ctrl-C is handled after this time at the latest
         if stop.asked:
             break
         sent = time.perf_counter()

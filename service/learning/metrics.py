@@ -13,7 +13,7 @@ from lipcore.vocabulary import CODES
 from service.learning.control import status
 from service.learning.ingest.monitor import Monitor
 from service.learning.learners import Learners
-from service.telemetry.meters import MetricKind
+from service.telemetry.meters import MetricKind, list_metrics
 
 
 def _quality(figure: str, meaning: str) -> MetricKind:
@@ -66,35 +66,33 @@ class LearningCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield every metric with a sample for each model."""
-        families = {
-            name: kind.family() for name, kind in vars(LearningCollector).items() if isinstance(kind, MetricKind)
-        }
+        families = {kind: kind.family() for kind in list_metrics(LearningCollector)}
         for model, monitor in self._learners.load_monitors().items():
-            _add_quality(families, model, monitor)
+            self._add_quality(families, model, monitor)
             for outcome in CODES:
-                families["rows"].add_metric([model, outcome], monitor.counts[outcome])
+                families[self.rows].add_metric([model, outcome], monitor.counts[outcome])
             if (served := self._learners.loaded.peek(model)) is None:
                 continue
             for joint, factor in zip(served.model.joint_names, served.scales.default_factors, strict=True):
-                families["scale"].add_metric([model, joint], factor)
+                families[self.scale].add_metric([model, joint], factor)
             known = served.payloads.masses()
-            families["streams"].add_metric([model], len(monitor.streams.all()))
-            families["carrying"].add_metric([model], sum(mass is not None for mass in known.values()))
-            families["revision"].add_metric([model, str(served.version)], served.revision)
+            families[self.streams].add_metric([model], len(monitor.streams.all()))
+            families[self.carrying].add_metric([model], sum(mass is not None for mass in known.values()))
+            families[self.revision].add_metric([model, str(served.version)], served.revision)
             lag = self._learners.lag(served)
-            families["lag_rows"].add_metric([model], lag.rows)
-            families["lag_s"].add_metric([model], lag.seconds)
+            families[self.lag_rows].add_metric([model], lag.rows)
+            families[self.lag_s].add_metric([model], lag.seconds)
             if (share := self._learners.status(model, served.version).novel_share) is not None:
-                families["novel"].add_metric([model], share)
-        families["loaded"].add_metric([], len(self._learners.loaded.versions()))
+                families[self.novel].add_metric([model], share)
+        families[self.loaded].add_metric([], len(self._learners.loaded.versions()))
         yield from families.values()
 
-
-def _add_quality(families: Mapping[str, Any], model: str, monitor: Monitor) -> None:
-    now = time.time()
-    for window in monitor.windows:
-        figures = status.summarise_window(window, now)
-        for name in ("nmse", "coverage", "nlpd"):
-            for joint, value in zip(monitor.joint_names, getattr(figures, name), strict=True):
-                if value is not None:
-                    families[name].add_metric([model, joint, f"{figures.seconds:g}"], value)
+    def _add_quality(self, families: Mapping[MetricKind, Any], model: str, monitor: Monitor) -> None:
+        now = time.time()
+        for window in monitor.windows:
+            figures = status.summarise_window(window, now)
+            by_figure = {self.nmse: figures.nmse, self.coverage: figures.coverage, self.nlpd: figures.nlpd}
+            for kind, values in by_figure.items():
+                for joint, value in zip(monitor.joint_names, values, strict=True):
+                    if value is not None:
+                        families[kind].add_metric([model, joint, f"{figures.seconds:g}"], value)

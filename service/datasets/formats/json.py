@@ -128,7 +128,7 @@ class Rows:
 
     def __init__(self, rows: Iterator[Any]) -> None:
         self._rest = rows
-        self._first = list(islice(rows, 1000))  # rows that tell which columns there are
+        self._first = list(islice(rows, 1000))  # enough rows to find the columns
         for number, row in enumerate(self._first, start=1):
             _check(row, number)
         shape = Shape(self._first, 2 * MAX_COLUMNS)

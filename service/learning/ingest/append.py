@@ -197,8 +197,8 @@ def _write(
     if judgement.change is not None and options.on_change == "adapt" and not logged.waited:
         log.append(session, model, "change", {"t": judgement.change.at}, batch.received)
     start = log.start_of(session, model, served.version)
-    event, source = log.append_batch(session, model, replace(batch, rows=judgement.rows), MAX_STREAMS)
-    event.record = None if judgement.record is None else judgement.record.to_json()
+    record = None if judgement.record is None else judgement.record.to_json()
+    event, source = log.append_batch(session, model, replace(batch, rows=judgement.rows, record=record), MAX_STREAMS)
     event.rows = len(arrival.predicted.rows.q[arrival.predicted.own])  # adjacent batches count the others
     consequences.apply_judgement(session, served, options, judgement, event)
     if arrival.leap is not None and not before.leapt:
