@@ -21,6 +21,7 @@ class Problem(BaseModel):
     field: str = Field(description="Where: a column, a JSON path or a parameter", examples=["q[0][3]"])
     value: str | None = Field(default=None, description="What was found", examples=["nan"])
     expected: str = Field(description="What was expected", examples=["a finite number"])
+    _message: str | None = None
 
 
 class ErrorBody(BaseModel):
@@ -164,11 +165,17 @@ class UnreadableVersionError(ServiceError):
     status, code = 500, "unreadable_version"
 
 
-def problem(field: str, value: object, expected: str) -> Problem:
-    """Return the description of one wrong value; long values and deep nesting are cut."""
+def problem(field: str, value: object, expected: str, message: str | None = None) -> Problem:
+    """Return the description of one wrong value; long values and deep nesting are cut.
+
+    Args:
+        message: the sentence for people, if "field is value, expected …" is not plain English.
+    """
     text = value if isinstance(value, str) else _REPR.repr(value)
     text = text if len(text) <= 200 else text[:200] + "…"
-    return Problem(field=readable(field[:200]), value=readable(text), expected=expected)
+    found = Problem(field=readable(field[:200]), value=readable(text), expected=expected)
+    found._message = message
+    return found
 
 
 def readable(text: str) -> str:
@@ -179,19 +186,19 @@ def readable(text: str) -> str:
 
 
 def sentence(item: Problem) -> str:
-    """Write a problem as one sentence."""
-    return f"{item.field} is {item.value}, expected {item.expected}"
+    """Return the problem as one sentence."""
+    return item._message or f"{item.field} is {item.value}, expected {item.expected}"
 
 
-def invalid_request(field: str, value: object, expected: str) -> InvalidRequestError:
+def invalid_request(field: str, value: object, expected: str, message: str | None = None) -> InvalidRequestError:
     """Return the error for one wrong value of a request."""
-    item = problem(field, value, expected)
+    item = problem(field, value, expected, message)
     return InvalidRequestError(sentence(item), [item])
 
 
-def invalid_data(field: str, value: object, expected: str) -> InvalidDataError:
+def invalid_data(field: str, value: object, expected: str, message: str | None = None) -> InvalidDataError:
     """Return the error for one fault in an uploaded data set."""
-    item = problem(field, value, expected)
+    item = problem(field, value, expected, message)
     return InvalidDataError(sentence(item), [item])
 
 
