@@ -168,8 +168,7 @@ class UnreadableVersionError(ServiceError):
 def problem(field: str, value: object, expected: str, message: str | None = None) -> Problem:
     """Return the description of one wrong value; long values and deep nesting are cut.
 
-    Args:
-        message: the sentence for people, if "field is value, expected …" is not plain English.
+    `message` is the sentence for people, for cases in which "field is value, expected …" is not plain English.
     """
     text = value if isinstance(value, str) else _REPR.repr(value)
     text = text if len(text) <= 200 else text[:200] + "…"
