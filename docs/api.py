@@ -1,4 +1,4 @@
-"""Writes docs/reference/api.md from the OpenAPI document: `python docs/api.py`. A test fails while it is not that."""
+"""Writes docs/reference/api.md from the OpenAPI document: `python docs/api.py`. A test fails if the page differs."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from service.foundation.settings import Settings
 TARGET = Path(__file__).parent / "reference/api.md"
 HEAD = """# API reference
 
-Every route of the HTTP API, generated from its OpenAPI document, which the service answers at `/openapi.json` and
-shows, to be tried out, at `/docs`. Units are SI: rad, rad/s, rad/s², N·m (prismatic joints: m, m/s, m/s², N). "Scope"
-is what an API key has to be allowed, where keys are needed. See also [error codes](../errors.md), and on WebSockets
+All routes of the HTTP API, generated from its OpenAPI document. The service returns the document at `/openapi.json`;
+try the routes at `/docs`. Units are SI: rad, rad/s, rad/s², N·m (prismatic joints: m, m/s, m/s², N). "Scope" is the
+scope that an API key needs, if the service requires keys. See also [error codes](../errors.md), and for WebSockets
 [in a control loop](../control-loop.md).
 
 """
@@ -25,18 +25,18 @@ Document = dict[str, Any]
 
 
 def document() -> str:
-    """The whole file."""
+    """Return the page."""
     api = create_app().openapi()
     return HEAD + "\n".join([*_contents(api), *_routes(api), *_schemas(api)]).rstrip() + "\n"
 
 
 def _anchor(heading: str) -> str:
-    """What GitHub and MkDocs link a heading by."""
+    """Return the anchor of a heading on GitHub and in MkDocs."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
 def _operations(api: Document) -> dict[str, list[tuple[str, str, Document]]]:
-    """Operations by tag, in the order of their paths: (method, path, operation)."""
+    """Return operations (method, path, operation) by tag, in the order of their paths."""
     found: dict[str, list[tuple[str, str, Document]]] = {}
     for path in sorted(api["paths"]):
         for method in METHODS:
@@ -47,7 +47,7 @@ def _operations(api: Document) -> dict[str, list[tuple[str, str, Document]]]:
 
 
 def _contents(api: Document) -> Iterator[str]:
-    yield from ("| route | what it does |", "| --- | --- |")
+    yield from ("| route | purpose |", "| --- | --- |")
     for operations in _operations(api).values():
         for method, path, operation in operations:
             yield f"| [`{method} {path}`](#{_anchor(f'{method} {path}')}) | {_cell(operation.get('summary', ''))} |"
@@ -63,19 +63,19 @@ def _routes(api: Document) -> Iterator[str]:
 
 def _route(method: str, path: str, operation: Document) -> Iterator[str]:
     yield f"### {method} {path}\n"
-    said = re.sub(r"\s*Scope: [^\n]*$", "", operation.get("description", "")).strip()
-    yield f"**{operation.get('summary', '')}.** {_prose(said)}\n".replace("?.**", "?**")
+    description = re.sub(r"\s*Scope: [^\n]*$", "", operation.get("description", "")).strip()
+    yield f"**{operation.get('summary', '')}.** {_prose(description)}\n".replace("?.**", "?**")
     for scope in operation["security"][-1]["key"] if operation["security"] else ():
         yield f"Scope: `{scope}`.\n"
     if parameters := operation.get("parameters"):
         yield from ("| parameter | in | type | meaning |", "| --- | --- | --- | --- |")
         for each in parameters:
             needed = ", required" if each.get("required") and each["in"] != "path" else ""
-            yield f"| `{each['name']}` | {each['in']}{needed} | {_type(each['schema'])} | {_said(each)} |"
+            yield f"| `{each['name']}` | {each['in']}{needed} | {_type(each['schema'])} | {_meaning(each)} |"
         yield ""
     if body := operation.get("requestBody"):
-        most = body_limit(body_limits(Settings()), path)
-        size = f"{most >> 20} MiB" if most >= 1 << 20 else f"{most >> 10} KiB"
+        limit = body_limit(body_limits(Settings()), path)
+        size = f"{limit >> 20} MiB" if limit >= 1 << 20 else f"{limit >> 10} KiB"
         yield f"Body, at most {size}: {_kinds(body['content'])}\n"
     for status, answer in operation["responses"].items():
         if int(status) < 400:
@@ -90,8 +90,8 @@ def _schemas(api: Document) -> Iterator[str]:
     yield "## Types\n"
     for name, schema in sorted(api["components"]["schemas"].items()):
         yield f"### {name}\n"
-        if said := schema.get("description"):
-            yield _prose(said) + "\n"
+        if description := schema.get("description"):
+            yield _prose(description) + "\n"
         if not (fields := schema.get("properties")):
             yield f"{_type(schema)}\n"
             continue
@@ -100,12 +100,12 @@ def _schemas(api: Document) -> Iterator[str]:
         for field, each in fields.items():
             default = f" Default: `{_cell(str(each['default']))}`." if each.get("default") not in (None, [], {}) else ""
             optional = "" if field in required else ", optional"
-            yield f"| `{field}` | {_type(each)}{optional} | {_said(each)}{default} |"
+            yield f"| `{field}` | {_type(each)}{optional} | {_meaning(each)}{default} |"
         yield ""
 
 
 def _type(schema: Document) -> str:
-    """A schema in a few words, with links to the types that it is made of."""
+    """Return a short description of a schema, with links to its types."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
         return f"[{name}](#{_anchor(name)})"
@@ -124,13 +124,12 @@ def _type(schema: Document) -> str:
     return " or ".join(kind) if isinstance(kind, list) else str(kind)
 
 
-def _said(each: Document) -> str:
-    said = each.get("description") or each.get("schema", {}).get("description") or ""
-    return _cell(said)
+def _meaning(each: Document) -> str:
+    return _cell(each.get("description") or each.get("schema", {}).get("description") or "")
 
 
 def _prose(text: str) -> str:
-    """Text of the document, in which `<` and `|` mean nothing."""
+    """Return a text of the document without indentation."""
     return "\n".join(line.strip() for line in text.strip().splitlines())
 
 

@@ -1,5 +1,7 @@
-"""Writes docs/reference/archives.md: `python docs/archives.py`. Its names and sizes are those of the service's modules;
-a test fails while the page is not that."""
+"""Writes docs/reference/archives.md, with the service's file names: `python docs/archives.py`.
+
+A test fails if the page differs.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +18,17 @@ Both are tar files of plain files. [What they are for](../operations.md#take-a-m
 
 ## An archive
 
-A version, as `GET /v1/models/{{model}}/export` answers it and `POST /v1/models/import` takes it. POSIX ustar; each file
-once, in any order; links, folders, devices and extended headers are refused, and so is any other name.
+A version of a model. `GET /v1/models/{{model}}/export` returns it, `POST /v1/models/import` reads it. The format is
+POSIX ustar; each file occurs once, in any order. Links, folders, devices, extended headers and other names are refused.
 
-| file | holds |
+| file | content |
 | --- | --- |
-| `{archive.CHECKSUMS}` | JSON object: by name, the hexadecimal sha256 of each other file but `{archive.SIGNATURE}` |
-| `{archive.EXPORT}` | where it comes from; `format` is `{archive.FORMAT}`, `format_version` {archive.FORMAT_VERSION} |
-| `{archive.MANIFEST}` | what the model is, its options, ranges and lineage |
-| `{archive.TENSORS}` | its numbers, safetensors |
-| `{archive.ROBOT}` | the URDF that it was trained with, where there was one |
-| `{archive.SIGNATURE}` | a signature by an earlier build; ignored |
+| `{archive.CHECKSUMS}` | JSON object: hexadecimal sha256 of each file except `{archive.SIGNATURE}`, by name |
+| `{archive.EXPORT}` | origin; `format` is `{archive.FORMAT}`, `format_version` {archive.FORMAT_VERSION} |
+| `{archive.MANIFEST}` | description of the model, options, ranges and lineage |
+| `{archive.TENSORS}` | numbers of the model, safetensors |
+| `{archive.ROBOT}` | URDF used for the training, if any |
+| `{archive.SIGNATURE}` | signature by an earlier build; ignored |
 
 ## Sign an archive
 
@@ -48,30 +50,31 @@ cosign verify-blob arm-v2.tar --bundle arm-v2.tar.sigstore.json \\
   --certificate-identity anna@example.com --certificate-oidc-issuer https://accounts.google.com
 ```
 
-Send both files. The identity is the address that the signer has logged in with, the issuer is the login service. Both
-tools write them into a public log.
+Send both files. The identity is the signer's login address, the issuer is the login service. Both tools publish them in
+a public log.
 
 Versions that earlier builds imported may name a signer in `lineage.imported`, `signed_by`.
 
 ## A backup
 
-A home, as `lipserve backup` writes it and `lipserve restore` takes it: GNU tar, in this order.
+A home. `lipserve backup` writes it, `lipserve restore` reads it. The format is GNU tar, with the files in this order.
 
-| file | holds |
+| file | content |
 | --- | --- |
-| `datasets/….safetensors`, `versions/…/…`, `learning/….safetensors` | samples, versions, snapshots, all whole |
-| `{FILE}` | the database as of one moment, by SQLite's online backup |
+| `datasets/….safetensors`, `versions/…/…`, `learning/….safetensors` | samples, versions, snapshots |
+| `{FILE}` | the database at one moment, by SQLite's online backup |
 | `{backup.MANIFEST}` | `format`: `{backup.FORMAT}`; `format_version`: {backup.FORMAT_VERSION}; `software`; \
-the moment `at`; `files`: `size` and `sha256` of each by name |
+time of the backup `at`; `files`: `size` and `sha256` of each file by name |
 
-At that moment writers wait for some milliseconds, while what came since the copying began is opened; all else is copied
-beside them. What the service deletes meanwhile may be in the tar file, and is not in `files`: a restore leaves it out.
-It is refused unless the rest is there with its sha256, and unless each row of the database has its file.
+At that moment writers wait for some milliseconds, while files written since the start of the backup are opened. All
+other copying does not block them. A file that the service deletes during the backup may be in the tar file, but not in
+`files`; a restore ignores it. A restore is refused if another file is missing or has a wrong sha256, or if a row of the
+database lacks its file.
 """
 
 
 def document() -> str:
-    """The page."""
+    """Return the page."""
     return PAGE.format(archive=archive, backup=backup, FILE=FILE)
 
 

@@ -1,4 +1,4 @@
-"""Writes docs/errors.md: `python docs/errors.py`. A test fails while that is not what the service documents."""
+"""Writes docs/errors.md: `python docs/errors.py`. A test fails if the page differs."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from service.app import create_app
 
 HEAD = """# Error codes
 
-Every answer with a status of 400 and above is `{"error": {"code", "message", "detail"}}`. The code is for programs and
-stays what it is; the message is for people; each item of `detail` names a `field`, the `value` that was found there and
-what was `expected`. Below `/v2` the Open Inference Protocol sets the shape, `{"error": message}`, and 422 becomes 400.
+Every answer with a status of 400 or above is `{"error": {"code", "message", "detail"}}`. Programs use the stable code,
+people read the message. Each item of `detail` has a `field`, its `value` and the `expected` value. Below `/v2` the Open
+Inference Protocol defines the format, `{"error": message}`, and 422 becomes 400.
 
-| when | what a client does |
+| status of the answer | action of the client |
 |---|---|
-| 408, 429, 503 | wait, as long as `Retry-After` says where it is given, and send the same again |
-| 507 | make room, then send the same again |
-| 501 | have the extra installed where the service runs; `detail` has the line |
-| 500 | read the service's log; `damaged_data` and `unreadable_version` name what is damaged |
+| 408, 429, 503 | wait (for the time in `Retry-After`, if present), then repeat the request |
+| 507 | free disk space or quota, then repeat the request |
+| 501 | install the extra on the service's machine; `detail` has the command |
+| 500 | read the service's log; `damaged_data` and `unreadable_version` name the damaged object |
 | all others | change the request |
 
-Where no answer comes at all, the request may have been done. Whatever is no POST can be sent again, and so can
-`predict`, `evaluate`, `compare`, `trace` and observations. Uploads, jobs and retries of jobs can where they carry the
-header `Idempotency-Key`, a name of the client's choice: they are done once, and what they made is answered each time.
-Another request under the same key is a conflict. The Python client does all of this by itself.
+If no answer arrives, the request may have been executed. Repeat it safely if it is not a POST, or if it is `predict`,
+`evaluate`, `compare`, `trace` or an observation batch. Uploads, jobs and retries of jobs are safe to repeat with the
+header `Idempotency-Key`, a text chosen by the client: the service executes them once, and returns the same result each
+time. Another request with the same key is a conflict. The Python client does all of this automatically.
 
 """
 
 
 def document() -> str:
-    """The whole file."""
-    create_app()  # brings in every module that defines an error
+    """Return the page."""
+    create_app()  # imports all modules that define errors
     return HEAD + error_table()
 
 

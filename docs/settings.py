@@ -18,7 +18,7 @@ variable that begins with `LIPSERVE_` stops the start.
 
 
 def page() -> str:
-    """The whole page."""
+    """Return the page."""
     rows = (
         f"| `{each.variable}` | {f'`{each.default}`' if each.default else ''} | {each.unit} | {_cell(each.meaning)} |\n"
         for each in describe(Settings())

@@ -1,5 +1,7 @@
-"""Writes docs/reference/stream-protocol.md: `python docs/stream.py`. Its text is that of the frames' module,
-`clients/python/lipserve/frames.py`, its examples are the test vectors of the clients. A test fails while it is not."""
+"""Writes docs/reference/stream-protocol.md: `python docs/stream.py`. A test fails if the page differs.
+
+The text is the docstring of `clients/python/lipserve/frames.py`; the examples are the test vectors of the clients.
+"""
 
 from __future__ import annotations
 
@@ -15,21 +17,23 @@ TARGET = Path(__file__).parent / "reference/stream-protocol.md"
 VECTORS = Path(__file__).parents[1] / "clients/stream-vectors.txt"
 HEAD = """# Stream protocol
 
-What a controller sends and reads, byte by byte: enough to write a client in any language. `StreamClient` (Python) and
-`clients/cpp` (C++) speak it. [In a control loop](../control-loop.md) says what for.
+The bytes that a controller sends and receives, in sufficient detail for a client in any language. `StreamClient`
+(Python) and `clients/cpp` (C++) implement it. For its use, see [in a control loop](../control-loop.md).
 
 """
 CHAPTERS = {
-    "One binary message": "Frames",
+    "Each frame is one": "Frames",
     "Request, ": "Request",
     "Answer, ": "Answer",
-    "Every request has": "Texts",
+    "Every request gets": "Texts",
+    "Deadlines. ": "Deadlines",
+    "Fallback. ": "Fallback",
     "External torque is": "External torque",
     "Learning. ": "Learning",
-    "The query of": "The address",
-    "The service reads no": "Limits and ends",
+    "Query parameters of": "The address",
+    "Flow control. ": "Limits and ends",
 }
-"""How the paragraphs of frames.py begin that a heading stands before."""
+"""Starts of paragraphs of frames.py, and the headings before them."""
 CONNECTION = """## WebSocket
 
 RFC 6455, version 13, without extensions and subprotocols, over TCP or a Unix-domain socket (`LIPSERVE_UDS`).
@@ -44,29 +48,29 @@ Sec-WebSocket-Key: 16 random bytes in base64
 Authorization: Bearer lip_…
 ```
 
-- `Authorization` only where the service asks for keys. `Host`: a service without keys answers to `localhost` and
-  addresses of loopback alone; over a Unix-domain socket say `localhost`. No `Origin`, unless you are a web page.
-- The answer is `101`, and its `Sec-WebSocket-Accept` is base64(SHA-1(key + `258EAFA5-E914-47DA-95CA-C5AB0DC85B11`)).
-  Any other status has a JSON error for a body, with `Content-Length`.
+- Send `Authorization` only if the service requires keys. `Host`: a service without keys accepts only `localhost` and
+  loopback addresses; use `localhost` over a Unix-domain socket. Only web pages send `Origin`.
+- The answer is `101` with the `Sec-WebSocket-Accept` base64(SHA-1(key + `258EAFA5-E914-47DA-95CA-C5AB0DC85B11`)). With
+  any other status, the body is a JSON error with `Content-Length`.
 - A client masks each of its frames with four bytes of its choice: byte k of the payload is xored with byte k mod 4 of
-  the mask. The service does not mask. It sends each message as one frame, but what stands between may cut it in parts.
-- A ping is answered with a pong of the same payload; the service sends one after 20 s, and ends a connection that does
-  not answer it. A close is answered with a close.
+  the mask. The service does not mask. It sends each message as one frame, but a proxy may split it.
+- Answer a ping with a pong of the same payload, and a close with a close. The service sends a ping after 20 s, and
+  closes a connection that does not answer it.
 
 """
-CLIENT = """## What a client has to keep
+CLIENT = """## Rules for a client
 
-- **Match answers by sequence.** An answer that comes after its asker has given up is still the next to come; it must
-  not be taken for the answer to a later question.
-- **Keep what is taught until it is settled**: `learnt.through` has reached its sequence, `refused` names it, or its own
-  answer was an error. After a lost connection send what is left again, oldest first, under the same sequences and with
-  the same bytes, before anything new is taught: a frame below one that the service has already taken is refused.
-- **Begin above the last sequence** where a stream_id is used by another run. The same sequence with other numbers is
+- **Match answers by sequence.** A late answer still arrives after a timeout; it must not be used as the answer to a
+  later request.
+- **Keep frames with torque until they are settled**: `learnt.through` has reached the sequence, `refused` names it, or
+  the answer is an error. After a lost connection, send the remaining frames again, oldest first, with the same
+  sequences and bytes, before any new frame with torque. A frame below the service's last sequence is refused.
+- **Start above the last sequence** if another run uses the same stream_id. The same sequence with other numbers is
   refused as a conflict.
-- **Bound what is under way.** Every request costs the service time in its turn; what is sent again after a restart
-  delays the answers behind it.
-- **Tell a dead connection from a slow one.** A machine that vanished sends no end: give up after some seconds without
-  an answer that is due, and connect again after a wait that grows.
+- **Limit pending requests.** The service answers requests in order; frames sent again after a restart delay the answers
+  behind them.
+- **Detect dead connections.** A machine that has vanished closes nothing: give up if an answer is missing for some
+  seconds, and reconnect after increasing waits.
 
 """
 REQUEST_FIELDS = ("sequence", "flags", "n", "deadline")
@@ -79,7 +83,7 @@ ARRAYS = {
 
 
 def document() -> str:
-    """The whole file."""
+    """Return the page."""
     assert frames.__doc__ is not None
     return (
         HEAD + CONNECTION + "\n".join(_protocol(frames.__doc__)) + "\n" + CLIENT + "\n".join(_vectors()).rstrip() + "\n"
@@ -87,19 +91,19 @@ def document() -> str:
 
 
 def _protocol(text: str) -> Iterator[str]:
-    """The text of frames.py, with headings; raise ValueError where a paragraph is missing that one stands before."""
+    """Yield the text of frames.py with headings; raise ValueError if a paragraph of CHAPTERS is missing."""
     left = dict(CHAPTERS)
     for paragraph in text.strip().split("\n\n")[1:]:
         for start in [start for start in left if paragraph.startswith(start)]:
             yield f"## {left.pop(start)}\n"
-        yield paragraph.removeprefix("Learning. ") + "\n"
+        yield re.sub(r"^(Deadlines|Fallback|Learning|Flow control)\. ", "", paragraph) + "\n"
     if left:
-        raise ValueError(f"clients/python/lipserve/frames.py has no paragraph that begins with {list(left)}")
+        raise ValueError(f"clients/python/lipserve/frames.py has no paragraph that starts with {list(left)}")
 
 
 def _vectors() -> Iterator[str]:
     yield "## Test vectors\n"
-    yield "From `clients/stream-vectors.txt`, which both clients are checked with. Bytes in hex, by their offsets.\n"
+    yield "From `clients/stream-vectors.txt`, with which both clients are tested: offsets, and bytes in hex.\n"
     for kind, name, fields in read_vectors(VECTORS.read_text("utf-8")):
         yield f"### {kind} {name}\n".replace("-", " ")
         yield "```text"
@@ -114,7 +118,7 @@ def _vectors() -> Iterator[str]:
 
 
 def read_vectors(text: str) -> Iterator[tuple[str, str, dict[str, str]]]:
-    """Kind, name and fields of each vector, as they are written."""
+    """Yield kind, name and fields of each vector, as texts."""
     for block in re.split(r"\n\n+", text.strip()):
         lines = [line for line in block.splitlines() if not line.startswith("#")]
         if lines:
@@ -123,7 +127,7 @@ def read_vectors(text: str) -> Iterator[tuple[str, str, dict[str, str]]]:
 
 
 def _annotated(kind: str, fields: dict[str, str], data: bytes) -> Iterator[str]:
-    """A line a field."""
+    """Yield a line for each field."""
     head, names = (frames.REQUEST, REQUEST_FIELDS) if kind == "request" else (frames.ANSWER, ANSWER_FIELDS)
     offset = 0
     for name, size in zip(names, _sizes(head), strict=True):
@@ -138,7 +142,7 @@ def _annotated(kind: str, fields: dict[str, str], data: bytes) -> Iterator[str]:
         yield f"{offset:>4}  the rest, UTF-8:"
         yield from textwrap.wrap(data[offset:].decode(), 110, initial_indent="      ", subsequent_indent="      ")
     elif offset != len(data):
-        raise ValueError(f"{offset} of {len(data)} bytes have a name")
+        raise ValueError(f"Only {offset} of {len(data)} bytes have a name.")
 
 
 def _sizes(head: Struct) -> list[int]:

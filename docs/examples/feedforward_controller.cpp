@@ -1,13 +1,13 @@
-// A controller as of ros2_control whose feedforward is an exported model: no network, no allocation, no wait.
+// A controller in the style of ros2_control with an exported model as feedforward: no network, allocation or waiting.
 //
 //     lipserve models export panda-sim --c .
 //     cc -O2 -c lipserve_model.c
 //     c++ -std=c++17 -O2 feedforward_controller.cpp lipserve_model.o -o controller
-//     ./controller 5000 0 0 0 -1.8 0 1.6 0     cycles, and the posture to move about, zero by default
+//     ./controller 5000 0 0 0 -1.8 0 1.6 0     number of cycles, and the posture to move around (default: zero)
 //
-// In ROS 2 the class derives from controller_interface::ControllerInterface: on_configure and update are its methods of
-// these names, references and commands its interfaces. Nothing here stands between a wrong torque and your hardware:
-// keep the limits and the emergency stop of your controller.
+// In ROS 2, derive the class from controller_interface::ControllerInterface: it has methods named on_configure and
+// update, and interfaces for references and commands. Nothing here protects your hardware from a wrong torque: keep the
+// limits and the emergency stop of your controller.
 
 #include "lipserve_model.h"
 
@@ -28,11 +28,11 @@ struct Reference {
 
 class FeedforwardController {
 public:
-    // Before the loop runs: whether this machine computes what the service does, for these joints in this order.
+    // Call before the loop. Returns whether this machine computes the same as the service, for these joints in order.
     bool on_configure(const std::vector<std::string> &joints)
     {
         if (const int vector = lipserve_selftest()) {
-            std::fprintf(stderr, "vector %d of the model's self-test differs: what compiled it?\n", vector);
+            std::fprintf(stderr, "vector %d of the model's self-test differs. Check the compiler and its options.\n", vector);
             return false;
         }
         if (joints.size() != LIPSERVE_JOINTS)
@@ -43,36 +43,36 @@ public:
         return true;
     }
 
-    // What the gripper holds from the next cycle on; nullptr: nothing. The loop's own thread calls it.
-    void carry(const lipserve_payload *payload)
+    // Sets the payload from the next cycle on; nullptr: none. Call it from the loop's thread.
+    void set_payload(const lipserve_payload *payload)
     {
-        carries_ = payload != nullptr;
-        if (carries_)
+        has_payload_ = payload != nullptr;
+        if (has_payload_)
             payload_ = *payload;
     }
 
-    // One cycle: the torque of the model, where it has seen such motion and is sure enough; else none, so that the
-    // feedback has to do it. Returns whether it was used.
+    // One cycle. Sets the model's torque if the motion is in the training range and the torque certain enough, else
+    // zero, so that only the feedback acts. Returns whether the torque is used.
     bool update(const Reference &reference, Joints &effort)
     {
         Joints tau_std;
         lipserve_torque_std_payload(reference.q.data(), reference.dq.data(), reference.ddq.data(),
-                                    carries_ ? &payload_ : nullptr, effort.data(), tau_std.data());
-        bool sure = lipserve_in_range(reference.q.data(), reference.dq.data(), reference.ddq.data()) != 0;
+                                    has_payload_ ? &payload_ : nullptr, effort.data(), tau_std.data());
+        bool certain = lipserve_in_range(reference.q.data(), reference.dq.data(), reference.ddq.data()) != 0;
         for (const double each : tau_std)
-            sure = sure && each < most_std_; // false where it is no number
-        if (!sure)
+            certain = certain && each < max_std_; // false for NaN
+        if (!certain)
             effort.fill(0.0);
-        return sure;
+        return certain;
     }
 
 private:
-    double most_std_ = 1.0; // N m; choose it joint by joint for your robot
-    bool carries_ = false;
+    double max_std_ = 1.0; // N m; choose it joint by joint for your robot
+    bool has_payload_ = false;
     lipserve_payload payload_ = {};
 };
 
-// Stands in for a trajectory: sinusoids about a posture.
+// An example trajectory: sinusoids around a posture.
 static Reference desired(const Joints &middle, double t)
 {
     Reference out;
@@ -102,14 +102,14 @@ int main(int count, char **arguments)
     for (long k = 0; k < cycles; k++) {
         std::this_thread::sleep_until(start + milliseconds(k)); // 1 kHz
         if (k == cycles / 2)
-            controller.carry(&held);
+            controller.set_payload(&held);
         const auto before = steady_clock::now();
         used += controller.update(desired(middle, 1e-3 * static_cast<double>(k)), effort);
         longest = std::fmax(longest, duration<double, std::micro>(steady_clock::now() - before).count());
-        // here the effort goes to the drives, beside the feedback
+        // send the effort to the drives here, added to the feedback
     }
     std::printf("used %ld of %ld, the longest cycle took %.1f us\n", used, cycles, longest);
     if (used == 0)
-        std::puts("none was used: name a posture that the training saw, lipserve_model.h says between which positions");
+        std::puts("No torque was used. Choose a posture within the training range in lipserve_model.h.");
     return 0;
 }
