@@ -1,5 +1,5 @@
 # Two images of services and workers, without a C compiler and without CUDA:
-#   docker build -t lipserve .                        all that runs in a container: every extra but robots' descriptions
+#   docker build -t lipserve .                        the full image: extras train, robots, ingest, cluster and grpc
 #   docker build --target serve -t lipserve:serve .   serves, streams, learns, trains learnt arms; see GET /health
 FROM python:3.11-slim AS sources
 RUN apt-get update && apt-get install --yes --no-install-recommends binutils libgomp1
@@ -18,8 +18,7 @@ RUN .ci/install-image ./clients/python '.'
 FROM sources AS build-full
 RUN .ci/install-image ./clients/python '.[train,robots,ingest,cluster,grpc]'
 
-# the system, without what installs packages, Python's or Debian's, and without Perl: a layer can only add, so it is
-# copied as it is in the end
+# the system without package managers and Perl; it is copied into an empty image below, as layers cannot remove files
 FROM python:3.11-slim AS system
 # Pinocchio's OpenMP runtime, which slim images lack
 RUN apt-get update && apt-get install --yes --no-install-recommends libgomp1 \
@@ -41,7 +40,7 @@ ENV PATH=/opt/lipserve/bin:/usr/local/bin:/usr/local/sbin:/usr/sbin:/usr/bin:/sb
     NUMBA_CACHE_DIR=/opt/numba \
     LIPSERVE_HOME=/data \
     LIPSERVE_HOST=0.0.0.0
-# a container listens on all its addresses to be reached, so the service asks for API keys; make the first one with
+# The service listens on all addresses of the container, so it requires API keys. Create the first one:
 # `docker exec CONTAINER lipserve keys create --name admin --scope admin`
 VOLUME /data
 EXPOSE 8000 8001
@@ -52,7 +51,7 @@ CMD ["lipserve", "serve"]
 
 FROM base AS serve
 COPY --from=build-serve /opt/lipserve /opt/lipserve
-# compiled kernels; writable, since another processor than the build's compiles its own
+# compiled kernels; writable, as a processor other than the build's compiles its own
 COPY --from=build-serve --chown=lipserve /opt/numba /opt/numba
 
 FROM base AS full

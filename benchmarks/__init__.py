@@ -1,4 +1,4 @@
-"""What measures us; not in the wheel. `python -m benchmarks --help`, `python -m benchmarks.reproduce --help`."""
+"""Benchmarks, not part of the wheel: `python -m benchmarks --help`, `python -m benchmarks.reproduce --help`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from service.cli.consoles import explain, print_error
 
 
 def run(app: typer.Typer, expected: tuple[type[Exception], ...], name: str) -> None:
-    """Run a command line; of errors that a user can act on, `expected` among them, only the words are printed."""
+    """Run a command line; print errors that a user can act on, the `expected` ones among them, without a traceback."""
     try:
         app(prog_name=name)
     except Exception as error:

@@ -1,4 +1,4 @@
-"""`python -m benchmarks`: latency, learning, real recordings, uploads, load, scale, and what kills cost."""
+"""`python -m benchmarks`: latency, online learning, real recordings, uploads, load, scale and durability."""
 
 from benchmarks import run
 from benchmarks.command import ERRORS, app

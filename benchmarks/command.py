@@ -27,9 +27,9 @@ from benchmarks.online import pickup, pickup_table
 from benchmarks.online import running as online_running
 from benchmarks.online import table as online_table
 from benchmarks.online.arms import KINDS
-from benchmarks.online.promises import targets as online_targets
 from benchmarks.online.running import PARTS
 from benchmarks.online.scene import Scene
+from benchmarks.online.targets import targets as online_targets
 from benchmarks.real import report as real_report
 from benchmarks.real import running as real_running
 from benchmarks.real.cells import product_revision
@@ -47,11 +47,11 @@ from service.foundation.errors import ServiceError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (ApiError, BadAnswerError, BenchError, DemoError, ServiceError, StreamError)
-"""What a user is told without a traceback."""
+"""Errors printed without a traceback."""
 
 QUICK_RUNS, QUICK_QUERIES, QUICK_SECONDS = 3, 1000, 5.0
 QUICK_FIT = {"hyperparameter_samples": 80, "max_iterations": 50, "starts": 1}
-"""Of the model; all samples stand behind its posterior all the same."""
+"""Fit options of `--quick`; the posterior still uses all samples."""
 QUICK_ONLINE: dict[str, Any] = {
     "idle_s": 4.0,
     "burst_s": 6.0,
@@ -60,11 +60,11 @@ QUICK_ONLINE: dict[str, Any] = {
     "refit_every": 6.0,
 }
 
-Seed = Annotated[int, typer.Option(min=0, help="Of all that is random.")]
-Robot = Annotated[str, typer.Option(help=f"One of {', '.join(ROBOTS)}.")]
-JsonFile = Annotated[Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures here.")]
-Markdown = Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables here.")]
-Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 where something promised was missed.")]
+Seed = Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")]
+Robot = Annotated[str, typer.Option(help=f"Robot: {', '.join(ROBOTS)}.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", dir_okay=False, help="Also write all figures to this file.")]
+Markdown = Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the tables to this file.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Exit with 1 if a target is missed.")]
 
 
 @app.callback()
@@ -80,24 +80,26 @@ def latency(
     folder: Annotated[
         Path | None, typer.Option(exists=True, file_okay=False, help="Measure the saved model in this folder.")
     ] = None,
-    runs: Annotated[int | None, typer.Option(min=1, help="5 by default, 3 with --quick.")] = None,
+    runs: Annotated[int | None, typer.Option(min=1, help="Number of runs: 5, with --quick 3.")] = None,
     queries: Annotated[
-        int | None, typer.Option(min=20, help="Of a run: 4000 by default, 1000 with --quick; fewer for what is slow.")
+        int | None, typer.Option(min=20, help="Queries a run: 4000, with --quick 1000; fewer for slow subjects.")
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0, help="Of the 1 kHz loop: 60 by default, 5 with --quick; 0 leaves it out.")
+        float | None, typer.Option(min=0, help="Length of the 1 kHz loop, s: 60, with --quick 5; 0 omits it.")
     ] = None,
     training: Annotated[bool, typer.Option(help="Also measure while a training job runs.")] = True,
-    motions: Annotated[bool, typer.Option("--motions", help="Also train on four kinds of motion: minutes.")] = False,
+    motions: Annotated[
+        bool, typer.Option("--motions", help="Also compare models of four kinds of motion; takes minutes.")
+    ] = False,
     only: Annotated[str | None, typer.Option(help=f"Names separated by commas: {', '.join(KEYS)}.")] = None,
-    quick: Annotated[bool, typer.Option("--quick", help="A first look in about two minutes.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Measure less, in about two minutes.")] = False,
     json_file: JsonFile = None,
     markdown: Markdown = None,
     strict: Strict = False,
 ) -> None:
-    """Time answers in process and over every transport, idle and while training, next to baselines."""
+    """Time answers in process and over every transport, idle and while training, and those of baselines."""
     if model is not None and folder is not None:
-        raise ValueError("--model and --folder name two models, expected one of them")
+        raise ValueError("--model and --folder exclude each other.")
     chosen = folder if model is None else model_folder(model)
     options = Options(
         source=Source(folder=chosen, fit=QUICK_FIT if quick else {}),
@@ -112,8 +114,8 @@ def latency(
     results = run(options, console)
     found = targets(results)
     if json_file is not None:
-        results.write(json_file, _judged(found))
-    _tell(table.grids(results), results.notes, found, console, markdown, strict)
+        results.write(json_file, _targets_json(found))
+    _report(table.grids(results), results.notes, found, console, markdown, strict)
 
 
 @app.command()
@@ -121,30 +123,38 @@ def online(
     robot: Robot = "panda",
     seed: Seed = 0,
     speed: Annotated[float, typer.Option(help="Multiplies the frequencies of the motion.")] = 5.0,
-    payload: Annotated[float, typer.Option(min=0, help="kg, attached in the middle of the stream.")] = 1.5,
-    drift: Annotated[float, typer.Option(min=0, help="Share by which friction grows over the stream.")] = 0.3,
+    payload: Annotated[float, typer.Option(min=0, help="Payload attached in the middle of the stream, kg.")] = 1.5,
+    drift: Annotated[float, typer.Option(min=0, help="Relative growth of friction over the stream.")] = 0.3,
     forgetting: Annotated[float, typer.Option(min=1, help="Time constant of forgetting, s.")] = 30.0,
-    estimator: Annotated[str, typer.Option(help="Of the model: by default the learnt arm.")] = "rigid-body",
+    estimator: Annotated[str, typer.Option(help="Estimator of the model.")] = "rigid-body",
     inducing: Annotated[
-        int, typer.Option(min=1, help="Most inducing outputs of an estimator that has some: what a sample costs.")
+        int, typer.Option(min=1, help="Max inducing outputs, for estimators that have some; more make rows slower.")
     ] = 500,
-    websocket: Annotated[bool, typer.Option("--websocket", help="Stream in frames, not in batches over HTTP.")] = False,
+    websocket: Annotated[
+        bool, typer.Option("--websocket", help="Send observations as WebSocket frames, not as HTTP batches.")
+    ] = False,
     only: Annotated[
         str | None,
-        typer.Option(help=f"Names separated by commas: {', '.join(PARTS)}; or {', '.join(pickup.PARTS)}: hours."),
+        typer.Option(
+            help=f"Names separated by commas: {', '.join(PARTS)}; or {', '.join(pickup.PARTS)}, which take hours."
+        ),
     ] = None,
-    arms: Annotated[str, typer.Option(help="Robots that take something up, with commas.")] = ",".join(pickup.ROBOTS),
-    kinds: Annotated[str, typer.Option(help="What these are, and how they are learnt.")] = ",".join(KINDS),
-    minutes: Annotated[float, typer.Option(min=0.1, help="Of quiet motion of each of these.")] = 3.0,
-    quick: Annotated[bool, typer.Option("--quick", help="A first look in about two minutes.")] = False,
+    arms: Annotated[str, typer.Option(help=f"Robots of {', '.join(pickup.PARTS)}, separated by commas.")] = ",".join(
+        pickup.ROBOTS
+    ),
+    kinds: Annotated[
+        str, typer.Option(help=f"Kinds of arm of {', '.join(pickup.PARTS)}, separated by commas.")
+    ] = ",".join(KINDS),
+    minutes: Annotated[float, typer.Option(min=0.1, help="Motion without payload of each of these arms, min.")] = 3.0,
+    quick: Annotated[bool, typer.Option("--quick", help="Measure less, in about two minutes.")] = False,
     json_file: JsonFile = None,
     markdown: Markdown = None,
     strict: Strict = False,
 ) -> None:
-    """Teach a served model in real time while it answers: throughput, latency, cost, and quality over a change."""
+    """Measure online learning in real time: throughput, latency, cost, and quality before and after a change."""
     if only is not None and set(_names(only)) & set(pickup.PARTS):
-        carrying = pickup.Options(_names(only), _names(arms), _names(kinds), minutes, seed)
-        _carrying(carrying, json_file, markdown, strict)
+        payloads = pickup.Options(_names(only), _names(arms), _names(kinds), minutes, seed)
+        _measure_payloads(payloads, json_file, markdown, strict)
         return
     short = QUICK_ONLINE if quick else {}
     seconds, change = (12.0, 6.0) if quick else (60.0, 30.0)
@@ -161,120 +171,122 @@ def online(
     results = online_running.run(options, console)
     found = online_targets(results)
     if json_file is not None:
-        results.write(json_file, _judged(found))
-    _tell(online_table.grids(results), results.notes, found, console, markdown, strict)
+        results.write(json_file, _targets_json(found))
+    _report(online_table.grids(results), results.notes, found, console, markdown, strict)
 
 
-def _carrying(options: pickup.Options, json_file: Path | None, markdown: Path | None, strict: bool) -> None:
-    """Measure what arms carry; print and write it."""
+def _measure_payloads(options: pickup.Options, json_file: Path | None, markdown: Path | None, strict: bool) -> None:
+    """Measure how payloads are noticed and estimated; print and write the results."""
     console = _begin()
     with facts.one_thread():
         found = pickup.run(options, console)
-    promised = pickup_table.targets(found)
+    targeted = pickup_table.targets(found)
     if json_file is not None:
-        found.write(json_file, _judged(promised))
-    _tell(pickup_table.grids(found), pickup_table.NOTES, promised, console, markdown, strict)
+        found.write(json_file, _targets_json(targeted))
+    _report(pickup_table.grids(found), pickup_table.NOTES, targeted, console, markdown, strict)
 
 
 @app.command()
 def durability(
-    trials: Annotated[int, typer.Option(min=1, help="Kills: of the service and of its learner in turn.")] = 100,
+    trials: Annotated[int, typer.Option(min=1, help="Number of kills, of service and learner in turn.")] = 100,
     seed: Seed = 0,
     json_file: JsonFile = None,
     markdown: Markdown = None,
     strict: Strict = False,
 ) -> None:
-    """Kill the service, or its learner, while batches come; count what is lost or learnt twice. 2 to 4 s a trial."""
+    """Kill the service or its learner while it learns; count lost and duplicate batches. 2 to 4 s a trial."""
     console = _begin()
     with TemporaryDirectory(prefix="lipserve-bench-") as folder:
         tally = durable.run(Path(folder), trials, seed, console)
     found = durable.targets(tally)
     if json_file is not None:
-        json_file.write_text(json.dumps({**asdict(tally), "targets": _judged(found)}, indent=2) + "\n")
-    _tell(durable.grids(tally), [durable.SAID], found, console, markdown, strict)
+        json_file.write_text(json.dumps({**asdict(tally), "targets": _targets_json(found)}, indent=2) + "\n")
+    _report(durable.grids(tally), [durable.NOTE], found, console, markdown, strict)
 
 
 @app.command()
 def load(
-    connections: Annotated[int, typer.Option(min=4, help="At the same time.")] = 64,
-    seconds: Annotated[float, typer.Option(min=1, help="How long.")] = 120.0,
-    pause: Annotated[float, typer.Option(min=0, help="s between an answer and the next question.")] = 0.02,
+    connections: Annotated[int, typer.Option(min=4, help="Simultaneous connections.")] = 64,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration, s.")] = 120.0,
+    pause: Annotated[float, typer.Option(min=0, help="Wait between an answer and the next request, s.")] = 0.02,
     robot: Robot = "panda",
     seed: Seed = 0,
     json_file: JsonFile = None,
     markdown: Markdown = None,
     strict: Strict = False,
 ) -> None:
-    """Predict, stream, teach and upload at once; then count errors, memory, and whether every write is there."""
+    """Predict, stream, learn and upload at once; count errors, measure memory, and check that no write is lost."""
     options = soak_running.Options(connections, seconds, pause, robot, seed)
     console = _begin()
     results = soak_running.run(options, console)
     found = soak_table.targets(results)
     if json_file is not None:
-        results.write(json_file, _judged(found))
-    _tell(soak_table.grids(results), [], found, console, markdown, strict)
+        results.write(json_file, _targets_json(found))
+    _report(soak_table.grids(results), [], found, console, markdown, strict)
 
 
 @app.command()
 def soak(
-    hours: Annotated[float, typer.Option(min=0.05, max=24, help="Of a busy arm, sent as fast as it goes.")] = 8.0,
-    rate: Annotated[int, typer.Option(min=5, max=1000, help="At which it is observed, Hz.")] = 100,
-    minutes: Annotated[
-        float | None, typer.Option(min=0.5, help="End it after so long, however far it has come.")
-    ] = None,
+    hours: Annotated[
+        float, typer.Option(min=0.05, max=24, help="Simulated hours of a busy arm, sent as fast as possible.")
+    ] = 8.0,
+    rate: Annotated[int, typer.Option(min=5, max=1000, help="Rate of the observations, Hz.")] = 100,
+    minutes: Annotated[float | None, typer.Option(min=0.5, help="Stop after this time in any case, min.")] = None,
     seed: Seed = 0,
-    plot: Annotated[Path | None, typer.Option(dir_okay=False, help="Also draw what was held, .png or .svg.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(dir_okay=False, help="Also draw memory, disk, descriptors, threads: .png or .svg.")
+    ] = None,
     json_file: JsonFile = None,
     markdown: Markdown = None,
 ) -> None:
-    """Do all that a busy arm does in hours: every route, streams, training, refreshes, backups, with retention on.
+    """Replay hours of a busy arm: all routes, streams, training, retraining and backups, with retention on.
 
-    Exit with 1 where memory, descriptors, threads, processes or disk grow after the first tenth, or anything fails.
+    Exit with 1 if memory, descriptors, threads, processes or disk grow after the first tenth, or if a request fails.
     """
     options = soak_hours.Options(hours, rate, minutes, seed)
     console = _begin()
     results = soak_hours.run(options, console)
     found = soak_hours.targets(results)
     if json_file is not None:
-        results.write(json_file, _judged(found))
+        results.write(json_file, _targets_json(found))
     if plot is not None:
         soak_hours.draw(results, plot)
-    _tell(soak_hours.grids(results), [], found, console, markdown, strict=True)
+    _report(soak_hours.grids(results), [], found, console, markdown, strict=True)
 
 
 @app.command()
 def ingest(
-    rows: Annotated[int, typer.Option(min=1000, help="Of the recording, at 1 kHz.")] = 1_000_000,
-    joints: Annotated[int, typer.Option(min=1, max=32, help="Of the robot.")] = 7,
-    formats: Annotated[str, typer.Option(help="Names separated by commas.")] = ",".join(FORMATS),
+    rows: Annotated[int, typer.Option(min=1000, help="Rows of the recording, at 1 kHz.")] = 1_000_000,
+    joints: Annotated[int, typer.Option(min=1, max=32, help="Joints of the robot.")] = 7,
+    formats: Annotated[str, typer.Option(help="File formats separated by commas.")] = ",".join(FORMATS),
     seed: Seed = 0,
     json_file: JsonFile = None,
     markdown: Markdown = None,
     strict: Strict = False,
 ) -> None:
-    """Upload a long recording; time and memory until its report is there."""
+    """Upload a long recording; measure time and memory until its report is ready."""
     options = ingest_running.Options(rows, joints, _names(formats), seed=seed)
     console = _begin()
     results = ingest_running.run(options, console)
     found = ingest_running.targets(results)
     if json_file is not None:
-        results.write(json_file, _judged(found))
-    _tell(ingest_running.grids(results), [], found, console, markdown, strict)
+        results.write(json_file, _targets_json(found))
+    _report(ingest_running.grids(results), [], found, console, markdown, strict)
 
 
 @app.command()
 def scale(
     sizes: Annotated[
-        str | None, typer.Option(help="Samples of the training jobs, with commas: 200000,1000000 by default.")
+        str | None, typer.Option(help="Samples of the training jobs, separated by commas: 200000,1000000 by default.")
     ] = None,
     only: Annotated[str | None, typer.Option(help=f"Names separated by commas: {', '.join(SCALE_PARTS)}.")] = None,
     seed: Seed = 0,
-    quick: Annotated[bool, typer.Option("--quick", help="A first look in a few minutes.")] = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Measure less, in a few minutes.")] = False,
     json_file: JsonFile = None,
     markdown: Markdown = None,
     strict: Strict = False,
 ) -> None:
-    """Several services and workers, with PostgreSQL, S3 and Dask started here: scaling, following, costs, faults."""
+    """Start PostgreSQL, S3, Dask, several services and workers; measure scaling, replication, costs and faults."""
     chosen: dict[str, Any] = {**(scale_running.QUICK if quick else {}), "seed": seed}
     if sizes is not None:
         chosen["sizes"] = tuple(int(size) for size in sizes.split(","))
@@ -285,51 +297,53 @@ def scale(
     results = scale_running.run(options, console)
     if json_file is not None:
         results.write(json_file)
-    _tell(list(results.grids()), results.notes(), results.targets(), console, markdown, strict)
+    _report(list(results.grids()), results.notes(), results.targets(), console, markdown, strict)
 
 
 @app.command()
 def exported(
     folder: Annotated[
-        Path, typer.Option(exists=True, file_okay=False, help="Of a saved model of rigid bodies.")
+        Path, typer.Option(exists=True, file_okay=False, help="Folder of a saved `rigid-body` model.")
     ] = exported_running.SHIPPED,
-    calls: Annotated[int, typer.Option(min=20, help="Of each function.")] = 1_000_000,
-    flags: Annotated[str, typer.Option(help="Of cc, with spaces.")] = "-O2",
+    calls: Annotated[int, typer.Option(min=20, help="Calls of each function.")] = 1_000_000,
+    flags: Annotated[str, typer.Option(help="Compiler flags, separated by spaces.")] = "-O2",
     eigen: Annotated[
         Path | None,
-        typer.Option(exists=True, file_okay=False, help="Headers of Eigen: times Pinocchio in C++, not from Python."),
+        typer.Option(exists=True, file_okay=False, help="Eigen's headers; Pinocchio is then called from C++."),
     ] = None,
     seed: Seed = 0,
     json_file: JsonFile = None,
     markdown: Markdown = None,
     strict: Strict = False,
 ) -> None:
-    """Time a model as C beside Pinocchio, and compare its numbers with the model's on random states."""
+    """Time an exported C model and Pinocchio, and compare the C model's numbers with the model's."""
     console = _begin()
     options = exported_running.Options(folder.absolute(), calls, flags=tuple(flags.split()), eigen=eigen, seed=seed)
     results = exported_running.run(options, console)
     found = exported_running.targets(results)
     if json_file is not None:
-        results.write(json_file, _judged(found))
-    _tell(exported_running.grids(results), [], found, console, markdown, strict)
+        results.write(json_file, _targets_json(found))
+    _report(exported_running.grids(results), [], found, console, markdown, strict)
 
 
 @app.command()
 def real(
-    folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Of the recordings.")],
+    folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Folder of the recordings.")],
     out: Annotated[
-        Path, typer.Option(file_okay=False, help="Folder of the results. What is there is not computed again.")
+        Path, typer.Option(file_okay=False, help="Folder of the results. Existing results are not computed again.")
     ] = Path("build/real"),
-    only: Annotated[str, typer.Option(help="Pattern that recording/split/told/method must contain.")] = "",
-    jobs: Annotated[int, typer.Option(min=1, help="Cells computed at a time. Compare seconds with 1.")] = 1,
-    tables: Annotated[bool, typer.Option("--table", help="Compute nothing: print the results that there are.")] = False,
+    only: Annotated[str, typer.Option(help="Regular expression for names recording/split/(nothing|URDF)/method.")] = "",
+    jobs: Annotated[int, typer.Option(min=1, help="Cells computed at a time. Timings are comparable only with 1.")] = 1,
+    tables: Annotated[bool, typer.Option("--table", help="Only print the existing results.")] = False,
     revision: Annotated[
-        str | None, typer.Option(help="Of the product, by which its results are kept. By default from git.")
+        str | None, typer.Option(help="Revision of LIPServe under which results are stored; by default git's.")
     ] = None,
-    page: Annotated[Path | None, typer.Option(dir_okay=False, help="Also write the documentation's page here.")] = None,
+    page: Annotated[
+        Path | None, typer.Option(dir_okay=False, help="Also write the page of the documentation to this file.")
+    ] = None,
     strict: Strict = False,
 ) -> None:
-    """Train on recordings of real arms with default options, beside what others try first: hours, resumable."""
+    """Train on recordings of real arms with default options, and compare with other methods. Hours; resumable."""
     console = _begin()
     known = revision or product_revision()
     options = real_running.Options(folder, out, known, only, jobs, compute=not tables)
@@ -337,13 +351,13 @@ def real(
     if page is not None:
         page.write_text(real_report.page(outcome, known))
     found = real_report.targets(outcome.results)
-    _tell(real_report.grids(outcome), real_report.notes(outcome), found, console, None, strict)
+    _report(real_report.grids(outcome), real_report.notes(outcome), found, console, None, strict)
     if outcome.failed:
-        raise BenchError(f"{counted(len(outcome.failed), 'cell')} failed. The same command computes what is missing.")
+        raise BenchError(f"{counted(len(outcome.failed), 'cell')} failed. Run the command again to retry.")
 
 
 def _begin() -> Console:
-    """Let a request to end also end the services that are measured; return where to print."""
+    """Return the console; let SIGTERM also stop the measured services."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     return Console(width=None if sys.stdout.isatty() else table.WIDTH)
 
@@ -352,12 +366,12 @@ def _names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(","))
 
 
-def _judged(found: Sequence[Target]) -> list[dict[str, Any]]:
-    """What was promised and measured, as JSON values."""
+def _targets_json(found: Sequence[Target]) -> list[dict[str, Any]]:
+    """Return the targets as JSON values."""
     return [{**asdict(each), "met": each.met} for each in found]
 
 
-def _tell(
+def _report(
     grids: Sequence[table.Grid],
     notes: Sequence[str],
     found: Sequence[Target],
@@ -365,12 +379,12 @@ def _tell(
     markdown: Path | None,
     strict: bool,
 ) -> None:
-    """Print the tables and whether all promises were kept; exit with 1 where one was missed and `strict` is set."""
+    """Print the tables and the number of missed targets; with `strict`, exit with 1 if a target is missed."""
     table.show_grids(grids, notes, console)
     if markdown is not None:
         markdown.write_text(table.grids_markdown(grids, notes))
     missed = [each for each in found if each.met is False]
-    said = f"{len(missed)} of {sum(each.met is not None for each in found)} promises were missed"
-    console.print(said if missed else "every promise that was measured was kept", highlight=False)
+    summary = f"{len(missed)} of {sum(each.met is not None for each in found)} targets missed."
+    console.print(summary if missed else "All measured targets met.", highlight=False)
     if strict and missed:
         raise typer.Exit(1)

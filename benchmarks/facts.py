@@ -1,4 +1,4 @@
-"""What a reader has to know of the machine and the model to judge the figures."""
+"""Facts about the machine and the model, printed above the figures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _CPU = Path("/proc/cpuinfo")
 
 
 def machine() -> dict[str, str]:
-    """Processor, cores, load at this moment and versions."""
+    """Return processor, cores, present load and versions."""
     versions = [f"{name} {found}" for name in _PACKAGES if (found := _version(name))]
     return {
         "processor": f"{_processor()}, {os.cpu_count()} cores",
@@ -27,35 +27,35 @@ def machine() -> dict[str, str]:
     }
 
 
-def model(manifest: Mapping[str, Any], said: str) -> dict[str, str]:
-    """Size of the model, and how far it deviates from the exact posterior, in shares of a standard deviation."""
+def model(manifest: Mapping[str, Any], origin: str) -> dict[str, str]:
+    """Return origin and size of the model, and its deviation from the exact posterior."""
     fit, entry = manifest["fit"], compact(manifest)
     size = f"{entry['inducing_outputs']:.0f} inducing outputs at {entry['inducing_samples']:.0f} samples"
     return {
-        "model": said,
+        "model": origin,
         "estimator": f"{manifest['estimator']}, {len(manifest['joint_names'])} joints",
-        "samples": f"{fit['samples_given']} given, {fit['samples_posterior']} behind the posterior",
+        "samples": f"{fit['samples_given']} given, {fit['samples_posterior']} in the posterior",
         "compact posterior": size,
-        "its deviation": f"mean {entry['mean_rms']:.2%} rms, {entry['mean_max']:.2%} at most, of an exact standard "
-        f"deviation; standard deviation {entry['std_max']:.2%} at most (as fitted, tolerance {entry['tolerance']:.1%})",
+        "deviation": f"mean {entry['mean_rms']:.2%} rms, {entry['mean_max']:.2%} max, of an exact standard "
+        f"deviation; standard deviation {entry['std_max']:.2%} max (as fitted, tolerance {entry['tolerance']:.1%})",
     }
 
 
 def compact(manifest: Mapping[str, Any]) -> dict[str, float]:
-    """Size of a manifest's compact posterior, and how far it deviates from the exact one."""
+    """Return size of a manifest's compact posterior and its deviation from the exact one."""
     names = ("inducing_outputs", "inducing_samples", "mean_rms", "mean_max", "std_max", "tolerance")
     return {name: float(manifest["compact"][name]) for name in names}
 
 
 def deviation(manifest: Mapping[str, Any]) -> float:
-    """Largest deviation of mean or standard deviation from the exact posterior, in standard deviations."""
+    """Return the largest deviation of mean or standard deviation from the exact posterior, in standard deviations."""
     entry = compact(manifest)
     return max(entry["mean_max"], entry["std_max"])
 
 
 @contextmanager
 def one_thread() -> Iterator[str]:
-    """Let this process's linear algebra use one thread, as a control loop would; say what was done."""
+    """Limit this process's linear algebra to one thread, as in a control loop; yield a note about it."""
     with threadpool_limits(1):
         yield "1 thread"
 

@@ -1,7 +1,4 @@
-"""Processes as the system tells of them: whose children they are, and how much memory they have. Linux only.
-
-Elsewhere nothing is found, and what would be measured is said to be unknown.
-"""
+"""Process trees and memory, read from /proc. On systems other than Linux nothing is found."""
 
 from __future__ import annotations
 
@@ -18,17 +15,17 @@ _PARENT = 1
 
 
 def stats() -> Iterator[tuple[int, list[str]]]:
-    """Every process: its id and the fields of /proc/PID/stat after its name."""
+    """Yield id and fields of /proc/PID/stat, after the name, of every process."""
     for path in PROC.glob("[0-9]*/stat"):
         try:
             fields = path.read_text().rpartition(")")[2].split()
-        except (FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+        except (FileNotFoundError, ProcessLookupError):  # the process has ended
             continue
         yield int(path.parent.name), fields
 
 
 def levels(pid: int, known: Mapping[int, list[str]] | None = None) -> list[list[int]]:
-    """A process, then its children, then theirs, and so on. known: what `stats` found, looked up where None."""
+    """Return a process, its children, their children and so on, a list each; known: the result of `stats`, if read."""
     children: dict[int, list[int]] = {}
     for child, fields in stats() if known is None else known.items():
         children.setdefault(int(fields[_PARENT]), []).append(child)
@@ -38,26 +35,25 @@ def levels(pid: int, known: Mapping[int, list[str]] | None = None) -> list[list[
     return found
 
 
-def resident(pid: int, name: str = "VmRSS") -> float | None:
-    """Resident memory of a process, MiB: VmRSS now, VmHWM the most since it started; None where it has ended."""
+def resident_mib(pid: int, name: str = "VmRSS") -> float | None:
+    """Return resident memory of a process (VmRSS: now, VmHWM: its peak); None if the process has ended."""
     return _figure(pid, "status", name)
 
 
-def written(pid: int) -> float | None:
-    """Memory that a process has written, MiB, where what n processes share counts an n-th; None where it has ended.
+def written_mib(pid: int) -> float | None:
+    """Return memory that a process has written; None if the process has ended.
 
-    Without what is mapped of files: its share changes with every other process on the machine that maps the same
-    libraries, and the system drops it when it needs the room.
+    A page that n processes share counts as 1/n. Mapped files do not count: their share depends on all processes that
+    map the same libraries, and the system can drop them.
     """
     return _figure(pid, "smaps_rollup", "Pss_Anon", "Pss_Shmem")
 
 
-class Watch:
-    """Calls `look` in a thread of its own, once a period of so many seconds, while it is entered; then raises the error
-    that `look` may have ended with."""
+class PeriodicCall:
+    """A context manager that calls `function` every `period` seconds in a thread, and raises its error on exit."""
 
-    def __init__(self, period: float, look: Callable[[], None]) -> None:
-        self.period, self.look = period, look
+    def __init__(self, period: float, function: Callable[[], None]) -> None:
+        self.period, self.function = period, function
         self._end = threading.Event()
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -66,7 +62,7 @@ class Watch:
         due = time.monotonic()
         try:
             while not self._end.wait(max(0.0, due - time.monotonic())):
-                self.look()
+                self.function()
                 due += self.period
         except Exception as error:
             self._error = error
@@ -85,7 +81,7 @@ class Watch:
 
 
 def _figure(pid: int, file: str, *names: str) -> float | None:
-    """Sum of what a file below /proc/PID says under these names, MiB; None where it does not say all of them."""
+    """Return the sum of these entries of a file below /proc/PID, MiB; None if one is missing."""
     try:
         text = (PROC / str(pid) / file).read_text()
     except OSError:

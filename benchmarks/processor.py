@@ -1,4 +1,4 @@
-"""Who used the processor meanwhile: figures are worth little where others did. Linux only; elsewhere all is zero."""
+"""Processor time that other programs and machines used during a measurement. Zero on systems other than Linux."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from dataclasses import dataclass
 
 from benchmarks.processes import PROC, levels, stats
 
-KNOWN = (PROC / "stat").exists()
-"""Whether the system tells."""
+IS_AVAILABLE = (PROC / "stat").exists()
+"""Whether the system reports processor time."""
 _BUSY, _STOLEN = (0, 1, 2, 5, 6), 7
-"""Fields of /proc/stat: user, nice, system, irq and softirq; what the host gave to others."""
+"""Fields of /proc/stat: user, nice, system, irq and softirq; steal."""
 _TIMES = (11, 12, 13, 14)
-"""Fields of /proc/PID/stat after the name: user and system time, of the process and of children that have ended."""
+"""Fields of /proc/PID/stat after the name: user and system time of the process and of its ended children."""
 
 
 @dataclass
 class Usage:
-    """Seconds of processor time while something was measured, and of wall time.
+    """Wall time of a measurement and processor time used by others meanwhile, s.
 
-    others: of processes that have nothing to do with the benchmark, the kernel's among them; stolen: of other machines
-    on the same host.
+    Attributes:
+        others: of processes outside the benchmark, the kernel's included.
+        stolen: of other virtual machines on the same host.
     """
 
     wall: float = 0.0
@@ -39,25 +40,25 @@ class Usage:
 
 @contextmanager
 def watched(usage: Usage, service: int) -> Iterator[None]:
-    """Add what is used meanwhile. service: id of the process whose time, with its children's, is the benchmark's."""
-    before = _look(service)
+    """Add the time used by others; `service` and its children belong to the benchmark."""
+    before = _read_times(service)
     yield
-    after = _look(service)
+    after = _read_times(service)
     usage.wall += after[0] - before[0]
     usage.others += after[1] - before[1]
     usage.stolen += after[2] - before[2]
 
 
 def seconds_below(pid: int, itself: bool = False) -> float:
-    """Processor time of all children of a process and of theirs, s, and of the process where wanted."""
+    """Return processor time of all descendants of a process, s; with `itself`, of the process too."""
     known = dict(stats())
     counted = [each for level in levels(pid, known)[0 if itself else 1 :] for each in level if each in known]
     return sum(int(known[each][at]) for each in counted for at in _TIMES) / _hertz()
 
 
-def _look(service: int) -> tuple[float, float, float]:
-    """Wall time, processor time of all but this process and the service, and stolen time, each in s."""
-    if not KNOWN:
+def _read_times(service: int) -> tuple[float, float, float]:
+    """Return wall time, processor time of all but this process and the service, and stolen time, s."""
+    if not IS_AVAILABLE:
         return time.monotonic(), 0.0, 0.0
     ticks = [int(value) for value in (PROC / "stat").read_text().split("\n", 1)[0].split()[1:]]
     busy = sum(ticks[each] for each in _BUSY) / _hertz()

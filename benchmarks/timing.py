@@ -1,4 +1,4 @@
-"""Timing one call many times, and what is said of it: percentiles and throughput."""
+"""Timing of repeated calls: percentiles and throughput."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 Nanoseconds = NDArray[np.int64]
 Ask = Callable[[int], object]
-"""Ask query number k and wait for the answer."""
+"""A function that sends query number k and waits for the answer."""
 
 PERCENTILES = (50.0, 90.0, 99.0, 99.9)
 WARM_UP = 5
-"""Calls before every measured stretch: caches hold what the subject before left there."""
+"""Calls before every measured stretch: caches still hold data of the previous subject."""
 
 
 @dataclass(frozen=True)
 class Timing:
-    """One run of one subject. Times in µs a query, per_second in queries; count: calls measured."""
+    """Percentiles of one run of one subject, µs a query, queries per second, and the number of measured calls."""
 
     count: int
     p50: float
@@ -34,9 +34,9 @@ class Timing:
 
     @classmethod
     def of(cls, times: Nanoseconds, queries: int = 1) -> Timing:
-        """Of calls that took `times` ns, each answering `queries` queries; raise ValueError where there are none."""
+        """Summarise calls that took `times` ns, each answering `queries` queries; raise ValueError without calls."""
         if len(times) == 0:
-            raise ValueError("no times to take percentiles of")
+            raise ValueError("Percentiles need at least one time.")
         each = times / (1e3 * queries)
         p50, p90, p99, p999 = (float(value) for value in np.percentile(each, PERCENTILES))
         return cls(
@@ -45,7 +45,7 @@ class Timing:
 
 
 def median(runs: Sequence[Timing]) -> Timing:
-    """Median of every figure over runs, but the largest time of all."""
+    """Return the median of every figure over runs; `largest` is the maximum."""
     return Timing(
         count=sum(run.count for run in runs),
         **{name: float(np.median([getattr(run, name) for run in runs])) for name in ("p50", "p90", "p99", "p999")},
@@ -55,7 +55,7 @@ def median(runs: Sequence[Timing]) -> Timing:
 
 
 def measure(ask: Ask, count: int, start: int = 0) -> Nanoseconds:
-    """Time `count` calls one after another, with queries numbered from `start`; ns each."""
+    """Time `count` calls one after another, with queries numbered from `start`; return ns each."""
     times, clock = np.empty(count, dtype=np.int64), time.perf_counter_ns
     for number in range(start, start + WARM_UP):
         ask(number)
@@ -69,7 +69,7 @@ def measure(ask: Ask, count: int, start: int = 0) -> Nanoseconds:
 
 @contextmanager
 def no_collection() -> Iterator[None]:
-    """Keep the garbage collector of this process from running inside a measurement."""
+    """Disable the garbage collector of this process during a measurement."""
     enabled = gc.isenabled()
     gc.collect()
     gc.freeze()

@@ -1,4 +1,4 @@
-"""What is measured: a model, queries it has not seen, and a service of its own that answers with it."""
+"""The measured model, queries that are not training data, and a service that serves the model."""
 
 from __future__ import annotations
 
@@ -32,8 +32,9 @@ from service.storage.files import Files, new_id
 MODEL = "bench"
 TRAIN_SEED, QUERY_SEED = 1, 2
 QUERY_SINUSOIDS = 100
-"""Queries follow an unseen trajectory of twice the bandwidth, as in the paper's tests."""
-UNKNOWN_QUERIES = 500
+"""Queries follow another trajectory of twice the bandwidth, as in the paper's tests."""
+RANDOM_QUERIES = 500
+"""Queries for a model whose simulator is unknown."""
 
 
 class BenchError(RuntimeError):
@@ -42,9 +43,11 @@ class BenchError(RuntimeError):
 
 @dataclass(frozen=True)
 class Source:
-    """Which model: trained here on a simulated stream, or an existing folder.
+    """Source of the model: a simulated stream to train on, or an existing folder.
 
-    fit: options of the training job; load: options of the job that runs while answers are timed.
+    Attributes:
+        fit: options of the training job.
+        load: options of the job that runs while answers are timed.
     """
 
     robot: str = "panda"
@@ -58,9 +61,12 @@ class Source:
 
 @dataclass(frozen=True)
 class Workload:
-    """A model as this process loaded it, and what it is asked.
+    """A model loaded in this process, and its queries.
 
-    queries: (Q, 3, n), q, dq and ddq; samples: what the model was trained on, robot: its simulator, where known.
+    Attributes:
+        queries: q, dq and ddq, (Q, 3, n).
+        samples: the training samples, if known.
+        robot: the simulator, if known.
     """
 
     folder: Path
@@ -72,7 +78,7 @@ class Workload:
 
     @classmethod
     def load(cls, folder: Path, robot: Robot | None, samples: Samples | None, stream: Simulation) -> Workload:
-        """Load the model in this process; queries are an unseen trajectory where its stream is known."""
+        """Load the model in this process; queries follow another trajectory, or are random if the stream is unknown."""
         manifest = json.loads((folder / "manifest.json").read_bytes())
         model = lipcore.load(folder)
         model.warm_up()
@@ -80,13 +86,13 @@ class Workload:
             unseen = simulate(robot, _unseen(stream), QUERY_SEED)
             queries = np.stack([unseen.q, unseen.dq, unseen.ddq], axis=1)
         else:
-            queries = _within(manifest["training_range"], UNKNOWN_QUERIES)
+            queries = _random_queries(manifest["training_range"], RANDOM_QUERIES)
         return cls(folder, manifest, model, np.ascontiguousarray(queries), samples, robot)
 
 
 @dataclass(frozen=True)
 class Bed:
-    """A running service with the model, and how to reach it. grpc: None without the extra; pid: of its process."""
+    """A running service with the model, its addresses (`grpc`: None without the extra) and its process id."""
 
     client: Client
     tcp: Address
@@ -99,7 +105,7 @@ class Bed:
 
 @contextmanager
 def open_bed(home: Path, source: Source, console: Console) -> Iterator[Bed]:
-    """Start a service in an empty `home` and give it the model, trained by a job or copied; load it here too."""
+    """Start a service in an empty `home` with the model, trained by a job or copied; load the model here too."""
     if source.folder is not None:
         _install(home, source.folder)
     unix = home / "lipserve.sock"
@@ -126,7 +132,7 @@ def open_bed(home: Path, source: Source, console: Console) -> Iterator[Bed]:
 
 
 def model_folder(name: str) -> Path:
-    """Folder of the latest version of a model in the home of the settings; raise NotFoundError."""
+    """Return the folder of a model's latest version in the home of the settings; raise NotFoundError."""
     settings = Settings()
     database = Database.of(settings)
     try:
@@ -136,7 +142,7 @@ def model_folder(name: str) -> Path:
 
 
 def _install(home: Path, folder: Path) -> None:
-    """Publish a copy of a saved model in a home that no service has opened yet."""
+    """Publish a copy of a saved model in a home that no service uses yet."""
     database, files, name = Database(home), Files(home), new_id("mv")
     try:
         with files.new_version(name) as target:
@@ -156,11 +162,11 @@ def _train(client: Client, home: Path, dataset: str, robot: Robot, source: Sourc
     queued = client.train(MODEL, [dataset], "lip-chain", list(robot.joint_types), dict(source.fit))
     job = follow(client, queued, console)
     if job.state != SUCCEEDED:
-        raise BenchError(f"the training job has {job.state}: {job.error.message if job.error else ''}")
+        raise BenchError(f"The training job has {job.state}: {job.error.message if job.error else 'no error given'}")
     for folder in (home / "versions").iterdir():
         if json.loads((folder / "manifest.json").read_bytes())["lineage"].get("job") == job.id:
             return folder
-    raise BenchError(f"no model in {home} comes from job {job.id}")
+    raise BenchError(f"No model in {home} was trained by job {job.id}.")
 
 
 def _unseen(stream: Simulation) -> Simulation:
@@ -168,14 +174,14 @@ def _unseen(stream: Simulation) -> Simulation:
 
 
 def simulator(folder: Path) -> Robot | None:
-    """The robot whose joints the model has, where it can be simulated."""
+    """Return the simulated robot with the model's joint names, if there is one."""
     names = tuple(json.loads((folder / "manifest.json").read_bytes())["joint_names"])
     found = next((name for name, source in ROBOTS.items() if source.free == names), None)
     return None if found is None else load_robot(found)
 
 
-def _within(ranges: Mapping[str, Mapping[str, list[float]]], count: int) -> Array:
-    """Random motions inside the range of the training samples, (count, 3, n)."""
+def _random_queries(ranges: Mapping[str, Mapping[str, list[float]]], count: int) -> Array:
+    """Return random motions inside the range of the training samples, (count, 3, n)."""
     rng = np.random.default_rng(QUERY_SEED)
     low, high = (np.array([ranges[name][end] for name in ("q", "dq", "ddq")]) for end in ("min", "max"))
     motions: Array = low + (high - low) * rng.random((count, *low.shape))

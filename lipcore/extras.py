@@ -37,7 +37,7 @@ EXTRAS = {
     "sim": Extra("simulate robots and know them by name", ("pinocchio",), ROBOTS_DATA),
     "ingest": Extra("read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra)", ("pyarrow",)),
     "cluster": Extra("share PostgreSQL, S3 and a Dask cluster", ("psycopg", "s3fs", "distributed")),
-    "grpc": Extra("answer over gRPC", ("grpc", "google.protobuf")),
+    "grpc": Extra("serve over gRPC", ("grpc", "google.protobuf")),
     "opentelemetry": Extra("send traces", ("opentelemetry.exporter.otlp.proto.http",)),
     "plot": Extra("draw pictures", ("matplotlib",)),
 }

@@ -1,4 +1,4 @@
-"""Train the shipped model `panda-sim` from simulated streams and print how it does on unseen trajectories."""
+"""Train the shipped model `panda-sim` on simulated streams, and print its accuracy on test trajectories."""
 
 import shutil
 import sys
@@ -16,13 +16,13 @@ from lipcore.robots.simulation import Simulation, simulate
 FOLDER = Path(__file__).parent / "panda-sim"
 SPEEDS = (1.0, 2.0, 5.0, 10.0)
 NOISE = 0.05
-"""N·m, about what an arm's torque sensors have."""
+"""Noise of the torque, N·m, about that of an arm's torque sensors."""
 STREAMS = [(Simulation(speed=SPEEDS[k % 4], noise=NOISE, motion="full"), 100 + k) for k in range(16)]
-"""The whole range of every joint. Its URDF is not looked at: the arm is learnt from torque alone."""
+"""Streams over the whole range of every joint. The arm is learnt from torque alone, without the URDF."""
 
 
 def main() -> None:
-    """Simulate, train, evaluate, save."""
+    """Simulate, train, evaluate and save."""
     threadpool_limits(1)
     robot = load_robot("panda")
     samples = lipcore.Samples.concatenate([simulate(robot, stream, seed) for stream, seed in STREAMS])

@@ -168,7 +168,7 @@ def _add_middleware(
         app.add_middleware(LocalAccess)
     else:
         app.add_middleware(KeyAccess, keyring=keyring)
-    app.add_middleware(Gate, most=MAX_REQUESTS)
+    app.add_middleware(Gate, max_requests=MAX_REQUESTS)
     quiet = (str(getattr(route, "path", "")) for route in hot)
     log = RequestLog(quiet, settings.log_slow_s, MAX_REFUSALS_PER_S)
     app.add_middleware(RequestContext, meters=meters, log=log, tracing=settings.opentelemetry)  # the outermost

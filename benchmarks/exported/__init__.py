@@ -1,1 +1,1 @@
-"""A model as C, compiled and timed beside Pinocchio's recursive Newton–Euler."""
+"""Latency and accuracy of a model exported as C, with Pinocchio's recursive Newton–Euler as the baseline."""

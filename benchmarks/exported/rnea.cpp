@@ -1,4 +1,4 @@
-// Times Pinocchio's recursive Newton–Euler: `rnea MODEL CALLS QUERIES TIMES`, files as of timing.c.
+// Times Pinocchio's recursive Newton–Euler: `rnea MODEL CALLS QUERIES TIMES`, with the files of timing.c.
 #include <pinocchio/fwd.hpp>
 
 #include <pinocchio/algorithm/rnea.hpp>

@@ -1,4 +1,4 @@
-"""Write a model as C, compile it with this machine's `cc`, time it, and compare its numbers with the model's."""
+"""The benchmark of a model exported as C and compiled with this machine's `cc`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 import subprocess
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from rich.console import Console
 
 from benchmarks import facts
 from benchmarks.latency.baselines import rnea
-from benchmarks.latency.table import Grid, promises
+from benchmarks.latency.table import Grid, targets_grid
 from benchmarks.latency.targets import Target
 from benchmarks.timing import Timing, measure
 from benchmarks.workload import BenchError, simulator
@@ -27,13 +27,21 @@ from lipcore.robots.library import Robot, pinocchio
 HERE = Path(__file__).parent
 SHIPPED = HERE.parents[1] / "models/panda-sim"
 PINOCCHIO = ("BOOST_MPL_LIMIT_LIST_SIZE=30", "BOOST_MPL_CFG_NO_PREPROCESSED_HEADERS")
-"""What Pinocchio's own CMake files define."""
+"""Macros that Pinocchio's own CMake files define."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """folder: of the model; calls: of each function; queries: random states; flags: of the compiler; eigen: folder of
-    Eigen's headers, to time Pinocchio in C++, in Python where None; seed: of the states."""
+    """Scope of the benchmark.
+
+    Attributes:
+        folder: folder of the model.
+        calls: calls of each function.
+        queries: number of random states.
+        flags: compiler flags.
+        eigen: folder of Eigen's headers, to call Pinocchio from C++; None: from Python.
+        seed: seed of the states.
+    """
 
     folder: Path
     calls: int = 1_000_000
@@ -45,8 +53,7 @@ class Options:
 
 @dataclass
 class Results:
-    """Everything that was measured. estimator: of the model; timings: µs by subject; sizes: bytes by file; deviations:
-    relative, by what."""
+    """All figures: timings in µs by subject, sizes in bytes by file, relative deviations by quantity."""
 
     machine: dict[str, str]
     estimator: str = "rigid-body"
@@ -54,13 +61,13 @@ class Results:
     sizes: dict[str, int] = field(default_factory=dict)
     deviations: dict[str, float] = field(default_factory=dict)
 
-    def write(self, path: Path, promised: list[dict[str, Any]]) -> None:
+    def write(self, path: Path, targets: list[dict[str, Any]]) -> None:
         """Write all figures as JSON."""
-        path.write_text(json.dumps({**asdict(self), "targets": promised}, indent=2) + "\n")
+        path.write_text(json.dumps({**asdict(self), "targets": targets}, indent=2) + "\n")
 
 
 def run(options: Options, console: Console) -> Results:
-    """Measure one model; raise BenchError where something does not compile."""
+    """Run the benchmark; raise BenchError if a compiler or a program fails."""
     model = load(options.folder)
     results = Results(facts.machine(), model.estimator.name)
     draw, limits = np.random.default_rng(options.seed).uniform, model.training_range
@@ -83,38 +90,38 @@ def run(options: Options, console: Console) -> Results:
         answers = np.fromfile(folder / "answers").reshape(-1, 2, model.n_joints)
         robot = simulator(options.folder)
         if robot is not None and options.eigen is not None:
-            console.print("Pinocchio in C++: it takes half a minute to compile", highlight=False)
-            results.timings["Pinocchio's rnea, C++"] = _in_cpp(robot, options, motion, folder)
+            console.print("compiling Pinocchio in C++, half a minute", highlight=False)
+            results.timings["Pinocchio's rnea, C++"] = _time_cpp(robot, options, motion, folder)
         elif robot is not None:
             times = measure(rnea(robot, motion[:1000]), options.calls // 10)
             results.timings["Pinocchio's rnea, called from Python"] = Timing.of(times)
     q, dq, ddq = (np.ascontiguousarray(part) for part in motion.transpose(1, 0, 2))
     tau, tau_std, *_ = model.evaluator.many(q, dq, ddq)  # C has no fallback
     results.deviations = {
-        # where a torque passes through zero nothing is left of its digits
-        "tau, of the service's or of tau_std": _relative(answers[:, 0], tau, tau_std),
-        "tau_std, of the service's": _relative(answers[:, 1], tau_std, 0.0),
+        # a torque near zero has no relative precision
+        "tau, relative to tau or tau_std": _relative(answers[:, 0], tau, tau_std),
+        "tau_std": _relative(answers[:, 1], tau_std, 0.0),
     }
     return results
 
 
 def grids(results: Results) -> list[Grid]:
-    """The tables."""
+    """Return all tables."""
     rows = [
         (name, *(f"{value:.2f}" for value in (each.p50, each.p99, each.p999, each.largest)), f"{each.count:,}")
         for name, each in results.timings.items()
     ]
     return [
         Grid("machine", ("", ""), list(results.machine.items()), texts=True),
-        Grid("µs a call, the clock's own (nothing) included", ("", "p50", "p99", "p99.9", "largest", "calls"), rows),
+        Grid("µs a call, time of the clock (nothing) included", ("", "p50", "p99", "p99.9", "largest", "calls"), rows),
         Grid("bytes", ("", ""), [(name, f"{size:,}") for name, size in results.sizes.items()]),
         Grid("largest relative deviation", ("", ""), [(k, f"{v:.1e}") for k, v in results.deviations.items()]),
-        replace(promises(targets(results)), columns=("", "promised", "measured", "")),
+        targets_grid(targets(results), ""),
     ]
 
 
 def targets(results: Results) -> list[Target]:
-    """What is promised of an arm of seven joints; times where nothing is added to rigid bodies."""
+    """Return the targets for an arm of seven joints; times have targets for `rigid-body` only."""
     mean, std = results.timings["mean"], results.timings["std"]
     tau, deviation = results.deviations.values()
     times = [
@@ -128,8 +135,8 @@ def targets(results: Results) -> list[Target]:
     ]
 
 
-def _in_cpp(robot: Robot, options: Options, motion: Array, folder: Path) -> Timing:
-    prefix = Path(str(pinocchio().__file__)).parents[4]  # cmeel.prefix, where the wheel has its headers
+def _time_cpp(robot: Robot, options: Options, motion: Array, folder: Path) -> Timing:
+    prefix = Path(str(pinocchio().__file__)).parents[4]  # cmeel.prefix, with the wheel's headers
     robot.model.saveToText(str(folder / "robot"))
     np.array([np.concatenate([robot.configuration(q), dq, ddq]) for q, dq, ddq in motion]).tofile(folder / "motions")
     defined = [f"-D{each}" for each in (*PINOCCHIO, "PINOCCHIO_ENABLE_TEMPLATE_INSTANTIATION")]
@@ -141,14 +148,14 @@ def _in_cpp(robot: Robot, options: Options, motion: Array, folder: Path) -> Timi
 
 
 def _do(command: Sequence[str], folder: Path) -> None:
-    """Run a command; raise BenchError with what it says where it fails."""
+    """Run a command; raise BenchError with its error output if it fails."""
     try:
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603 - ours
     except FileNotFoundError:
-        raise BenchError(f"{command[0]} is not installed, expected a C compiler of that name") from None
+        raise BenchError(f"{command[0]} is not installed. Install a C compiler of that name.") from None
     if done.returncode:
-        raise BenchError(f"{' '.join(command)} exits with {done.returncode}: {done.stderr[:2000]}")
+        raise BenchError(f"{' '.join(command)} failed with exit code {done.returncode}: {done.stderr[:2000]}")
 
 
-def _relative(values: Array, expected: Array, least: Array | float) -> float:
-    return float((np.abs(values - expected) / np.maximum(np.abs(expected), least)).max())
+def _relative(values: Array, expected: Array, min_unit: Array | float) -> float:
+    return float((np.abs(values - expected) / np.maximum(np.abs(expected), min_unit)).max())

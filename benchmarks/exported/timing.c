@@ -1,7 +1,7 @@
 /* Times an exported model: `timing mean|std|nothing CALLS QUERIES TIMES ANSWERS`.
  *
  * QUERIES: float64 q, dq, ddq of each; TIMES: ns of each call (int64), all queries in turn; ANSWERS: float64 tau and
- * tau_std of each query. `nothing` is what the clock takes. */
+ * tau_std of each query. `nothing` measures the clock itself. */
 #define _POSIX_C_SOURCE 200112L
 #include "lipserve_model.h"
 

@@ -1,1 +1,1 @@
-"""How long a long recording takes from upload to report, and how much memory."""
+"""Time and memory from the upload of a long recording to its report."""

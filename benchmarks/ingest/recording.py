@@ -1,4 +1,4 @@
-"""A recording as long as wanted, written block by block by others' writers."""
+"""Simulated recordings of any length, written block by block with pyarrow."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ NOISE = 0.05
 
 
 def write(path: Path, rows: int, n_joints: int, columns: tuple[str, ...], seed: int) -> None:
-    """Write t and some of q, dq, ddq, tau of so many joints at RATE; the ending of the path says the format."""
+    """Write t and the given columns at RATE, as Parquet or CSV by the suffix of the path."""
     names = ["t", *(f"{name}{joint}" for name in columns for joint in range(1, n_joints + 1))]
     schema = pa.schema([(name, pa.float64()) for name in names])
     with pq.ParquetWriter(path, schema) if path.suffix == ".parquet" else pa_csv.CSVWriter(path, schema) as writer:
@@ -29,7 +29,7 @@ def write(path: Path, rows: int, n_joints: int, columns: tuple[str, ...], seed: 
 
 
 def _blocks(rows: int, n_joints: int, columns: tuple[str, ...], seed: int) -> Iterator[Array]:
-    """Sinusoids of 0.1 to 1 Hz; torque as of independent pendulums with friction and white noise."""
+    """Yield sinusoids of 0.1 to 1 Hz, with the torque of independent pendulums, friction and white noise."""
     rng = np.random.default_rng(seed)
     omega = 2 * np.pi * rng.uniform(0.1, 1.0, (SINUSOIDS, n_joints))
     phase = rng.uniform(0, 2 * np.pi, (SINUSOIDS, n_joints))

@@ -1,11 +1,11 @@
-"""Upload long recordings to a service of their own; take time and memory."""
+"""The benchmark of uploads, each to a service that has just started."""
 
 from __future__ import annotations
 
 import json
 import tempfile
 import time
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,22 +13,23 @@ from rich.console import Console
 
 from benchmarks import facts
 from benchmarks.ingest import recording
-from benchmarks.latency.table import NOTHING, Grid, promises
+from benchmarks.latency.table import NOTHING, Grid, targets_grid
 from benchmarks.latency.targets import Target
-from benchmarks.processes import resident
+from benchmarks.processes import resident_mib
 from lipserve import Client
 from service.cli.demo import ServiceProcess
 
-MOST_SECONDS, MOST_MIB = 60.0, 500.0
-PROMISED_ROWS = 1_000_000
+MAX_SECONDS, MAX_MIB = 60.0, 500.0
+TARGET_ROWS = 1_000_000
+"""Rows of the recording that the targets are about."""
 MIB = 1 << 20
 
 
 @dataclass(frozen=True)
 class Options:
-    """columns: of the file; what is missing is derived."""
+    """Scope of the benchmark; columns: of the file, the service derives the others."""
 
-    rows: int = PROMISED_ROWS
+    rows: int = TARGET_ROWS
     joints: int = 7
     formats: tuple[str, ...] = recording.FORMATS
     columns: tuple[str, ...] = ("q", "dq", "tau")
@@ -36,13 +37,21 @@ class Options:
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.formats if name not in recording.FORMATS]:
-            raise ValueError(f"--formats has {unknown[0]!r}, expected names out of {', '.join(recording.FORMATS)}")
+            raise ValueError(f"Unknown format {unknown[0]!r} in --formats. Formats: {', '.join(recording.FORMATS)}.")
 
 
 @dataclass(frozen=True)
 class Ingested:
-    """file_mib: size of the upload; seconds: from the first byte sent to the answer with the report; before, peak: MiB
-    of the service's process, None where the system does not tell; rows: of the data set."""
+    """Figures of one upload.
+
+    Attributes:
+        format: format of the file.
+        file_mib: size of the file.
+        seconds: time from the first byte sent to the answer with the report.
+        before: memory of the service before, MiB; None if the system does not report it.
+        peak: peak memory of the service, MiB.
+        rows: rows of the data set.
+    """
 
     format: str
     file_mib: float
@@ -53,21 +62,21 @@ class Ingested:
 
     @property
     def taken(self) -> float | None:
-        """MiB beyond what the service had before."""
+        """Additional memory, MiB."""
         return None if self.peak is None or self.before is None else self.peak - self.before
 
 
 @dataclass
 class Results:
-    """Everything that was measured."""
+    """All figures of the benchmark."""
 
     options: Options
     machine: dict[str, str]
     found: list[Ingested] = field(default_factory=list)
 
-    def write(self, path: Path, promised: list[dict[str, Any]]) -> None:
+    def write(self, path: Path, targets: list[dict[str, Any]]) -> None:
         """Write all figures as JSON."""
-        path.write_text(json.dumps({**asdict(self), "targets": promised}, indent=2) + "\n")
+        path.write_text(json.dumps({**asdict(self), "targets": targets}, indent=2) + "\n")
 
 
 def run(options: Options, console: Console) -> Results:
@@ -84,7 +93,7 @@ def run(options: Options, console: Console) -> Results:
 
 
 def grids(results: Results) -> list[Grid]:
-    """The tables."""
+    """Return all tables."""
     rows = [
         (
             each.format,
@@ -97,23 +106,23 @@ def grids(results: Results) -> list[Grid]:
         )
         for each in results.found
     ]
-    header = ("", "samples", "file MiB", "seconds", "rows/s", "memory before MiB", "at most MiB")
+    header = ("", "samples", "file MiB", "seconds", "rows/s", "memory before MiB", "peak MiB")
     title = f"{results.options.rows:,} rows, {results.options.joints} joints, {', '.join(results.options.columns)}"
     return [
         Grid("machine", ("", ""), list(results.machine.items()), texts=True),
         Grid(f"{title}: from upload to report", header, rows),
-        replace(promises(targets(results)), columns=("", "promised", "measured", "")),
+        targets_grid(targets(results), ""),
     ]
 
 
 def targets(results: Results) -> list[Target]:
-    """What is promised of a million rows of Parquet."""
-    found = [each for each in results.found if each.format == "parquet" and results.options.rows >= PROMISED_ROWS]
+    """Return the targets for a million rows of Parquet."""
+    found = [each for each in results.found if each.format == "parquet" and results.options.rows >= TARGET_ROWS]
     seconds = max((each.seconds for each in found), default=None)
     taken = max((each.taken for each in found if each.taken is not None), default=None)
     return [
-        Target("a million rows of Parquet, report included", seconds, "s", "<", MOST_SECONDS),
-        Target("memory that it takes beyond the service's own", taken, "MiB", "<", MOST_MIB),
+        Target("a million rows of Parquet, report included", seconds, "s", "<", MAX_SECONDS),
+        Target("additional memory for it", taken, "MiB", "<", MAX_MIB),
     ]
 
 
@@ -123,11 +132,11 @@ def _upload(path: Path, kind: str, home: Path, options: Options) -> Ingested:
     try:
         with Client(service.url) as client:
             service.wait_ready(client)
-            before = resident(service.process.pid, "VmRSS")
+            before = resident_mib(service.process.pid, "VmRSS")
             began = time.monotonic()
             dataset = client.upload(path)
             seconds = time.monotonic() - began
-            peak = resident(service.process.pid, "VmHWM")
+            peak = resident_mib(service.process.pid, "VmHWM")
     finally:
         service.stop()
     return Ingested(kind, path.stat().st_size / MIB, seconds, before, peak, dataset.report.rows)

@@ -1,1 +1,1 @@
-"""How long answers take: in process, over every transport, beside baselines."""
+"""Latency of answers in process and over every transport, and of baselines."""

@@ -1,4 +1,4 @@
-"""What answers are compared with, all in this process: rigid-body dynamics, the exact posterior, GPyTorch."""
+"""Baselines in this process: rigid-body dynamics, the exact posterior, GPyTorch."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from lipcore.posterior.exact import ExactPosterior
 from lipcore.posterior.selection import spread_out
 from lipcore.robots.library import Robot, pinocchio
 
-GPYTORCH_SAID = (
-    "GPyTorch: one independent exact GP a joint, as a batch of n: zero mean, RBF with one lengthscale an input "
-    "(q, dq, ddq: 3n inputs), fixed hyperparameters (lengthscales from the spread of the inputs, so the cost but not "
-    "the accuracy is comparable), float64, Cholesky, eval mode, caches warm; mean and std of the function"
+GPYTORCH_NOTE = (
+    "GPyTorch: one exact GP per joint, as a batch of n; zero mean, RBF with one lengthscale per input (q, dq, ddq: 3n "
+    "inputs), float64, Cholesky, eval mode, warm caches. Hyperparameters are fixed, with lengthscales from the spread "
+    "of the inputs; compare the cost, not the accuracy. Answers are mean and std of the function."
 )
 
 
 def gpytorch_installed() -> bool:
-    """Whether the extra `bench` is there."""
+    """Return whether GPyTorch, of the extra `bench`, is installed."""
     return find_spec("gpytorch") is not None
 
 
 def rnea(robot: Robot, queries: Array) -> Ask:
-    """Pinocchio's recursive Newton–Euler with the simulator's own bodies: the torque when everything is known."""
+    """Return Pinocchio's recursive Newton–Euler with the simulator's own bodies."""
     pin = pinocchio()
     algorithm, model, data = pin.rnea, robot.model, robot.model.createData()
     motions = [(robot.configuration(q), dq.copy(), ddq.copy()) for q, dq, ddq in queries]
@@ -42,7 +42,7 @@ def rnea(robot: Robot, queries: Array) -> Ask:
 
 
 def exact_posterior(workload: Workload) -> ExactPosterior:
-    """The exact Gaussian process with the model's hyperparameters, on the samples that the model stands on."""
+    """Return the exact Gaussian process with the model's hyperparameters, on the samples of its posterior."""
     samples, model = workload.samples, workload.model
     assert samples is not None
     motion, tau = samples.motion(), samples.tau
@@ -52,21 +52,21 @@ def exact_posterior(workload: Workload) -> ExactPosterior:
 
 
 def deviation(workload: Workload, exact: ExactPosterior) -> tuple[float, str]:
-    """How far the model's answers to the queries lie from those of the exact posterior: at most, and in words."""
+    """Return the largest deviation of the model's answers from the exact posterior's, and a note about it."""
     q, dq, ddq = (np.ascontiguousarray(workload.queries[:, part]) for part in range(3))
     answer, expected = workload.model.predict(q, dq, ddq), exact.predict(Motion.from_arrays(q, dq, ddq))
     unit = expected.std
     mean, std = (answer.tau - expected.mean) / unit, answer.tau_std / unit - 1
     largest = float(max(np.abs(mean).max(), np.abs(std).max()))
     return largest, (
-        f"on the {len(q)} queries, an unseen trajectory, the model's mean deviates from the exact GP's by "
-        f"{np.sqrt(np.mean(mean**2)):.2%} (rms) and at most {np.abs(mean).max():.2%} of its standard deviation, the "
-        f"standard deviation by at most {np.abs(std).max():.2%}"
+        f"On the {len(q)} queries of another trajectory, the model's mean deviates from the exact GP's by "
+        f"{np.sqrt(np.mean(mean**2)):.2%} rms and {np.abs(mean).max():.2%} max of the GP's standard deviation; its "
+        f"standard deviation deviates by {np.abs(std).max():.2%} max."
     )
 
 
 def exact(posterior: ExactPosterior, queries: Array) -> Ask:
-    """The exact posterior, one query with standard deviation."""
+    """Return a function that asks the exact posterior one query with standard deviation."""
     motions = [Motion(*(part[None].copy() for part in query)) for query in queries]
 
     def ask(number: int) -> object:
@@ -77,7 +77,7 @@ def exact(posterior: ExactPosterior, queries: Array) -> Ask:
 
 
 class GPyTorch:
-    """Exact GPs of GPyTorch on the same samples; see GPYTORCH_SAID."""
+    """Exact GPs of GPyTorch on the same samples; see GPYTORCH_NOTE."""
 
     def __init__(self, samples: Samples, noise_std: Array) -> None:
         import gpytorch  # noqa: PLC0415 - of the extra `bench`
@@ -86,7 +86,7 @@ class GPyTorch:
         inputs, targets = _inputs(samples.motion()), torch.from_numpy(np.ascontiguousarray(samples.tau.T))
         n = samples.n_joints
         variance = torch.from_numpy(noise_std)[:, None] ** 2
-        above = gpytorch.constraints.GreaterThan(0.5 * float(variance.min()))  # small joints have less than its 1e-4
+        above = gpytorch.constraints.GreaterThan(0.5 * float(variance.min()))  # some joints have less than 1e-4
         likelihood = gpytorch.likelihoods.GaussianLikelihood(
             noise_constraint=above, batch_shape=torch.Size([n])
         ).double()
@@ -112,7 +112,7 @@ class GPyTorch:
         self.model = model
 
     def ask(self, queries: Array, fast_pred_var: bool) -> Ask:
-        """One query with standard deviation; fast_pred_var caches a low-rank form of the variance (LOVE)."""
+        """Return a function that asks one query with std; `fast_pred_var` caches a low-rank variance (LOVE)."""
         points = [torch.from_numpy(query.reshape(1, -1).copy()) for query in queries]
         settings, model = self._settings, self.model
         n = len(model.train_targets)

@@ -1,4 +1,4 @@
-"""A control loop: one query at every tick of a clock, and which answers come too late."""
+"""A control loop that sends one query at every tick of a clock, and counts late answers."""
 
 from __future__ import annotations
 
@@ -14,16 +14,18 @@ from benchmarks.timing import Ask, Nanoseconds
 RATE = 1000.0
 """Queries a second."""
 DEADLINE_MS = 1.0
-"""An answer later than this after its tick is a miss."""
-_SPIN = 400_000
-"""Nanoseconds before a tick from which on the loop spins: a sleep may end that much late. Spinning all the time makes
-more answers late: the scheduler then lets others run when it suits it, not in the sleep."""
-_LEAD = 5_000_000
+"""Max time from a tick to its answer; a later answer is a miss."""
+_SPIN_NS = 400_000
+"""Time before a tick from which the loop spins, as a sleep may end that late.
+
+Spinning all the time makes more answers late: the scheduler then interrupts the loop at any moment.
+"""
+_LEAD_NS = 5_000_000
 
 
 @dataclass(frozen=True)
 class Loop:
-    """What became of the ticks. Delays in ms, from tick to answer; clusters: runs of misses in a row."""
+    """Figures of a loop. Delays in ms, from tick to answer; clusters: sequences of successive misses."""
 
     ticks: int
     misses: int
@@ -36,22 +38,22 @@ class Loop:
 
     @property
     def share(self) -> float:
-        """Misses a tick."""
+        """Share of ticks that were missed."""
         return self.misses / self.ticks
 
 
 def run_slice(ask: Ask, ticks: int, rate: float = RATE, start: int = 0) -> Nanoseconds:
-    """Ask at every tick of an absolute schedule; return the delays from tick to answer, ns.
+    """Send a query at every tick of an absolute schedule; return the delays from tick to answer, ns.
 
-    A late answer delays the next query, not its tick: whoever is behind catches up, and every late answer counts.
+    A late answer delays the next query, not its tick, so that all answers delayed by one stall count.
     """
     period, clock = round(1e9 / rate), time.perf_counter_ns
     delays = np.empty(ticks, dtype=np.int64)
-    first = clock() + _LEAD
+    first = clock() + _LEAD_NS
     for index in range(ticks):
         tick = first + index * period
-        if (left := tick - clock()) > _SPIN:
-            time.sleep((left - _SPIN) / 1e9)
+        if (left := tick - clock()) > _SPIN_NS:
+            time.sleep((left - _SPIN_NS) / 1e9)
         while clock() < tick:
             pass
         ask(start + index)
@@ -60,7 +62,7 @@ def run_slice(ask: Ask, ticks: int, rate: float = RATE, start: int = 0) -> Nanos
 
 
 def summarise(slices: Sequence[Nanoseconds], shown: int = 3) -> Loop:
-    """Count the misses of all slices; clusters do not reach from one slice into the next."""
+    """Summarise all slices; clusters end with their slice."""
     lengths = [length for part in slices for length in _clusters(part)]
     delays = np.concatenate(slices) / 1e6
     p50, p99, p999 = (float(value) for value in np.percentile(delays, (50, 99, 99.9)))
@@ -77,7 +79,7 @@ def summarise(slices: Sequence[Nanoseconds], shown: int = 3) -> Loop:
 
 
 def excess(asked: Loop, floor: Loop) -> float:
-    """Share of the ticks that are missed beyond the floor's own misses; negative where the floor missed more."""
+    """Return the share of missed ticks minus that of the floor."""
     return asked.share - floor.share
 
 

@@ -1,4 +1,4 @@
-"""Runs of all subjects, interleaved: what disturbs the machine for a while disturbs them all alike."""
+"""Interleaved runs of all subjects, so that a temporary load on the machine affects all of them."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from benchmarks.load import TrainingLoad
 from benchmarks.timing import Nanoseconds, Timing, measure, no_collection
 
 PASSES = 4
-"""Times that a run goes round all subjects, measuring a part of each one's queries."""
+"""Passes over all subjects in a run; each measures a part of every subject's queries."""
 SLICE_SECONDS = 1.0
-"""Length of a slice of the control loop, before the other one has its turn."""
-FEWEST = 2
-"""Calls of a slow subject in a pass."""
+"""Length of a slice of the control loop."""
+MIN_CALLS = 2
+"""Min calls of a slow subject in a pass."""
 
 
 def add_run(
     results: Results, subjects: Sequence[Subject], state: State, queries: int, load: TrainingLoad | None = None
 ) -> None:
-    """Time every subject once more, `queries` queries each, and add the run to the results."""
+    """Time `queries` queries of every subject and add the run to the results."""
     times: dict[str, list[Nanoseconds]] = {subject.key: [] for subject in subjects}
     with no_collection():
         for turn in range(PASSES):
-            # from both ends in turn, so that none always follows the same other
+            # alternate the order, so that no subject always follows the same one
             for subject in subjects if turn % 2 == 0 else reversed(subjects):
-                count = max(FEWEST, round(queries * subject.share / PASSES))
+                count = max(MIN_CALLS, round(queries * subject.share / PASSES))
                 with _under(load):
                     times[subject.key].append(measure(subject.ask, count, turn * count))
     for subject in subjects:
@@ -41,9 +41,9 @@ def add_run(
 def control_loop(
     asked: Subject, floor: Subject, late: Callable[[], int], seconds: float, load: TrainingLoad | None = None
 ) -> LoopPair:
-    """Run the control loop for `seconds` on each of two subjects, slice by slice in turn.
+    """Run the control loop for `seconds` on each of two subjects in alternating slices.
 
-    late: the service's own count of late answers so far.
+    `late` returns the service's own count of late answers.
     """
     slices: dict[str, list[Nanoseconds]] = {asked.key: [], floor.key: []}
     left, before = seconds, late()

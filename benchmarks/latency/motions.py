@@ -1,4 +1,4 @@
-"""How the motion that a model was trained on decides its size, and so how fast it answers."""
+"""Effect of the training motion on the size of a model and its latency."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ QUERIES = 1000
 def compare(
     robot: str, fit: Mapping[str, Any], runs: int, home: Path, console: Console, queries: int = QUERIES
 ) -> list[MotionRow]:
-    """Train a model on each kind of motion in this process and time them in turn; rows as in MOTIONS."""
+    """Train a model on each kind of motion in this process and time all; return rows in the order of MOTIONS."""
     simulator, results = load_robot(robot), Results({}, {}, 0.0, runs, queries)
     found = {name: _train(name, simulator, streams, fit, home, console) for name, streams in MOTIONS.items()}
     asked = [_named(subject, name) for name, workload in found.items() for subject in in_process(workload)]

@@ -1,4 +1,4 @@
-"""What a benchmark found: plain data, written as JSON."""
+"""Results of the latency benchmark: plain data, written as JSON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ STATES: tuple[State, ...] = ("idle", "training")
 
 @dataclass
 class Row:
-    """One subject and its runs; floor: key of the echo that its transport is compared with."""
+    """One subject and its runs; floor: key of the echo of its transport."""
 
     key: str
     label: str
@@ -29,8 +29,9 @@ class Row:
 class LoopPair:
     """The control loop on the model and on the echo, in alternating slices.
 
-    server_late: answers that the service itself counted as late, from the arrival of a query to the departure of its
-    answer; the rest of the late ones waited in the network, for the processor, or in the client.
+    Attributes:
+        server_late: late answers by the service's own count, from arrival of a query to departure of its answer. The
+            other late answers were delayed by network, scheduler or client.
     """
 
     asked: Loop
@@ -40,7 +41,7 @@ class LoopPair:
 
 @dataclass(frozen=True)
 class MotionRow:
-    """How large a model one kind of training motion makes, and how fast it answers in process, p50 in µs a query."""
+    """Size of the model of one kind of training motion, and its latencies in process (p50, µs a query)."""
 
     motion: str
     samples: int
@@ -52,11 +53,14 @@ class MotionRow:
 
 @dataclass
 class Results:
-    """Everything that is printed.
+    """All figures of a benchmark.
 
-    facts: machine and packages; model: what was measured; deviation: the largest from the exact posterior, in standard
-    deviations, as fitted; unseen: the same at the queries, where it was compared; notes: what a reader has to
-    know about single rows.
+    Attributes:
+        facts: machine and packages.
+        model: the measured model.
+        deviation: largest deviation from the exact posterior as fitted, in standard deviations.
+        notes: remarks on single rows.
+        unseen: largest deviation at the queries, if the exact posterior was computed.
     """
 
     facts: dict[str, str]
@@ -71,14 +75,14 @@ class Results:
     unseen: float | None = None
 
     def of(self, key: str, state: State = "idle") -> list[Timing] | None:
-        """Runs of a subject in a state, None where it was not measured."""
+        """Return the runs of a subject in a state; None if it was not measured."""
         row = self.rows.get(key)
         return None if row is None else row.runs.get(state)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON values."""
+        """Return the results as JSON values."""
         return asdict(self)
 
     def write(self, path: Path, targets: list[dict[str, Any]]) -> None:
-        """Write everything, with the targets, as JSON."""
+        """Write the results and the targets as JSON."""
         path.write_text(json.dumps({**self.as_dict(), "targets": targets}, indent=2) + "\n")

@@ -1,4 +1,4 @@
-"""A benchmark from start to end: options in, results out."""
+"""The latency benchmark from options to results."""
 
 from __future__ import annotations
 
@@ -22,15 +22,20 @@ from benchmarks.workload import Bed, Source, open_bed
 
 LOOP = "loop"
 KEYS = (*("mean", "std", "batch"), *transports.KEYS, *("rnea", "exact", "gpytorch", "gpytorch-fast"), LOOP)
-"""What can be measured, by name."""
+"""Names of all subjects."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How much is measured.
+    """Scope of the benchmark.
 
-    runs: of every subject and state; queries: of a run, fewer for what takes long; seconds: of the control loop on the
-    model and on the echo each; training: also while a job runs; only: names out of KEYS, all where empty.
+    Attributes:
+        runs: runs of every subject in every state.
+        queries: queries a run, fewer for slow subjects.
+        seconds: length of the control loop, on the model and on the echo each.
+        training: measure also while a training job runs.
+        motions: compare models of several kinds of motion, too.
+        only: names out of KEYS; empty: all.
     """
 
     source: Source = field(default_factory=Source)
@@ -43,50 +48,50 @@ class Options:
 
     @property
     def states(self) -> list[State]:
-        """The states that are measured."""
+        """The states to measure in."""
         return ["idle", "training"] if self.training else ["idle"]
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.only if name not in KEYS]:
-            raise ValueError(f"--only has {unknown[0]!r}, expected names out of {', '.join(KEYS)}")
+            raise ValueError(f"Unknown name {unknown[0]!r} in --only. Names: {', '.join(KEYS)}.")
 
-    def wanted(self, name: str) -> bool:
-        """Whether a subject, or the echo that a wanted one is compared with, is measured."""
+    def is_wanted(self, name: str) -> bool:
+        """Return whether a subject is measured, by itself or as the floor of another."""
         return not self.only or name in self.only or name in transports.floors(self.only, LOOP)
 
 
 def run(options: Options, console: Console) -> Results:
-    """Measure everything that the options ask for; raise BenchError where a step fails or an answer is wrong."""
+    """Run the benchmark; raise BenchError if a step fails or an answer is wrong."""
     machine = facts.machine()
     with ExitStack() as stack:
         home = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="lipserve-bench-")))
         bed = stack.enter_context(open_bed(home, options.source, console))
         machine["threads of this process"] = stack.enter_context(facts.one_thread())
         manifest = bed.workload.manifest
-        said, deviation = facts.model(manifest, _said(options)), facts.deviation(manifest)
-        results = Results(machine, said, deviation, options.runs, options.queries)
+        model, deviation = facts.model(manifest, _describe_source(options)), facts.deviation(manifest)
+        results = Results(machine, model, deviation, options.runs, options.queries)
         load = TrainingLoad(bed, options.source.load)
         stack.callback(load.stop)
         asked = _subjects(bed, options, results, stack)
         _runs(bed, asked, load, options, results, console)
-        if options.wanted(LOOP) and options.seconds > 0:
+        if options.is_wanted(LOOP) and options.seconds > 0:
             _loop(bed, asked, load, options, results, console, stack)
         results.rows = {key: results.rows[key] for key in KEYS if key in results.rows}
-        results.notes += load.said()
+        results.notes += load.notes()
         if options.motions:
-            console.print("training on four kinds of motion")
+            console.print("training models of four kinds of motion")
             results.motions = motions.compare(options.source.robot, options.source.fit, options.runs, home, console)
     return results
 
 
 def _subjects(bed: Bed, options: Options, results: Results, stack: ExitStack) -> list[Subject]:
-    """Everything that is asked, each answer checked once; connections stay open as long as `stack`."""
-    found = subjects.in_process(bed.workload) + transports.open_all(bed, options.wanted, stack)
-    compared, notes, results.unseen = subjects.compared(bed.workload, options.wanted)
-    chosen = [subject for subject in [*found, *compared] if options.wanted(subject.key)]
+    """Return all wanted subjects, their answers checked; `stack` closes their connections."""
+    found = subjects.in_process(bed.workload) + transports.open_all(bed, options.is_wanted, stack)
+    baselines, notes, results.unseen = subjects.make_baselines(bed.workload, options.is_wanted)
+    chosen = [subject for subject in [*found, *baselines] if options.is_wanted(subject.key)]
     for subject in chosen:
         subject.check(bed.workload)
-    results.notes += [transports.SAID, *notes]
+    results.notes += [transports.NOTE, *notes]
     return chosen
 
 
@@ -125,12 +130,12 @@ def _loop(
 
 
 def _note_usage(results: Results, usage: dict[str, Usage]) -> None:
-    """Who else used the machine; figures taken beside a busy neighbour are to be seen as such."""
-    if processor.KNOWN:
-        results.facts |= {f"taken during {name}": str(used) for name, used in usage.items()}
+    """Add processor time used by others to the facts."""
+    if processor.IS_AVAILABLE:
+        results.facts |= {f"processor during {name}": str(used) for name, used in usage.items()}
 
 
-def _said(options: Options) -> str:
+def _describe_source(options: Options) -> str:
     source = options.source
     if source.folder is not None:
         return str(source.folder)

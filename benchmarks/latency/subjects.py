@@ -1,4 +1,4 @@
-"""What is timed in this process: the model as a controller would hold it, and what it is compared with."""
+"""Subjects timed in this process: the model and the baselines."""
 
 from __future__ import annotations
 
@@ -14,18 +14,22 @@ from lipcore.data.samples import Array
 
 BATCH = 1000
 """Queries of a batch."""
-CHECKED = 5
-"""Queries whose answers are compared with the model's own before anything is timed."""
+CHECKED_QUERIES = 5
+"""Queries whose answers are compared with the model's own before the timing."""
 TOLERANCE = 1e-6
-"""Relative and in N·m: service and bench each rebuild the posterior, and rounding differs with BLAS threads."""
+"""Relative, and in N·m: service and benchmark rebuild the posterior; rounding differs with BLAS threads."""
 
 
 @dataclass(frozen=True)
 class Subject:
-    """One way to ask.
+    """One measured way to get answers.
 
-    ask: asks query number k; queries: answered by one call; share: how many of the queries of a run it is asked, for
-    what takes long; floor: key of the echo of its transport; answer: mean and std of query k, to be checked.
+    Attributes:
+        ask: sends query number k.
+        queries: queries answered by one call.
+        share: share of a run's queries to send; below 1 for slow subjects.
+        floor: key of the echo of its transport.
+        answer: returns mean and std of query k, to be checked.
     """
 
     key: str
@@ -37,10 +41,10 @@ class Subject:
     answer: Callable[[int], tuple[Array, Array | None]] | None = None
 
     def check(self, workload: Workload) -> None:
-        """Compare its answers with the model's own; raise BenchError where they differ."""
+        """Compare the answers with the model's own; raise BenchError if they differ."""
         if self.answer is None:
             return
-        for number in range(CHECKED):
+        for number in range(CHECKED_QUERIES):
             expected = workload.model.answer(workload.queries[number])
             for name, found, wanted in zip(("tau", "tau_std"), self.answer(number), expected, strict=True):
                 if found is None or wanted is None:
@@ -50,7 +54,7 @@ class Subject:
 
 
 def in_process(workload: Workload) -> list[Subject]:
-    """The model itself: one query with and without standard deviation, and a batch."""
+    """Return the model itself as subjects: one query with and without standard deviation, and a batch."""
     model, queries = workload.model, list(workload.queries)
     count = len(queries)
     answer = model.answer
@@ -75,35 +79,36 @@ def in_process(workload: Workload) -> list[Subject]:
     ]
 
 
-def compared(workload: Workload, wanted: Callable[[str], bool]) -> tuple[list[Subject], list[str], float | None]:
-    """The baselines that are wanted and can be had, and notes: what they are, or why one is left out.
+def make_baselines(workload: Workload, wanted: Callable[[str], bool]) -> tuple[list[Subject], list[str], float | None]:
+    """Return the wanted baselines, notes about them, and the model's deviation.
 
-    Last, the model's largest deviation from the exact posterior at the queries, in standard deviations, if compared.
+    The deviation is the largest one from the exact posterior at the queries, in standard deviations; None if the exact
+    posterior is not a baseline.
     """
     found, notes, largest = [], [], None
     robot, samples = workload.robot, workload.samples
     if wanted("rnea"):
         if robot is None:
-            notes.append("Pinocchio RNEA left out: no robot of the simulator has the joints of this model")
+            notes.append("Pinocchio RNEA omitted: no simulated robot has the joints of this model.")
         else:
             found.append(Subject("rnea", "Pinocchio RNEA", baselines.rnea(robot, workload.queries)))
     if samples is None:
         if any(map(wanted, ("exact", "gpytorch", "gpytorch-fast"))):
-            notes.append("exact GP and GPyTorch left out: the samples of an existing model are not at hand")
+            notes.append("Exact GP and GPyTorch omitted: the training samples of an existing model are not available.")
         return found, notes, largest
     if wanted("exact"):
         posterior = baselines.exact_posterior(workload)
         ask = baselines.exact(posterior, workload.queries)
         found.append(Subject("exact", f"exact GP, {len(posterior.motion)} samples, std", ask, share=0.04))
-        largest, said = baselines.deviation(workload, posterior)
-        notes.append(said)
+        largest, note = baselines.deviation(workload, posterior)
+        notes.append(note)
     if wanted("gpytorch") or wanted("gpytorch-fast"):
         if baselines.gpytorch_installed():
             model = baselines.GPyTorch(samples, workload.model.noise_std)
             plain, fast = (model.ask(workload.queries, fast_pred_var=each) for each in (False, True))
             found.append(Subject("gpytorch", "GPyTorch exact GPs, std", plain, share=0.005))
             found.append(Subject("gpytorch-fast", "GPyTorch, fast_pred_var", fast, share=0.02))
-            notes.append(baselines.GPYTORCH_SAID)
+            notes.append(baselines.GPYTORCH_NOTE)
         else:
-            notes.append("GPyTorch left out: not installed (pip install 'lipserve[bench]')")
+            notes.append("GPyTorch omitted: not installed (pip install 'lipserve[bench]').")
     return found, notes, largest

@@ -1,4 +1,4 @@
-"""Results as tables: for a terminal, for a pipe and as Markdown."""
+"""Tables of results for a terminal, a pipe and Markdown."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ WHEN: dict[State, str] = {"idle": "idle", "training": "while a training job runs
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of texts; every column but the first is aligned to the right unless `texts` says so."""
+    """A table of texts; with `texts`, all columns are aligned to the left, else the first only."""
 
     title: str
     columns: tuple[str, ...]
@@ -32,7 +32,7 @@ class Grid:
     texts: bool = False
 
     def rich(self) -> Table:
-        """For a terminal."""
+        """Return the table for a terminal."""
         table = Table(
             title=self.title, title_justify="left", box=SIMPLE_HEAD, show_header=any(self.columns), padding=(0, 1, 0, 0)
         )
@@ -44,14 +44,14 @@ class Grid:
         return table
 
     def markdown(self) -> str:
-        """As a Markdown table below its title."""
+        """Return title and table as Markdown."""
         rule = ["---"] + ["---" if self.texts else "---:"] * (len(self.columns) - 1)
         lines = [_cells(self.columns), _cells(rule), *map(_cells, self.rows)]
         return f"**{self.title}**\n\n" + "\n".join(lines)
 
 
 def grids(results: Results) -> list[Grid]:
-    """Every table of the results, in order; those without rows are left out."""
+    """Return all tables with rows, in order."""
     states: list[State] = [state for state in WHEN if any(row.runs.get(state) for row in results.rows.values())]
     found = [
         Grid("machine", ("", ""), list(results.facts.items()), texts=True),
@@ -59,13 +59,13 @@ def grids(results: Results) -> list[Grid]:
         *(latencies(results, state) for state in states),
         loops(results),
         motions(results),
-        promises(targets(results)),
+        targets_grid(targets(results)),
     ]
     return [grid for grid in found if grid.rows]
 
 
 def latencies(results: Results, state: State) -> Grid:
-    """Percentiles and throughput of every subject in one state."""
+    """Return percentiles and throughput of every subject in one state."""
     columns = ["µs a query", "p50", "p90", "p99", "p99.9", "largest", "queries/s", "above floor"]
     if state != "idle":
         columns += ["p50/idle", "p99/idle"]
@@ -85,18 +85,18 @@ def latencies(results: Results, state: State) -> Grid:
             idle = row.runs.get("idle")
             cells += [_ratio(paired(runs, idle, figure, figure)) for figure in (p50, p99)]
         rows.append(tuple(cells))
-    title = f"{WHEN[state]}: medians of {results.runs} runs, the largest of all; above floor: p50 less that of the echo"
+    title = f"{WHEN[state]}: medians of {results.runs} runs, largest of all; above floor: p50 minus the echo's p50"
     return Grid(title, tuple(columns), rows)
 
 
 def loops(results: Results) -> Grid:
-    """Late answers of the control loop, on the model and on the echo."""
+    """Return late answers of the control loop, on the model and on the echo."""
     columns = (
         "1 kHz WebSocket loop",
         "ticks",
         "late",
         "late %",
-        "in a row",
+        "longest run",
         "p50 ms",
         "p99 ms",
         "p99.9 ms",
@@ -113,9 +113,9 @@ def loops(results: Results) -> Grid:
 
 
 def motions(results: Results) -> Grid:
-    """How the training motion decides the size of the model and so the time of an answer."""
+    """Return size and latency of the models of several training motions."""
     columns = (
-        *("trained on", "samples", "inducing outputs", "at samples", "mean off by", "std off by"),
+        *("trained on", "samples", "inducing outputs", "inducing samples", "mean error max", "std error max"),
         *("mean only µs", "with std µs", "batch µs"),
     )
     rows = []
@@ -124,18 +124,18 @@ def motions(results: Results) -> Grid:
         off = [_percent(row.compact.get(name)) for name in ("mean_max", "std_max")]
         times = [_time(value) for value in (row.mean, row.std, row.batch)]
         rows.append((row.motion, str(row.samples), *sizes, *off, *times))
-    return Grid("how the motion decides: p50 in process, idle", columns, rows)
+    return Grid("training motions: p50 in process, idle", columns, rows)
 
 
-def promises(found: Sequence[Target], heading: str = "medians over runs") -> Grid:
-    """What was promised and what was measured; heading: of the column of names."""
+def targets_grid(found: Sequence[Target], heading: str = "medians over runs") -> Grid:
+    """Return targets and measured values; heading: of the column of names."""
     verdicts = {True: "met", False: "NOT met", None: ""}
     rows = []
     for each in found:
         measured = "not measured" if each.value is None else f"{_figure(each.value)} {each.unit}"
         limit = "" if each.limit is None else f"{each.sense} {each.limit:g} {each.unit}"
         rows.append((each.name, limit, measured, verdicts[each.met]))
-    return Grid("promised and measured", (heading, "promised", "measured", ""), rows)
+    return Grid("targets", (heading, "target", "measured", ""), rows)
 
 
 def show(results: Results, console: Console) -> None:
@@ -153,12 +153,12 @@ def show_grids(found: Sequence[Grid], notes: Sequence[str], console: Console) ->
 
 
 def markdown(results: Results) -> str:
-    """All tables and notes as Markdown."""
+    """Return all tables and notes as Markdown."""
     return grids_markdown(grids(results), results.notes)
 
 
 def grids_markdown(found: Sequence[Grid], notes: Sequence[str]) -> str:
-    """Tables and notes as Markdown."""
+    """Return tables and notes as Markdown."""
     listed = "\n".join(f"- {note}" for note in notes)
     return "\n\n".join([*(grid.markdown() for grid in found), *([listed] if listed else [])]) + "\n"
 

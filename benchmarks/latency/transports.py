@@ -1,4 +1,4 @@
-"""The ways to ask a running service, and an echo of each kind of connection: what the transport costs by itself."""
+"""All transports of a running service, and an echo of each kind of connection as the floor of its cost."""
 
 from __future__ import annotations
 
@@ -41,23 +41,23 @@ KEYS = (*_LABELS, *_ECHOES)
 _TENSORS = ("q", "dq", "ddq")
 _OUTPUTS = ("tau", "tau_std")
 _STREAM = f"/v1/models/{MODEL}/stream"
-SAID = (
-    "over sockets the client is as lean as Python allows: one connection, requests encoded beforehand, answers read "
-    "but not decoded; the echoes send back a body as long as query and answer are on average (for /v2 that of HTTP "
-    "JSON). StreamClient is the package's own client, which encodes and decodes"
+NOTE = (
+    "Over sockets, a minimal client keeps one connection, sends prepared requests, and reads answers without decoding "
+    "them. An echo returns a body of the mean size of query and answer (for /v2 and gRPC: of HTTP JSON). StreamClient "
+    "is the package's own client, which encodes and decodes."
 )
 
 Answer = tuple[Array, Array | None]
 
 
 def floors(names: Iterable[str], loop: str) -> set[str]:
-    """What has to be asked besides the named subjects: their echoes; for the control loop, the stream and its echo."""
+    """Return what the named subjects need besides themselves: echoes; for the control loop, stream and echo."""
     needed = {_FLOORS[name] for name in names if name in _FLOORS}
     return needed | ({"ws", "echo-ws"} if loop in names else set())
 
 
 def open_all(bed: Bed, wanted: Callable[[str], bool], stack: ExitStack) -> list[Subject]:
-    """Open a connection for everything wanted; `stack` closes them. Each echo follows what it is the floor of."""
+    """Open a connection for every wanted subject, each followed by its echo; `stack` closes them."""
     found = []
     for suffix, address in (("", bed.tcp), ("-unix", bed.unix)):
         if wanted(f"ws{suffix}") or wanted(f"echo-ws{suffix}"):
@@ -73,7 +73,11 @@ def open_all(bed: Bed, wanted: Callable[[str], bool], stack: ExitStack) -> list[
 
 
 def open_loop(bed: Bed, deadline: float, stack: ExitStack) -> tuple[Subject, Callable[[], int]]:
-    """Open a stream for the control loop, deadline in s; also return what tells the service's count of late answers."""
+    """Open a stream for the control loop; deadline in s.
+
+    Returns:
+        The subject, and a function that returns the service's count of late answers.
+    """
     stream = stack.enter_context(WebSocket(bed.tcp, _STREAM))
     frames = [request_frame(motion, deadline=deadline) for motion in bed.workload.queries]
     late = 0
@@ -149,7 +153,7 @@ def _v2(bed: Bed, key: str, stack: ExitStack) -> Subject:
 
 
 def _infer(motion: Array, binary: bool) -> bytes:
-    """An inference request for one motion."""
+    """Return an inference request for one motion."""
     inputs: list[dict[str, Any]] = []
     for tensor, values in zip(_TENSORS, motion, strict=True):
         content = {"parameters": {"binary_data_size": values.nbytes}} if binary else {"data": values.tolist()}
@@ -164,7 +168,7 @@ def _infer(motion: Array, binary: bool) -> bytes:
 
 
 def _grpc(address: tuple[str, int], bed: Bed, stack: ExitStack) -> Subject:
-    import grpc  # noqa: PLC0415 - of an extra, as what follows
+    import grpc  # noqa: PLC0415 - of an extra, like the modules below
 
     from service.api.oip.rpc.definition import SERVICE  # noqa: PLC0415
     from service.api.oip.rpc.messages import InferRequest, InferResponse  # noqa: PLC0415

@@ -1,6 +1,6 @@
-"""A lean WebSocket client of torque streams: frames built beforehand, one read an answer.
+"""Minimal WebSocket client of torque streams: prepared frames, one read an answer.
 
-The package's own `StreamClient` is timed beside it: it builds frames and decodes answers, and reads in a thread.
+The package's own `StreamClient` builds frames, decodes answers and reads in a thread; it is timed separately.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from lipserve.frames import ANSWER, ASK_STD, ERROR, HAS_STD, NUMBER, REQUEST
 _BINARY, _TEXT, _CLOSE, _PING, _PONG = 2, 1, 8, 9, 10
 _FINAL, _MASKED = 0x80, 0x80
 _NO_MASK = bytes(4)
-"""Clients must mask what they send; a mask of zeros leaves it as it is, and costs the service as much as any other."""
+"""Clients must mask their frames; a mask of zeros changes nothing, and costs the service as much as any other."""
 
 
 def request_frame(motion: Array, std: bool = True, deadline: float = 0.0, sequence: int = 0) -> bytes:
-    """A query of one motion, (3, n), as it is sent; deadline in s, 0 for none."""
+    """Return the frame of one motion, (3, n); deadline in s, 0: none."""
     header = REQUEST.pack(sequence, ASK_STD if std else 0, motion.shape[1], deadline)
     return frame(header + np.ascontiguousarray(motion, NUMBER).tobytes())
 
 
 def read_answer(data: bytes) -> tuple[Array, Array | None, int]:
-    """Torque, its standard deviation where it is there, and how many answers of the connection were late."""
+    """Return torque, its standard deviation if present, and the connection's count of late answers."""
     _, flags, n, _, late, _, _ = ANSWER.unpack_from(data)
     if flags & ERROR:
         raise BadAnswerError(data[ANSWER.size :].decode(errors="replace"))
@@ -36,21 +36,21 @@ def read_answer(data: bytes) -> tuple[Array, Array | None, int]:
 
 
 def frame(payload: bytes, opcode: int = _BINARY) -> bytes:
-    """One message as a client sends it."""
+    """Return one message as a client's frame."""
     size = len(payload)
     if size < 126:
         head = bytes((_FINAL | opcode, _MASKED | size))
     elif size < 1 << 16:
         head = bytes((_FINAL | opcode, _MASKED | 126)) + size.to_bytes(2, "big")
     else:
-        raise ValueError(f"the message has {size} bytes, expected at most {(1 << 16) - 1}")
+        raise ValueError(f"The message has {size} bytes; at most {(1 << 16) - 1} are allowed.")
     return head + _NO_MASK + payload
 
 
 class WebSocket(Connection):
-    """Sends one message at a time and waits for the binary one that answers it.
+    """A client that sends one message at a time and waits for the binary answer.
 
-    While nobody asks, nobody answers the service's pings either; it then closes the connection, which is opened again.
+    Pings are answered only during a call. The service closes an idle connection; the next call reconnects.
     """
 
     def __init__(self, address: Address, path: str) -> None:
@@ -93,9 +93,9 @@ class WebSocket(Connection):
             if opcode == _PING:
                 self._socket.sendall(frame(payload, _PONG))
             elif opcode == _CLOSE:
-                raise GoneError(f"the service closed the stream: {payload[2:].decode(errors='replace')}")
-            elif opcode != _TEXT:  # what holds for all answers of a version; nothing here needs it
-                raise BadAnswerError(f"the service sent a frame with opcode {opcode}")
+                raise GoneError(f"The service closed the stream: {payload[2:].decode(errors='replace')}")
+            elif opcode != _TEXT:  # texts describe a version; nothing here needs them
+                raise BadAnswerError(f"The service sent a frame with opcode {opcode}.")
 
     def _next(self) -> tuple[int, bytes]:
         data = self._left or self._more()
@@ -107,7 +107,7 @@ class WebSocket(Connection):
                 data += self._more()
             size, start = int.from_bytes(data[2:4], "big"), 4
         elif size == 127:
-            raise BadAnswerError("the service sent a frame of 64 KiB or more")
+            raise BadAnswerError("The service sent a frame of 64 KiB or more.")
         end = start + size
         while len(data) < end:
             data += self._more()

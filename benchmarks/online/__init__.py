@@ -1,1 +1,1 @@
-"""Learning while serving: under load, over a change, and over kills."""
+"""Benchmarks of online learning: throughput, changes of the robot, payloads, and durability."""

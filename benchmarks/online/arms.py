@@ -1,4 +1,4 @@
-"""Arms that take something up and put it down: their motion, simulated, and models of them."""
+"""Simulated arms that pick up and release payloads, and models of them."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ from lipcore.robots.urdf import RigidBody
 Kind = Literal["clean", "dirty", "dirty+urdf"]
 KINDS: tuple[Kind, ...] = ("clean", "dirty", "dirty+urdf")
 RATE, NOISE = 100.0, 0.05
-"""Hz of the streams; N·m of the clean simulator's torque."""
+"""Rate of the streams, Hz, and noise of a clean arm's torque, N·m."""
 MASSES: tuple[float, ...] = (0.3, 1.0, 3.0)
 PLACES = {"centred": (0.0, 0.0, 0.1), "off-centre": (0.05, 0.03, 0.08)}
-"""Where the payload is in the frame of the last link, m."""
+"""Position of the payload in the frame of the last link, m."""
 SPEEDS = {"slow": 1.0, "fast": 5.0}
 SECONDS, UP, DOWN = 10.0, 3.0, 7.0
-"""Of a stream; when its payload is taken up, and put down."""
-SIMULATED = 30.0
-"""s of motion, of which the last are taken: a short motion is stretched over the joints' whole range, and violent."""
+"""Length of a stream; times of pick-up and release, s."""
+SIMULATED_S = 30.0
+"""Min simulated motion, of which the end is used; a shorter motion would span the joints' range too fast."""
 EDGE_S = 1.0
-"""s that are left out at the end, and of quiet motion at the beginning: filters without delay see nothing beyond it."""
+"""Time omitted at the end, and at the start of motion without payload, where filters without delay lack data."""
 UNSEEN_S, UNSEEN_EVERY = 20.0, 10
-"""s of the motion that is asked for, and of how many of its rows one is."""
+"""Length of the test motion, and distance of its rows."""
 TRAINED_S = 60.0
-"""s of motion that a model of a dirty arm is trained on."""
+"""Training motion of a dirty arm."""
 _SEEDS = 1000
-"""Between what is drawn of one seed and of the next."""
+"""Distance between the random seeds of two successive seeds."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """Who takes up what, and how it moves. number: of the case, which its motion is drawn by."""
+    """An arm, its payload and its speed; number: seed of the motion."""
 
     robot: str
     kind: Kind
@@ -52,7 +52,7 @@ class Case:
 
     @property
     def payload(self) -> Payload:
-        """What is carried, from the start on."""
+        """The payload, carried from time 0."""
         return Payload(self.mass, 0.0, PLACES[self.place])
 
 
@@ -66,16 +66,16 @@ class Arm:
 
     @cached_property
     def robot(self) -> Robot:
-        """Its bodies and joints."""
+        """Bodies and joints."""
         return load_robot(self.name)
 
     @property
     def dirt(self) -> Dirt | None:
-        """Of a dirty one."""
+        """Dirt; None for a clean arm."""
         return None if self.kind == "clean" else Dirt(seed=self.seed)
 
     def trained(self) -> TorqueModel:
-        """A model of rigid bodies, learnt from torque alone or, for `dirty+urdf`, calibrated around the URDF."""
+        """Train a `rigid-body` model from torque alone or, for `dirty+urdf`, calibrated around the URDF."""
         robot, seed = self.robot, _SEEDS * self.seed
         if (dirt := self.dirt) is None:
             samples = simulate(robot, Simulation(speed=FAST_SPEED, noise=NOISE, motion="full"), seed)
@@ -88,8 +88,8 @@ class Arm:
         return lipcore.train(samples, robot.joint_types, "rigid-body", options, robot=body)
 
     def moving(self, seconds: float, speed: float, part: int, payload: Payload | None, noise: float = NOISE) -> Samples:
-        """The last so many seconds of a motion, at RATE, from time 0 on. payload: carried all the time."""
-        end = round(max(SIMULATED, seconds) * RATE)
+        """Return the last `seconds` of a motion with this payload all the time, at RATE from time 0."""
+        end = round(max(SIMULATED_S, seconds) * RATE)
         dirt = self.dirt
         count, noise = end + round(EDGE_S * RATE), noise if dirt is None else 0.0
         stream = Simulation(count, RATE, speed=speed, noise=noise, payload=payload, dirt=dirt)
@@ -98,16 +98,16 @@ class Arm:
         return replace(last, t=last.t - last.t[0])
 
     def live(self, case: Case) -> Samples:
-        """The stream of a case: the same motion with its payload from UP to DOWN, and else without."""
+        """Return the stream of a case, with the payload from UP to DOWN."""
         speed = SPEEDS[case.speed]
         free, loaded = (self.moving(SECONDS, speed, case.number, each) for each in (None, case.payload))
         carries = (free.t >= UP - 0.5 / RATE) & (free.t < DOWN - 0.5 / RATE)
         return replace(free, tau=np.where(carries[:, None], loaded.tau, free.tau))
 
     def unseen(self, case: Case, carries: bool) -> tuple[Samples, Array]:
-        """Another motion with or without the payload, and its torque as measured, (N, n).
+        """Return another motion with or without the payload, and its measured torque, (N, n).
 
-        The samples' torque has no noise on the clean arm, and is the measured one of a dirty arm.
+        The torque of the samples has no noise for a clean arm, and is the measured torque for a dirty one.
         """
         payload = case.payload if carries else None
         speed, part = SPEEDS[case.speed], _SEEDS // 2 + case.number
@@ -119,6 +119,6 @@ class Arm:
 
 
 def cases(robot: str, kind: Kind) -> list[Case]:
-    """All that one arm is tried with."""
+    """Return all cases of one arm."""
     every = [(mass, place, speed) for speed in SPEEDS for mass in MASSES for place in PLACES]
     return [Case(robot, kind, *each, number) for number, each in enumerate(every, start=1)]

@@ -1,4 +1,4 @@
-"""A control loop in a process of its own that asks for torques while others teach the model."""
+"""A control loop in a separate process that requests torques while the model learns."""
 
 from __future__ import annotations
 
@@ -19,19 +19,22 @@ from lipserve.frames import ANSWER, ERROR, request_bytes
 
 RATE = 500.0
 ECHO_EVERY = 5
-"""After so many answers an echo as long is asked for: what transport and machine cost by themselves."""
-_LOOK_EVERY = 25
+"""Answers between two echoes of the same size, which measure the cost of transport and machine."""
+_POLL_EVERY = 25
 _WARM_UP = 50
-_SPIN = 400_000
-_PATIENCE = 60.0
+_SPIN_NS = 400_000
+_START_TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What a loop saw. Times in µs.
+    """Figures of a loop, times in µs.
 
-    answers: from sending to the answer; ticks: from the tick of the loop's clock to the answer; echo: of the floor;
-    revisions: when (`time.monotonic_ns`) the first answer of each revision came.
+    Attributes:
+        answers: time from query to answer.
+        ticks: time from the tick of the loop's clock to the answer.
+        echo: time of an echo.
+        revisions: time (`time.monotonic_ns`) of the first answer of each revision, and the revision.
     """
 
     answers: Timing
@@ -41,7 +44,7 @@ class Asked:
 
 
 class Asker:
-    """Runs the loop while it is entered; `finish` ends it and tells what it saw."""
+    """A context manager that runs the loop; `finish` ends it and returns its figures."""
 
     def __init__(self, address: Address, model: str, motions: Array, rate: float = RATE) -> None:
         context = multiprocessing.get_context("spawn")
@@ -50,13 +53,13 @@ class Asker:
 
     def __enter__(self) -> Self:
         self._process.start()
-        if not self._connection.poll(_PATIENCE):
-            raise TimeoutError(f"the asking process was not ready after {_PATIENCE:g} s")
+        if not self._connection.poll(_START_TIMEOUT_S):
+            raise TimeoutError(f"The process of the control loop was not ready after {_START_TIMEOUT_S:g} s.")
         self._connection.recv()
         return self
 
     def finish(self) -> Asked:
-        """End the loop; raise EOFError where its process has ended by itself."""
+        """End the loop and return its figures; raise EOFError if its process has ended."""
         self._connection.send(None)
         asked: Asked = self._connection.recv()
         return asked
@@ -70,7 +73,7 @@ class Asker:
 
 
 def _loop(connection: Connection, address: Address, model: str, motions: Array, rate: float) -> None:
-    """Ask at every tick of an absolute schedule until the other side says something."""
+    """Send a query at every tick of an absolute schedule until a message arrives on the connection."""
     frames = [request_frame(motion) for motion in motions]
     period, clock, count = round(1e9 / rate), time.monotonic_ns, len(frames)
     answers: list[int] = []
@@ -89,10 +92,10 @@ def _loop(connection: Connection, address: Address, model: str, motions: Array, 
             echo.ask(echoed)
         connection.send(None)
         first, index = clock() + period, 0
-        while index < ECHO_EVERY or index % _LOOK_EVERY or not connection.poll():
+        while index < ECHO_EVERY or index % _POLL_EVERY or not connection.poll():
             tick = first + index * period
-            if (left := tick - clock()) > _SPIN:
-                time.sleep((left - _SPIN) / 1e9)
+            if (left := tick - clock()) > _SPIN_NS:
+                time.sleep((left - _SPIN_NS) / 1e9)
             while clock() < tick:
                 pass
             sent = clock()

@@ -1,4 +1,4 @@
-"""A model trained on earlier motion, and a service of its own that serves and teaches copies of it."""
+"""A service of the benchmark that serves copies of a trained model."""
 
 from __future__ import annotations
 
@@ -26,41 +26,42 @@ from service.storage.database import Database
 from service.storage.files import Files, new_id
 
 CAUGHT_UP_SECONDS = 300.0
-"""Longest wait until all that was acknowledged is learnt."""
-_POLL = 0.02
+"""Max wait until all acknowledged batches are learnt."""
+_POLL_S = 0.02
 
 
 @dataclass(frozen=True)
 class Bed:
-    """A running service. pid: of its process."""
+    """A running service, its address and its process id."""
 
     tcp: tuple[str, int]
     pid: int
     client: Client
 
     def wait_learnt(self, model: str, motion: Array, revision: int, seconds: float = CAUGHT_UP_SECONDS) -> int:
-        """Wait until answers contain a revision; return when (`time.monotonic_ns`). Raise BenchError after `seconds`.
+        """Wait until answers to a motion, (3, n), have a revision; return the time (`time.monotonic_ns`).
 
-        motion: (3, n), what is asked.
+        Raises:
+            BenchError: The revision did not come within `seconds`.
         """
         end = time.monotonic() + seconds
         with HttpClient(self.tcp) as client:
             request = _query(model, motion)
             while (found := json.loads(client.ask(request))["revision"]) < revision:
                 if time.monotonic() > end:
-                    raise BenchError(f"model {model} has revision {found} after {seconds:g} s, expected {revision}")
-                time.sleep(_POLL)
+                    raise BenchError(f"Model {model} has revision {found} after {seconds:g} s, expected {revision}.")
+                time.sleep(_POLL_S)
             return time.monotonic_ns()
 
     def predict(self, model: str, samples: Samples) -> tuple[Array, Array, Array, int]:
-        """Torque and its standard deviation, (N, n), noise's (n,), and the revision that answered."""
+        """Return torque and its standard deviation, (N, n), the noise's, (n,), and the revision."""
         answer = self.client.predict(model, samples.q, samples.dq, samples.ddq)
         tau, std, noise = (np.array(each) for each in (answer.tau, answer.tau_std, answer.noise_std))
         return tau, std, noise, answer.revision
 
 
 def install(home: Path, folder: Path, models: Mapping[str, LearningOptions], n_joints: int) -> None:
-    """Publish copies of a saved model, by name and with their options of learning, where no service runs yet."""
+    """Publish copies of a saved model with these names and learning options in a home that no service uses yet."""
     database, files = Database(home), Files(home)
     try:
         for model, options in models.items():
@@ -76,7 +77,7 @@ def install(home: Path, folder: Path, models: Mapping[str, LearningOptions], n_j
 
 @contextmanager
 def serving(home: Path, settings: Mapping[str, Any] | None = None) -> Iterator[Bed]:
-    """Serve a home while inside. settings: more of the service's, by name."""
+    """Serve a home with these additional settings."""
     given = {"home": home, "log_level": "warning", "max_loaded_models": 8, **(settings or {})}
     service = ServiceProcess(0, {f"LIPSERVE_{name.upper()}": str(value) for name, value in given.items()})
     try:
@@ -90,7 +91,7 @@ def serving(home: Path, settings: Mapping[str, Any] | None = None) -> Iterator[B
 def train(
     samples: Samples, joint_types: tuple[str, ...], fit: Mapping[str, Any], estimator: str = "lip-chain"
 ) -> tuple[TorqueModel, float]:
-    """Train a model in this process; also return how long it took, s."""
+    """Train a model in this process; return it and the time of the training, s."""
     began = time.monotonic()
     model = lipcore.train(samples, joint_types, estimator, lipcore.FitOptions(**fit))
     return model, time.monotonic() - began

@@ -1,4 +1,4 @@
-"""What a served arm knows of its payload, over its users' path: batches and questions over HTTP, in turn."""
+"""Payload estimates and torques of a served arm that gets observation batches and queries over HTTP."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from lipcore.data.samples import Array, Samples
 
 BATCH, STREAM = 10, "arm"
 AFTER = (0.1, 0.5, 1.0, 3.0)
-"""s after the payload is taken up at which the service is judged."""
+"""Times after the pick-up at which the service is judged, s."""
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A number and its standard deviation."""
+    """An estimate and its standard deviation."""
 
     mean: float
     std: float
 
-    def holds(self, truth: float) -> bool:
-        """Whether the 95 % interval does."""
+    def contains(self, truth: float) -> bool:
+        """Return whether the 95 % interval contains the truth."""
         return abs(self.mean - truth) <= quantile(0.95) * self.std
 
 
@@ -50,8 +50,13 @@ class _Payloads:
 
 @dataclass(frozen=True)
 class Answers:
-    """How good torques of an unseen motion are. nmse, coverage: joint by joint; pooled: squared errors of all joints
-    over the variances of all, which a joint that hardly ever bears any torque does not rule."""
+    """Accuracy of torques on a test motion.
+
+    Attributes:
+        nmse: nMSE of each joint.
+        coverage: coverage of each joint.
+        pooled: squared errors of all joints over the variances of all; a joint with little torque hardly counts.
+    """
 
     nmse: tuple[float, ...]
     coverage: tuple[float, ...]
@@ -64,18 +69,26 @@ class Answers:
 
     @property
     def lowest(self) -> float:
-        """Coverage of the joint that has the lowest."""
+        """Lowest coverage of a joint."""
         return min(self.coverage)
 
 
 @dataclass
 class Outcome:
-    """Of one case. detected: s of event time from the pick-up to the end of the batch after which the service reports a
-    payload, None for never; released: the same of putting it down; early: whether it reported one before; masses,
-    answers: by s after the pick-up, None or missing where nothing is reported; before: answers to the motion with the
-    payload before it is taken up; free: those to the motion without it before that, first: the first after putting it
-    down; states: that the service named meanwhile;
-    acks: s that batches took while something was carried.
+    """Figures of one case.
+
+    Attributes:
+        case: the case.
+        before: answers, before the pick-up, to the motion with payload.
+        free: answers, before the pick-up, to the motion without payload.
+        detected: stream time from the pick-up to the end of the batch that revealed the payload, s; None: never.
+        released: the same after the release.
+        early: whether a payload was reported before the pick-up.
+        masses: reported mass by s after the pick-up; None: nothing was reported.
+        answers: answers to the motion with payload, by s after the pick-up.
+        first: first answers after the release to the motion without payload.
+        states: all states that the service reported.
+        acks: times to acknowledgement while the payload is carried, s.
     """
 
     case: Case
@@ -92,32 +105,31 @@ class Outcome:
 
 
 def judged(exact: Samples, measured: Array, tau: Array, std: Array, noise: Array, scale: Array | float) -> Answers:
-    """nMSE against the samples' torque, and coverage of the measured one."""
+    """Return nMSE against the samples' torque, and coverage of the measured torque."""
     nmse = evaluate(exact.tau, tau, std, noise, scale).nmse
     coverage = evaluate(measured, tau, std, noise, scale).coverage
     pooled = np.mean((exact.tau - tau) ** 2, axis=0).sum() / exact.tau.var(axis=0).sum()
     return Answers(tuple(nmse.tolist()), tuple(coverage.tolist()), float(pooled))
 
 
-def asked(bed: Bed, model: str, unseen: tuple[Samples, Array]) -> Answers:
-    """Ask for an unseen motion, in no stream's name, and judge what is answered."""
+def judge_served(bed: Bed, model: str, unseen: tuple[Samples, Array]) -> Answers:
+    """Judge the answers of the default model to a test motion."""
     exact, measured = unseen
     answer = bed.client.predict(model, exact.q, exact.dq, exact.ddq)
     tau, std, noise = (np.array(each) for each in (answer.tau, answer.tau_std, answer.noise_std))
     return judged(exact, measured, tau, std, noise, 1.0 if answer.scale is None else np.array(answer.scale))
 
 
-def known(client: HttpClient, model: str) -> tuple[str, Figure | None]:
-    """State and mass of the model's only stream, as the service reports them."""
+def read_payload(client: HttpClient, model: str) -> tuple[str, Figure | None]:
+    """Return the reported state and mass of the model's only stream."""
     streams = msgspec.json.decode(client.ask(get(f"/v1/models/{model}/payload")), type=_Payloads).streams
     if not streams:
         return "none", None
     return streams[0].state, None if streams[0].payload is None else streams[0].payload.mass
 
 
-def carried(bed: Bed, model: str, arm: Arm, case: Case) -> Outcome:
-    """Stream a case to a model of its own at its own pace, each batch asked for and then observed; judge the service on
-    the way."""
+def stream_case(bed: Bed, model: str, arm: Arm, case: Case) -> Outcome:
+    """Stream a case to a model in real time, with a query before each batch, and judge the service."""
     samples = arm.live(case)
     loaded, free = (arm.unseen(case, carries) for carries in (True, False))
     moments = {round((UP + after) * RATE): after for after in AFTER}
@@ -129,18 +141,18 @@ def carried(bed: Bed, model: str, arm: Arm, case: Case) -> Outcome:
             batch, now = samples.rows(slice(start, start + BATCH)), start + BATCH
             client.ask(_question(model, batch))
             ack = send(client, batch_request(model, STREAM, number, batch))
-            # payloads are noticed beside the acknowledgement: what is known when the next batch comes, as from a robot
+            # payloads are detected after the acknowledgement: read the estimate when a robot sends the next batch
             time.sleep(max(0.0, began + now / RATE - time.monotonic()))
             if out is not None and out.detected is not None and now not in moments and now < down:
-                out.acks.append(ack.seconds)  # its report takes as long as some batches: only where it is asked for
+                out.acks.append(ack.seconds)  # reading the estimate takes as long as some batches: skip it
                 continue
-            state, mass = known(client, model)
+            state, mass = read_payload(client, model)
             if now <= up:
                 early = early or mass is not None
             if now < up:
                 continue
             if out is None:
-                out = Outcome(case, asked(bed, model, loaded), asked(bed, model, free), early=early)
+                out = Outcome(case, judge_served(bed, model, loaded), judge_served(bed, model, free), early=early)
             if state not in out.states:
                 out.states.append(state)
             if up < now <= down and mass is not None and out.detected is None:
@@ -149,9 +161,9 @@ def carried(bed: Bed, model: str, arm: Arm, case: Case) -> Outcome:
                 out.released = (now - down) / RATE
             if now in moments:
                 out.masses[moments[now]] = mass
-                out.answers[moments[now]] = asked(bed, model, loaded)
+                out.answers[moments[now]] = judge_served(bed, model, loaded)
             if now == down + BATCH:
-                out.first = asked(bed, model, free)
+                out.first = judge_served(bed, model, free)
     assert out is not None
     return out
 

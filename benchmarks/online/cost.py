@@ -1,4 +1,4 @@
-"""What an update costs after few and after many samples: it must not grow."""
+"""Cost of an update after few and after many samples."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 
 CHUNK = 100
-"""Rows that are learnt together and timed: a batch."""
-TIMED, SOLVED = 40, 5
-"""Chunks and solutions that are timed at every size."""
-_LONG = 1000
-"""Rows that are learnt together in between."""
+"""Rows of a timed batch."""
+TIMED_CHUNKS, TIMED_SOLUTIONS = 40, 5
+"""Timed batches and solutions at every size."""
+_UNTIMED_CHUNK = 1000
+"""Rows of a batch in between."""
 
 
 @dataclass(frozen=True)
 class Cost:
-    """After `samples`: µs to learn one more, medians over chunks; ms to solve for a new revision."""
+    """Cost after `samples`: median time to learn another one, µs, and to solve for a new revision, ms."""
 
     samples: int
     learn: float
@@ -31,30 +31,32 @@ class Cost:
 
 
 def update_costs(model: TorqueModel, rows: Rows, sizes: Sequence[int], forgetting_s: float | None) -> list[Cost]:
-    """Learn rows up to each of `sizes`, ascending, then time more of them there; raise ValueError for too few.
+    """Learn rows up to each of the ascending `sizes`, and time further batches there.
 
-    All sizes are timed in turn, chunk by chunk: what else the machine does meanwhile meets all of them alike. Rows are
-    needed for the sizes and the chunks that are timed after the last.
+    All sizes are timed in turn, batch by batch, so that a temporary load on the machine affects all of them.
+
+    Raises:
+        ValueError: There are too few rows for the last size and its timed batches.
     """
-    if len(rows) < sizes[-1] + TIMED * CHUNK:
-        raise ValueError(f"rows has {len(rows)} rows, expected at least {sizes[-1] + TIMED * CHUNK}")
+    if len(rows) < sizes[-1] + TIMED_CHUNKS * CHUNK:
+        raise ValueError(f"At least {sizes[-1] + TIMED_CHUNKS * CHUNK} rows are required; got {len(rows)}.")
     states, at = list[OnlineModel](), 0
     online = OnlineModel.start(model, forgetting_s)
     with no_collection():
         for size in sizes:
-            for part in _chunks(at, size, _LONG):
+            for part in _chunks(at, size, _UNTIMED_CHUNK):
                 online = online.learn(rows.take(part))
             states.append(online)
             at = size
-        learn = [[0.0] * TIMED for _ in sizes]
-        solve = [[0.0] * SOLVED for _ in sizes]
-        for number in range(TIMED):
+        learn = [[0.0] * TIMED_CHUNKS for _ in sizes]
+        solve = [[0.0] * TIMED_SOLUTIONS for _ in sizes]
+        for number in range(TIMED_CHUNKS):
             for index, size in enumerate(sizes):
                 start = size + number * CHUNK
                 chunk, began = rows.take(slice(start, start + CHUNK)), time.perf_counter()
                 states[index] = states[index].learn(chunk)
                 learn[index][number] = (time.perf_counter() - began) / CHUNK
-        for number in range(SOLVED):
+        for number in range(TIMED_SOLUTIONS):
             for index, state in enumerate(states):
                 began = time.perf_counter()
                 state.model()
@@ -64,6 +66,6 @@ def update_costs(model: TorqueModel, rows: Rows, sizes: Sequence[int], forgettin
 
 
 def _chunks(start: int, stop: int, size: int) -> Iterator[slice]:
-    """Slices that cover a range, none where it is empty."""
+    """Yield slices that cover a range."""
     for at in range(start, stop, size):
         yield slice(at, min(at + size, stop))

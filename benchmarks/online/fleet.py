@@ -1,4 +1,4 @@
-"""Robots of one kind that learn apart and put together what they have learnt."""
+"""Merging of the statistics of several robots of one kind."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lipcore.posterior.statistics import Statistics, collect, merge
 
 
 def merged_difference(model: TorqueModel, parts: Sequence[Samples], queries: Motion) -> float:
-    """How far the posterior from merged statistics lies from that of all samples at once.
+    """Return the relative difference between posteriors of merged statistics and of all samples at once.
 
-    The largest difference of mean torque and of its standard deviation at the queries, relative to the largest torque.
+    It is the largest difference of torque or standard deviation at the queries, over the largest torque.
     """
     posterior = model.posterior
     kernel, noise = posterior.kernel, posterior.noise_variance

@@ -1,4 +1,4 @@
-"""How fast rows are acknowledged and learnt, and what that does to who asks meanwhile."""
+"""Throughput of acknowledgements and learning, and latency of answers meanwhile."""
 
 from __future__ import annotations
 
@@ -20,19 +20,24 @@ from lipserve import StreamClient
 
 STREAM = "bench"
 PUSHED_ROWS = 500
-"""Rows of a batch of a stream that is pushed."""
-_COMPRESSED = 0.1
-"""Of the time of a stream that is sent faster than it ran: otherwise its rows would come from the future."""
+"""Rows of a batch that is sent as fast as possible."""
+_TIME_SCALE = 0.1
+"""Factor on the times of such a stream; otherwise its rows would lie in the future."""
 
 
 @dataclass(frozen=True)
 class Flow:
-    """What became of a stream.
+    """Figures of a stream.
 
-    rows, accepted: that came, and that teach; rejected: by code; acknowledged, learnt: rows a second, of `rows` and of
-    `accepted`, over the time until the last acknowledgement, and until answers contained them all; ack: p50, p99 and
-    largest time of a request, ms; lag: the same from an acknowledgement to the first answer that contains its batch, s,
-    None where nobody asked; learner: share of one core that the service's children had.
+    Attributes:
+        rows: rows sent.
+        accepted: rows accepted for learning.
+        rejected: rejected rows by code.
+        acknowledged: `rows` per second until the last acknowledgement.
+        learnt: `accepted` per second until answers contain all of them.
+        ack: p50, p99 and maximum of the time of a request, ms.
+        lag: the same of the time from an acknowledgement to the first answer with its batch, s; None without answers.
+        learner: share of one core that the service's children used.
     """
 
     rows: int
@@ -46,14 +51,14 @@ class Flow:
 
 
 def idle(bed: Bed, model: str, motions: Array, seconds: float) -> Asked:
-    """Ask while nobody teaches."""
+    """Run the loop without learning."""
     with Asker(bed.tcp, model, motions) as asker:
         time.sleep(seconds)
         return asker.finish()
 
 
 def live(bed: Bed, model: str, samples: Samples, motions: Array, websocket: bool = False) -> tuple[Asked, Flow]:
-    """Ask while a stream is learnt in real time. websocket: it comes in frames, one a row, instead of in batches."""
+    """Run the loop while a stream is learnt in real time; websocket: the stream is sent in frames, one a row."""
     period = BATCH_ROWS * float(samples.t[1] - samples.t[0])
     requests = [] if websocket else batch_requests(model, STREAM, samples)
     with Asker(bed.tcp, model, motions) as asker:
@@ -67,14 +72,14 @@ def live(bed: Bed, model: str, samples: Samples, motions: Array, websocket: bool
         share = (processor.seconds_below(bed.pid) - used) / (time.monotonic() - began)
         learnt = bed.wait_learnt(model, motions[0], max(ack.revision for ack in acks))
         asked = asker.finish()
-    # the rows of the first batch had been measured in the period before it was sent
+    # the rows of the first batch were measured in the period before it was sent
     start = acks[0].sent - round(1e9 * period)
     return asked, _flow(acks, start, learnt, share, lags(acks, asked.revisions))
 
 
 def burst(bed: Bed, model: str, samples: Samples, motions: Array) -> tuple[Asked, Flow]:
-    """Ask while a stream is taught as fast as the service acknowledges."""
-    requests = batch_requests(model, STREAM, samples, _COMPRESSED, PUSHED_ROWS)
+    """Run the loop while a stream is sent as fast as the service acknowledges it."""
+    requests = batch_requests(model, STREAM, samples, _TIME_SCALE, PUSHED_ROWS)
     with Asker(bed.tcp, model, motions) as asker, HttpClient(bed.tcp) as client:
         began, used = time.monotonic(), processor.seconds_below(bed.pid)
         acks = send_all(client, requests)
@@ -85,9 +90,10 @@ def burst(bed: Bed, model: str, samples: Samples, motions: Array) -> tuple[Asked
 
 
 def lags(acks: Sequence[Ack], revisions: Sequence[tuple[int, int]]) -> list[float]:
-    """Seconds from each acknowledgement to the first answer that contains the batch; of batches that teach anything.
+    """Return seconds from each acknowledgement to the first answer with the batch.
 
-    revisions: when (ns) each revision was first seen, in order. Batches that no answer contained are left out.
+    `revisions` holds time (ns) and number of each revision's first answer, in order. Batches without accepted rows, and
+    batches in no answer, are omitted.
     """
     numbers, found = [revision for _, revision in revisions], []
     for ack in acks:

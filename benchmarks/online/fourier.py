@@ -1,7 +1,7 @@
-"""The incremental sparse spectrum Gaussian process of Gijsberts and Metta (2013), with forgetting: a baseline.
+"""A baseline: the incremental sparse spectrum Gaussian process of Gijsberts and Metta (2013), with forgetting.
 
-Each joint on its own: the squared exponential kernel in random Fourier features, and weights by recursive least
-squares. The friction features of every estimator here are added, and hyperparameters are those that `se` fits.
+Each joint has its own model: random Fourier features of a squared exponential kernel, lipcore's friction features, and
+weights by recursive least squares. Hyperparameters are those of a fitted `se` estimator.
 """
 
 from __future__ import annotations
@@ -21,12 +21,19 @@ FEATURES = 500
 
 @dataclass(frozen=True)
 class FourierModel:
-    """Torque of joint i: φ_i(x)ᵀ w_i, w_i ~ N(0, I), measured with noise; P features, cosines, sines and friction.
+    """Torque φ_i(x)ᵀ w_i of each joint i, with w_i ~ N(0, I) and P features: cosines, sines and friction.
 
-    frequencies: (n, 3 n, F) drawn from the kernel's spectrum; scales: (n,) of the torque, N·m; friction: (n, 3) prior
-    standard deviations; noise_std: (n,) N·m; a: (n, P, P), Σ γ φ φᵀ / σ² and b: (n, P), Σ γ φ τ / σ² over the rows so
-    far with γ = exp(−age / forgetting_s), ages in s at `time`.
-    The prior is not forgotten, which plain recursive least squares does: it would wind up where nothing excites it.
+    Unlike plain recursive least squares, the prior is not forgotten, as weights without excitation would wind up.
+
+    Attributes:
+        frequencies: draws from the kernel's spectrum, (n, 3 n, F).
+        scales: scales of the torque, (n,), N·m.
+        friction: prior standard deviations of friction, (n, 3).
+        noise_std: (n,), N·m.
+        forgetting_s: time constant of the weights γ = exp(−age / forgetting_s); None: no forgetting.
+        a: Σ γ φ φᵀ / σ² over all rows, (n, P, P).
+        b: Σ γ φ τ / σ² over all rows, (n, P).
+        time: time at which ages are 0, s.
     """
 
     frequencies: Array
@@ -42,7 +49,7 @@ class FourierModel:
     def start(
         cls, fitted: TorqueModel, forgetting_s: float | None, features: int = FEATURES, seed: int = 0
     ) -> FourierModel:
-        """Before any row, with the hyperparameters of a fitted `se` estimator."""
+        """Return the prior with the hyperparameters of a fitted `se` estimator."""
         params, n = fitted.posterior.params, fitted.n_joints
         normal = np.random.default_rng(seed).standard_normal((n, 3 * n, features // 2))
         lengthscales = np.exp(params["se.log_lengthscales"])
@@ -59,7 +66,7 @@ class FourierModel:
         )
 
     def learn(self, rows: Rows) -> FourierModel:
-        """Fold in rows, in the order of their times."""
+        """Return the model after more rows, in the order of their times."""
         now = float(rows.time[-1])
         weight, kept = self._weight(now - rows.time), float(self._weight(np.array(now - self.time)))
         a, b = kept * self.a, kept * self.b
@@ -70,7 +77,7 @@ class FourierModel:
         return replace(self, a=a, b=b, time=now)
 
     def predict(self, q: Array, dq: Array, ddq: Array) -> tuple[Array, Array]:
-        """Mean and standard deviation of the function, both (N, n) N·m: posterior of the weights (I + A)⁻¹."""
+        """Return mean and standard deviation of the function, (N, n), N·m."""
         mean, std = np.empty_like(q), np.empty_like(q)
         for joint, features in enumerate(self._features(q, dq, ddq)):
             factor = cho_factor(np.eye(len(self.b[joint])) + self.a[joint], lower=True)
@@ -80,11 +87,11 @@ class FourierModel:
         return mean, std
 
     def _weight(self, age: Array) -> Array:
-        """Weight of a row so many seconds ago."""
+        """Return the weights of rows of these ages, s."""
         return np.ones_like(age) if self.forgetting_s is None else np.exp(-age / self.forgetting_s)
 
     def _features(self, q: Array, dq: Array, ddq: Array) -> list[Array]:
-        """φ of every joint, (N, P) each."""
+        """Return φ of every joint, (N, P) each."""
         state = np.concatenate([q, dq, ddq], axis=1)
         friction = friction_features(dq)  # (3, N, n)
         found = []

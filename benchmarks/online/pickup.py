@@ -1,4 +1,4 @@
-"""The benchmark of payloads: every case over HTTP, a line as each ends, and what else could have been done."""
+"""The benchmark of payloads: all cases over HTTP, other methods, and motion without payload."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ import lipcore
 from benchmarks.online import quiet
 from benchmarks.online.arms import KINDS, Arm, Case, cases
 from benchmarks.online.bed import install, serving
-from benchmarks.online.carried import Outcome, carried
+from benchmarks.online.carried import Outcome, stream_case
 from benchmarks.online.pickup_table import Carrying, case_row, rival_row
 from benchmarks.online.rivals import rivals
 from lipcore.model.torque_model import TorqueModel
 from service.contract.observations import LearningOptions
 
 PARTS = ("payload", "rivals", "quiet")
-"""What can be measured, by name; only where it is asked for."""
+"""Names of the parts; they run only on request."""
 ROBOTS = ("panda", "ur10", "xarm7")
 RIVAL = 1.0, "centred", "fast"
-"""Mass, place and speed of the case that the rivals are tried on."""
+"""Mass, place and speed of the case for other methods."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How much is measured. parts: of PARTS; minutes: of quiet motion, of each arm."""
+    """Scope of the benchmark; minutes: motion without payload, of each arm."""
 
     parts: tuple[str, ...]
     robots: tuple[str, ...] = ROBOTS
@@ -40,11 +40,11 @@ class Options:
     def __post_init__(self) -> None:
         for name, given, known in (("--only", self.parts, PARTS), ("--kinds", self.kinds, KINDS)):
             if unknown := [each for each in given if each not in known]:
-                raise ValueError(f"{name} has {unknown[0]!r}, expected names out of {', '.join(known)}")
+                raise ValueError(f"Unknown name {unknown[0]!r} in {name}. Names: {', '.join(known)}.")
 
 
 def run(options: Options, console: Console) -> Carrying:
-    """Measure arm by arm, the clean ones first; print a line for each case."""
+    """Measure arm by arm, clean ones first; print a line for each case."""
     found = Carrying()
     for kind in (each for each in KINDS if each in options.kinds):
         for robot in options.robots:
@@ -52,7 +52,7 @@ def run(options: Options, console: Console) -> Carrying:
             model = arm.trained()
             console.print(f"{robot}, {kind}: trained in {time.monotonic() - began:.0f} s", highlight=False)
             if "payload" in options.parts:
-                found.outcomes += _carried(arm, model, cases(robot, kind), console)
+                found.outcomes += _stream_cases(arm, model, cases(robot, kind), console)
             if "rivals" in options.parts and (robot, kind) == (ROBOTS[0], KINDS[0]):
                 case = next(each for each in cases(robot, kind) if (each.mass, each.place, each.speed) == RIVAL)
                 found.rivals = rivals(arm, model, case)
@@ -63,8 +63,8 @@ def run(options: Options, console: Console) -> Carrying:
     return found
 
 
-def _carried(arm: Arm, model: TorqueModel, every: Sequence[Case], console: Console) -> list[Outcome]:
-    """Each case on a copy of the model: what one has taught is unknown in the next."""
+def _stream_cases(arm: Arm, model: TorqueModel, every: Sequence[Case], console: Console) -> list[Outcome]:
+    """Stream each case to its own copy of the model."""
     found = []
     with tempfile.TemporaryDirectory(prefix="lipserve-bench-") as folder:
         lipcore.save(model, Path(folder) / "model")
@@ -74,11 +74,11 @@ def _carried(arm: Arm, model: TorqueModel, every: Sequence[Case], console: Conso
         )
         with serving(Path(folder) / "home") as bed:
             for case in every:
-                found.append(carried(bed, name_of(case), arm, case))
+                found.append(stream_case(bed, name_of(case), arm, case))
                 console.print("; ".join(case_row(found[-1])), highlight=False, soft_wrap=True)
     return found
 
 
 def name_of(case: Case) -> str:
-    """Of the model that a case is streamed to."""
+    """Return the name of the model of a case."""
     return f"case-{case.number}"

@@ -1,4 +1,4 @@
-"""How well torques are predicted before and after a change of the robot, by several ways of learning from it."""
+"""Accuracy of several methods of learning before and after a change of the robot."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
 
 REFIT_ROWS = 3000
-"""Rows that a refit is given, thinned evenly; it chooses among them those that it stands on."""
+"""Max rows of a refit, thinned evenly."""
 
 
 @dataclass(frozen=True)
 class Quality:
-    """Per joint: nmse against the torque without noise; coverage of noisy measurements by the 95 % interval."""
+    """nMSE of each joint against the torque without noise, and coverage of the 95 % interval for measurements."""
 
     nmse: tuple[float, ...]
     coverage: tuple[float, ...]
@@ -44,7 +44,7 @@ class Quality:
 
 @dataclass(frozen=True)
 class Moment:
-    """When predictions are judged: `at` s of the live stream."""
+    """A time of the live stream, s, at which predictions are judged."""
 
     name: str
     at: float
@@ -52,7 +52,7 @@ class Moment:
 
 @dataclass
 class Method:
-    """A way of learning, and how well it did at each moment by name; seconds: that it computed for each refit."""
+    """A method of learning, its quality by name of the moment, and the time of each refit, s."""
 
     key: str
     label: str
@@ -61,14 +61,14 @@ class Method:
 
 
 def judge(scene: Scene, unseen: Samples, tau: Array, std: Array, noise_std: Array) -> Quality:
-    """Compare predictions, (N, n), with the torques of an unseen trajectory."""
+    """Compare predictions, (N, n), with the torques of a test trajectory."""
     exact = evaluate(unseen.tau, tau, std, noise_std)
     noisy = evaluate(scene.measured(unseen), tau, std, noise_std)
     return Quality(tuple(exact.nmse.tolist()), tuple(noisy.coverage.tolist()))
 
 
 def served(bed: Bed, model: str, label: str, scene: Scene, samples: Samples, moments: Sequence[Moment]) -> Method:
-    """Stream to a served model in real time, and ask it at every moment, once the batch of then is acknowledged."""
+    """Stream to a served model in real time; query it at every moment, after the acknowledgement of its batch."""
     method = Method(model, label)
     unseen = {moment.name: scene.unseen(moment.at) for moment in moments}
     answers: dict[str, tuple[Array, Array, Array]] = {}
@@ -84,8 +84,8 @@ def served(bed: Bed, model: str, label: str, scene: Scene, samples: Samples, mom
     return method
 
 
-def untaught(base: TorqueModel, scene: Scene, moments: Sequence[Moment]) -> Method:
-    """The model as trained, which learns nothing."""
+def not_updated(base: TorqueModel, scene: Scene, moments: Sequence[Moment]) -> Method:
+    """Judge the model as trained."""
     found = {moment.name: _judged(scene, base, moment.at) for moment in moments}
     return Method("none", "no update", found)
 
@@ -99,10 +99,9 @@ def refitted(
     every: float,
     window: float,
 ) -> Method:
-    """A model trained anew every so many seconds, on the rows of the last `window` seconds or since the change.
+    """Judge a model trained anew every `every` seconds, on the rows of the last `window` seconds or since the change.
 
-    It is told when the change was, and stands ready at once, whatever its training takes. Only the refits that are in
-    force at some moment are computed.
+    It knows the time of the change and is ready without delay. Refits that no moment uses are not computed.
     """
     method = Method("refit", f"full refit every {every:g} s")
     models: dict[float, TorqueModel] = {}
@@ -126,12 +125,9 @@ def fourier(
     fitted: TorqueModel,
     forgetting_s: float,
 ) -> Method:
-    """The incremental sparse spectrum Gaussian process, taught the history and then batch by batch.
-
-    fitted: of the estimator `se`, on the history.
-    """
+    """Judge the sparse spectrum GP, with the history and then batch by batch; `fitted`: `se` on the history."""
     model = FourierModel.start(fitted, forgetting_s, seed=scene.seed)
-    # the history as one block, none of it forgotten before the stream begins, as of the trained version
+    # the history is one block, not forgotten before the stream begins, like a trained version
     model = model.learn(rows_of(_at(history, float(samples.t[0]))))
     method = Method("fourier", "sparse spectrum GP")
     began = time.monotonic()
@@ -152,7 +148,7 @@ def _judged(scene: Scene, model: TorqueModel, at: float) -> Quality:
 
 
 def _between(samples: Samples, moments: Sequence[Moment], rate: float) -> Iterator[tuple[Moment, Samples]]:
-    """Each moment with the rows since the one before."""
+    """Yield each moment with the rows since the previous one."""
     before = 0
     for moment in moments:
         now = round(moment.at * rate)
@@ -161,7 +157,7 @@ def _between(samples: Samples, moments: Sequence[Moment], rate: float) -> Iterat
 
 
 def _at(samples: Samples, time_: float) -> Samples:
-    """The same samples, all as of one time."""
+    """Return the samples with one time for all."""
     return Samples(
         samples.joint_names,
         np.full(len(samples), time_),

@@ -1,7 +1,6 @@
-"""Streams of arms that carry nothing: how often a payload is noticed all the same, by itself and in contacts.
+"""False payloads on streams without payload, with and without contacts.
 
-The library's `PayloadTracker` is driven in this process, by the model as trained: what a service learns on the way is
-not in it.
+`PayloadTracker` runs in this process with the model as trained, without online learning.
 """
 
 from __future__ import annotations
@@ -22,20 +21,31 @@ from lipcore.robots.library import Robot, pinocchio
 from lipcore.robots.simulation import Simulation, simulate
 
 BLOCK_S = 300.0
-"""The longest motion that is simulated at once: every block is of another motion, begins cold and is watched anew."""
+"""Max length of a block; every block has another motion, a cold start and a new tracker."""
 EVERY_S, CONTACT_S = 2.0, 0.2
-"""A contact comes once in so long, and lasts so long."""
+"""Period and length of contacts."""
 FORCES, REACH = (10.0, 40.0), 0.1
-"""N, least and most; m, how far from a link's joint it may touch the link, along each axis."""
-TAKEN_S = 1.0
-"""After a contact's beginning; a payload noticed within is noticed because of it."""
+"""Min and max force of a contact, N; max distance of the contact from the link's joint along each axis, m."""
+CONTACT_EFFECT_S = 1.0
+"""A payload detected within this time of a contact's start counts as its effect."""
 _PART = 700
 
 
 @dataclass
 class Quiet:
-    """Of one arm in one kind of motion: minutes of it, payloads noticed in them; contacts, and those that were taken
-    for a payload; held_s: for how long the longest of these was believed; failures: of the watch's numerics."""
+    """Figures of one arm in one kind of motion.
+
+    Attributes:
+        robot: name of the robot.
+        kind: kind of the arm.
+        speed: name of the speed.
+        minutes: length of the motion.
+        noticed: payloads detected without contacts.
+        contacts: number of contacts.
+        taken: contacts detected as a payload.
+        held_s: longest time until such a payload was dropped.
+        failures: numerical failures of the tracker.
+    """
 
     robot: str
     kind: str
@@ -49,7 +59,7 @@ class Quiet:
 
 
 def watched(arm: Arm, model: TorqueModel, minutes: float, console: Console) -> list[Quiet]:
-    """Watch so many minutes of slow and of fast motion, once left alone and once with contacts."""
+    """Track `minutes` of slow and of fast motion, each without and with contacts."""
     found, carrier = [], Carrier(model)
     for speed in SPEEDS:
         total, at, block = Quiet(arm.name, arm.kind, speed, minutes), 0.0, 0
@@ -61,7 +71,7 @@ def watched(arm: Arm, model: TorqueModel, minutes: float, console: Console) -> l
             rng = np.random.default_rng([arm.seed, block])
             touched = replace(samples, tau=samples.tau + touches(arm.robot, samples, starts, rng))
             seen, failures_touched = payloads(carrier, touched)
-            taken = [held for held in (_believed(seen, start) for start in starts) if held > 0]
+            taken = [held for held in (_held_seconds(seen, start) for start in starts) if held > 0]
             total.contacts += len(starts)
             total.taken += len(taken)
             total.held_s = max([total.held_s, *taken])
@@ -73,9 +83,9 @@ def watched(arm: Arm, model: TorqueModel, minutes: float, console: Console) -> l
 
 
 def payloads(carrier: Carrier, samples: Samples) -> tuple[list[tuple[float, float]], int]:
-    """When a payload was noticed on a stream, s, and for how long it was believed, s; how often the watch failed."""
+    """Return time and duration of each detected payload, s, and the number of numerical failures."""
     failed = 0
-    watch, rows, found, since = (
+    tracker, rows, found, since = (
         PayloadTracker(carrier.model.n_joints),
         rows_of(samples),
         list[tuple[float, float]](),
@@ -85,12 +95,12 @@ def payloads(carrier: Carrier, samples: Samples) -> tuple[list[tuple[float, floa
         batch = rows.take(slice(start, start + BATCH))
         now = float(batch.time[-1])
         try:
-            watch = watch.step(carrier, batch)
-        except np.linalg.LinAlgError:  # as the service does, which then begins anew
-            watch, failed = PayloadTracker(carrier.model.n_joints), failed + 1
-        if watch.held is not None and since is None:
+            tracker = tracker.step(carrier, batch)
+        except np.linalg.LinAlgError:  # restart the tracker, like the service
+            tracker, failed = PayloadTracker(carrier.model.n_joints), failed + 1
+        if tracker.held is not None and since is None:
             since = now
-        elif watch.held is None and since is not None:
+        elif tracker.held is None and since is not None:
             found.append((since, now - since))
             since = None
     if since is not None:
@@ -99,8 +109,10 @@ def payloads(carrier: Carrier, samples: Samples) -> tuple[list[tuple[float, floa
 
 
 def touches(robot: Robot, samples: Samples, starts: Array, rng: np.random.Generator) -> Array:
-    """Torque Jᵀ f of contacts that begin at `starts`, s: each a force of constant size and direction in the world, on a
-    point of a random link, for CONTACT_S; (N, n) N·m."""
+    """Return the torque Jᵀ f of contacts that begin at `starts`, s, (N, n), N·m.
+
+    Each contact is a force, constant in the world, on a point of a random link, for CONTACT_S.
+    """
     pin, data, out = pinocchio(), robot.model.createData(), np.zeros_like(samples.tau)
     for start in starts:
         link, force = int(rng.integers(1, robot.model.njoints)), rng.standard_normal(3)
@@ -110,18 +122,18 @@ def touches(robot: Robot, samples: Samples, starts: Array, rng: np.random.Genera
             pin.computeJointJacobians(robot.model, data, robot.configuration(samples.q[row]))
             jacobian = pin.getJointJacobian(robot.model, data, link, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
             arm = data.oMi[link].rotation @ point
-            # of the point: its velocity is v + ω × arm
+            # the velocity of the point is v + ω × arm
             out[row] = jacobian[:3].T @ force + jacobian[3:].T @ np.cross(arm, force)
     return out
 
 
-def _believed(found: list[tuple[float, float]], start: float) -> float:
-    """For how long payloads were believed, s, that were noticed because of the contact that began then."""
-    return sum(held for at, held in found if 0 <= at - start < TAKEN_S)
+def _held_seconds(found: list[tuple[float, float]], start: float) -> float:
+    """Return the duration of payloads detected because of the contact that began at `start`, s."""
+    return sum(held for at, held in found if 0 <= at - start < CONTACT_EFFECT_S)
 
 
 def _block(arm: Arm, seconds: float, speed: float, block: int) -> Samples:
-    """Motion without payload, whose friction is that of a cold arm at first."""
+    """Return motion without payload, from a cold start."""
     dirt, edge = arm.dirt, round(EDGE_S * RATE)
     count = round(seconds * RATE) + 2 * edge
     stream = Simulation(count, RATE, speed=speed, noise=NOISE if dirt is None else 0.0, dirt=dirt)

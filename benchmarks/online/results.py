@@ -1,4 +1,4 @@
-"""What the benchmark of learning found: plain data, written as JSON."""
+"""Results of the benchmark of learning: plain data, written as JSON."""
 
 from __future__ import annotations
 
@@ -15,12 +15,23 @@ from benchmarks.online.quality import Method
 
 @dataclass
 class Results:
-    """Everything that is printed; None or empty is what was not measured.
+    """All figures; None or empty if not measured.
 
-    facts: machine and packages; model: what was taught; live: the stream in real time, burst: the one that came as fast
-    as it was acknowledged; learning, pushed: who asked during each; moments: names in order; robots, merged: how many
-    robots' statistics were put together, and how far the outcome lies from training on all of their samples at once,
-    relative.
+    Attributes:
+        facts: machine and packages.
+        model: the learning model.
+        idle: loop without learning.
+        learning: loop during the stream in real time.
+        pushed: loop during the stream sent as fast as possible.
+        live: stream in real time.
+        burst: stream sent as fast as possible.
+        costs: cost of an update.
+        joints: names of the joints.
+        moments: names of the moments, in order.
+        methods: quality of each method.
+        robots: number of robots with merged statistics.
+        merged: relative difference of merged statistics from training on all samples at once.
+        notes: remarks.
     """
 
     facts: dict[str, str]
@@ -39,9 +50,9 @@ class Results:
     notes: list[str] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as JSON values."""
+        """Return the results as JSON values."""
         return asdict(self)
 
     def write(self, path: Path, targets: list[dict[str, Any]]) -> None:
-        """Write everything, with the targets, as JSON."""
+        """Write the results and the targets as JSON."""
         path.write_text(json.dumps({**self.as_dict(), "targets": targets}, indent=2) + "\n")

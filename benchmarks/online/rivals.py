@@ -1,4 +1,4 @@
-"""What else could be done about a payload: adapting to it as to any change, a full refit, and least squares."""
+"""Other methods to learn a payload: adapting as to any change, a full refit, and least squares."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import lipcore
 from benchmarks.clients import HttpClient
 from benchmarks.online.arms import NOISE, RATE, UP, Arm, Case
 from benchmarks.online.bed import install, serving
-from benchmarks.online.carried import AFTER, BATCH, STREAM, Answers, asked, judged
+from benchmarks.online.carried import AFTER, BATCH, STREAM, Answers, judge_served, judged
 from benchmarks.online.sending import batch_request, send
 from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
@@ -22,20 +22,20 @@ from service.contract.observations import LearningOptions
 
 MODEL, FORGETTING_S = "adapts", 30.0
 PRIOR = 1.0
-"""Standard deviation of each of a link's ten parameters around the URDF's, kg, kg·m or kg·m²: not tuned."""
+"""Prior standard deviation of each of a link's ten parameters around the URDF's, kg, kg·m or kg·m²; not tuned."""
 Unseen = tuple[Samples, Array]
 
 
 @dataclass
 class Rival:
-    """Another way, and how good its answers are by s after the pick-up; a text is why there are none."""
+    """Another method, and its answers by s after the pick-up; a text is the reason for no answer."""
 
     label: str
     answers: dict[float, Answers | str] = field(default_factory=dict)
 
 
 def rivals(arm: Arm, model: TorqueModel, case: Case) -> list[Rival]:
-    """All of them on the stream of one case, judged on the same unseen motion with the payload."""
+    """Judge all methods on the stream of one case, and the same test motion with the payload."""
     samples, unseen = arm.live(case), arm.unseen(case, True)
     return [
         Rival("adapts (payloads=false, on_change=adapt)", dict(_adapting(model, samples, unseen))),
@@ -45,13 +45,13 @@ def rivals(arm: Arm, model: TorqueModel, case: Case) -> list[Rival]:
 
 
 def _each(samples: Samples, answer: Callable[[Samples], Answers | str]) -> dict[float, Answers | str]:
-    """Judge what is made, each time, of the rows since the pick-up; when that was is known here."""
+    """Judge a method on the rows since the pick-up, whose time it knows."""
     first = round(UP * RATE)
     return {after: answer(samples.rows(slice(first, first + round(after * RATE)))) for after in AFTER}
 
 
 def _adapting(model: TorqueModel, samples: Samples, unseen: Unseen) -> dict[float, Answers]:
-    """The service without payloads; at each moment it has learnt all that was sent."""
+    """Judge the service without payload detection, after it has learnt all rows sent."""
     options = LearningOptions(
         payloads=False, on_change="adapt", forgetting_s=FORGETTING_S, auto_refresh=False, auto_promote=False
     )
@@ -67,12 +67,12 @@ def _adapting(model: TorqueModel, samples: Samples, unseen: Unseen) -> dict[floa
                 if (after := moments.get(start + BATCH)) is not None:
                     motion = np.stack([batch.q[-1], batch.dq[-1], batch.ddq[-1]])
                     bed.wait_learnt(MODEL, motion, ack.revision)
-                    out[after] = asked(bed, MODEL, unseen)
+                    out[after] = judge_served(bed, MODEL, unseen)
     return out
 
 
 def _refitted(arm: Arm, since: Samples, unseen: Unseen) -> Answers | str:
-    """A model trained on nothing but these rows, ready at once."""
+    """Judge a model trained on these rows only."""
     try:
         model = lipcore.train(since, arm.robot.joint_types, "rigid-body")
     except (ValueError, ArithmeticError, RuntimeError) as error:
@@ -83,8 +83,10 @@ def _refitted(arm: Arm, since: Samples, unseen: Unseen) -> Answers | str:
 
 
 def _least_squares(robot: Robot, since: Samples, unseen: Unseen) -> Answers:
-    """Ridge regression of every link's ten parameters around the URDF's, which is what recursive least squares with
-    that prior arrives at: N(π₀, PRIOR² I), torque tau = Y π + noise of NOISE."""
+    """Judge ridge regression of every link's ten parameters around the URDF's.
+
+    It equals recursive least squares with the prior N(π₀, PRIOR² I) and torque Y π with noise of NOISE.
+    """
     exact, measured = unseen
     usual = np.concatenate([body.toDynamicParameters() for body in list(robot.model.inertias)[1:]])
     rows = _regressor(robot, since)
@@ -98,7 +100,7 @@ def _least_squares(robot: Robot, since: Samples, unseen: Unseen) -> Answers:
 
 
 def _regressor(robot: Robot, samples: Samples) -> Array:
-    """Pinocchio's joint-torque regressor of N instants, (N n, 10 n)."""
+    """Return Pinocchio's joint-torque regressor of N states, (N n, 10 n)."""
     pin, data = pinocchio(), robot.model.createData()
     motions = zip(samples.q, samples.dq, samples.ddq, strict=True)
     return np.concatenate(

@@ -1,4 +1,4 @@
-"""What is learnt from: a robot that moves at random, whose friction drifts and which takes up a payload on the way."""
+"""A simulated robot in random motion, with drifting friction and a payload attached on the way."""
 
 from __future__ import annotations
 
@@ -16,20 +16,29 @@ from lipcore.robots.simulation import Payload, Simulation, simulate
 from lipcore.vocabulary import Code
 
 SINUSOIDS, UNSEEN_SINUSOIDS = 50, 100
-"""The unseen trajectory has twice the bandwidth, as in the paper's tests."""
+"""The test trajectory has twice the bandwidth, as in the paper's tests."""
 UNSEEN_SAMPLES, UNSEEN_RATE = 500, 10.0
 _HISTORY, _LIVE, _UNSEEN, _NOISE, _MORE, _FLEET = range(6)
 _SEEDS = 100
-"""Seeds of a scene's parts lie between those of its own seed and of the next one."""
+"""Distance between the random seeds of two successive scenes."""
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A simulated robot at 1 kHz, moving ±0.5 rad about the middle of its joints.
+    """A simulated robot that moves ±0.5 rad about the middle of its joints.
 
-    seconds: length of the live stream, change_at: when the payload (kg) is attached; rate in Hz; speed: multiplies the
-    frequencies of the motion; noise: of the measured torque, N·m; viscous (N·m·s/rad) and coulomb (N·m) friction of
-    every joint at first; drift: share by which both grow, evenly, over the live stream.
+    Attributes:
+        robot: name of the robot.
+        seconds: length of the live stream.
+        change_at: time at which the payload is attached, s.
+        rate: rate of the live stream, Hz.
+        speed: factor on the frequencies of the motion.
+        noise: standard deviation of the measured torque, N·m.
+        viscous: initial viscous friction of every joint, N·m·s/rad.
+        coulomb: initial Coulomb friction of every joint, N·m.
+        drift: relative linear growth of friction over the live stream.
+        payload: mass of the payload, kg.
+        seed: seed of all random numbers.
     """
 
     robot: str = "panda"
@@ -46,56 +55,56 @@ class Scene:
 
     def __post_init__(self) -> None:
         if not 0 < self.change_at < self.seconds:
-            raise ValueError(f"change_at is {self.change_at:g} s, expected a time within {self.seconds:g} s")
+            raise ValueError(f"change_at is {self.change_at:g} s, expected a time between 0 and {self.seconds:g} s")
 
     @cached_property
     def arm(self) -> Robot:
-        """The robot."""
+        """The simulated robot."""
         return load_robot(self.robot)
 
     def history(self, seconds: float, rate: float) -> Samples:
-        """Earlier motion without payload, before the friction drifts; its time ends where the live stream's begins."""
+        """Return earlier motion without payload and drift; its time ends at the start of the live stream."""
         samples = self._measured(self._moving(_HISTORY, round(seconds * rate), rate), 1.0, _NOISE)
         return replace(samples, t=samples.t - seconds)
 
     def live(self) -> Samples:
-        """The live stream."""
+        """Return the live stream."""
         samples = self._moving(_LIVE, round(self.seconds * self.rate), self.rate, self.change_at)
         return self._measured(samples, self.friction(samples.t)[:, None], _NOISE + _SEEDS // 2)
 
     def more(self, seconds: float) -> Samples:
-        """Another stream as long as wanted, in which nothing changes."""
+        """Return another stream without payload and drift."""
         return self._measured(self._moving(_MORE, round(seconds * self.rate), self.rate), 1.0, _MORE + _SEEDS // 2)
 
     def fleet(self, robots: int, samples: int, rate: float) -> list[Samples]:
-        """Streams of several robots of the kind, as before the change."""
+        """Return streams of several robots without payload and drift."""
         parts = [self._moving(_FLEET + number, samples, rate) for number in range(robots)]
         return [self._measured(part, 1.0, _FLEET + _SEEDS // 2 + number) for number, part in enumerate(parts)]
 
     def unseen(self, at: float) -> Samples:
-        """An unseen trajectory under the dynamics at time `at` of the live stream; the torque has no noise.
+        """Return a test trajectory under the dynamics at a time of the live stream, torque without noise.
 
-        The payload is attached right after `change_at`.
+        It has the payload if `at` is later than `change_at`.
         """
         loaded = 0.0 if at > self.change_at else None
         samples = self._moving(_UNSEEN, UNSEEN_SAMPLES, UNSEEN_RATE, loaded, UNSEEN_SINUSOIDS)
         return self._with_friction(samples, float(self.friction(np.array(at))))
 
     def measured(self, unseen: Samples) -> Array:
-        """The torques of an unseen trajectory with noise, (N, n)."""
+        """Return the torques of a test trajectory with noise, (N, n)."""
         rng = np.random.default_rng(self._seed(_UNSEEN + _SEEDS // 2))
         noisy: Array = unseen.tau + self.noise * rng.standard_normal(unseen.tau.shape)
         return noisy
 
     def friction(self, t: Array) -> Array:
-        """Factor of both frictions at times of the live stream."""
+        """Return the factor on friction at times of the live stream."""
         factor: Array = 1 + self.drift * t / self.seconds
         return factor
 
     def _moving(
         self, part: int, count: int, rate: float, loaded: float | None = None, sinusoids: int = SINUSOIDS
     ) -> Samples:
-        """Rigid bodies alone: no friction, no noise. loaded: time from which on they carry the payload."""
+        """Simulate rigid bodies without friction and noise, with the payload from time `loaded` on."""
         payload = None if loaded is None else Payload(self.payload, loaded)
         stream = Simulation(count, rate, sinusoids, speed=self.speed, noise=0.0, payload=payload)
         return simulate(self.arm, stream, self._seed(part))
@@ -114,6 +123,6 @@ class Scene:
 
 
 def rows_of(samples: Samples) -> Rows:
-    """Rows to learn from, all of them."""
+    """Return all samples as rows to learn."""
     code: NDArray[np.uint8] = np.full(len(samples), Code.LEARNT, dtype=np.uint8)
     return Rows(samples.t, samples.q, samples.dq, samples.ddq, samples.tau, code, independence.even_weights(samples.t))

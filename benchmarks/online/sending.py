@@ -1,4 +1,4 @@
-"""A client that streams observation batches, and what the service says to each."""
+"""A client that streams observation batches and collects their acknowledgements."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from lipserve import StreamClient
 from lipserve.stream import StreamLearnt
 
 BATCH_ROWS = 100
-_LEAD = 50_000_000
-"""Nanoseconds before a paced stream begins."""
+_LEAD_NS = 50_000_000
+"""Time before a paced stream begins."""
 
 
 @dataclass(frozen=True)
 class Ack:
-    """An acknowledged batch. sent, acked: nanoseconds of `time.monotonic_ns`; revision: from which on it is learnt."""
+    """An acknowledged batch; sent, acked: `time.monotonic_ns`; revision: the first that contains it."""
 
     sequence: int
     sent: int
@@ -33,12 +33,12 @@ class Ack:
 
     @property
     def seconds(self) -> float:
-        """From the request to the acknowledgement."""
+        """Time from the request to the acknowledgement."""
         return (self.acked - self.sent) / 1e9
 
 
 class _Answer(msgspec.Struct):
-    """What is read of an acknowledgement."""
+    """Fields of an acknowledgement."""
 
     sequence: int
     rows: int
@@ -59,7 +59,7 @@ def batch_request(
     time_scale: float = 1.0,
     headers: dict[str, str] | None = None,
 ) -> bytes:
-    """One batch as an HTTP request. time_scale: multiplies its times, for a stream that is sent faster than it ran."""
+    """Return one batch as an HTTP request; `time_scale` multiplies its times."""
     body = {
         "stream_id": stream_id,
         "sequence": sequence,
@@ -72,34 +72,34 @@ def batch_request(
 def batch_requests(
     model: str, stream_id: str, samples: Samples, time_scale: float = 1.0, rows: int | None = None
 ) -> list[bytes]:
-    """Requests of so many samples each, BATCH_ROWS where None, sequences from 0 on."""
+    """Return requests of `rows` samples each (None: BATCH_ROWS), with sequences from 0."""
     rows = rows or BATCH_ROWS
     parts = (samples.rows(slice(start, start + rows)) for start in range(0, len(samples), rows))
     return [batch_request(model, stream_id, number, part, time_scale) for number, part in enumerate(parts)]
 
 
 def send(client: HttpClient, request: bytes) -> Ack:
-    """Send a batch and wait until it is acknowledged; raise BadAnswerError where it is refused."""
+    """Send a batch and wait for its acknowledgement; raise BadAnswerError if it is refused."""
     sent = time.monotonic_ns()
     answer = client.ask(request)
     acked = time.monotonic_ns()
-    said = _decoder.decode(answer)
-    return Ack(said.sequence, sent, acked, said.rows, said.accepted, said.revision, said.duplicate, said.rejected)
+    ack = _decoder.decode(answer)
+    return Ack(ack.sequence, sent, acked, ack.rows, ack.accepted, ack.revision, ack.duplicate, ack.rejected)
 
 
 def send_all(client: HttpClient, requests: Sequence[bytes]) -> list[Ack]:
-    """Send batches one after the other, each as soon as the one before is acknowledged."""
+    """Send batches one after the other, without pauses."""
     return [send(client, request) for request in requests]
 
 
 def stream(
     client: HttpClient, requests: Sequence[bytes], period: float, after: Mapping[int, Callable[[], None]] | None = None
 ) -> list[Ack]:
-    """Send a batch every `period` seconds, when its last row has been measured; one that is late delays no tick.
+    """Send a batch every `period` seconds; a late batch does not delay the following ticks.
 
-    after: what to do when so many batches are acknowledged.
+    `after` holds functions to call after this number of acknowledgements.
     """
-    acks, first = [], time.monotonic_ns() + _LEAD
+    acks, first = [], time.monotonic_ns() + _LEAD_NS
     for number, request in enumerate(requests, start=1):
         _sleep_until(first + number * round(1e9 * period))
         acks.append(send(client, request))
@@ -109,13 +109,13 @@ def stream(
 
 
 def stream_frames(client: StreamClient, samples: Samples) -> list[Ack]:
-    """Send every row as a frame at the time it was measured, ask for its torque too, and collect acknowledgements.
+    """Send every row as a frame at the time of its measurement, with a query; collect acknowledgements.
 
-    Each acknowledgement stands for all frames since the one before; it was sent when the newest of them was.
+    An acknowledgement covers all frames since the previous one; its `sent` is that of the newest frame.
     """
     acks: list[Ack] = []
     sent: list[int] = []
-    before, first = client.learnt, time.monotonic_ns() + _LEAD
+    before, first = client.learnt, time.monotonic_ns() + _LEAD_NS
     for row, at in enumerate(samples.t - samples.t[0]):
         _sleep_until(first + round(1e9 * at))
         sent.append(time.monotonic_ns())
@@ -126,7 +126,7 @@ def stream_frames(client: StreamClient, samples: Samples) -> list[Ack]:
     if client.flush() is not before:
         acks.append(_frames_ack(before, client.learnt, sent))
     if client.refusals:
-        raise BadAnswerError(f"frames were not logged: {client.refusals[0].message}")
+        raise BadAnswerError(f"The service refused frames: {client.refusals[0].message}")
     return acks
 
 
@@ -139,7 +139,7 @@ def _frames_ack(before: StreamLearnt, now: StreamLearnt, sent: Sequence[int]) ->
 
 
 def _sleep_until(at: int) -> None:
-    """Sleep until a moment of `time.monotonic_ns`."""
+    """Sleep until a time of `time.monotonic_ns`."""
     left = at - time.monotonic_ns()
     if left > 0:
         time.sleep(left / 1e9)

@@ -1,18 +1,16 @@
-"""Results of the benchmark of learning as tables."""
+"""Tables of the benchmark of learning."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from benchmarks.latency.table import NOTHING, Grid, promises
+from benchmarks.latency.table import NOTHING, Grid, targets_grid
 from benchmarks.online.flow import Flow
-from benchmarks.online.promises import targets
 from benchmarks.online.results import Results
+from benchmarks.online.targets import targets
 from benchmarks.timing import Timing
 
 
 def grids(results: Results) -> list[Grid]:
-    """Every table, in order; those without rows are left out."""
+    """Return all tables with rows, in order."""
     found = [
         Grid("machine", ("", ""), list(results.facts.items()), texts=True),
         Grid("model", ("", ""), list(results.model.items()), texts=True),
@@ -21,13 +19,13 @@ def grids(results: Results) -> list[Grid]:
         costs(results),
         quality(results),
         *joints(results),
-        replace(promises(targets(results)), columns=("", "promised", "measured", "")),
+        targets_grid(targets(results), ""),
     ]
     return [grid for grid in found if grid.rows]
 
 
 def latencies(results: Results) -> Grid:
-    """Percentiles of answers, idle and while the model learns."""
+    """Return percentiles of answers, idle and while the model learns."""
     rows = []
     states = {"idle": results.idle, "learning": results.learning, "pushed": results.pushed}
     for state, asked in states.items():
@@ -44,19 +42,19 @@ def latencies(results: Results) -> Grid:
                 _ratios(f"echo, {state} / idle", asked.echo, results.idle.echo),
             ]
     columns = ("500 Hz WebSocket loop, µs", "answers", "p50", "p90", "p99", "p99.9", "largest")
-    return Grid("prediction while the model learns: 1000 rows a second, and pushed", columns, rows)
+    return Grid("prediction while the model learns 1000 rows a second, and pushed rows", columns, rows)
 
 
 def flows(results: Results) -> Grid:
-    """How fast rows are acknowledged and learnt."""
-    columns = ("rows", "came", "teach", "acked/s", "learnt/s", "ack p50 ms", "p99", "lag p50 s", "p99", "largest")
-    named = (("in real time", results.live), ("as fast as acknowledged", results.burst))
+    """Return throughput of acknowledgements and learning."""
+    columns = ("rows", "sent", "accepted", "acked/s", "learnt/s", "ack p50 ms", "p99", "lag p50 s", "p99", "largest")
+    named = (("in real time", results.live), ("as fast as possible", results.burst))
     rows = [_flow(name, flow) for name, flow in named if flow is not None]
     return Grid("learning; lag: from an acknowledgement to the first answer that contains it", columns, rows)
 
 
 def costs(results: Results) -> Grid:
-    """What one more sample costs, after few and after many."""
+    """Return the cost of a sample after few and after many."""
     if not results.costs:
         return Grid("", (), [])
     first = results.costs[0]
@@ -70,19 +68,19 @@ def costs(results: Results) -> Grid:
 
 
 def quality(results: Results) -> Grid:
-    """Mean nMSE and coverage of every method at every moment."""
+    """Return mean nMSE and coverage of every method at every moment."""
     rows = []
     for method in results.methods.values():
         found = [method.found[name] for name in results.moments]
         seconds = ", ".join(f"{each:.0f}" for each in method.seconds) or NOTHING
         cells = [f"{each.mean_nmse:.2e} ({100 * each.mean_coverage:.0f} %)" for each in found]
         rows.append((method.label, *cells, seconds))
-    columns = ("", *results.moments, "computed s")
-    return Grid("mean nMSE on an unseen trajectory (coverage of 95 %)", columns, rows)
+    columns = ("", *results.moments, "training s")
+    return Grid("mean nMSE on a test trajectory (coverage of 95 %)", columns, rows)
 
 
 def joints(results: Results) -> list[Grid]:
-    """nMSE of every joint, a table a moment, and the coverage at the last."""
+    """Return nMSE of every joint, a table for each moment, and coverage at the last moment."""
     columns = ("", *(str(number) for number in range(1, len(results.joints) + 1)))
     tables = []
     for name in results.moments:

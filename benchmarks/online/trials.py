@@ -1,4 +1,4 @@
-"""Kills at random moments while batches come, and what the service knows afterwards."""
+"""Trials that kill a service or its learner while it learns, and check its state afterwards."""
 
 from __future__ import annotations
 
@@ -30,25 +30,32 @@ from service.cli.demo import ServiceProcess
 Victim = Literal["service", "learner"]
 MODEL, STREAM = "durable", "trials"
 BATCHES, ROWS = 30, 10
-"""Of a trial."""
-LATE, TWICE = 0.2, 0.2
-"""Shares of batches that are sent after a later one, and a second time."""
-GAP = 0.02
-"""Longest pause between two batches, s."""
+"""Batches of a trial, and rows of a batch."""
+LATE_SHARE, TWICE_SHARE = 0.2, 0.2
+"""Shares of batches that are sent after a later one, and twice."""
+MAX_GAP_S = 0.02
+"""Max pause between two batches."""
 SETTINGS = {"publish_every_s": 0.005, "max_snapshots": 4, "log_level": "error"}
-"""Of the service: revisions and snapshots follow each other fast enough to be hit."""
+"""Settings of the service; revisions and snapshots are so frequent that kills interrupt them."""
 DATABASE = "lipserve.sqlite3"
-_RECOVERY = 60.0
+_RECOVERY_TIMEOUT_S = 60.0
 
 
 @dataclass
 class Tally:
-    """Of all trials.
+    """Counts of all trials.
 
-    kills: by victim; unanswered: batches that were on their way at a kill; repeated, late: that were sent twice, or
-    after a later one, on purpose; lost: acknowledged, but unknown when sent again after the kill; twice: logged more
-    than once; refused: rows that were not learnt; largest: of the relative differences of served torques from those of
-    a model that learnt all rows at once; one_batch: the least that one batch more or less would make of it.
+    Attributes:
+        kills: kills by victim.
+        batches: batches sent.
+        unanswered: batches without an answer at a kill.
+        repeated: batches sent twice on purpose.
+        late: batches sent after a later one on purpose.
+        lost: acknowledged batches that the service no longer knew after the kill.
+        twice: batches logged more than once.
+        refused: rows not learnt.
+        largest: largest relative difference of served torques from a model that learnt all rows at once.
+        one_batch: smallest such difference if one batch is learnt again.
     """
 
     kills: dict[Victim, int] = field(default_factory=lambda: {"service": 0, "learner": 0})
@@ -64,10 +71,15 @@ class Tally:
 
 
 class Trials:
-    """Trials on one home, one after the other; the service runs while this is entered.
+    """A context manager that runs a service, for trials one after the other on one home.
 
-    samples: what is sent, in batches of ROWS numbered from 0 on; base: the served model as trained; queries: where
-    torques are compared.
+    Attributes:
+        home: home of the service.
+        base: the served model as trained.
+        samples: samples to send in batches of ROWS, with sequences from 0.
+        queries: states at which torques are compared.
+        rng: source of random numbers.
+        tally: counts of all trials.
     """
 
     def __init__(self, home: Path, base: TorqueModel, samples: Samples, queries: Samples, seed: int) -> None:
@@ -85,13 +97,14 @@ class Trials:
         self._service.stop()
 
     def trial(self, victim: Victim, batches: int = BATCHES) -> None:
-        """Send the next batches, kill somewhere among them, send again what was not acknowledged, and compare.
+        """Send the next batches, kill the victim meanwhile, send the rest and compare.
 
-        Raise BenchError where the service does not recover.
+        Raises:
+            BenchError: The service does not recover.
         """
         tally, acks = self.tally, dict[int, Ack]()
         plan = self._plan(tally.batches, batches)
-        killer = Timer(float(self.rng.uniform(0, GAP * len(plan))), self._kill, [victim])
+        killer = Timer(float(self.rng.uniform(0, MAX_GAP_S * len(plan))), self._kill, [victim])
         killer.start()
         left = self._send(plan, acks)
         killer.join()
@@ -104,56 +117,56 @@ class Trials:
         acknowledged = sorted(acks)
         tally.unanswered += bool(left)
         if rest := self._send(left, acks):
-            raise BenchError(f"batch {rest[0]} was not acknowledged after the {victim} was killed")
+            raise BenchError(f"Batch {rest[0]} was not acknowledged after the {victim} was killed.")
         self._send_again(acknowledged)
         tally.refused += sum(ack.rows - ack.accepted for ack in acks.values())
         tally.twice += max(0, self._logged() - tally.batches)
         self._compare(max(ack.revision for ack in acks.values()))
 
-    def weigh(self, batches: int = 5) -> None:
-        """Find out what difference one batch more or less would make."""
+    def measure_one_batch(self, batches: int = 5) -> None:
+        """Measure the difference that one batch more would make."""
         known, rest = self._learnt(), self.rng.choice(self.tally.batches, batches).tolist()
         learnt = self._tau(known.model())
         more = (self._tau(known.learn(rows_of(self._batch(sequence))).model()) for sequence in rest)
         self.tally.one_batch = min(_difference(tau, learnt) for tau in more)
 
     def _plan(self, first: int, count: int) -> list[int]:
-        """Sequences as they are sent: most in order, some after their successor, some twice."""
+        """Return the sequences in the order of sending: some after their successor, some twice."""
         plan = list(range(first, first + count))
-        for place in np.flatnonzero(self.rng.random(count - 1) < LATE).tolist():
+        for place in np.flatnonzero(self.rng.random(count - 1) < LATE_SHARE).tolist():
             plan[place], plan[place + 1] = plan[place + 1], plan[place]
         self.tally.late += sum(plan[place] > plan[place + 1] for place in range(count - 1))
-        again = self.rng.random(count) < TWICE
+        again = self.rng.random(count) < TWICE_SHARE
         self.tally.repeated += int(again.sum())
         return [sequence for sequence, twice in zip(plan, again, strict=True) for _ in range(1 + twice)]
 
     def _send(self, plan: list[int], acks: dict[int, Ack]) -> list[int]:
-        """Send batches until the service is gone; return those that it has not acknowledged."""
+        """Send batches until the service stops answering; return those that it has not acknowledged."""
         for place, sequence in enumerate(plan):
             try:
                 with HttpClient(self._bed.tcp) as client:
                     acks[sequence] = send(client, self._request(sequence))
             except (BadAnswerError, OSError):
                 return plan[place:]
-            time.sleep(float(self.rng.uniform(0, GAP)))
+            time.sleep(float(self.rng.uniform(0, MAX_GAP_S)))
         return []
 
     def _send_again(self, acknowledged: list[int]) -> None:
-        """Send what was acknowledged before the kill: the service must know all of it."""
+        """Send batches that were acknowledged before the kill; count those that the service does not know."""
         with HttpClient(self._bed.tcp) as client:
             for sequence in acknowledged:
                 self.tally.lost += not send(client, self._request(sequence)).duplicate
 
     def _compare(self, revision: int) -> None:
-        """Wait until all is learnt, and compare torques with those of a model that learnt it at once."""
+        """Wait until all rows are learnt; compare torques with those of a model that learnt them at once."""
         queries = self.queries
         motion = np.stack([queries.q[0], queries.dq[0], queries.ddq[0]])
-        self._bed.wait_learnt(MODEL, motion, revision, _RECOVERY)
+        self._bed.wait_learnt(MODEL, motion, revision, _RECOVERY_TIMEOUT_S)
         served = self._bed.predict(MODEL, queries)[0]
         self.tally.largest = max(self.tally.largest, _difference(served, self._tau(self._learnt().model())))
 
     def _learnt(self) -> OnlineModel:
-        """The model after all batches so far, learnt in one go."""
+        """Return the model that learnt all batches so far at once."""
         return OnlineModel.start(self.base).learn(rows_of(self.samples.rows(slice(0, ROWS * self.tally.batches))))
 
     def _tau(self, model: TorqueModel) -> Array:
@@ -166,7 +179,7 @@ class Trials:
         return batch_request(MODEL, STREAM, sequence, self._batch(sequence))
 
     def _logged(self) -> int:
-        """How many batches the log in the database has."""
+        """Return the number of batches in the log of the database."""
         address = f"file:{self.home / DATABASE}?mode=ro"
         with closing(sqlite3.connect(address, uri=True)) as database:
             query = "SELECT COUNT(*) FROM events WHERE model = ? AND kind = 'batch' AND NOT void"
@@ -186,7 +199,7 @@ class Trials:
         if victim == "service":
             self._service.process.kill()
             return
-        end = time.monotonic() + _RECOVERY
+        end = time.monotonic() + _RECOVERY_TIMEOUT_S
         while not (found := learners(self._service.process.pid)) and time.monotonic() < end:
             time.sleep(0.001)
         for pid in found:
@@ -195,7 +208,7 @@ class Trials:
 
 
 def learners(service: int) -> list[int]:
-    """Process ids of what learns and weighs for a service, its only spawned children while nothing is trained."""
+    """Return the process ids of the learner and the weigher, the only spawned children if no job runs."""
     found = []
     for child in (each for level in levels(service)[1:2] for each in level):
         with suppress(FileNotFoundError, ProcessLookupError):
@@ -205,5 +218,5 @@ def learners(service: int) -> list[int]:
 
 
 def _difference(one: Array, other: Array) -> float:
-    """Largest difference, relative to the largest of the others."""
+    """Return the largest difference, relative to the largest value of `other`."""
     return float(np.abs(one - other).max() / np.abs(other).max())

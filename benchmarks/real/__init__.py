@@ -1,1 +1,1 @@
-"""Recordings of real arms: the default beside what others try first. `python -m benchmarks real FOLDER`."""
+"""`python -m benchmarks real FOLDER`: recordings of real arms, default options and other methods."""

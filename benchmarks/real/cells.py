@@ -1,4 +1,4 @@
-"""Results of cells, one JSON file each, so that a run continues where another has ended."""
+"""Results of cells, one JSON file each, so that a run can be resumed."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from benchmarks.workload import BenchError
 from lipcore.data.metrics import LEVEL, evaluate, quantile
 
 Told = Literal["nothing", "URDF"]
-"""What a method knows of the robot beside the samples; the types of the joints are always known."""
+"""What a method knows of the robot besides the samples and the joint types."""
 PRODUCT = "LIPServe"
-"""The method that is the service with default options."""
+"""Method: the service with default options."""
 SOURCES = ("lipcore", "service", "clients/python/lipserve")
-"""What decides a result of PRODUCT."""
+"""Folders of code on which results of PRODUCT depend."""
 
 
 class Cell(BaseModel):
@@ -39,12 +39,20 @@ class Cell(BaseModel):
 
 
 class Result(BaseModel):
-    """Figures of a cell, of each joint unless they are of all.
+    """Figures of a cell; lists have a value for each joint.
 
-    revision: of the product, None of another method; train_s: duration of the training samples, s; nmse: mean squared
-    error / variance of the measured torque; nmse_mean: of the training samples' mean; coverage: share of measurements
-    inside the 95 % interval; width: mean half width of that interval / (1.96 × RMSE); seconds: of training, of the
-    rivals with prediction; estimator: the one that the product chose.
+    Attributes:
+        cell: the cell.
+        revision: revision of LIPServe; None for another method.
+        train_s: duration of the training samples, s.
+        train_rows: rows of the training samples.
+        test_rows: rows of the test.
+        nmse: mean squared error / variance of the measured torque.
+        nmse_mean: nMSE of the training samples' mean.
+        coverage: share of measurements inside the 95 % interval.
+        width: mean half width of that interval / (1.96 × RMSE).
+        seconds: time of training, for other methods with prediction, s.
+        estimator: the estimator that LIPServe chose.
     """
 
     model_config = ConfigDict(ser_json_inf_nan="constants")
@@ -68,12 +76,12 @@ class Result(BaseModel):
 
     @property
     def of_mean(self) -> float:
-        """Mean nMSE over the joints, in that of the training samples' mean."""
+        """Mean nMSE over the joints / mean nMSE of the training samples' mean."""
         return self.error / float(np.mean(self.nmse_mean))
 
     @property
     def worst(self) -> float:
-        """Error of the worst joint, in errors of the training samples' mean."""
+        """Largest nMSE of a joint / nMSE of the training samples' mean."""
         return float(np.max(np.divide(self.nmse, self.nmse_mean)))
 
 
@@ -97,13 +105,13 @@ def judge(cell: Cell, split: Split, forecast: Forecast, seconds: float, estimato
 
 
 class Cache:
-    """Results in a folder. Those of PRODUCT are of one revision, those of rivals are kept until they are deleted."""
+    """Results in a folder; results of PRODUCT belong to a revision, others are kept until they are deleted."""
 
     def __init__(self, folder: Path, revision: str) -> None:
         self.folder, self.revision = folder, revision
 
     def add(self, result: Result) -> None:
-        """Store a result; it is complete or absent, whenever the run ends."""
+        """Store a result atomically."""
         if result.cell.method == PRODUCT:
             result = result.model_copy(update={"revision": self.revision})
         path = self._path(result.cell)

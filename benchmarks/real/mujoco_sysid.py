@@ -1,8 +1,8 @@
 """`mujoco.sysid` on the URDF's arm: `pip install 'mujoco[sysid]'`, version 4.
 
-The arm is a MuJoCo model with the kinematics and, to begin with, the masses of the URDF. `mujoco.sysid` finds inertias
-within its default bounds, rotor inertias, viscous and Coulomb friction and offsets. It minimises the residual of
-inverse dynamics. Coulomb friction is added to MuJoCo's torque, because MuJoCo's own is a constraint.
+The arm is a MuJoCo model with the kinematics and the initial masses of the URDF. `mujoco.sysid` minimises the residual
+of inverse dynamics over inertias within its default bounds, rotor inertias, viscous and Coulomb friction and offsets.
+Coulomb friction is added to MuJoCo's torque, because MuJoCo's own is a constraint.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from lipcore.data.samples import Array, Samples
 from lipcore.robots.urdf import RigidBody
 
 MAX_ROWS = 500
-"""Rows that are learnt from; more are thinned evenly, as each step takes one pass a parameter."""
+"""Max training rows; more are thinned evenly, as each step takes one pass a parameter."""
 MAX_ITERATIONS = 50
 OWN = ("rotor", "viscous", "coulomb", "offset")
-"""Parameters of each joint beside its body's inertia."""
+"""Parameters of each joint besides its body's inertia."""
 MAX_ROTOR = 5.0
-"""Bound of a rotor inertia, kg·m². Those of friction, at 1 rad/s, and of the offset are a joint's largest torque."""
+"""Bound of a rotor inertia, kg·m²; the bound of friction, at 1 rad/s, and of the offset is a joint's largest torque."""
 
 
 def is_installed() -> bool:
-    """Return whether `mujoco.sysid` and what it imports are installed."""
+    """Return whether `mujoco.sysid` and its dependencies are installed."""
     return all(find_spec(name) is not None for name in ("mujoco", "absl", "tabulate"))
 
 
 def predict_mujoco(body: RigidBody, train: Samples, test: Samples) -> Forecast:
-    """Predict torque with the parameters that `mujoco.sysid` finds."""
+    """Predict torque with the parameters found by `mujoco.sysid`."""
     import mujoco  # noqa: PLC0415 - not a dependency
     from mujoco import sysid  # noqa: PLC0415 - as above
 
@@ -98,13 +98,13 @@ def _quaternion(mujoco: Any, rotation: Array) -> list[float]:
 def _inertia_of(sysid: Any, body: str) -> Callable[[Any, Any], None]:
     def apply(spec: Any, parameter: Any) -> None:
         sysid.apply_body_inertia(spec, body, parameter)
-        spec.body(body).iquat = [1.0, 0.0, 0.0, 0.0]  # it is left as NaN, which version 4.0.0 does not compile
+        spec.body(body).iquat = [1.0, 0.0, 0.0, 0.0]  # NaN otherwise, which version 4.0.0 cannot compile
 
     return apply
 
 
 def _parameters(sysid: Any, spec: Any, largest: Array, body: RigidBody) -> Any:
-    """Return what is to be found, of the joints in the order of the data, and its bounds."""
+    """Return the parameters to find and their bounds; joints in the order of the data."""
     model, n, found = spec.compile(), body.n_joints, sysid.ParameterDict()
     for index in range(1, n + 1):
         name = f"body{index}"

@@ -1,4 +1,4 @@
-"""The service under test: it prepares recordings, trains with default options and predicts, all through its API."""
+"""The service under test: it prepares recordings, trains with default options and predicts, through its API."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from service.foundation.settings import Settings
 from service.storage.storage import Storage
 
 BATCH_ROWS = 500
-"""Queries of one request to predict."""
+"""Queries of one prediction request."""
 
 
 @dataclass(frozen=True)
 class Trained:
-    """A trained version. estimator: the one that serves; seconds: from the job's start to its end."""
+    """A trained version, the estimator it chose, and the duration of its job, s."""
 
     model: str
     version: int
@@ -40,13 +40,13 @@ class Trained:
 
 @dataclass(frozen=True)
 class Bed:
-    """A running service of its own, and the folder of its files."""
+    """A running service and its home."""
 
     client: Client
     home: Path
 
     def prepare(self, path: Path, reading: Reading) -> Samples:
-        """Upload a recording and return its samples as the service has prepared and stored them."""
+        """Upload a recording and return its samples as prepared by the service."""
         dataset = self.client.upload(path, **reading)
         storage = Storage.open(Settings(home=self.home))
         try:
@@ -71,7 +71,7 @@ class Bed:
         return Trained(model, job.version, version.estimator, spent.total_seconds())
 
     def predict(self, trained: Trained, samples: Samples) -> Forecast:
-        """Predict the torque of each row, and the standard deviation that the 95 % interval stands for."""
+        """Predict the torque of each row, and the standard deviation equivalent to the 95 % interval."""
         means, halves = [], []
         for start in range(0, len(samples), BATCH_ROWS):
             rows = samples.rows(slice(start, start + BATCH_ROWS))

@@ -1,4 +1,4 @@
-"""The recordings of a folder, as the service prepares them."""
+"""The recordings of a folder, prepared by the service."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from lipserve.asking import Reading
 from service.cli.simulate import write_recording
 
 ARMS_FILE = "real_arms.npz"
-"""Holds several arms; its arrays are called `arm|part|field`."""
+"""File of several arms; its arrays are named `arm|part|field`."""
 TRAIN = "train"
-"""The part that is learnt from; a recording of one part has only this one."""
+"""Name of the part for training; other parts are other motions."""
 FIELDS = ("t", "episode", "q", "dq", "ddq", "tau")
 _UR10 = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint")
 
@@ -29,9 +29,14 @@ _UR10 = ("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_jo
 class Recording:
     """A recording of one arm.
 
-    arm: its name in ARMS_FILE, None if the file holds one arm; parts: by name, TRAIN first, the others are other
-    motions; robot: the profile whose URDF describes the arm, None if there is none; sliding: which joints are
-    prismatic; reading: how an upload is read.
+    Attributes:
+        name: name of the recording.
+        file: name of its file.
+        arm: name of the arm in ARMS_FILE; None if the file has one arm.
+        parts: names of the parts, TRAIN first.
+        robot: profile with the arm's URDF, if there is one.
+        sliding: indices of prismatic joints.
+        reading: options of the upload.
     """
 
     name: str
@@ -63,17 +68,14 @@ RECORDINGS = (
     Recording("kr300", arm="kr300", parts=(TRAIN, "other", "other2")),
     Recording("double-pendulum", arm="double_pendulum", parts=(TRAIN, "other"), robot="double-pendulum"),
 )
-"""Eight arms. `sarcos_test.npz` is left out: its rows have no times, so that no split by time exists."""
+"""Eight arms. `sarcos_test.npz` is omitted, because its rows have no times to split by."""
 
 Parts = Mapping[str, Samples]
 """The prepared samples of a recording's parts by name."""
 
 
 def prepare(recording: Recording, folder: Path, cache: Path, bed: Callable[[], Bed]) -> Parts:
-    """Return the parts of a recording as the service prepares them, from `cache` if they were prepared before.
-
-    Raise BenchError if the folder lacks the recording's file.
-    """
+    """Return the prepared parts of a recording, from `cache` if they exist; raise BenchError without the file."""
     return {part: _prepared(recording, part, folder, cache, bed) for part in recording.parts}
 
 
@@ -82,7 +84,7 @@ def _prepared(recording: Recording, part: str, folder: Path, cache: Path, bed: C
     if not path.is_file():
         source = folder / recording.file
         if not source.is_file():
-            raise BenchError(f"{source} does not exist: the folder of the recordings is required.")
+            raise BenchError(f"{source} does not exist. Give the folder of the recordings.")
         cache.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory() as scratch:
             if recording.arm is not None:
@@ -95,7 +97,7 @@ def _prepared(recording: Recording, part: str, folder: Path, cache: Path, bed: C
 
 
 def _extract(source: Path, prefix: str, target: Path) -> Path:
-    """Write one part of one arm of ARMS_FILE as a recording of its own."""
+    """Write one part of one arm of ARMS_FILE as a separate recording."""
     with np.load(source) as arrays:
         found = {name: arrays[prefix + name] for name in FIELDS if prefix + name in arrays}
     np.savez(target, **found)

@@ -1,7 +1,7 @@
-"""What others try first, from the recording's mean to least squares with known kinematics.
+"""Other methods, from the recording's mean to least squares with known kinematics.
 
-Each method sees the training samples and the states of the test, not its torque. What it has to choose, it chooses on
-the last quarter of the training samples: no constant was tuned on these robots.
+Each method sees the training samples and the states of the test, not its torque. It chooses its constants on the last
+quarter of the training samples; no constant was tuned on these robots.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from lipcore.robots.library import pinocchio
 from lipcore.robots.urdf import RigidBody
 
 SIGN_RAD_S = 0.05
-"""Velocity at which the RBF's sign of velocity is 76 % of its final value, rad/s."""
+"""Velocity scale of the smooth sign of velocity in the RBF's inputs."""
 COULOMB_RAD_S = 0.02
-"""The same of Coulomb friction, rad/s."""
+"""Velocity scale of the smooth sign in Coulomb friction."""
 MAX_RBF_ROWS = 1500
-"""Rows that the RBF learns from; more are thinned evenly, as its cost is cubic."""
+"""Max training rows of the RBF; more are thinned evenly, as its cost is cubic."""
 LENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Length scales of the RBF, in standard deviations of an input times the square root of their number."""
 RIDGES = tuple(10.0**power for power in range(-8, 1))
@@ -35,7 +35,7 @@ class Forecast(NamedTuple):
 
 
 Predict = Callable[[Samples, Samples], Forecast]
-"""Learns from the first samples and predicts at the states of the second."""
+"""A function that learns from the first samples and predicts at the states of the second."""
 
 
 def predict_mean(train: Samples, test: Samples) -> Forecast:

@@ -1,4 +1,4 @@
-"""Which cells there are, and computing those that have no result yet."""
+"""The cells of a run, and the computation of missing results."""
 
 from __future__ import annotations
 
@@ -25,26 +25,32 @@ from lipcore.data.samples import Samples
 from lipcore.robots.urdf import RigidBody
 
 ALONE: Mapping[str, Predict] = {"mean": rivals.predict_mean, "RBF ridge": rivals.predict_rbf}
-"""Rivals that know nothing of the robot."""
+"""Other methods without knowledge of the robot."""
 WITH_BODY: Mapping[str, Callable[[RigidBody, Samples, Samples], Forecast]] = {
     "least squares": rivals.predict_least_squares,
     "Bayesian least squares": rivals.predict_bayesian,
     "mujoco.sysid": mujoco_sysid.predict_mujoco,
 }
-"""Rivals that know the URDF."""
+"""Other methods that know the URDF."""
 OPTIONAL = {"mujoco.sysid": mujoco_sysid.is_installed}
-"""Rivals that may be missing here, and whether they are there."""
+"""Methods that may not be installed, and functions that check it."""
 
 Service = Callable[[], Bed]
-"""Returns the service, which starts when it is first needed."""
+"""A function that returns the service and starts it on the first call."""
 
 
 @dataclass(frozen=True)
 class Options:
     """Options of a run.
 
-    folder: of the recordings; out: of the results; revision: of the product; only: pattern that the name of a cell
-    must contain; jobs: cells that are computed at a time; compute: False returns only the results that there are.
+    Attributes:
+        folder: folder of the recordings.
+        out: folder of the results.
+        revision: revision of LIPServe.
+        only: regular expression to find in the name of a cell.
+        jobs: cells computed at a time.
+        compute: whether missing results are computed.
+        recordings: the recordings.
     """
 
     folder: Path
@@ -58,7 +64,7 @@ class Options:
 
 @dataclass(frozen=True)
 class Plan:
-    """work: what each cell learns from and is tested on; skipped: splits that a recording is too short for, and why."""
+    """Recording and split of each cell, and splits for which a recording is too short, with the reason."""
 
     work: Mapping[Cell, tuple[Recording, Split]]
     skipped: Mapping[str, str]
@@ -66,7 +72,7 @@ class Plan:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All results of a plan. failed: why a cell has none, by its name; absent: rivals that are not installed."""
+    """Results of a plan, skipped splits, errors of failed cells by name, and methods that are not installed."""
 
     results: Sequence[Result]
     skipped: Mapping[str, str]
@@ -75,10 +81,7 @@ class Outcome:
 
 
 def run(options: Options, console: Console) -> Outcome:
-    """Compute the cells that have no result; return all results.
-
-    Raise BenchError if a recording is neither in the folder nor prepared in the results.
-    """
+    """Compute the missing results and return all; raise BenchError if a recording is missing."""
     cache = Cache(options.out / "cells", options.revision)
     with _service(options.jobs) as service:
         plan = make_plan(options, service)
@@ -92,7 +95,7 @@ def run(options: Options, console: Console) -> Outcome:
 
 
 def make_plan(options: Options, service: Service) -> Plan:
-    """Prepare the recordings; return the cells whose names `only` matches."""
+    """Prepare the recordings; return the cells whose names match `only`."""
     work, all_skipped = {}, {}
     for recording in options.recordings:
         found, skipped = splits(prepare(recording, options.folder, options.out / "prepared", service))
@@ -113,7 +116,7 @@ def _cells(recording: Recording, split: str) -> Iterator[Cell]:
 
 
 def compute_cell(cell: Cell, recording: Recording, split: Split, service: Service) -> Result:
-    """Train on the split's training samples and predict its test, whose torque no method sees."""
+    """Train on the training samples of a split and predict its test, without the test's torque."""
     states = replace(split.test, tau=np.full_like(split.test.tau, np.nan))
     if cell.method == PRODUCT:
         bed, types = service(), recording.joint_types(split.train.n_joints)
@@ -130,7 +133,7 @@ def compute_cell(cell: Cell, recording: Recording, split: Split, service: Servic
 def _compute_all(
     cells: Sequence[Cell], plan: Plan, cache: Cache, jobs: int, service: Service, console: Console
 ) -> dict[str, str]:
-    """Compute cells, `jobs` at a time, and store each result; return why others failed."""
+    """Compute cells, `jobs` at a time, and store each result; return the errors of failed cells."""
     failed = {}
     with ThreadPoolExecutor(jobs) as pool:
         running = {pool.submit(compute_cell, cell, *plan.work[cell], service): cell for cell in cells}
@@ -140,10 +143,10 @@ def _compute_all(
                 if error is None:
                     result = future.result()
                     cache.add(result)
-                    said = f"nMSE {result.error:.1e}, {result.seconds:.1f} s {result.estimator}"
+                    outcome = f"nMSE {result.error:.1e}, {result.seconds:.1f} s {result.estimator}"
                 else:
-                    failed[str(cell)] = said = f"{type(error).__name__}: {error}"
-                console.print(f"  {done}/{len(cells)}  {cell}: {said}", highlight=False, markup=False)
+                    failed[str(cell)] = outcome = f"{type(error).__name__}: {error}"
+                console.print(f"  {done}/{len(cells)}  {cell}: {outcome}", highlight=False, markup=False)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise

@@ -1,4 +1,4 @@
-"""`python -m benchmarks.reproduce`: from options to results."""
+"""The command line of `python -m benchmarks.reproduce`."""
 
 from __future__ import annotations
 
@@ -24,41 +24,44 @@ from service.cli.options import Json
 
 SIZES = (60, 120, 250)
 QUICK_SIZES = (60, 120)
-"""Other numbers of training samples; 250 take as long as 500, since hyperparameters are fitted on 150 of them."""
+"""Further numbers of training samples; 250 take as long as 500, since hyperparameters are fitted on 150 of them."""
 CURVE_SETS = 5
-"""Training sets of the learning curve, which are costly; `--quick` has one."""
+"""Training sets of the learning curve; `--quick` has one."""
 
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 ERRORS = (ReproductionError,)
-"""What a user is told without a traceback."""
+"""Errors printed without a traceback."""
 
 
 @app.command()
 def reproduce(
-    robot: Annotated[str, typer.Option(help=f"One of {', '.join(ROBOTS)}.")] = "panda",
-    out: Annotated[
-        Path, typer.Option(help="Folder of the results; what is there already is not computed again.")
-    ] = Path("reproduction"),
+    robot: Annotated[str, typer.Option(help=f"Robot: {', '.join(ROBOTS)}.")] = "panda",
+    out: Annotated[Path, typer.Option(help="Folder of the results. Existing results are not computed again.")] = Path(
+        "reproduction"
+    ),
     quick: Annotated[bool, typer.Option("--quick", help="3 × 4 sets: minutes instead of hours.")] = False,
     speed: Annotated[
         list[float] | None, typer.Option(help="Factor on the paper's frequencies, 1 by default; may be repeated.")
     ] = None,
-    estimator: Annotated[list[str] | None, typer.Option(help="May be repeated; all by default.")] = None,
-    training_sets: Annotated[int | None, typer.Option(min=1, help="10 by default, 3 with --quick.")] = None,
-    test_sets: Annotated[int | None, typer.Option(min=1, help="16 by default, 4 with --quick.")] = None,
+    estimator: Annotated[list[str] | None, typer.Option(help="Estimator; may be repeated; all by default.")] = None,
+    training_sets: Annotated[
+        int | None, typer.Option(min=1, help="Number of training sets: 10, with --quick 3.")
+    ] = None,
+    test_sets: Annotated[int | None, typer.Option(min=1, help="Number of test sets: 16, with --quick 4.")] = None,
     samples: Annotated[int, typer.Option(min=2 * MIN_SAMPLES, help="Samples of each training and test set.")] = 500,
     size: Annotated[
-        list[int] | None, typer.Option(help="Fewer samples to train on too; may be repeated. 0: none.")
+        list[int] | None,
+        typer.Option(help="Also train on this smaller number of samples; may be repeated; 0: no other number."),
     ] = None,
     test_stride: Annotated[
-        int | None, typer.Option(min=1, help="Compare every so many test samples: 2 by default, 5 with --quick.")
+        int | None, typer.Option(min=1, help="Compare every n-th test sample: 2, with --quick 5.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first training set.")] = 1,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes at a time; all cores by default.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Number of processes; all cores by default.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Run the paper's experiment: every estimator on training × test sets of a simulated robot; tables and figures."""
+    """Run the paper's experiment: all estimators on training × test sets of a simulated robot; tables and figures."""
     console, began = Console(soft_wrap=True, stderr=as_json), time.monotonic()
     figures.pyplot()
     experiment = Experiment(
@@ -84,11 +87,11 @@ def reproduce(
             run(experiment, cells, results, count, console)
         except KeyboardInterrupt:
             kept = len(cells) - len(results.missing(cells))
-            console.print(f"stopped: {kept} of {len(cells)} trainings are kept; the same command goes on from there")
+            console.print(f"Stopped: {kept} of {len(cells)} trainings are stored. Run the command again to resume.")
             raise typer.Exit(130) from None
         done, failed = results.of(cells), results.failed(cells)
     if not done:
-        raise ReproductionError(f"every training failed, the first with {failed[0].error}")
+        raise ReproductionError(f"All trainings failed, the first with {failed[0].error}")
     reported = report.Run(
         experiment=experiment,
         command=shlex.join(["python", "-m", "benchmarks.reproduce", *sys.argv[1:]]),
@@ -117,7 +120,7 @@ def reproduce(
 def plan(
     experiment: Experiment, speeds: list[float], estimators: list[str], sizes: list[int], sets: int, curve_sets: int
 ) -> list[Cell]:
-    """Cells in order: full sets seed by seed, then fewer samples, whose short trainings fill the cores at the end."""
+    """Return the cells: full sets seed by seed, then short trainings, which fill the cores at the end."""
     full = [
         Cell(estimator=name, speed=speed, samples=experiment.samples, seed=seed)
         for seed in experiment.training_seeds(sets)

@@ -1,4 +1,4 @@
-"""What the experiment is: its settings, its cells, and how one cell is computed."""
+"""The experiment: its settings, its cells, and the computation of a cell."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from lipcore.robots.urdf import RigidBody
 from lipcore.vocabulary import JointType
 
 FIRST_TEST_SEED = 1000
-"""Test sets have the seeds from here on, so that none is a training set."""
+"""First seed of the test sets, above those of training sets."""
 
 
 class Cell(BaseModel):
-    """One training: an estimator on `samples` samples of the stream of a seed, at a speed. Tested on every test set."""
+    """One training: an estimator on `samples` samples of the stream of a seed and a speed."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -44,14 +44,19 @@ class Cell(BaseModel):
 
 
 class TestResult(BaseModel):
-    """Figures of one test set, one number a joint; coverage and width one list for each of data.metrics.LEVELS.
+    """Figures of one test set, a value for each joint.
 
-    nmse is against the simulator's torque without noise, nmse_noisy against the measured one; torque_std, N·m, is the
-    standard deviation of the former.
+    Attributes:
+        seed: seed of the test set.
+        nmse: nMSE against the simulator's torque without noise.
+        nmse_noisy: nMSE against the measured torque.
+        torque_std: standard deviation of the torque without noise, N·m.
+        coverage: coverage at each of `lipcore.data.metrics.LEVELS`.
+        width: width of the interval at each of these levels, N·m.
     """
 
     model_config = ConfigDict(ser_json_inf_nan="constants")
-    __test__ = False  # no test, whatever pytest thinks
+    __test__ = False  # not a test for pytest
 
     seed: int
     nmse: list[float]
@@ -62,7 +67,7 @@ class TestResult(BaseModel):
 
 
 class CellResult(BaseModel):
-    """What became of a cell. reliability: coverage at each of RELIABILITY_LEVELS, per joint, over all test sets."""
+    """Result of a cell; reliability: coverage at each of RELIABILITY_LEVELS, per joint, over all test sets."""
 
     cell: Cell
     error: str | None = None
@@ -77,7 +82,7 @@ class CellResult(BaseModel):
 
 
 def fingerprint() -> str:
-    """Short hash of lipcore's source: results of other code are other results."""
+    """Return a short hash of lipcore's source."""
     total = hashlib.sha256()
     for path, content in sorted(_sources(files("lipcore"))):
         total.update(path.encode() + b"\0" + content)
@@ -95,15 +100,25 @@ def _sources(folder: Traversable) -> list[tuple[str, bytes]]:
 
 
 YARDSTICK = "rigid-body (URDF)"
-"""The arm whose geometry is that of the URDF, which is the simulator's own; its masses are learnt."""
+"""Reference: `rigid-body` with the true geometry from the URDF; masses are learnt."""
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What all cells of one folder share. Streams are the paper's but for what is said here; see lipcore.simulation.
+    """Settings of all cells of one folder; see `lipcore.robots.simulation`.
 
-    samples, rate (Hz), noise (N·m): of training and test sets; test_stride: every how many test samples are compared;
-    options: of the fits; code: fingerprint of the numerics, since other code gives other results.
+    Attributes:
+        robot: the simulated robot.
+        samples: samples of each training and test set.
+        rate: rate of the samples, Hz.
+        training_sinusoids: sinusoids of training motions.
+        test_sinusoids: sinusoids of test motions.
+        noise: standard deviation of the measured torque, N·m.
+        first_seed: seed of the first training set.
+        test_sets: number of test sets.
+        test_stride: distance of compared test samples.
+        options: fit options.
+        code: hash of lipcore's source, as other code gives other results.
     """
 
     robot: str = "panda"
@@ -119,7 +134,7 @@ class Experiment:
     code: str = field(default_factory=fingerprint)
 
     def settings(self) -> dict[str, Any]:
-        """The settings as JSON holds them."""
+        """Return the settings as JSON values."""
         settings: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return settings
 
@@ -129,28 +144,28 @@ class Experiment:
         return hashlib.sha256(json.dumps(self.settings(), sort_keys=True).encode()).hexdigest()[:12]
 
     def training_seeds(self, count: int) -> list[int]:
-        """Seeds of the first `count` training sets."""
+        """Return the seeds of the first `count` training sets."""
         return list(range(self.first_seed, self.first_seed + count))
 
     def test_seeds(self) -> list[int]:
-        """Seeds of the test sets."""
+        """Return the seeds of the test sets."""
         return [FIRST_TEST_SEED + seed for seed in self.training_seeds(self.test_sets)]
 
     def training_set(self, cell: Cell) -> Samples:
-        """Samples spread evenly over the whole stream of a cell, so that fewer samples see the same region."""
+        """Return samples spread evenly over the whole stream of a cell, so that all sizes cover the same region."""
         stream = Simulation(self.samples, self.rate, self.training_sinusoids, speed=cell.speed, noise=self.noise)
         rows = np.linspace(0, self.samples - 1, cell.samples).round().astype(np.int64)
         return simulate(load_robot(self.robot), stream, cell.seed).rows(rows)
 
     def test_set(self, speed: float, seed: int) -> tuple[Samples, Array]:
-        """Every `test_stride`-th sample of a test stream and its torque without noise, (N, n) N·m."""
+        """Return every `test_stride`-th sample of a test stream, and the torque without noise, (N, n), N·m."""
         robot = load_robot(self.robot)
         stream = Simulation(self.samples, self.rate, self.test_sinusoids, speed=speed, noise=self.noise)
         samples = simulate(robot, stream, seed).rows(slice(None, None, self.test_stride))
         return samples, inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)
 
     def check(self, estimators: list[str]) -> Robot:
-        """Load the robot and check each estimator; raise what a cell would raise, before any work."""
+        """Load the robot and check each estimator; raise the errors that a cell would raise."""
         robot = load_robot(self.robot)
         for name in estimators:
             check_estimator(*self.training(name, robot.joint_types))
@@ -159,10 +174,7 @@ class Experiment:
     def training(
         self, estimator: str, joint_types: tuple[JointType, ...]
     ) -> tuple[str, tuple[JointType, ...], RigidBody | None, FitOptions]:
-        """Estimator, joint types, robot and options that a name in the tables is trained with.
-
-        Arms of rigid bodies are learnt from torque alone; YARDSTICK is told where the joints lie.
-        """
+        """Return estimator, joint types, robot and options for a name in the tables; YARDSTICK has a fixed geometry."""
         if estimator != YARDSTICK:
             return estimator, joint_types, None, self.options
         loaded = load_robot(self.robot)
@@ -171,7 +183,7 @@ class Experiment:
 
 
 def run_cell(experiment: Experiment, cell: Cell) -> CellResult:
-    """Train once, compare with every test set. A failure is part of the result: other cells go on."""
+    """Train once and compare with every test set; return an error as part of the result."""
     try:
         return _run(experiment, cell)
     except Exception as error:

@@ -23,7 +23,7 @@ COLOURS = {
     "rigid-body": "#D55E00",
     "rigid-body+lip-chain": "#E69F00",
 }
-"""Okabe and Ito's palette, told apart by the colour-blind too; relatives have related hues."""
+"""Okabe and Ito's palette, safe for colour-blind readers; related estimators have related hues."""
 MARKERS = dict(zip(COLOURS, "Xsvo^DP", strict=True))
 OTHER = "#000000"
 STYLE = {
@@ -44,7 +44,7 @@ STYLE = {
 
 
 def pyplot() -> Any:
-    """Matplotlib's pyplot, without a window; raise MissingExtraError."""
+    """Return Matplotlib's pyplot without a window; raise MissingExtraError."""
     import_extra("matplotlib", "plot").use("agg")
     return import_extra("matplotlib.pyplot", "plot")
 
@@ -169,7 +169,7 @@ def _legend(figure: Any, handles: Sequence[Any]) -> None:
 
 
 def _width(panels: float) -> float:
-    """Width of a figure, inches: room for the legend where there are few panels."""
+    """Return the width of a figure with room for the legend, inches."""
     return max(panels + 0.8, 6.5)
 
 

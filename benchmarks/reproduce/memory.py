@@ -1,4 +1,4 @@
-"""Peak memory of this process since a moment, so that one cell's is not another's."""
+"""Peak memory of this process for one cell."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ _STATUS = Path("/proc/self/status")
 
 
 def reset_peak() -> None:
-    """Start to measure anew where the system can (Linux); elsewhere the peak is that of the process's whole life."""
+    """Reset the peak on Linux; elsewhere the peak is that since the start of the process."""
     with suppress(OSError):
         _CLEAR.write_text("5")
 
 
 def peak_mb() -> int:
-    """Largest resident memory since `reset_peak`, MB."""
+    """Return the peak of resident memory since `reset_peak`, MB."""
     with suppress(OSError, StopIteration):
         line = next(line for line in _STATUS.read_text().splitlines() if line.startswith("VmHWM:"))
         return int(line.split()[1]) // 1024

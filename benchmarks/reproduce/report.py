@@ -22,9 +22,9 @@ _PACKAGES = ("lipserve", "numpy", "scipy", "torch", "numba", "pin", "example-rob
 
 @dataclass(frozen=True)
 class Run:
-    """What is reported.
+    """Content of the report.
 
-    rows, results: of all cells without error; seconds: wall time of this run, which computed `computed` of them.
+    Results and rows are of all cells without error; this run computed `computed` of them in `seconds`.
     """
 
     experiment: Experiment
@@ -43,11 +43,11 @@ class Run:
     computed: int
 
     def main(self, **equal: object) -> list[Row]:
-        """Rows of the training sets of full size."""
+        """Return the rows of training sets of full size."""
         return table.select(self.rows, samples=self.experiment.samples, **equal)
 
     def noise_share(self, speed: float) -> Array:
-        """Variance of the noise / variance of the torque, mean over test sets: (n,)."""
+        """Return variance of the noise / variance of the torque, mean over test sets, (n,)."""
         std = [table.column(self.main(speed=speed, joint=joint), "torque_std") for joint in self.joint_names]
         return np.array([np.mean(self.experiment.noise**2 / each**2) if len(each) else np.nan for each in std])
 
@@ -61,7 +61,7 @@ def write(run: Run, folder: Path) -> None:
 
 
 def markdown(run: Run, summary: Sequence[Summary]) -> str:
-    """The page: what was run, then tables and figures a speed."""
+    """Return the page: description of the run, tables for each speed, figures."""
     parts = [_introduction(run)]
     for speed in run.speeds:
         at = [each for each in summary if each.speed == speed]
@@ -86,10 +86,10 @@ def _introduction(run: Run) -> str:
     ]
     if any(name.startswith("rigid-body") for name in run.estimators):
         parts.append(
-            f"`rigid-body` learns the arm from torque alone: geometry, masses and friction. `{YARDSTICK}` is the "
-            "yardstick: it knows where the joints lie, which is as the simulator has it, and of the masses only the "
-            "scale of each body. (The search for a geometry also looks at those of installed URDFs, of which the "
-            "robot's own is one; `python benchmarks/studies/learnt_arm.py rows` does without.)"
+            f"`rigid-body` learns geometry, masses and friction of the arm from torque alone. `{YARDSTICK}` is a "
+            "reference: it knows the true geometry, and the scale of each body's mass. (The search for a geometry also "
+            "tries those of installed URDFs, which include the robot's own; `python benchmarks/studies/learnt_arm.py "
+            "rows` does not.)"
         )
     if run.failed:
         parts.append(
@@ -118,8 +118,8 @@ def _tables(run: Run, summary: Sequence[Summary], speed: float) -> list[str]:
     ]
     for size in run.sizes:
         fewer = [each for each in summary if each.samples == size]
-        said = f"Median nMSE after training on {size} samples ({_sets(run.curve_sets)}):"
-        parts += [said, _by_joint(run, fewer, lambda each: _power(each.nmse_median), lambda each: each.nmse_median)]
+        heading = f"Median nMSE after training on {size} samples ({_sets(run.curve_sets)}):"
+        parts += [heading, _by_joint(run, fewer, lambda each: _power(each.nmse_median), lambda each: each.nmse_median)]
     return parts
 
 
@@ -129,7 +129,7 @@ def _by_joint(
     text: Callable[[Summary], str],
     bold: Callable[[Summary], float] | None = None,
 ) -> str:
-    """Estimators × joints; the smallest value of `bold` of each joint is set in bold."""
+    """Return a table of estimators × joints; the smallest value of `bold` of each joint is in bold."""
     found = {(each.estimator, each.joint): each for each in summary}
     best = {
         joint: min((bold(each) for each in summary if each.joint == joint), default=None) if bold else None
@@ -140,8 +140,8 @@ def _by_joint(
         cells = []
         for joint in run.joint_names:
             each = found.get((estimator, joint))
-            said = "–" if each is None else text(each)
-            cells.append(f"**{said}**" if each is not None and bold and bold(each) == best[joint] else said)
+            shown = "–" if each is None else text(each)
+            cells.append(f"**{shown}**" if each is not None and bold and bold(each) == best[joint] else shown)
         body.append([f"`{estimator}`", *cells])
     return _table(["", *run.joint_names], body)
 
@@ -182,14 +182,14 @@ def _cost(run: Run) -> str:
             ]
         )
     heading = ["", "fit, median s", "fit, longest s", "iterations", "peak memory MB", "ms a query"]
-    said = f"Training on {e.samples} samples, each process on one thread while {run.workers} ran at a time:"
-    return f"{said}\n\n{_table(heading, body)}"
+    text = f"Training on {e.samples} samples, {run.workers} processes at a time with one thread each:"
+    return f"{text}\n\n{_table(heading, body)}"
 
 
 def _versions(run: Run) -> str:
     o = run.experiment.options
     everything = sum(each.total_s for each in run.results)
-    trained = f"{len(run.results)} trainings of {everything:.0f} s of work"
+    trained = f"{len(run.results)} trainings with {everything:.0f} s of work"
     lines = [
         f"{run.seconds:.0f} s of wall time for {run.computed} trainings in this run, of {trained} in all, "
         f"{run.workers} workers on {os.cpu_count()} cores ({platform.machine()})",
@@ -202,8 +202,8 @@ def _versions(run: Run) -> str:
     ]
     if run.sizes:
         lines.append(
-            "fewer samples are spread evenly over the same streams, so that they see the same region; the figure "
-            f"compares {_sets(run.curve_sets)} at every size"
+            "fewer samples are spread evenly over the same streams and cover the same region; the figure compares "
+            f"{_sets(run.curve_sets)} at every size"
         )
     return "\n".join(f"- {line}" for line in lines)
 

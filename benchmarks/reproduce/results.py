@@ -1,4 +1,4 @@
-"""The results of cells on disk: one JSON line each, so that a run goes on where another was ended."""
+"""The results of cells on disk, one JSON line each, so that a run can be resumed."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ FILE = "cells.jsonl"
 
 
 class ResultsError(ValueError):
-    """The folder cannot take the results: it holds others, or another run works on it."""
+    """The folder has results of other settings, or is in use by another run."""
 
 
 class Results:
-    """Results in a folder, held by this process. The first line of the file holds the settings, others a cell each."""
+    """Results in a folder that this process locks.
+
+    The first line of the file has the settings, each further line a cell.
+    """
 
     def __init__(self, folder: Path, experiment: Experiment) -> None:
-        """Open or start a file; raise ResultsError for other settings, a damaged file or a folder in use."""
+        """Open or create the file; raise ResultsError for other settings, a damaged file or a folder in use."""
         folder.mkdir(parents=True, exist_ok=True)
         self.path, self.hash = folder / FILE, experiment.hash
         self._found: dict[Cell, CellResult] = {}
@@ -33,7 +36,7 @@ class Results:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             self._file.close()
-            raise ResultsError(f"--out is {folder}, where another run is at work") from None
+            raise ResultsError(f"The folder {folder} of --out is in use by another run.") from None
         try:
             self._read(experiment.settings())
         except BaseException:
@@ -47,21 +50,21 @@ class Results:
         self._file.close()
 
     def add(self, result: CellResult) -> None:
-        """Append a result; it is on the disk when this returns."""
+        """Append a result durably."""
         self._write({"settings": self.hash, "result": json.loads(result.model_dump_json())})
         self._found[result.cell] = result
 
     def of(self, cells: Sequence[Cell]) -> list[CellResult]:
-        """Results without error of those cells that have one."""
+        """Return the results without error."""
         found = (self._found.get(cell) for cell in cells)
         return [result for result in found if result is not None and result.error is None]
 
     def failed(self, cells: Sequence[Cell]) -> list[CellResult]:
-        """Results of those cells that failed."""
+        """Return the results of failed cells."""
         return [self._found[cell] for cell in cells if cell in self._found and self._found[cell].error is not None]
 
     def missing(self, cells: Sequence[Cell]) -> list[Cell]:
-        """Cells without a result, failed ones among them."""
+        """Return the cells without a result, and failed ones."""
         done = {result.cell for result in self.of(cells)}
         return [cell for cell in cells if cell not in done]
 
@@ -69,7 +72,7 @@ class Results:
         self._file.seek(0)
         content = self._file.read()
         complete = content[: content.rfind(b"\n") + 1]
-        self._file.truncate(len(complete))  # a last line without its end is what a killed run was writing
+        self._file.truncate(len(complete))  # a killed run leaves an incomplete last line
         lines = complete.splitlines()
         if not lines:
             self._write({"settings": self.hash, "of": settings})
@@ -81,18 +84,20 @@ class Results:
                 if number == 1 and found != self.hash:
                     raise ResultsError(self._differing(entry["of"], settings))
                 if found != self.hash:
-                    raise ResultsError(f"{self.path}, line {number}, holds results of other settings: {_REMEDY}")
+                    raise ResultsError(f"Line {number} of {self.path} has results of other settings. {_REMEDY}")
                 if number > 1:
                     parsed = CellResult.model_validate(result)
                     self._found[parsed.cell] = parsed
             except (json.JSONDecodeError, KeyError, TypeError, AttributeError, ValidationError) as error:
-                raise ResultsError(f"{self.path}, line {number}, is no result of this command: {_REMEDY}") from error
+                raise ResultsError(
+                    f"Line {number} of {self.path} is not a result of this command. {_REMEDY}"
+                ) from error
 
     def _differing(self, found: dict[str, Any], settings: dict[str, Any]) -> str:
         flat_found, flat = _flat(found), _flat(settings)
         names = [name for name in flat_found | flat if flat_found.get(name) != flat.get(name)]
-        said = "; ".join(f"{name} was {flat_found.get(name)}, now {flat.get(name)}" for name in names)
-        return f"{self.path} holds results of other settings ({said}): {_REMEDY}"
+        changes = "; ".join(f"{name} was {flat_found.get(name)}, now {flat.get(name)}" for name in names)
+        return f"{self.path} has results of other settings ({changes}). {_REMEDY}"
 
     def _write(self, entry: dict[str, Any]) -> None:
         self._file.write(json.dumps(entry).encode() + b"\n")
@@ -100,7 +105,7 @@ class Results:
         os.fsync(self._file.fileno())
 
 
-_REMEDY = "choose another folder with --out, or delete that file"
+_REMEDY = "Choose another folder with --out, or delete that file."
 
 
 def _flat(settings: dict[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Computing cells in a pool of processes, with progress."""
+"""Computation of cells in a pool of processes, with progress."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from service.runtime.process import ProcessOptions, start_process
 
 
 class ReproductionError(RuntimeError):
-    """The experiment could not be run to its end; what is finished is kept."""
+    """The experiment could not be finished; finished cells are stored."""
 
 
 def run(experiment: Experiment, cells: Sequence[Cell], results: Results, workers: int, console: Console) -> None:
-    """Compute the cells that have no result yet, `workers` at a time, each on one core; results are kept as they come.
+    """Compute the cells without a result, `workers` at a time on one core each, and store each result.
 
-    Raise ReproductionError where a process dies; KeyboardInterrupt ends the processes and goes on.
+    Raises:
+        ReproductionError: A worker process died.
     """
     todo = results.missing(cells)
     clock = _Clock(len(cells), results.of(cells), todo, workers)
@@ -45,14 +46,14 @@ def run(experiment: Experiment, cells: Sequence[Cell], results: Results, workers
                 left = clock.finished(result)
                 bar.update(task, advance=1, description=str(result.cell), left=left)
                 if result.error is not None or not console.is_terminal:
-                    said = f"failed: {result.error}" if result.error is not None else f"{result.fit_s:.1f} s"
+                    outcome = f"failed: {result.error}" if result.error is not None else f"{result.fit_s:.1f} s"
                     console.print(
-                        f"  {clock.done}/{len(cells)}  {result.cell}: {said}  {left}", highlight=False, markup=False
+                        f"  {clock.done}/{len(cells)}  {result.cell}: {outcome}  {left}", highlight=False, markup=False
                     )
         except BrokenProcessPool:
             raise ReproductionError(
-                f"a worker process died, perhaps for want of memory; {clock.done} of {len(cells)} cells are kept: run "
-                "the same command again, with fewer --workers"
+                f"A worker process died, possibly out of memory; {clock.done} of {len(cells)} cells are stored. Run "
+                "the command again, with fewer --workers."
             ) from None
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -69,7 +70,7 @@ def _finished(pool: ProcessPoolExecutor, experiment: Experiment, cells: Sequence
 
 
 class _Clock:
-    """Estimates the time that is left: cells of one estimator and size take about equally long."""
+    """An estimate of the remaining time from cells of the same estimator and size."""
 
     def __init__(self, total: int, known: Sequence[CellResult], todo: Sequence[Cell], workers: int) -> None:
         self.total, self.todo, self.workers, self.began = total, list(todo), workers, time.monotonic()
@@ -83,7 +84,7 @@ class _Clock:
         return self.total - len(self.todo)
 
     def finished(self, result: CellResult) -> str:
-        """Note a result; say what is left."""
+        """Record a result; describe the remaining time."""
         self.todo.remove(result.cell)
         self._note(result)
         if not self.spent:

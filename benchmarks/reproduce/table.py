@@ -1,4 +1,4 @@
-"""The results in long form, one row a test set and joint, and their summary: what is written as CSV and drawn."""
+"""Results as rows, one for each test set and joint, and their summary, for CSV files and figures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lipcore.data.samples import Array
 
 
 class Row(NamedTuple):
-    """Figures of one joint on one test set after one training; widths and torque_std in N·m."""
+    """Figures of one joint on one test set after one training; widths and `torque_std` in N·m."""
 
     speed: float
     estimator: str
@@ -58,7 +58,7 @@ class Summary(NamedTuple):
 
 
 def rows(results: Iterable[CellResult], joint_names: Sequence[str]) -> list[Row]:
-    """Long form of results without error."""
+    """Return the rows of results without error."""
     assert LEVELS == (0.5, 0.8, 0.95, 0.99)
     found = []
     for result in results:
@@ -72,17 +72,17 @@ def rows(results: Iterable[CellResult], joint_names: Sequence[str]) -> list[Row]
 
 
 def select(table: Iterable[Row], **equal: object) -> list[Row]:
-    """Rows whose columns have the given values."""
+    """Return the rows whose columns have the given values."""
     return [row for row in table if all(getattr(row, name) == value for name, value in equal.items())]
 
 
 def column(table: Iterable[Row], name: str) -> Array:
-    """One column of numbers."""
+    """Return one column of numbers."""
     return np.array([getattr(row, name) for row in table], dtype=np.float64)
 
 
 def summarise(table: Sequence[Row]) -> list[Summary]:
-    """Summaries in the order in which speed, estimator, samples and joint occur."""
+    """Return the summary of each speed, estimator, number of samples and joint, in the order of their occurrence."""
     groups: dict[tuple[Any, ...], list[Row]] = {}
     for row in table:
         groups.setdefault((row.speed, row.estimator, row.samples, row.joint), []).append(row)

@@ -1,1 +1,1 @@
-"""`python -m benchmarks scale`: several services and workers, with a database, a store and a scheduler of their own."""
+"""`python -m benchmarks scale`: several services and workers with PostgreSQL, S3 and Dask."""

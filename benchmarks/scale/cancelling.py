@@ -1,4 +1,4 @@
-"""Cancelling a job that runs on a worker of the cluster."""
+"""Time to cancel a job that runs on a worker of the cluster."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from lipserve.states import ACTIVE
 
 NAME = "cancel"
 ENDLESS = {"hyperparameter_samples": 200, "posterior_samples": 60, "max_iterations": 10_000, "starts": 1}
-MOST_SECONDS = 2.0
+MAX_SECONDS = 2.0
 SAMPLES = 400
-_POLL = 0.02
+_POLL_S = 0.02
 
 
 def run(engines: Engines, trials: int, seed: int, console: Console) -> Part:
-    """Cancel a job in the middle of its fit, so many times, and take the seconds until it has ended."""
+    """Cancel a job during its fit, `trials` times, and measure the time until its end."""
     service = engines.service(cluster=True)
     worker = engines.worker()
     found = []
@@ -39,8 +39,8 @@ def run(engines: Engines, trials: int, seed: int, console: Console) -> Part:
     worker.terminate()
     worker.wait(30)
     rows = [("trials", str(trials)), ("s, median", f"{np.median(found):.2f}"), ("s, worst", f"{max(found):.2f}")]
-    target = Target("a job on the cluster is cancelled, worst", max(found), "s", "≤", MOST_SECONDS)
-    return Part(NAME, {"seconds": found}, [Grid("from the cancel to its end", ("", ""), rows)], [target])
+    target = Target("a job on the cluster is cancelled, worst", max(found), "s", "≤", MAX_SECONDS)
+    return Part(NAME, {"seconds": found}, [Grid("time from cancelling a job to its end", ("", ""), rows)], [target])
 
 
 def _cancel(client: Client, dataset: str) -> float:
@@ -48,5 +48,5 @@ def _cancel(client: Client, dataset: str) -> float:
     eventually(lambda: client.job(name).progress.iteration > 0, "the first iteration of a job")
     began = time.monotonic()
     client.cancel(name)
-    eventually(lambda: client.job(name).state not in ACTIVE, "the end of a cancelled job", poll=_POLL)
+    eventually(lambda: client.job(name).state not in ACTIVE, "the end of a cancelled job", poll=_POLL_S)
     return time.monotonic() - began

@@ -1,4 +1,4 @@
-"""What a batch, a sample, a query and a model cost: processor time, memory, bytes. The constants of docs/sizing.md."""
+"""Processor time, memory and bytes of a batch, a sample, a query and a model: the constants of docs/sizing.md."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.clients import HttpClient, post
 from benchmarks.latency.table import NOTHING, Grid
 from benchmarks.online.sending import batch_request, send
 from benchmarks.online.trials import learners
-from benchmarks.processes import resident
+from benchmarks.processes import resident_mib
 from benchmarks.processor import seconds_below
 from benchmarks.scale import plan, streams
 from benchmarks.scale.engines import Engines, eventually, ready, stored
@@ -29,17 +29,27 @@ from service.foundation.settings import shipped_models
 
 NAME = "costs"
 ROWS = (1, 10, 100)
-"""Of a batch; what a batch costs and what a sample costs is the line through these."""
+"""Sizes of batches; the line through these gives the costs of a batch and of a sample."""
 COPIES = 6
-"""Of the model, to see what memory each takes."""
+"""Copies of the model, to measure the memory of one."""
 IDLE_SECONDS, PACED_SECONDS = 5.0, 10
 KIB = 1024.0
 
 
 @dataclass(frozen=True)
 class Batches:
-    """Of one size and one service. ack_ms: median; the rest is of one batch: processor ms of the service's own process,
-    of its learner and of the database server, and bytes by which the database grew (None where it is SQLite's)."""
+    """Costs of a batch of one size and one service.
+
+    Attributes:
+        rows: rows of the batch.
+        shared: whether the service uses PostgreSQL and S3.
+        ack_ms: median time to acknowledgement.
+        ack_p99_ms: 99th percentile of it.
+        service_ms: processor time of the service's own process.
+        learner_ms: processor time of its learner.
+        database_ms: processor time of the database server; None for SQLite.
+        stored_bytes: growth of the database; None for SQLite.
+    """
 
     rows: int
     shared: bool
@@ -52,7 +62,7 @@ class Batches:
 
 
 class Subject:
-    """A service that is taught, and what its processes have used."""
+    """A service that learns, and the processor time of its processes."""
 
     def __init__(self, service: ServiceProcess, client: Client, engines: Engines | None) -> None:
         self.service, self.client, self.engines = service, client, engines
@@ -61,24 +71,24 @@ class Subject:
         self.revision = 0
 
     def teach(self, samples: Samples) -> float:
-        """Send the next batch; return the milliseconds until it was acknowledged."""
+        """Send the next batch; return the milliseconds until its acknowledgement."""
         ack = send(self.http, batch_request(MODEL, "costs", self.sequence, samples))
         self.sequence, self.revision = self.sequence + 1, ack.revision
         return 1e3 * ack.seconds
 
     def caught_up(self, query: Samples) -> None:
-        """Wait until all is learnt."""
-        eventually(partial(_knows, self.client, MODEL, query, self.revision), "learning what was sent", 120.0)
+        """Wait until all batches are learnt."""
+        eventually(partial(_knows, self.client, MODEL, query, self.revision), "learning of all batches", 120.0)
 
     def used(self) -> tuple[float, float, float]:
-        """Seconds of processor time so far: service, learner, database server."""
+        """Return seconds of processor time so far of service, learner and database server."""
         pid = self.service.process.pid
         learner = sum(seconds_below(each, itself=True) for each in learners(pid))
         own = seconds_below(pid, itself=True) - seconds_below(pid)
         return own, learner, 0.0 if self.engines is None else seconds_below(self.engines.postgres.pid, itself=True)
 
     def size(self) -> int:
-        """Bytes of the database server's database; 0 where there is none."""
+        """Return the size of the database in bytes; 0 for SQLite."""
         if self.engines is None:
             return 0
         return int(
@@ -87,14 +97,14 @@ class Subject:
 
 
 def run(engines: Engines, batches: int, queries: int, seed: int, console: Console) -> Part:
-    """Measure two services in turn: one on PostgreSQL and S3, one alone on SQLite."""
+    """Measure two services in turn, one with PostgreSQL and S3, one with SQLite."""
     settings = {"max_loaded_models": COPIES + 2}
     services = [engines.service(settings), engines.alone(settings)]
     subjects = [Subject(each, ready(each), engines if each is services[0] else None) for each in services]
     query = streams.stream(50, seed + 4, rate=1.0)
     for subject in subjects:
         subject.client.put_learning(MODEL, LEARNING)
-        subject.teach(streams.stream(10, seed + 5))  # starts its learner
+        subject.teach(streams.stream(10, seed + 5))  # start its learner
         subject.caught_up(query)
     found: list[Batches] = []
     for rows in ROWS:
@@ -115,23 +125,20 @@ def run(engines: Engines, batches: int, queries: int, seed: int, console: Consol
         subject.service.stop()
     line = {name: _line(found, name) for name in ("service_ms", "learner_ms", "database_ms", "stored_bytes")}
     figures |= {name: {"batch": ends[0], "sample": ends[1]} for name, ends in line.items()}
-    notes = [
-        f"plans: a training job takes {_job_seconds():.0f} s of one CPU, as that of {MODEL} did; see docs/sizing.md"
-    ]
+    notes = [f"Plans: a training job takes {_job_seconds():.0f} s of one CPU, as for {MODEL}; see docs/sizing.md."]
     return Part(NAME, figures, [_batch_grid(found), _constants(figures), plan.grid(figures, _job_seconds())], [], notes)
 
 
 def _job_seconds() -> float:
-    """What the fit of the shipped model took."""
+    """Return the time of the shipped model's fit."""
     return float(json.loads((shipped_models() / MODEL / "manifest.json").read_bytes())["fit"]["seconds"])
 
 
 def _batches(subjects: Sequence[Subject], samples: Samples, rows: int, count: int, query: Samples) -> list[Batches]:
-    """Batches of one size to all subjects in turn; processor time until all is learnt."""
+    """Send batches of one size to all subjects in turn; measure until all are learnt."""
     acks: list[list[float]] = [[] for _ in subjects]
     before = [(subject.used(), subject.size()) for subject in subjects]
     for number in range(count):
-        # two rows are the least that times can be told from
         part = samples.rows(slice(number * rows, (number + 1) * rows))
         for place, subject in enumerate(subjects):
             acks[place].append(subject.teach(part))
@@ -159,7 +166,7 @@ def _stream_query(subject: Subject, query: Samples, count: int) -> float:
 
 
 def _each(subject: Subject, ask: Callable[[], object], count: int) -> float:
-    """Microseconds of the service's processor time a call."""
+    """Return the service's processor time a call, µs."""
     before = subject.used()[0]
     for _ in range(count):
         ask()
@@ -167,7 +174,7 @@ def _each(subject: Subject, ask: Callable[[], object], count: int) -> float:
 
 
 def _idle(subject: Subject) -> float:
-    """Milliseconds of processor time a second, of a service and its learner that nobody asks."""
+    """Return processor time of an idle service and its learner, ms per second."""
     before = subject.used()
     time.sleep(IDLE_SECONDS)
     after = subject.used()
@@ -175,9 +182,9 @@ def _idle(subject: Subject) -> float:
 
 
 def _paced(subject: Subject, samples: Samples, query: Samples) -> float:
-    """Milliseconds of the learner's processor time a second, of a model that is taught one row a second.
+    """Return the learner's processor time for a model that learns one row a second, ms per second.
 
-    Nearly all of it is what a revision costs: one is made of all that has come since the one before.
+    Nearly all of it is the cost of revisions; a revision contains all rows since the previous one.
     """
     before = subject.used()[1]
     for number in range(PACED_SECONDS):
@@ -188,23 +195,23 @@ def _paced(subject: Subject, samples: Samples, query: Samples) -> float:
 
 
 def _memory(subject: Subject, engines: Engines, query: Samples) -> dict[str, float | None]:
-    """MiB that one more loaded, and one more taught model take."""
+    """Return memory of service and learner, and of one more loaded and one more learning model, MiB."""
     pid, client = subject.service.process.pid, subject.client
     archive = engines.folder / "model.tar"
     client.export(MODEL, archive, learnt=False)
-    before = resident(pid)
+    before = resident_mib(pid)
     names = [f"copy-{number}" for number in range(COPIES)]
     for name in names:
         client.import_model(archive, name, "always")
         client.put_learning(name, LEARNING)
         client.predict(name, query.q[0], query.dq[0], query.ddq[0])
-    loaded = resident(pid)
+    loaded = resident_mib(pid)
     learner = learners(pid)[0]
-    idle = resident(learner)
+    idle = resident_mib(learner)
     for name in names:
         revision = json.loads(subject.http.ask(batch_request(name, "costs", 0, query)))["revision"]
-        eventually(partial(_knows, client, name, query, revision), "learning what was sent", 120.0)
-    taught = resident(learner)
+        eventually(partial(_knows, client, name, query, revision), "learning of all batches", 120.0)
+    taught = resident_mib(learner)
     return {
         "service_mib": before,
         "learner_mib": idle,
@@ -214,7 +221,7 @@ def _memory(subject: Subject, engines: Engines, query: Samples) -> dict[str, flo
 
 
 def _files(engines: Engines) -> dict[str, float | None]:
-    """Bytes of one stored version and of one snapshot."""
+    """Return the bytes of one stored version and of one snapshot."""
     found = stored(engines)
     snapshots = found.get("learning")
     versions = [row[0] for row in engines.postgres.ask("SELECT count(*) FROM versions", engines.database)]
@@ -226,7 +233,7 @@ def _files(engines: Engines) -> dict[str, float | None]:
 
 
 def _knows(client: Client, model: str, query: Samples, revision: int) -> bool:
-    """Whether a model answers with a revision."""
+    """Return whether a model answers with a revision."""
     return client.predict(model, query.q[0], query.dq[0], query.ddq[0]).revision >= revision
 
 
@@ -235,7 +242,7 @@ def _share(before: float | None, after: float | None) -> float | None:
 
 
 def _line(found: Sequence[Batches], name: str) -> tuple[float, float]:
-    """What a batch costs and what a sample more costs, on PostgreSQL: from the smallest and the largest batches."""
+    """Return costs of a batch and of a sample with PostgreSQL, from the smallest and the largest batches."""
     shared = [each for each in found if each.shared]
     small, large = shared[0], shared[-1]
     low, high = getattr(small, name), getattr(large, name)
@@ -263,18 +270,18 @@ def _constants(figures: dict[str, Any]) -> Grid:
         ("database CPU", "database_ms", "ms"),
     ]
     rows = [(f"{label} of a batch", _text(figures[name]["batch"]), unit) for label, name, unit in both]
-    rows += [(f"{label} of a sample more", _text(figures[name]["sample"]), unit) for label, name, unit in both]
+    rows += [(f"{label} of a sample", _text(figures[name]["sample"]), unit) for label, name, unit in both]
     rows += [
-        ("database, of a batch", _text(figures["stored_bytes"]["batch"]), "bytes"),
-        ("database, of a sample more", _text(figures["stored_bytes"]["sample"]), "bytes"),
+        ("database size of a batch", _text(figures["stored_bytes"]["batch"]), "bytes"),
+        ("database size of a sample", _text(figures["stored_bytes"]["sample"]), "bytes"),
         ("CPU of a query over HTTP", _text(figures["query_http_us"]), "µs"),
         ("CPU of a query over a WebSocket", _text(figures["query_stream_us"]), "µs"),
         ("CPU of a service and its learner, idle", _text(figures["idle_ms_per_s"]), "ms/s"),
-        ("learner CPU of a model taught a row a second", _text(figures["taught_ms_per_s"]), "ms/s"),
+        ("learner CPU of a model that learns a row a second", _text(figures["taught_ms_per_s"]), "ms/s"),
         ("a service without copies of the model", _text(figures["service_mib"]), "MiB"),
-        ("a model loaded", _text(figures["loaded_mib"]), "MiB"),
+        ("a loaded model", _text(figures["loaded_mib"]), "MiB"),
         ("its learner, with one model", _text(figures["learner_mib"]), "MiB"),
-        ("a model taught, in the learner", _text(figures["taught_mib"]), "MiB"),
+        ("a learning model, in the learner", _text(figures["taught_mib"]), "MiB"),
         ("a version in the store", _mib(figures["version_bytes"]), "MiB"),
         ("a snapshot in the store", _mib(figures["snapshot_bytes"]), "MiB"),
     ]

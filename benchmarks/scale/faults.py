@@ -1,4 +1,4 @@
-"""Kills and restarts under load: a worker in the middle of a job, a service in the middle of batches, PostgreSQL."""
+"""Kills and restarts under load: a worker during a job, a service and its learner, PostgreSQL."""
 
 from __future__ import annotations
 
@@ -32,23 +32,29 @@ from service.cli.demo import ServiceProcess
 NAME = "faults"
 STREAM = "faults"
 BATCHES, ROWS = 40, 10
-"""Of a trial."""
-GAP = 0.02
-"""Longest pause between two batches, s."""
+"""Batches of a trial, and rows of a batch."""
+MAX_GAP_S = 0.02
+"""Max pause between two batches."""
 JOB = {"hyperparameter_samples": 100, "posterior_samples": 200, "max_iterations": 150, "starts": 1}
-"""A job that runs long enough to be hit."""
+"""Options of a job that is long enough to be interrupted."""
 SETTINGS = {"publish_every_s": 0.02, "replica_lost_s": 3.0, "log_level": "critical"}
-"""Errors are made here on purpose: what they say of them would only hide the tally."""
-_PATIENCE = 120.0
+"""Settings of the services; the errors provoked here are not logged."""
+_TIMEOUT_S = 120.0
 
 
 @dataclass
 class Tally:
-    """Of faults of one kind.
+    """Counts of faults of one kind.
 
-    acknowledged: batches, or jobs that were queued; refused: answers that were none, after which the client tried
-    again; lost: acknowledged, but unknown afterwards; twice: there more often than once; recovered: faults after which
-    everything went on by itself and all services answered with the same bits; longest: s without an acknowledgement.
+    Attributes:
+        name: kind of the fault.
+        faults: number of faults.
+        acknowledged: acknowledged batches, or queued jobs.
+        refused: failed requests, which the client repeated.
+        lost: acknowledged, but unknown afterwards.
+        twice: stored more than once.
+        recovered: faults after which all services continued and had identical answers.
+        longest: longest time without an acknowledgement, s.
     """
 
     name: str
@@ -62,7 +68,7 @@ class Tally:
 
 
 class Load:
-    """A client of two services that sends batches to them in turn, and again where one does not answer."""
+    """A client that sends batches to two services in turn, and repeats those without an answer."""
 
     def __init__(self, engines: Engines, samples: Samples, seed: int) -> None:
         self.engines, self.samples, self.rng = engines, samples, np.random.default_rng(seed)
@@ -72,7 +78,7 @@ class Load:
             client.put_learning(MODEL, LEARNING)
 
     def batches(self, count: int, tally: Tally) -> None:
-        """Send the next batches until each is acknowledged; raise BenchError where one is not within two minutes."""
+        """Send the next batches until each is acknowledged; raise BenchError after _TIMEOUT_S."""
         last = time.monotonic()
         for sequence in range(self.sent, self.sent + count):
             ack = self._send(sequence, tally)
@@ -80,11 +86,11 @@ class Load:
             tally.longest = max(tally.longest, time.monotonic() - last)
             last = time.monotonic()
             self.revision = max(self.revision, ack.revision)
-            time.sleep(float(self.rng.uniform(0, GAP)))
+            time.sleep(float(self.rng.uniform(0, MAX_GAP_S)))
         self.sent += count
 
     def judge(self, tally: Tally) -> None:
-        """Ask for every batch that was acknowledged, count those logged, and compare the answers of both services."""
+        """Send all acknowledged batches again and count logged ones, to find lost and duplicate batches."""
         with HttpClient(("127.0.0.1", self.services[0].port)) as http:
             known = sum(send(http, self._request(sequence)).duplicate for sequence in range(self.sent))
         query = "SELECT count(*) FROM events WHERE model = %s AND stream_id = %s AND kind = 'batch' AND NOT void"
@@ -92,8 +98,8 @@ class Load:
         tally.lost += self.sent - known
         tally.twice += max(0, logged - self.sent)
 
-    def same(self) -> bool:
-        """Wait until both services answer with all that was acknowledged; return whether their answers are the same."""
+    def is_same(self) -> bool:
+        """Wait until both services have learnt all acknowledged batches; return whether their answers are identical."""
         motion = self.samples.rows(slice(0, 50))
         found = []
         for service in self.services:
@@ -105,19 +111,19 @@ class Load:
                         return answer.revision >= self.revision
                     return False
 
-                eventually(look, f"revision {self.revision} at {service.url}", _PATIENCE)
+                eventually(look, f"revision {self.revision} at {service.url}", _TIMEOUT_S)
                 answer = client.predict(MODEL, motion.q, motion.dq, motion.ddq)
                 found.append((answer.revision, answer.tau.tobytes(), np.asarray(answer.tau_std).tobytes()))
         return found[0] == found[1]
 
     def replace(self, place: int) -> None:
-        """Start another service where one was killed."""
+        """Start a service in the place of a killed one."""
         self.services[place].process.wait()
         self.services[place] = self._start()
         ready(self.services[place]).close()
 
     def stop(self) -> None:
-        """End both services."""
+        """Stop both services."""
         for service in self.services:
             service.stop()
 
@@ -125,7 +131,7 @@ class Load:
         return self.engines.service(SETTINGS)
 
     def _send(self, sequence: int, tally: Tally) -> Ack:
-        request, attempt, deadline = self._request(sequence), sequence, time.monotonic() + _PATIENCE
+        request, attempt, deadline = self._request(sequence), sequence, time.monotonic() + _TIMEOUT_S
         while time.monotonic() < deadline:
             try:
                 with HttpClient(("127.0.0.1", self.services[attempt % 2].port)) as http:
@@ -133,27 +139,27 @@ class Load:
             except (BadAnswerError, OSError):
                 tally.refused += 1
                 attempt += 1
-                time.sleep(GAP)
-        raise BenchError(f"batch {sequence} was not acknowledged within {_PATIENCE:g} s")
+                time.sleep(MAX_GAP_S)
+        raise BenchError(f"Batch {sequence} was not acknowledged within {_TIMEOUT_S:g} s.")
 
     def _request(self, sequence: int) -> bytes:
         return batch_request(MODEL, STREAM, sequence, self.samples.rows(slice(ROWS * sequence, ROWS * (sequence + 1))))
 
 
 def run(engines: Engines, faults: int, seed: int, console: Console) -> Part:
-    """So many faults of each kind."""
+    """Inject `faults` faults of each kind."""
     rng = np.random.default_rng(seed)
     load = Load(engines, streams.stream(4 * (faults + 1) * BATCHES * ROWS, seed + 8), seed)
     tallies = []
     for name, strike in (
-        ("a service killed while batches come", lambda: _kill_service(load, rng)),
-        ("a learner killed while batches come", lambda: _kill_learner(load, rng)),
-        ("PostgreSQL restarted while batches come", lambda: _restart_database(load, rng)),
+        ("service killed while it learns", lambda: _kill_service(load, rng)),
+        ("learner killed while it learns", lambda: _kill_learner(load, rng)),
+        ("PostgreSQL restarted while services learn", lambda: _restart_database(load, rng)),
     ):
         tallies.append(_trials(load, Tally(name), strike, faults, console))
     load.stop()
     tallies.append(_workers(engines, faults, seed, console))
-    columns = ("", "faults", "acknowledged", "refused meanwhile", "lost", "twice", "recovered", "longest pause s")
+    columns = ("", "faults", "acknowledged", "failed requests", "lost", "twice", "recovered", "longest pause s")
     rows = []
     for each in tallies:
         counts = (each.faults, each.acknowledged, each.refused, each.lost, each.twice, each.recovered)
@@ -168,10 +174,10 @@ def run(engines: Engines, faults: int, seed: int, console: Console) -> Part:
 
 
 def _trials(load: Load, tally: Tally, strike: Callable[[], Callable[[], None]], count: int, console: Console) -> Tally:
-    """Strike somewhere among the batches of each trial; `strike` returns what mends it afterwards."""
+    """Call `strike` during the batches of each trial; it returns a function that repairs the fault."""
     for _ in range(count):
         mend: list[Callable[[], None]] = []
-        delay = float(load.rng.uniform(0.1, 0.5 * GAP * BATCHES))
+        delay = float(load.rng.uniform(0.1, 0.5 * MAX_GAP_S * BATCHES))
         striker = threading.Timer(delay, lambda mend=mend: mend.append(strike()))
         striker.start()
         load.batches(BATCHES, tally)
@@ -180,7 +186,7 @@ def _trials(load: Load, tally: Tally, strike: Callable[[], Callable[[], None]], 
             each()
         load.batches(BATCHES // 4, tally)
         tally.faults += 1
-        tally.recovered += load.same()
+        tally.recovered += load.is_same()
         console.print(f"{tally.name}: {tally.recovered} of {tally.faults} recovered", highlight=False)
     load.judge(tally)
     return tally
@@ -205,8 +211,8 @@ def _restart_database(load: Load, _: np.random.Generator) -> Callable[[], None]:
 
 
 def _workers(engines: Engines, faults: int, seed: int, console: Console) -> Tally:
-    """Kill the worker that runs a job; another one of two has to finish it."""
-    tally = Tally("a worker killed while it runs a job")
+    """Kill the worker that runs a job; the second worker has to finish it."""
+    tally = Tally("worker killed while it runs a job")
     service = engines.service(SETTINGS, cluster=True)
     workers = [engines.worker(), engines.worker()]
     with ready(service) as client:
@@ -217,14 +223,14 @@ def _workers(engines: Engines, faults: int, seed: int, console: Console) -> Tall
         for number in range(faults):
             name = client.train(f"job-{number}", [dataset], "lip-chain", list(streams.robot().joint_types), JOB).id
             tally.acknowledged += 1
-            eventually(partial(_iterates, client, name), "the first iteration", _PATIENCE)
+            eventually(partial(_iterates, client, name), "the first iteration", _TIMEOUT_S)
             busy = next(place for place, worker in enumerate(workers) if learners(worker.pid))
             began = time.monotonic()
             workers[busy].kill()
             workers[busy].wait()
             tally.faults += 1
             workers[busy] = engines.worker()
-            eventually(partial(_ended, client, name), "the end of the job", _PATIENCE)
+            eventually(partial(_ended, client, name), "the end of the job", _TIMEOUT_S)
             tally.longest = max(tally.longest, time.monotonic() - began)
             tally.recovered += client.job(name).state == SUCCEEDED
             versions = client.model(f"job-{number}").versions if client.job(name).state == SUCCEEDED else []

@@ -1,4 +1,4 @@
-"""What every part of the benchmark gives: figures, tables of them, and what was promised."""
+"""Results of a part of the benchmark: figures, tables and targets."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.latency.table import Grid, promises
+from benchmarks.latency.table import Grid, targets_grid
 from benchmarks.latency.targets import Target
 
 
 @dataclass(frozen=True)
 class Part:
-    """One part that was measured. figures: plain numbers and texts, for JSON."""
+    """Results of one part; figures: numbers and texts for JSON."""
 
     name: str
     figures: dict[str, Any]
@@ -25,29 +25,28 @@ class Part:
 
 @dataclass
 class Results:
-    """All parts, in the order in which they were measured."""
+    """Results of all parts, in order."""
 
     machine: dict[str, str]
     parts: list[Part] = field(default_factory=list)
 
     def targets(self) -> list[Target]:
-        """What was promised, of all parts."""
+        """Return the targets of all parts."""
         return [each for part in self.parts for each in part.targets]
 
     def notes(self) -> list[str]:
-        """What a reader has to know."""
+        """Return the remarks of all parts."""
         return [each for part in self.parts for each in part.notes]
 
     def grids(self) -> Iterator[Grid]:
-        """All tables."""
+        """Yield all tables."""
         yield Grid("machine", ("", ""), list(self.machine.items()), texts=True)
         for part in self.parts:
             yield from part.grids
-        judged = promises(self.targets())
-        yield Grid(judged.title, ("", *judged.columns[1:]), judged.rows)
+        yield targets_grid(self.targets(), "")
 
     def write(self, path: Path) -> None:
-        """Write everything as JSON."""
-        judged = [{**asdict(each), "met": each.met} for each in self.targets()]
+        """Write the results as JSON."""
+        targets = [{**asdict(each), "met": each.met} for each in self.targets()]
         parts = {part.name: part.figures for part in self.parts}
-        path.write_text(json.dumps({"machine": self.machine, **parts, "targets": judged}, indent=2) + "\n")
+        path.write_text(json.dumps({"machine": self.machine, **parts, "targets": targets}, indent=2) + "\n")

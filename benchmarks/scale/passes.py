@@ -1,4 +1,4 @@
-"""The pass over all samples, with one and two processes in turn: how it scales, and that the sum stays the same."""
+"""Speed-up of the pass over all samples by a second process, and identity of its sum."""
 
 from __future__ import annotations
 
@@ -31,15 +31,15 @@ from service.runtime.executors import Processes, sum_shards
 NAME = "pass"
 MODEL = "panda-sim"
 NAMES = ("t", "episode", "q", "dq", "ddq", "tau")
-LEAST_SPEEDUP = 1.7
-LONGER, MOST_RATIO = 5, 1.1
-"""Times as many samples, for the cost of one; and how much more one may cost."""
+MIN_SPEEDUP = 1.7
+LONGER, MAX_COST_RATIO = 5, 1.1
+"""Factor on the number of samples, and max growth of the cost of a sample."""
 POOL, CLUSTER = "processes of this host", "Dask workers"
 
 
 @dataclass(frozen=True)
 class Shard:
-    """Rows of a recording in a folder, one file an array."""
+    """Rows of a recording in a folder with a file for each array."""
 
     model: str
     recording: str
@@ -48,7 +48,7 @@ class Shard:
 
 
 def work(shard: Shard) -> ShardStatistics:
-    """What the rows of a shard tell of the model."""
+    """Return the statistics of a shard."""
     folder, rows = Path(shard.recording), slice(shard.first, shard.last)
     arrays = {name: np.array(np.load(folder / f"{name}.npy", mmap_mode="r")[rows]) for name in NAMES}
     summing, names = _summing(shard.model)
@@ -62,7 +62,7 @@ def _summing(model: str) -> tuple[Summing, tuple[str, ...]]:
 
 
 def run(engines: Engines, rows: int, pairs: int, seed: int, console: Console) -> Part:
-    """Sum up one recording again and again, on one and on two processes alternately, here and on a cluster."""
+    """Sum up one recording repeatedly with one and two processes in turn, on this host and on a cluster."""
     shards = _shards(engines.home("recording"), rows, seed)
     seconds: dict[str, dict[int, list[float]]] = {}
     sums: set[str] = set()
@@ -71,7 +71,7 @@ def run(engines: Engines, rows: int, pairs: int, seed: int, console: Console) ->
         with opened as by_count:
             found = seconds[kind] = {count: [] for count in by_count}
             for executor in by_count.values():
-                sum_shards(executor, work, shards[:2], _never)  # imports, loads the model
+                sum_shards(executor, work, shards[:2], _never)  # import modules, load the model
             for pair in range(pairs):
                 for count in sorted(by_count, reverse=bool(pair % 2)):
                     began = time.monotonic()
@@ -132,13 +132,13 @@ def _part(rows: int, seconds: Mapping[str, Mapping[int, list[float]]], longer: f
             rate = rows / float(np.median(times))
             table.append((kind, str(count), f"{rate:,.0f}", f"{min(times):.1f}", f"{max(times):.1f}"))
         table.append((f"{kind}: median ratio of pairs", "", f"{ratio:.2f}", "", ""))
-        targets.append(Target(f"two over one, {kind}", ratio, "×", "≥", LEAST_SPEEDUP))
+        targets.append(Target(f"speed-up by a second process, {kind}", ratio, "×", "≥", MIN_SPEEDUP))
     table.append((f"{POOL}: {LONGER * rows:,} samples", "2", f"{LONGER * rows / longer:,.0f}", f"{longer:.1f}", ""))
     ratio = longer / LONGER / float(np.median(seconds[POOL][2]))
-    targets.append(Target(f"cost of a sample among {LONGER} times as many", ratio, "×", "≤", MOST_RATIO))
+    targets.append(Target(f"cost of a sample with {LONGER} times as many", ratio, "×", "≤", MAX_COST_RATIO))
     targets.append(Target("different sums", sums, "", "≤", 1))
     columns = ("", "processes", "samples/s", "fastest s", "slowest s")
-    title = f"pass over {rows:,} samples of seven joints in shards of {SHARD:,}, as {MODEL} takes them in"
+    title = f"pass over {rows:,} samples of seven joints in shards of {SHARD:,}, model {MODEL}"
     figures = {
         "rows": rows,
         "seconds": {kind: dict(found) for kind, found in seconds.items()},

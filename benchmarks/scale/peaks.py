@@ -1,24 +1,24 @@
-"""The most memory that each process of a service has had. Linux only; elsewhere nothing is found."""
+"""Peak memory of each process of a service. Linux only; elsewhere nothing is found."""
 
 from __future__ import annotations
 
-from benchmarks.processes import Watch, levels, resident
+from benchmarks.processes import PeriodicCall, levels, resident_mib
 
-PERIOD = 0.2
+PERIOD_S = 0.2
 KINDS = ("service", "training", "statistics")
-"""By depth: the service, what it has started (training and learner), and what those have (statistics of shards)."""
+"""Kinds of processes by depth: the service; its children (training and learner); their children (statistics)."""
 
 
-class Peaks(Watch):
-    """Looks five times a second while it is entered. found: MiB at most of one process, by kind."""
+class Peaks(PeriodicCall):
+    """A context manager that reads peaks every PERIOD_S; found: peak of one process by kind, MiB."""
 
     def __init__(self, pid: int) -> None:
-        super().__init__(PERIOD, self.note)
+        super().__init__(PERIOD_S, self.note)
         self.pid = pid
         self.found: dict[str, float] = {}
 
     def note(self) -> None:
-        """Note what every process below has had so far."""
+        """Record the peaks so far."""
         for kind, pids in zip(KINDS, levels(self.pid), strict=False):
             for pid in pids:
-                self.found[kind] = max(self.found.get(kind, 0.0), resident(pid, "VmHWM") or 0.0)
+                self.found[kind] = max(self.found.get(kind, 0.0), resident_mib(pid, "VmHWM") or 0.0)

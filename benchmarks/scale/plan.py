@@ -1,4 +1,4 @@
-"""From what a batch, a sample, a query and a model cost to what a fleet needs: the formula of docs/sizing.md."""
+"""Resources of a fleet from the costs of a batch, a sample, a query and a model: the formula of docs/sizing.md."""
 
 from __future__ import annotations
 
@@ -10,25 +10,32 @@ from typing import Any
 from benchmarks.latency.table import Grid
 
 REPLICAS = 2
-"""Services that answer for each robot: one may be gone."""
+"""Services for each robot, of which one may fail."""
 LOAD = 0.6
-"""Share of a CPU that is planned for; the rest is for peaks and for the other service's robots when that is gone."""
+"""Planned load of a CPU; the rest is for peaks and for robots of a failed service."""
 ACTIVE, MOVING = 0.5, 1 / 3
-"""Share of the robots that move, and teach, at the same time; share of the day for which each does."""
+"""Share of the robots that move and learn at the same time; share of the day in which each robot moves."""
 DAYS, LOG_BYTES = 30, 1 << 30
-"""How long observations are kept, and how many bytes of a model's log at most: the defaults of the settings."""
+"""Retention of observations, and max size of a model's log: the defaults of the settings."""
 SNAPSHOTS, VERSIONS = 20, 3
-"""Kept of a version, as by default, and versions of a model."""
-WEEK = 7 * 86400.0
+"""Snapshots of a version (the default), and versions of a model."""
+WEEK_S = 7 * 86400.0
 MIB, GIB = float(1 << 20), float(1 << 30)
 
 
 @dataclass(frozen=True)
 class Fleet:
-    """Robots and what they do. models: that learn, of all of them; teachers: robots that teach at most, all where None.
+    """Robots and their load.
 
-    samples: taught a second by a robot that moves; period: s between its batches; publish: LIPSERVE_PUBLISH_EVERY_S;
-    queries: it asks a second, over a stream.
+    Attributes:
+        name: name in the table.
+        robots: number of robots.
+        models: number of models of all robots.
+        samples: samples per second of a moving robot.
+        period: time between its batches, s.
+        publish: LIPSERVE_PUBLISH_EVERY_S.
+        queries: its queries per second, over a stream.
+        teachers: max number of robots that send samples at a time; None: all.
     """
 
     name: str
@@ -45,14 +52,14 @@ FLEETS = (
     Fleet("10 robots, a model each, 100 samples/s", 10, 10, 100.0, 1.0),
     Fleet("1 000 robots, a model each, 10 samples/s", 1000, 1000, 10.0, 10.0, 10.0),
     Fleet("100 000 robots, a model each, 10 samples/s", 100_000, 100_000, 10.0, 10.0, 10.0),
-    Fleet("100 000 robots, 100 models, 10 teach each", 100_000, 100, 10.0, 10.0, 10.0, teachers=1000),
+    Fleet("100 000 robots, 100 models, 10 senders each", 100_000, 100, 10.0, 10.0, 10.0, teachers=1000),
 )
 """The plans of docs/sizing.md."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a fleet needs. CPUs are whole ones, of the kind that was measured; bytes as they are."""
+    """Resources of a fleet; CPUs of the measured kind."""
 
     batches_per_s: float
     samples_per_s: float
@@ -67,9 +74,14 @@ class Plan:
 
 
 def plan(costs: Mapping[str, Any], fleet: Fleet, job_s: float) -> Plan:
-    """Apply the formula. costs: figures of `costs.run`; job_s: processor seconds of a training job, of one a week.
+    """Return the resources of a fleet, with one training job a week for each model.
 
-    Every service of a pair learns what both take; queries and batches are shared between them.
+    Each service of a pair learns the batches of both; queries and batches are distributed between them.
+
+    Args:
+        costs: figures of `benchmarks.scale.costs.run`.
+        fleet: the fleet.
+        job_s: processor time of a training job.
     """
     teachers = ACTIVE * fleet.robots if fleet.teachers is None else fleet.teachers
     batches, samples = teachers / fleet.period, teachers * fleet.samples
@@ -79,13 +91,13 @@ def plan(costs: Mapping[str, Any], fleet: Fleet, job_s: float) -> Plan:
     service = _cost(costs, "service_ms", batches, samples) / 1e3 + queries * costs["query_stream_us"] / 1e6
     learner = (revisions * costs["taught_ms_per_s"] + samples * costs["learner_ms"]["sample"]) / 1e3
     database = _cost(costs, "database_ms", batches, samples) / 1e3
-    learners = ceil(learner / LOAD)  # a learner is one process, and one CPU
+    learners = ceil(learner / LOAD)  # a learner uses one CPU
     services = REPLICAS * max(1, learners, ceil(service / LOAD / REPLICAS))
     models_each = fleet.models * REPLICAS / services
     memory = MIB * (
         costs["service_mib"] + costs["learner_mib"] + models_each * (_mib(costs, "loaded") + _mib(costs, "taught"))
     )
-    share = MOVING / ACTIVE  # of the day, of what is taught at a busy moment
+    share = MOVING / ACTIVE  # mean rate of samples over the rate at a busy time
     kept = _cost(costs, "stored_bytes", batches, samples) * share * DAYS * 86400
     of_model = VERSIONS * (costs["version_bytes"] or 0.0) + SNAPSHOTS * (costs["snapshot_bytes"] or 0.0)
     return Plan(
@@ -94,7 +106,7 @@ def plan(costs: Mapping[str, Any], fleet: Fleet, job_s: float) -> Plan:
         service,
         REPLICAS * learner,
         database,
-        fleet.models * job_s / WEEK,
+        fleet.models * job_s / WEEK_S,
         services,
         memory,
         min(kept, fleet.models * LOG_BYTES),
@@ -103,10 +115,10 @@ def plan(costs: Mapping[str, Any], fleet: Fleet, job_s: float) -> Plan:
 
 
 def grid(costs: Mapping[str, Any], job_s: float) -> Grid:
-    """The plans of all fleets, one a column."""
+    """Return the plans of all fleets, one in each column."""
     plans = [plan(costs, fleet, job_s) for fleet in FLEETS]
     lines: tuple[tuple[str, Callable[[Plan], float]], ...] = (
-        ("batches/s, and commits", lambda each: each.batches_per_s),
+        ("batches/s and commits/s", lambda each: each.batches_per_s),
         ("samples/s", lambda each: each.samples_per_s),
         ("CPUs used by services", lambda each: each.service_cpus),
         (f"CPUs used by learners, {REPLICAS} for each model", lambda each: each.learner_cpus),
@@ -122,7 +134,7 @@ def grid(costs: Mapping[str, Any], job_s: float) -> Grid:
 
 
 def _cost(costs: Mapping[str, Any], name: str, batches: float, samples: float) -> float:
-    """Of so many batches with so many samples in all; a batch is measured with none of them."""
+    """Return the cost of batches with this total of samples; the cost of a batch excludes that of its samples."""
     batch, sample = float(costs[name]["batch"]), float(costs[name]["sample"])
     return max(0.0, batch) * batches + max(0.0, sample) * samples
 

@@ -1,4 +1,4 @@
-"""Two services that follow one log: how long until both answer with all that was acknowledged, and the same bits."""
+"""Two services with one log: time until both have learnt all acknowledged batches, and identity of their answers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lipserve import ApiError, Client
 
 NAME = "replicas"
 MODEL = "panda-sim"
-"""The model that every service brings."""
+"""The shipped model."""
 BATCHES, ROWS, QUERIES = 10, 20, 100
 LEARNING = {
     "enabled": True,
@@ -33,16 +33,21 @@ LEARNING = {
     "auto_refresh": False,
     "auto_promote": False,
 }
-"""Every row is learnt, and nothing else happens."""
-MOST_SECONDS = 1.0
-_WAIT = 30.0
-"""Longest wait of a query for the revision it asks for, s: asked once, as asking again and again takes what learns."""
+"""All rows are learnt, and the model is not retrained."""
+MAX_SECONDS = 1.0
+_MAX_WAIT_S = 30.0
+"""Max wait of a query for its revision; polling would take processor time from the learners."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """Batches to both services in turn. seconds: from the last acknowledgement until the first and the second service
-    answered with all of them; same: whether their answers then had the same bits."""
+    """Figures of batches sent to both services in turn.
+
+    Attributes:
+        first: time from the last acknowledgement until one service has learnt all batches, s.
+        second: time until both have learnt them, s.
+        same: whether their answers then are identical.
+    """
 
     first: float
     second: float
@@ -50,9 +55,9 @@ class Trial:
 
 
 def run(engines: Engines, trials: int, seed: int, console: Console) -> Part:
-    """Teach one model through both services alternately, so many times; their learners run when that begins."""
-    # on one machine: services on machines of their own leave each learner a CPU, too
-    settings = {"min_revision_wait_s": _WAIT, "training_cpus": os.cpu_count() or 1}
+    """Send batches for one model to both services in turn, `trials` times, with running learners."""
+    # give each learner a CPU, as on separate machines
+    settings = {"min_revision_wait_s": _MAX_WAIT_S, "training_cpus": os.cpu_count() or 1}
     services = [engines.service(settings), engines.service(settings)]
     clients = [ready(service) for service in services]
     try:
@@ -66,7 +71,7 @@ def run(engines: Engines, trials: int, seed: int, console: Console) -> Part:
             found.append(_trial(addresses, clients, samples, queries, number))
             console.print(
                 f"{number} of {trials}: both after {found[-1].second:.2f} s, "
-                f"{'the same bits' if found[-1].same else 'DIFFERENT bits'}",
+                f"{'identical answers' if found[-1].same else 'DIFFERENT answers'}",
                 highlight=False,
             )
     finally:
@@ -103,7 +108,7 @@ def _trial(
 
 
 def _knows(client: Client, query: Samples, revision: int) -> bool:
-    """Ask for an answer that stands on a revision; False where there is none in time."""
+    """Return whether a model answers with a revision in time."""
     with suppress(ApiError):
         answer = client.predict(MODEL, query.q[0], query.dq[0], query.ddq[0], min_revision=revision)
         return (answer.revision or 0) >= revision
@@ -116,14 +121,14 @@ def _part(found: Sequence[Trial]) -> Part:
     rows = [
         ("trials", str(len(found))),
         (f"batches of {ROWS} rows a trial, to both in turn", str(BATCHES)),
-        ("s until one has all: median", f"{np.median([each.first for each in found]):.2f}"),
-        ("s until both have all: median", f"{np.median(both):.2f}"),
-        ("s until both have all: worst", f"{max(both):.2f}"),
-        (f"same bits of {QUERIES} answers, with covariances", f"{same} of {len(found)}"),
+        ("s until one has learnt all: median", f"{np.median([each.first for each in found]):.2f}"),
+        ("s until both have learnt all: median", f"{np.median(both):.2f}"),
+        ("s until both have learnt all: worst", f"{max(both):.2f}"),
+        (f"{QUERIES} identical answers, with covariances", f"{same} of {len(found)}"),
     ]
     targets = [
-        Target("both services have the last acknowledged batch, worst", max(both), "s", "<", MOST_SECONDS),
-        Target("trials in which their answers differ", len(found) - same, "", "≤", 0),
+        Target("time until both services have learnt all, worst", max(both), "s", "<", MAX_SECONDS),
+        Target("trials with different answers", len(found) - same, "", "≤", 0),
     ]
     figures = {"seconds": both, "first": [each.first for each in found], "same": same, "trials": len(found)}
     return Part(NAME, figures, [Grid("two services, one log", ("", ""), rows)], targets)

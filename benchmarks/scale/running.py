@@ -1,4 +1,4 @@
-"""The benchmark of several services from start to end: options in, results out."""
+"""The benchmark of several services from options to results."""
 
 from __future__ import annotations
 
@@ -16,16 +16,25 @@ from benchmarks.scale.engines import started
 from benchmarks.scale.part import Part, Results
 
 PARTS = (passes.NAME, training.NAME, replicas.NAME, cancelling.NAME, costs.NAME, faults.NAME)
-"""What can be measured, by name."""
+"""Names of all parts."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How much is measured.
+    """Scope of the benchmark.
 
-    sizes: samples of the training jobs; fit: their options; pass_rows: samples of one pass over all, pairs: passes with
-    one and with two processes; trials: of convergence, cancels: of jobs; batches: of each size, queries: whose cost is
-    taken; kills: faults of each kind; only: parts, all where empty.
+    Attributes:
+        sizes: samples of the training jobs.
+        fit: fit options of the training jobs.
+        pass_rows: samples of a pass over all.
+        pairs: passes with one and with two processes.
+        trials: trials with two services.
+        cancels: number of cancelled jobs.
+        batches: batches of each size.
+        queries: timed queries.
+        kills: faults of each kind.
+        seed: seed of all random numbers.
+        only: names of parts; empty: all.
     """
 
     sizes: tuple[int, ...] = (200_000, 1_000_000)
@@ -42,7 +51,7 @@ class Options:
 
     def __post_init__(self) -> None:
         if unknown := [name for name in self.only if name not in PARTS]:
-            raise ValueError(f"--only has {unknown[0]!r}, expected names out of {', '.join(PARTS)}")
+            raise ValueError(f"Unknown name {unknown[0]!r} in --only. Names: {', '.join(PARTS)}.")
 
 
 QUICK = {
@@ -56,11 +65,11 @@ QUICK = {
     "queries": 500,
     "kills": 1,
 }
-"""A first look."""
+"""Options of `--quick`."""
 
 
 def run(options: Options, console: Console) -> Results:
-    """Measure everything that the options ask for; raise BenchError where a step fails."""
+    """Run the benchmark; raise BenchError if a step fails."""
     results = Results(facts.machine())
     with tempfile.TemporaryDirectory(prefix="lipserve-bench-") as folder, started(Path(folder)) as engines:
         seed = options.seed

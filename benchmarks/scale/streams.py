@@ -1,4 +1,4 @@
-"""Simulated recordings of a Panda as long as wanted, in shards: each a trajectory of its own."""
+"""Simulated recordings of a Panda of any length, in shards with separate trajectories."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _SEEDS = 1000
 
 
 def robot() -> Robot:
-    """The robot of all parts."""
+    """Return the robot of all parts."""
     return load_robot(ROBOT)
 
 
 def stream(rows: int, seed: int, rate: float = RATE) -> Samples:
-    """One trajectory with friction and noise."""
+    """Return one trajectory with friction and noise."""
     motion = Simulation(rows, rate, speed=SPEED, noise=NOISE, viscous=VISCOUS, coulomb=COULOMB)
     return simulate(robot(), motion, seed)
 
 
 def shards(folder: Path, rows: int, seed: int, shard_rows: int = SHARD_ROWS) -> Iterator[Path]:
-    """Write so many rows as Parquet, shard by shard; give the path of each as soon as it is there."""
+    """Write `rows` rows as Parquet, shard by shard; yield the path of each shard."""
     for number, first in enumerate(range(0, rows, shard_rows)):
         path = folder / f"shard-{number:03d}.parquet"
         write(path, stream(min(shard_rows, rows - first), _SEEDS * (seed + 1) + number))
@@ -40,7 +40,7 @@ def shards(folder: Path, rows: int, seed: int, shard_rows: int = SHARD_ROWS) -> 
 
 
 def write(path: Path, samples: Samples) -> None:
-    """Write samples as Parquet, one column a joint and quantity."""
+    """Write samples as Parquet, with a column for each joint and quantity."""
     columns = {"t": samples.t}
     for name in ("q", "dq", "ddq", "tau"):
         for joint, values in enumerate(getattr(samples, name).T, start=1):

@@ -1,4 +1,4 @@
-"""Training over sharded recordings: how the cost grows with the samples, and what memory it takes."""
+"""Time and memory of training on sharded recordings."""
 
 from __future__ import annotations
 
@@ -22,17 +22,25 @@ from lipserve import Client
 from lipserve.states import ACTIVE, SUCCEEDED
 
 NAME = "train"
-PROMISED_ROWS = 1_000_000
-MOST_SECONDS, MOST_MIB, MOST_RATIO = 15 * 60.0, 2048.0, 1.2
-_POLL = 0.2
+TARGET_ROWS = 1_000_000
+"""Samples of the job that the target of time is about."""
+MAX_SECONDS, MAX_MIB, MAX_COST_RATIO = 15 * 60.0, 2048.0, 1.2
+_POLL_S = 0.2
 
 
 @dataclass(frozen=True)
 class Trained:
-    """One job. seconds: from the request to its end; stages: seconds of each; peaks: MiB at most of a process.
+    """Figures of one job.
 
-    standing: samples that its posterior stands on; inducing: outputs of its basis, with whose square grows what a
-    sample costs.
+    Attributes:
+        rows: number of samples.
+        shards: number of shards.
+        upload_s: time of the uploads.
+        seconds: time from the request to the end of the job.
+        stages: seconds of each stage.
+        peaks: peak memory of a process, MiB.
+        standing: samples in its posterior.
+        inducing: outputs of its basis; the cost of a sample grows with their square.
     """
 
     rows: int
@@ -46,13 +54,13 @@ class Trained:
 
     @property
     def summing_us(self) -> float | None:
-        """Microseconds a sample of the pass over all of them, where there was one."""
+        """Time a sample of the pass over all samples, µs; None without such a pass."""
         seconds = self.stages.get("statistics")
         return None if not seconds else 1e6 * seconds / self.rows
 
 
 def run(engines: Engines, sizes: Sequence[int], fit: Mapping[str, Any], seed: int, console: Console) -> Part:
-    """Train on recordings of each size, each on a service of its own, with as many summing processes as CPUs."""
+    """Train on recordings of each size, each on a new service with as many statistics processes as CPUs."""
     found = [_train(engines, rows, fit, seed, console) for rows in sizes]
     return Part(NAME, {"jobs": [asdict(each) for each in found]}, [_grid(found)], _targets(found))
 
@@ -76,17 +84,21 @@ def _train(engines: Engines, rows: int, fit: Mapping[str, Any], seed: int, conso
         queued = client.train("bench", datasets, "lip-chain", types, fit, holdout={"only": True})  # one fit, one pass
         stages: dict[str, float] = {}
         while (job := client.job(queued.id)).state in ACTIVE:
-            stages[job.progress.stage] = stages.get(job.progress.stage, 0.0) + _POLL
-            time.sleep(_POLL)
+            stages[job.progress.stage] = stages.get(job.progress.stage, 0.0) + _POLL_S
+            time.sleep(_POLL_S)
         seconds = time.monotonic() - began
         peaks.note()
         if job.state != SUCCEEDED or job.version is None:
-            raise BenchError(f"the training job has {job.state}: {job.error.message if job.error else ''}")
+            raise BenchError(
+                f"The training job has {job.state}: {job.error.message if job.error else 'no error given'}"
+            )
         version = client.version("bench", job.version)
     service.stop()
     standing, inducing = int(version.fit["samples_posterior"]), int((version.compact or {})["inducing_outputs"])
-    console.print(f"{seconds:.0f} s; a basis of {inducing} outputs, standing on {standing:,} samples", highlight=False)
-    scale = seconds / max(sum(stages.values()), _POLL)  # looking takes time, too
+    console.print(
+        f"{seconds:.0f} s; a basis of {inducing} outputs, {standing:,} samples in the posterior", highlight=False
+    )
+    scale = seconds / max(sum(stages.values()), _POLL_S)  # polling takes time, too
     shares = {name: scale * value for name, value in stages.items()}
     return Trained(rows, len(datasets), upload_s, seconds, shares, dict(peaks.found), standing, inducing)
 
@@ -103,14 +115,14 @@ def _grid(found: Sequence[Trained]) -> Grid:
         shown = (each.upload_s, each.seconds, *stages, each.summing_us)
         peaks = (each.peaks.get(kind) for kind in ("service", "training", "statistics"))
         rows.append((f"{each.rows:,}", str(each.shards), *map(_text, shown), str(each.inducing), *map(_text, peaks)))
-    title = f"training over shards, summed by {os.cpu_count()} processes; basis: outputs; memory: most of one, MiB"
-    return Grid(title, (*columns, "service", "training", "summing"), rows)
+    title = f"training on shards, {os.cpu_count()} statistics processes; last columns: peak memory of a process, MiB"
+    return Grid(title, (*columns, "service", "training", "statistics"), rows)
 
 
 def _targets(found: Sequence[Trained]) -> list[Target]:
     largest = max(found, key=lambda each: each.rows)
-    seconds = largest.seconds if largest.rows >= PROMISED_ROWS else None
-    # what the samples decide, not what the basis does, which a fit chooses anew for each size
+    seconds = largest.seconds if largest.rows >= TARGET_ROWS else None
+    # divide by outputs², as each fit chooses another basis
     costs = [
         None if each.summing_us is None else each.summing_us / each.inducing**2
         for each in sorted(found, key=lambda each: each.rows)
@@ -119,9 +131,9 @@ def _targets(found: Sequence[Trained]) -> list[Target]:
     ratio = None if len(found) < 2 or first is None or last is None else last / first
     memory = max((peak for each in found for peak in each.peaks.values()), default=None)
     return [
-        Target(f"{PROMISED_ROWS:,} samples of seven joints trained", seconds, "s", "<", MOST_SECONDS),
-        Target("memory of any one process", memory, "MiB", "<", MOST_MIB),
-        Target("cost of the pass a sample and outputs², largest over smallest size", ratio, "×", "≤", MOST_RATIO),
+        Target(f"training on {TARGET_ROWS:,} samples of seven joints", seconds, "s", "<", MAX_SECONDS),
+        Target("memory of a process", memory, "MiB", "<", MAX_MIB),
+        Target("pass a sample and outputs², largest / smallest size", ratio, "×", "≤", MAX_COST_RATIO),
     ]
 
 

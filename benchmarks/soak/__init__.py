@@ -1,1 +1,1 @@
-"""Many clients at once for minutes: errors, memory, and whether every accepted write is there afterwards."""
+"""Load by many clients: errors, memory, and a check that no acknowledged write is lost."""

@@ -1,4 +1,4 @@
-"""After the load: whether all that was acknowledged is there, once, as it was acknowledged, and nothing else."""
+"""Comparison of acknowledged writes with those that the service has stored."""
 
 from __future__ import annotations
 
@@ -25,12 +25,19 @@ _PAGE = 100
 
 @dataclass
 class Account:
-    """What was acknowledged, and what the service knows of it.
+    """Counts of writes.
 
-    batches, rows: acknowledged; datasets, deleted: acknowledged uploads and deletions; unsure: writes without an
-    answer, which may have been stored or not; lost: of all that was acknowledged, what is not there; changed: there,
-    but not as acknowledged; surplus: there, but neither acknowledged nor unsure; twice: batches that were learnt again
-    when sent again; difference: of served torques from those of a model that learnt the same rows at once, relative.
+    Attributes:
+        batches: acknowledged observation batches.
+        rows: accepted rows in them.
+        datasets: acknowledged uploads.
+        deleted: acknowledged deletions.
+        unsure: writes without an answer, which may be stored.
+        lost: acknowledged, but not stored.
+        changed: stored with other content than acknowledged.
+        surplus: stored, but neither acknowledged nor unsure.
+        twice: batches that were learnt again when sent again.
+        difference: relative difference of served torques from a model that learnt the same rows at once.
     """
 
     batches: int = 0
@@ -46,7 +53,7 @@ class Account:
 
     @classmethod
     def of(cls, logs: Sequence[Log]) -> Account:
-        """What the clients were told."""
+        """Count the acknowledgements that the clients received."""
         acks = [ack for log in logs for ack in log.acks.values()]
         return cls(
             batches=len(acks),
@@ -58,13 +65,13 @@ class Account:
 
 
 def check(account: Account, logs: Sequence[Log], client: Client) -> None:
-    """Compare what clients were told with the lists that the service gives now; add what is wrong."""
+    """Compare the acknowledgements with the service's lists; add the differences to the account."""
     _check_datasets(account, logs, client)
     _check_batches(account, logs, client)
 
 
 def send_again(account: Account, logs: Sequence[Log], observed: dict[int, Samples], bed: Bed, every: int = 10) -> None:
-    """Send every tenth acknowledged batch once more: the service must know it."""
+    """Send every tenth acknowledged batch again; the service must answer that it is a duplicate."""
     with HttpClient(bed.tcp) as client:
         for number, log in _observing(logs).items():
             for sequence in sorted(log.acks)[::every]:
@@ -76,7 +83,7 @@ def send_again(account: Account, logs: Sequence[Log], observed: dict[int, Sample
 def compare(
     account: Account, logs: Sequence[Log], observed: dict[int, Samples], base: TorqueModel, queries: Samples, bed: Bed
 ) -> None:
-    """Wait until all is learnt, and compare torques with those of a model that learnt the same rows at once."""
+    """Wait until all rows are learnt; compare torques with those of a model that learnt them at once."""
     online, revision = OnlineModel.start(base), 0
     for number, log in _observing(logs).items():
         if log.acks:
@@ -98,16 +105,16 @@ def _check_datasets(account: Account, logs: Sequence[Log], client: Client) -> No
     for log in logs:
         known |= log.stored
         gone |= log.deleted
-    for name, said in known.items():
+    for name, acknowledged in known.items():
         if name in gone:
             account.surplus += name in listed
         elif name not in listed:
             account.lost += 1
         else:
             found = {"sha256": listed[name]["sha256"], "rows": listed[name]["report"]["rows"]}
-            account.changed += found != said
-    strangers = len(listed.keys() - known.keys())
-    account.surplus += max(0, strangers - sum(log.unsure for log in logs))
+            account.changed += found != acknowledged
+    unknown = len(listed.keys() - known.keys())
+    account.surplus += max(0, unknown - sum(log.unsure for log in logs))
 
 
 def _check_batches(account: Account, logs: Sequence[Log], client: Client) -> None:
@@ -129,7 +136,7 @@ def _check_batches(account: Account, logs: Sequence[Log], client: Client) -> Non
 
 
 def _pages(http: httpx.Client, path: str) -> list[dict[str, Any]]:
-    """All items of a list."""
+    """Return all items of a paginated list."""
     items: list[dict[str, Any]] = []
     params: dict[str, Any] = {"limit": _PAGE}
     while True:
@@ -143,5 +150,5 @@ def _pages(http: httpx.Client, path: str) -> list[dict[str, Any]]:
 
 
 def _observing(logs: Sequence[Log]) -> dict[int, Log]:
-    """Logs of the connections that teach, by number: they are listed in the order of their numbers."""
+    """Return the logs of the connections that send observations, by their number."""
     return dict(enumerate(log for log in logs if log.kind == "observe"))

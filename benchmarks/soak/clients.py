@@ -1,4 +1,4 @@
-"""The clients of the load, in processes of their own: a thread each connection."""
+"""The clients of the load, in several processes; each connection has a thread."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PROCESSES = 2
 
 @dataclass(frozen=True)
 class Mix:
-    """How many connections do what."""
+    """Number of connections of each kind."""
 
     predict: int = 32
     stream: int = 8
@@ -25,14 +25,14 @@ class Mix:
 
     @property
     def total(self) -> int:
-        """Of all connections."""
+        """Number of all connections."""
         return self.predict + self.stream + self.observe + self.upload
 
     @classmethod
     def of(cls, connections: int) -> Mix:
-        """Split a number of connections as the usual mix is; raise ValueError for fewer than 4."""
+        """Split a number of connections in the usual proportions; raise ValueError if there are fewer than 4."""
         if connections < 4:
-            raise ValueError(f"connections is {connections}, expected at least 4: one of each kind")
+            raise ValueError(f"At least 4 connections are required, one of each kind; got {connections}.")
         usual = cls()
         stream, observe, upload = (
             max(1, round(connections * each / usual.total)) for each in (usual.stream, usual.observe, usual.upload)
@@ -42,7 +42,7 @@ class Mix:
 
 @dataclass(frozen=True)
 class Work:
-    """What one process of clients is told. observed: samples by the number of the connection that sends them."""
+    """Work of one process of clients; observed: samples by the number of the connection that sends them."""
 
     tcp: tuple[str, int]
     url: str
@@ -56,7 +56,7 @@ class Work:
 
 
 def run(works: list[Work]) -> list[Log]:
-    """Run the clients of all processes at the same time; return what happened on each connection."""
+    """Run the clients of all processes at the same time; return the log of each connection."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(len(works), mp_context=context) as pool:
         logs = pool.map(_work, works)
@@ -64,7 +64,7 @@ def run(works: list[Work]) -> list[Log]:
 
 
 def share(total: int, parts: int) -> list[int]:
-    """Split a number into parts that differ by one at most."""
+    """Split a number into parts that differ by at most one."""
     return [total // parts + (number < total % parts) for number in range(parts)]
 
 

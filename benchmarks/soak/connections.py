@@ -1,4 +1,4 @@
-"""What one connection of the load does, again and again, and what it remembers of it."""
+"""The connections of the load, and a log of each."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from lipcore.data.samples import Array, Samples
 from lipserve import StreamClient
 
 STEADY, TAUGHT = "steady", "taught"
-"""The served models: one answers the same for ever, the other one learns."""
+"""The served models: the first does not change, the second learns."""
 BATCH_ROWS, BATCH_PERIOD = 25, 0.5
-UPLOAD_PERIOD, KEPT = 0.5, 10
-"""Seconds between two uploads of a connection, and how many of them it keeps: older ones it deletes."""
+UPLOAD_PERIOD, MAX_DATASETS = 0.5, 10
+"""Seconds between two uploads of a connection, and data sets that it keeps before it deletes the oldest."""
 TOLERANCE = 1e-9
-"""Relative, of a torque against the one computed in the process of the benchmark."""
-_MOST_MESSAGES = 5
+"""Max relative difference of a torque from the one computed in the process of the benchmark."""
+_MAX_MESSAGES = 5
 
 
 class WrongAnswerError(RuntimeError):
-    """An answer came that cannot be right."""
+    """An answer is wrong."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,16 @@ class Expected:
 
 @dataclass
 class Log:
-    """What happened on one connection.
+    """Events of one connection.
 
-    times: ns of each exchange that was answered; acks: of batches by sequence; stored: what the service said of each
-    data set that was uploaded, by id; deleted: ids that it said to have deleted; unsure: uploads or deletions without
-    an answer.
+    Attributes:
+        kind: kind of the connection.
+        times: duration of each answered exchange, ns.
+        errors: count of each error message.
+        acks: acknowledgements of batches, by sequence.
+        stored: acknowledged sha256 and rows of each uploaded data set, by id.
+        deleted: ids of data sets with acknowledged deletion.
+        unsure: uploads or deletions without an answer.
     """
 
     kind: str
@@ -62,7 +67,7 @@ class Log:
 
 
 class Connection(ABC):
-    """One connection: `work` is called again and again, with a pause in between."""
+    """A connection that calls `work` repeatedly, with a pause in between."""
 
     kind: str
     period = 0.0
@@ -72,23 +77,23 @@ class Connection(ABC):
 
     @abstractmethod
     def work(self, turn: int) -> None:
-        """Exchange something and remember it; raise what goes wrong."""
+        """Make one exchange and log it; raise an error if it fails."""
 
     @abstractmethod
     def close(self) -> None:
         """Close the connection."""
 
     def run(self, end: float, pause: float) -> None:
-        """Work until a moment of `time.monotonic`; everything that goes wrong is counted."""
+        """Work until a time of `time.monotonic`; count all errors."""
         turn = 0
         while time.monotonic() < end:
             began = time.perf_counter_ns()
             try:
                 self.work(turn)
                 self.log.times.append(time.perf_counter_ns() - began)
-            except Exception as error:  # whatever it is, it counts as an error of the run
+            except Exception as error:  # every error counts
                 text = f"{type(error).__name__}: {error}"[:300]
-                known = text in self.log.errors or len(self.log.errors) < _MOST_MESSAGES
+                known = text in self.log.errors or len(self.log.errors) < _MAX_MESSAGES
                 self.log.errors[text if known else "others"] += 1
             turn += 1
             time.sleep(max(pause, self.period))
@@ -96,7 +101,7 @@ class Connection(ABC):
 
 
 class Predicting(Connection):
-    """Asks over HTTP: single motions, batches, and of the model that learns too."""
+    """A connection that predicts over HTTP: single motions and batches, with both models."""
 
     kind = "predict"
 
@@ -105,7 +110,7 @@ class Predicting(Connection):
         self._expected, self._client, self._revision = expected, HttpClient(address), 0
 
     def work(self, turn: int) -> None:
-        """Ask one query of either model in turn, every tenth time a batch."""
+        """Send one query to the two models in turn, every tenth time a batch."""
         many = turn % 10 == 9
         at = (self.number + turn) % len(self._expected.q)
         rows: Any = slice(0, 20) if many else at
@@ -117,9 +122,9 @@ class Predicting(Connection):
             _check_torque(tau, self._expected.tau[rows])
             return
         if not np.isfinite(tau).all() or not np.isfinite(answer["tau_std"]).all():
-            raise WrongAnswerError("a torque is not finite")
+            raise WrongAnswerError("A torque is not finite.")
         if answer["revision"] < self._revision:
-            raise WrongAnswerError(f"revision {answer['revision']} came after {self._revision}")
+            raise WrongAnswerError(f"Revision {answer['revision']} came after revision {self._revision}.")
         self._revision = answer["revision"]
 
     def close(self) -> None:
@@ -128,7 +133,7 @@ class Predicting(Connection):
 
 
 class Streaming(Connection):
-    """Asks over a WebSocket."""
+    """A connection that predicts over a WebSocket."""
 
     kind = "stream"
 
@@ -137,7 +142,7 @@ class Streaming(Connection):
         self._expected, self._client = expected, StreamClient(STEADY, url)
 
     def work(self, turn: int) -> None:
-        """Ask one query of the steady model."""
+        """Send one query to the model that does not change."""
         expected, at = self._expected, (self.number + turn) % len(self._expected.q)
         answer = self._client.predict(expected.q[at], expected.dq[at], expected.ddq[at])
         _check_torque(np.asarray(answer.tau), expected.tau[at])
@@ -148,7 +153,7 @@ class Streaming(Connection):
 
 
 class Observing(Connection):
-    """Teaches the model that learns: a stream of its own, each batch sent once or, every tenth one, twice."""
+    """A connection that sends observation batches of its own stream, every tenth batch twice."""
 
     kind, period = "observe", BATCH_PERIOD
 
@@ -162,10 +167,10 @@ class Observing(Connection):
         request = batch_request(TAUGHT, stream_of(self.number), turn, self._samples.rows(rows))
         ack = send(self._client, request)
         if ack.duplicate:
-            raise WrongAnswerError(f"batch {turn} is said to be known")
+            raise WrongAnswerError(f"The new batch {turn} was answered as a duplicate.")
         self.log.acks[turn] = ack
         if turn % 10 == 9 and not send(self._client, request).duplicate:
-            raise WrongAnswerError(f"batch {turn} was taken twice")
+            raise WrongAnswerError(f"The repeated batch {turn} was not answered as a duplicate.")
 
     def close(self) -> None:
         """Close the connection."""
@@ -173,7 +178,7 @@ class Observing(Connection):
 
 
 class Uploading(Connection):
-    """Uploads data sets, looks at them, and deletes its older ones."""
+    """A connection that uploads and lists data sets, and deletes its older ones."""
 
     kind, period = "upload", UPLOAD_PERIOD
 
@@ -182,7 +187,7 @@ class Uploading(Connection):
         self._http, self._body, self._rows = httpx.Client(base_url=url, timeout=60.0), npz(samples), len(samples)
 
     def work(self, turn: int) -> None:
-        """Upload one, list some, delete one."""
+        """Upload a data set, list some, delete the oldest."""
         self.log.unsure += 1
         answer = self._http.post(
             "/v1/datasets",
@@ -190,14 +195,14 @@ class Uploading(Connection):
             content=self._chunks(),
             headers={"content-type": "application/x-npz"},
         )
-        said = _said(answer, httpx.codes.CREATED)
-        self.log.stored[said["id"]] = {"sha256": said["sha256"], "rows": said["report"]["rows"]}
-        if said["report"]["rows"] != self._rows:
-            raise WrongAnswerError(f"{said['report']['rows']} rows are said to be stored, {self._rows} were sent")
-        _said(self._http.get("/v1/datasets", params={"limit": 5}), httpx.codes.OK)
+        dataset = _json(answer, httpx.codes.CREATED)
+        self.log.stored[dataset["id"]] = {"sha256": dataset["sha256"], "rows": dataset["report"]["rows"]}
+        if dataset["report"]["rows"] != self._rows:
+            raise WrongAnswerError(f"The data set has {dataset['report']['rows']} rows; {self._rows} were sent.")
+        _json(self._http.get("/v1/datasets", params={"limit": 5}), httpx.codes.OK)
         left = [name for name in self.log.stored if name not in self.log.deleted]
-        if len(left) > KEPT:
-            _said(self._http.delete(f"/v1/datasets/{left[0]}"), httpx.codes.NO_CONTENT)
+        if len(left) > MAX_DATASETS:
+            _json(self._http.delete(f"/v1/datasets/{left[0]}"), httpx.codes.NO_CONTENT)
             self.log.deleted.add(left[0])
         self.log.unsure -= 1
 
@@ -206,30 +211,30 @@ class Uploading(Connection):
         self._http.close()
 
     def _chunks(self) -> Iterator[bytes]:
-        """The body in pieces, as a client sends a file whose length it does not announce."""
+        """Yield the body in chunks, without a content-length."""
         for start in range(0, len(self._body), 16_384):
             yield self._body[start : start + 16_384]
 
 
 def stream_of(number: int) -> str:
-    """Name of the stream of an observing connection."""
+    """Return the stream_id of an observing connection."""
     return f"load-{number}"
 
 
 def _check_torque(found: Array, expected: Array) -> None:
     difference = float(np.abs(found - expected).max() / np.abs(expected).max())
     if not difference <= TOLERANCE:
-        raise WrongAnswerError(f"a torque differs by {difference:.1e} from the right one, relative to the largest")
+        raise WrongAnswerError(f"A torque differs from the expected one by {difference:.1e} of the largest.")
 
 
-def _said(answer: httpx.Response, status: int) -> Any:
+def _json(answer: httpx.Response, status: int) -> Any:
     if answer.status_code != status:
         raise WrongAnswerError(f"{answer.request.method} {answer.request.url.path}: {answer.status_code} {answer.text}")
     return answer.json() if answer.content else None
 
 
 def npz(samples: Samples) -> bytes:
-    """A recording as a file of NumPy."""
+    """Return a recording as an npz file."""
     file = io.BytesIO()
     np.savez(file, **{name: getattr(samples, name) for name in ("t", "q", "dq", "ddq", "tau")})
     return file.getvalue()

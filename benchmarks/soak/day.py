@@ -1,4 +1,4 @@
-"""An arm's working day, as fast as it goes: a clock in the arm's seconds, and those who do something by it."""
+"""A simulated day of an arm: a clock in the arm's seconds, and the tasks that follow it."""
 
 from __future__ import annotations
 
@@ -21,26 +21,23 @@ from lipcore.data.samples import Samples
 from lipserve import StreamClient
 
 ARM, LOOP = "arm", "loop"
-"""The models: one is taught in batches, trained anew and refreshed; the other learns from the frames of its loop."""
+"""The models: the first learns from batches and is retrained; the second learns from the frames of its loop."""
 BATCH_S = 2
-"""Arm seconds of a batch."""
-ASKED, FRAMES = 1, 2
-"""Questions over HTTP and frames of the loop, each arm second."""
+"""Length of a batch, in arm seconds."""
+QUERIES, FRAMES = 1, 2
+"""Queries over HTTP and frames of the loop, per arm second."""
 STREAM_S = 900
-"""Arm seconds after which the loop connects anew."""
-APART_S = 120
-"""Arm seconds that anybody may stay behind the arm, or its learner behind in batches."""
+"""Length of a WebSocket connection, in arm seconds."""
+MAX_LAG_S = 120
+"""Max lag of a task behind the arm, in arm seconds, and of the learner, in batches."""
 CONTACT_S, CONTACT_NM = 300, 60.0
-"""Every so many arm seconds something is touched for a fifth of one: the torque at each joint, N·m."""
+"""Arm seconds between contacts of 0.2 s, and their torque at each joint."""
 PAUSE_S = 0.05
-_MOST_MESSAGES = 20
+_MAX_MESSAGES = 20
 
 
 class Clock:
-    """Seconds of the arm. It goes on with each batch that is acknowledged, and waits for who stays behind.
-
-    over: whether the day was ended before its time.
-    """
+    """Clock in the arm's seconds, which waits for tasks that lag behind; over: whether the day was ended early."""
 
     def __init__(self, seconds: int) -> None:
         self.seconds, self.now, self.over = seconds, 0, False
@@ -48,17 +45,17 @@ class Clock:
         self._changed = threading.Condition()
 
     def tick(self, seconds: int = 1) -> bool:
-        """Some seconds are over; return whether the day goes on."""
+        """Advance the clock and wait for slow tasks; return whether the day continues."""
         with self._changed:
             self.now += seconds
             self._changed.notify_all()
             self._changed.wait_for(
-                lambda: self.over or self.now - min(self._places.values(), default=self.now) <= APART_S
+                lambda: self.over or self.now - min(self._places.values(), default=self.now) <= MAX_LAG_S
             )
             return not self.over
 
     def follow(self, name: str, at: float) -> bool:
-        """Wait until the arm has come to a second; return whether the day goes on. The arm waits for its followers."""
+        """Wait for a second of the arm, and let the arm wait for `name`; return whether the day continues."""
         with self._changed:
             self._places[name] = at
             self._changed.notify_all()
@@ -66,13 +63,13 @@ class Clock:
             return not self.over
 
     def end(self) -> None:
-        """Let everybody finish what they are at."""
+        """End the day; tasks finish their present step."""
         with self._changed:
             self.over = True
             self._changed.notify_all()
 
     def leave(self, name: str) -> None:
-        """Follow no more."""
+        """Let the arm no longer wait for `name`."""
         with self._changed:
             self._places.pop(name, None)
             self._changed.notify_all()
@@ -80,20 +77,20 @@ class Clock:
 
 @dataclass
 class Tally:
-    """What was done, by name, and what went wrong."""
+    """Counts of successful steps by name, and of errors by message."""
 
     done: Counter[str] = field(default_factory=Counter)
     errors: Counter[str] = field(default_factory=Counter)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def attempt(self, name: str, act: Callable[[], Any], times: int = 1) -> None:
-        """Do something and count it, or that it went wrong."""
+        """Perform a step and count its success or its error."""
         try:
             act()
         except (WrongAnswerError, RuntimeError, OSError, httpx.HTTPError, ValueError, KeyError, IndexError) as error:
             text = f"{name}: {type(error).__name__}: {error}"[:400]
             with self._lock:
-                known = text in self.errors or len(self.errors) < _MOST_MESSAGES
+                known = text in self.errors or len(self.errors) < _MAX_MESSAGES
                 self.errors[text if known else "others"] += 1
         else:
             with self._lock:
@@ -102,7 +99,7 @@ class Tally:
 
 @dataclass
 class Day:
-    """All that those who take part share. samples: what the arm does, again and again; rate: of it, Hz."""
+    """Shared state of all tasks; samples: the arm's motion, repeated all day; rate: of the samples, Hz."""
 
     clock: Clock
     tally: Tally
@@ -114,18 +111,18 @@ class Day:
 
     @property
     def headers(self) -> dict[str, str]:
-        """Of every request."""
+        """Headers of every request."""
         return {"authorization": f"Bearer {self.key}"}
 
     def predict(self, client: HttpClient, row: int) -> Any:
-        """What the arm's model answers at a motion."""
+        """Return the answer of the arm's model at a motion."""
         at = row % len(self.samples)
         body = {name: getattr(self.samples, name)[at].tolist() for name in ("q", "dq", "ddq")}
         request = post(f"/v1/models/{ARM}/predict", msgspec.json.encode(body), headers=self.headers)
         return msgspec.json.decode(client.ask(request))
 
     def rows(self, start: int, seconds: int) -> Samples:
-        """What the arm does from one of its seconds on, by its own clock."""
+        """Return the arm's samples from one of its seconds on, with contacts."""
         first, count = start * self.rate % len(self.samples), seconds * self.rate
         rows = self.samples.rows(slice(first, first + count))
         tau = rows.tau.copy()
@@ -135,7 +132,7 @@ class Day:
 
 
 def teach(day: Day) -> None:
-    """Send each batch once; every hundredth comes twice. Wait where the learner is far behind."""
+    """Send all batches, every hundredth twice; wait if the learner lags."""
     client = HttpClient(day.tcp)
 
     def behind() -> int:
@@ -146,8 +143,8 @@ def teach(day: Day) -> None:
         request = batch_request(ARM, ARM, number, day.rows(number * BATCH_S, BATCH_S), headers=day.headers)
         ack = send(client, request)
         if ack.duplicate or (number % 100 == 99 and not send(client, request).duplicate):
-            raise WrongAnswerError(f"batch {number} is not known as what it is")
-        while number % APART_S == 0 and behind() > APART_S:
+            raise WrongAnswerError(f"Batch {number} was wrongly answered as new or as a duplicate.")
+        while number % MAX_LAG_S == 0 and behind() > MAX_LAG_S:
             time.sleep(PAUSE_S)
 
     for number in range(day.clock.seconds // BATCH_S):
@@ -158,25 +155,25 @@ def teach(day: Day) -> None:
 
 
 def ask(day: Day) -> None:
-    """Ask over HTTP what is served."""
+    """Send queries over HTTP."""
     client = HttpClient(day.tcp)
 
     def answers(number: int) -> None:
-        for turn in range(ASKED):
+        for turn in range(QUERIES):
             answer = day.predict(client, number * day.rate + turn)
             if not np.isfinite(answer["tau"]).all() or not np.isfinite(answer["tau_std"]).all():
-                raise WrongAnswerError("a torque is not finite")
+                raise WrongAnswerError("A torque is not finite.")
 
     for number in range(day.clock.seconds):
         if not day.clock.follow("ask", number):
             break
-        day.tally.attempt("answer over HTTP", partial(answers, number), ASKED)
+        day.tally.attempt("answer over HTTP", partial(answers, number), QUERIES)
     client.close()
     day.clock.leave("ask")
 
 
 def loop(day: Day) -> None:
-    """Ask frame by frame over a WebSocket, with measured torque to learn from; connect anew now and then."""
+    """Send frames with measured torque over a WebSocket; reconnect every STREAM_S arm seconds."""
 
     def frames(client: StreamClient, number: int) -> None:
         rows = day.rows(number, 1)

@@ -1,4 +1,4 @@
-"""What is asked of a service beside its arm's loop, and how often: all routes, and the commands that a shift gives."""
+"""Periodic requests to a service besides the control loop: all routes, and some commands."""
 
 from __future__ import annotations
 
@@ -23,20 +23,19 @@ from benchmarks.soak.day import ARM, BATCH_S, CONTACT_S, LOOP, Day
 from lipcore.data.samples import Samples
 from lipcore.robots.library import profile_urdf
 
-KEPT, KEPT_VERSIONS = 12, 3
+MAX_DATASETS, MAX_VERSIONS = 12, 3
 """Data sets, and versions of a model, that are kept; older ones are deleted."""
 PROFILE = "panda"
 FIT = {"search_seconds": 5.0}
-"""Of training jobs: the geometry is calibrated from the robot's URDF."""
-ALTERNATE = "shift"
-"""An alias that is moved to and fro."""
-BACK = 3
-"""Revisions that are taken back."""
+"""Options of training jobs; the geometry is calibrated from the robot's URDF."""
+ALIAS = "shift"
+"""An alias that moves between versions."""
+ROLLBACK_REVISIONS = 3
 
 
 @dataclass
 class Desk:
-    """Who runs errands: a client with a key. folder: for files; datasets: that are there, the oldest first."""
+    """A client with a key; folder: for files; datasets: stored data sets, oldest first."""
 
     day: Day
     http: httpx.Client
@@ -46,27 +45,27 @@ class Desk:
     datasets: list[str]
 
     def ask(self, method: str, path: str, *expected: int, **request: Any) -> Any:
-        """What is answered: JSON, or bytes; raise WrongAnswerError for another status than expected, 200 by default."""
+        """Return the answer, JSON or bytes; raise WrongAnswerError unless its status is expected (default: 200)."""
         answer = self.http.request(method, path, **request)
         if answer.status_code not in (expected or (httpx.codes.OK,)):
             raise WrongAnswerError(f"{method} {path}: {answer.status_code} {answer.text[:240]}")
-        told = answer.content and answer.headers.get("content-type") == "application/json"
-        return answer.json() if told else answer.content
+        is_json = answer.content and answer.headers.get("content-type") == "application/json"
+        return answer.json() if is_json else answer.content
 
-    def events(self, path: str, most: int) -> int:
-        """Read server-sent events until so many, or the end; return how many came."""
+    def events(self, path: str, limit: int) -> int:
+        """Read at most `limit` server-sent events; return their number."""
         seen = 0
         with self.http.stream("GET", path) as answer:
             for line in answer.iter_lines():
                 seen += line.startswith("event:")
-                if seen >= most:
+                if seen >= limit:
                     break
         if not seen:
             raise WrongAnswerError(f"GET {path}: no event")
         return seen
 
     def command(self, *arguments: str) -> str:
-        """Run `lipserve` on the home; return what it prints."""
+        """Run `lipserve` on the home; return its output."""
         env = {**os.environ, "LIPSERVE_HOME": str(self.home), "OMP_NUM_THREADS": "1"}
         command = [sys.executable, "-m", "service", *arguments]
         done = subprocess.run(command, env=env, capture_output=True, text=True, check=False)  # noqa: S603 - our own
@@ -75,11 +74,11 @@ class Desk:
         return done.stdout
 
     def recording(self, turn: int) -> Samples:
-        """Fifty seconds of the arm at 10 Hz, others each turn."""
+        """Return 50 s of the arm at 10 Hz, different in each turn."""
         return replace(self.scene, seed=1 + turn % 50).history(50.0, 10.0)
 
-    def at(self) -> dict[str, Any]:
-        """A motion."""
+    def motion(self) -> dict[str, Any]:
+        """Return q, dq and ddq at the present second."""
         row = self.day.clock.now * 7 % len(self.day.samples)
         return {name: getattr(self.day.samples, name)[row].tolist() for name in ("q", "dq", "ddq")}
 
@@ -88,20 +87,20 @@ Errand = Callable[[Desk, int], Any]
 
 
 def watch_over(desk: Desk, turn: int) -> None:
-    """What monitoring asks for."""
+    """Send the requests of a monitoring system."""
     for path in ("/metrics", "/health", "/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready"):
         desk.ask("GET", path)
 
 
 def look_on(desk: Desk, turn: int) -> None:
-    """What an open dashboard asks for."""
+    """Send the requests of an open dashboard."""
     desk.ask("GET", "/v1/overview")
     for path in ("learning", "quality", "observations?limit=10", "alarms?limit=5", "payload"):
         desk.ask("GET", f"/v1/models/{ARM}/{path}")
 
 
 def look_around(desk: Desk, turn: int) -> None:
-    """Everything that can be read."""
+    """Read every resource."""
     paths = ["models", "audit?limit=20", "jobs", "datasets", "robots", "robots/profiles", f"robots/profiles/{PROFILE}"]
     for path in [*paths, f"models/{ARM}/aliases"]:
         desk.ask("GET", f"/v1/{path}")
@@ -109,25 +108,27 @@ def look_around(desk: Desk, turn: int) -> None:
     desk.ask("GET", f"/v1/models/{ARM}/versions/{newest[ARM]}")
     batch = desk.ask("GET", f"/v1/models/{ARM}/observations?limit=1")["items"][0]
     desk.ask("GET", f"/v1/models/{ARM}/observations/{ARM}/{batch['sequence']}?rows=true")
-    desk.ask("POST", f"/v1/models/{ARM}/predict", json={**desk.at(), "components": ["gravity", "friction"]})
-    desk.ask("POST", "/v1/echo", json={**desk.at()})
+    desk.ask("POST", f"/v1/models/{ARM}/predict", json={**desk.motion(), "components": ["gravity", "friction"]})
+    desk.ask("POST", "/v1/echo", json={**desk.motion()})
     desk.ask("GET", "/v2")
     for path in (f"/v2/models/{LOOP}", f"/v2/models/{LOOP}/versions/{newest[LOOP]}"):
         desk.ask("GET", path)
         desk.ask("GET", f"{path}/ready")
-        inputs = [{"name": name, "shape": [1, 7], "datatype": "FP64", "data": data} for name, data in desk.at().items()]
+        inputs = [
+            {"name": name, "shape": [1, 7], "datatype": "FP64", "data": data} for name, data in desk.motion().items()
+        ]
         desk.ask("POST", f"{path}/infer", json={"inputs": inputs})
     for path in ("/", "/docs", "/openapi.json", "/guide"):
         desk.ask("GET", path, 200, 307)
 
 
 def follow(desk: Desk, turn: int) -> None:
-    """Follow the arm live for a moment."""
+    """Read some live events of the arm."""
     desk.events(f"/v1/models/{ARM}/live", 3)
 
 
 def correct(desk: Desk, turn: int) -> None:
-    """Learn what a contact has kept out, unlearn a batch, declare a payload and put it down, decide."""
+    """Replay rejected rows, undo a batch, declare and remove a payload, decide about a change."""
     touched = turn * CONTACT_S // BATCH_S
     path = f"/v1/models/{ARM}/observations/{ARM}"
     desk.ask("POST", f"{path}/{touched}/replay", 200, 409, 422, json={"codes": ["contact"]})
@@ -138,9 +139,9 @@ def correct(desk: Desk, turn: int) -> None:
 
 
 def move(desk: Desk, turn: int) -> None:
-    """Move an alias to and fro, and remove it."""
+    """Move an alias between versions, roll it back and delete it."""
     versions = [each["version"] for each in desk.ask("GET", f"/v1/models/{ARM}")["versions"]]
-    path = f"/v1/models/{ARM}/aliases/{ALTERNATE}"
+    path = f"/v1/models/{ARM}/aliases/{ALIAS}"
     for version in (versions[0], versions[-1]):
         desk.ask("PUT", path, json={"version": version})
     desk.ask("POST", f"{path}/rollback", 200, 409, json={})
@@ -148,7 +149,7 @@ def move(desk: Desk, turn: int) -> None:
 
 
 def judge(desk: Desk, turn: int) -> None:
-    """Hold versions against a recording."""
+    """Evaluate and compare versions on a recording."""
     if not desk.datasets:
         return
     dataset, versions = desk.datasets[-1], [each["version"] for each in _versions(desk)]
@@ -156,19 +157,19 @@ def judge(desk: Desk, turn: int) -> None:
     desk.ask("POST", f"/v1/models/{ARM}/trace", json={"dataset": dataset, "points": 200, "components": ["gravity"]})
     if len(versions) > 1:
         chosen = [versions[0], versions[-1]]
-        # 404: one was deleted meanwhile, as refreshes do
+        # 404: a version may have been deleted meanwhile
         desk.ask("POST", f"/v1/models/{ARM}/compare", 200, 404, json={"dataset": dataset, "versions": chosen})
 
 
 def tidy(desk: Desk, turn: int) -> None:
     """Delete old versions."""
     for model in (ARM, LOOP):
-        for each in _versions(desk, model)[:-KEPT_VERSIONS]:  # the oldest come first
+        for each in _versions(desk, model)[:-MAX_VERSIONS]:  # oldest first
             desk.ask("DELETE", f"/v1/models/{model}/versions/{each['version']}", 204, 404, 409)
 
 
 def record(desk: Desk, turn: int) -> None:
-    """Upload recordings in one file and in several, look at them, and delete older ones."""
+    """Upload recordings as one file and as several, read them, and delete older ones."""
     samples = desk.recording(turn)
     for content, kind in ((npz(samples), "application/x-npz"), (joined(samples), "application/zip")):
         query = {"name": f"day {turn} {kind}", "robot": PROFILE}
@@ -176,12 +177,12 @@ def record(desk: Desk, turn: int) -> None:
         desk.ask("GET", f"/v1/datasets/{made['id']}")
         desk.ask("GET", f"/v1/datasets/{made['id']}/preview?quantities=q,tau&points=100")
         desk.datasets.append(made["id"])
-    while len(desk.datasets) > KEPT:
+    while len(desk.datasets) > MAX_DATASETS:
         desk.ask("DELETE", f"/v1/datasets/{desk.datasets.pop(0)}", 204)
 
 
 def archive(desk: Desk, turn: int) -> None:
-    """Export what was learnt, import it as another model, and delete that; the same of a URDF."""
+    """Export a version, import it as another model and delete that; export C and URDF; upload and delete a robot."""
     content = desk.ask("GET", f"/v1/models/{ARM}/export")
     kind = {"content-type": "application/x-tar"}
     desk.ask("POST", "/v1/models/import?name=copy&promotion=always", 201, content=content, headers=kind)
@@ -195,17 +196,17 @@ def archive(desk: Desk, turn: int) -> None:
 
 
 def set_learning(desk: Desk, turn: int) -> None:
-    """Set how the arm learns, and go back to what was learnt a moment ago."""
+    """Change the learning options, and roll back to an earlier revision."""
     options = desk.ask("GET", f"/v1/models/{ARM}/learning")["options"]
     desk.ask("PUT", f"/v1/models/{ARM}/learning", json={**options, "forgetting_s": 3600.0 + turn})
     status = desk.ask("GET", f"/v1/models/{ARM}/learning")["status"]
     first, last = status["reachable"][-1]
-    if first <= last - BACK:
-        desk.ask("POST", f"/v1/models/{ARM}/rollback", 200, 409, json={"revision": last - BACK})
+    if first <= last - ROLLBACK_REVISIONS:
+        desk.ask("POST", f"/v1/models/{ARM}/rollback", 200, 409, json={"revision": last - ROLLBACK_REVISIONS})
 
 
 def train(desk: Desk, turn: int) -> None:
-    """Train, from recordings and then from what was observed; cancel a job and repeat it."""
+    """Train from recordings, cancel and retry a job, then retrain from observations."""
     if not desk.datasets:
         record(desk, turn)
     request = {
@@ -223,18 +224,17 @@ def train(desk: Desk, turn: int) -> None:
     _done(desk, desk.ask("POST", f"/v1/jobs/{job}/retry", 202)["id"])
     row = _ended(desk, desk.ask("POST", f"/v1/models/{ARM}/refresh", 202, json={})["id"])
     if row["state"] == "failed" and row["error"]["code"] == "observations_taken_back":
-        return  # by who corrects
+        return  # by `correct`, which runs at the same time
     _succeeded(row)
 
 
 def renew(desk: Desk, turn: int) -> None:
-    """Refresh the model of the loop, where that is possible and not under way: from the first hour on, not only once
-    it refreshes itself."""
+    """Retrain the model of the loop if possible, from the first hour on."""
     desk.ask("POST", f"/v1/models/{LOOP}/refresh", 202, 409, json={})
 
 
 def keep(desk: Desk, turn: int) -> None:
-    """Back the home up; make a key with a rate, ask by it beyond that, and revoke it."""
+    """Make a backup; create a key with a rate limit, exceed the limit, and revoke the key."""
     file = desk.folder / f"backup-{turn}"
     desk.command("backup", str(file))
     file.unlink()
@@ -253,13 +253,13 @@ ERRANDS: dict[int, tuple[Errand, ...]] = {
     900: (record, archive, set_learning, renew),
     3600: (keep,),
 }
-"""By the arm seconds between two of a kind."""
+"""Errands by their period in arm seconds."""
 SLOW: dict[int, tuple[Errand, ...]] = {3600: (train,)}
-"""Those that the arm does not wait for."""
+"""Errands that the arm does not wait for."""
 
 
 def run(desk: Desk, period: int, errands: tuple[Errand, ...], waited: bool = True) -> None:
-    """Run errands of a period all day. waited: whether the arm waits for who runs them."""
+    """Run errands of a period all day; waited: whether the arm waits for them."""
     name = f"every {period} s: {errands[0].__name__}"
     for turn, at in enumerate(range(0, desk.day.clock.seconds, period)):
         if not desk.day.clock.follow(name, at + BATCH_S):
@@ -272,7 +272,7 @@ def run(desk: Desk, period: int, errands: tuple[Errand, ...], waited: bool = Tru
 
 
 def unasked(desk: Desk) -> list[str]:
-    """Routes of the service's description that were never asked, by what it has counted."""
+    """Return routes of the OpenAPI document that the service has not counted a request for."""
     text = desk.ask("GET", "/metrics").decode()
     counted = {
         (labels["method"], labels["route"])
@@ -300,7 +300,7 @@ def _versions(desk: Desk, model: str = ARM) -> list[Any]:
 
 
 def _ended(desk: Desk, job: str) -> Any:
-    """How a job ended, followed by its events."""
+    """Follow the events of a job until it ends; return the job."""
     while True:
         desk.events(f"/v1/jobs/{job}/events", 10_000)
         row = desk.ask("GET", f"/v1/jobs/{job}")
@@ -318,7 +318,7 @@ def _succeeded(row: Any) -> None:
 
 
 def joined(samples: Samples) -> bytes:
-    """A recording as tables of text in a zip, one a quantity, without names of columns."""
+    """Return a recording as a zip of text tables, one for each quantity, without column names."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         parts = {"time": samples.t[:, None], "positions": samples.q, "velocities": samples.dq}

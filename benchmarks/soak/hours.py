@@ -1,4 +1,4 @@
-"""`python -m benchmarks soak`: what a busy arm asks for in hours, as fast as it goes; nothing may grow meanwhile."""
+"""`python -m benchmarks soak`: hours of a busy arm, replayed as fast as possible; no resource may grow."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -20,7 +20,7 @@ from rich.console import Console
 
 import lipcore
 from benchmarks import facts
-from benchmarks.latency.table import Grid, promises
+from benchmarks.latency.table import Grid, targets_grid
 from benchmarks.latency.targets import Target
 from benchmarks.online.bed import install, serving, train
 from benchmarks.online.scene import Scene
@@ -28,24 +28,24 @@ from benchmarks.soak import day as days
 from benchmarks.soak import errands
 from benchmarks.soak.day import ARM, LOOP, Clock, Day, Tally
 from benchmarks.soak.errands import ERRANDS, SLOW, Desk
-from benchmarks.soak.resources import WARMING, Growth, Look, ResourceWatch, growth, series
+from benchmarks.soak.resources import WARM_UP_SHARE, Growth, Look, ResourceWatch, growth, series
 from lipcore.warm_up import warm_up
 from service.api.access import keys
 from service.contract.observations import LearningOptions
 from service.storage.database import Database
 
 MOTION_S = 600.0
-"""Of the arm, repeated all day."""
+"""Length of the arm's motion, which is repeated all day."""
 SETTINGS = {"keys": "on", "max_loaded_models": 8}
-"""Of the service."""
+"""Settings of the service."""
 RETAINED_S, ROW_BYTES = 2400, 250
-"""Seconds of the loop for which its log is kept, less than a tenth of eight hours; and roughly what a row takes."""
+"""Retention of the loop's log, less than a tenth of eight hours, and the approximate size of a row."""
 LEARNING = LearningOptions(on_change="learn")
 FIT = {"posterior_samples": 500, "search_seconds": 10.0}
-MEMORY_SHARE, DISK_SHARE = 5.0, 5.0
-"""Percent by which memory and disk may rise, by the line through all that comes after the first tenth."""
-DESCRIPTORS, THREADS, PROCESSES = 3.0, 2.0, 0.5
-"""How many of them may be more by then."""
+MAX_MEMORY_GROWTH, MAX_DISK_GROWTH = 5.0, 5.0
+"""Max growth in percent, of the regression line after the first tenth."""
+MAX_MORE_DESCRIPTORS, MAX_MORE_THREADS, MAX_MORE_PROCESSES = 3.0, 2.0, 0.5
+"""Max increase, of the regression line after the first tenth."""
 UNITS = {
     "service": "memory of the service, MiB",
     "learner": "memory of its learner, MiB",
@@ -59,8 +59,14 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Options:
-    """How much. hours: of the arm; rate: at which it is observed, Hz; minutes: after which it is ended in any case;
-    seed: of motion."""
+    """Scope of the benchmark.
+
+    Attributes:
+        hours: hours of the arm.
+        rate: rate of the observations, Hz.
+        minutes: max duration of the benchmark.
+        seed: seed of the motion.
+    """
 
     hours: float = 8.0
     rate: int = 100
@@ -70,7 +76,17 @@ class Options:
 
 @dataclass
 class Results:
-    """What was done and seen. seconds: that it took; looks: at the service; unasked: routes that nobody asked."""
+    """All figures of a day.
+
+    Attributes:
+        facts: machine and packages.
+        hours: hours of the arm.
+        seconds: duration of the benchmark.
+        done: count of each step.
+        errors: count of each error.
+        looks: resources of the service over time.
+        unasked: routes without a request.
+    """
 
     facts: dict[str, str]
     hours: float
@@ -86,14 +102,14 @@ class Results:
 
 
 def run(options: Options, console: Console) -> Results:
-    """Serve a day; raise BenchError where a step fails."""
+    """Run the benchmark; raise BenchError if a step fails."""
     scene = Scene("panda", rate=float(options.rate), seed=options.seed)
     results = Results(facts.machine(), options.hours)
     with tempfile.TemporaryDirectory(prefix="lipserve-bench-") as name:
         folder = Path(name)
         home = folder / "home"
         console.print("training a model of panda", highlight=False)
-        warm_up("rigid-body")  # a process that compiles keeps 30 MiB of the compiler
+        warm_up("rigid-body")  # a process that compiles keeps 30 MiB of compiler memory
         base, _ = train(scene.history(50.0, 10.0), scene.arm.joint_types, FIT, "rigid-body")
         lipcore.save(base, folder / "model")
         install(home, folder / "model", {ARM: LEARNING, LOOP: LEARNING}, base.n_joints)
@@ -117,7 +133,7 @@ def run(options: Options, console: Console) -> Results:
 
 
 def _work(desk: Desk, minutes: float | None, console: Console) -> None:
-    """Let everybody work until the day is over."""
+    """Run all tasks until the day is over."""
     day = desk.day
     work = [partial(each, day) for each in (days.teach, days.ask, days.loop)]
     work += [partial(errands.run, desk, period, each) for period, each in ERRANDS.items()]
@@ -140,7 +156,7 @@ def _work(desk: Desk, minutes: float | None, console: Console) -> None:
 
 
 def targets(results: Results) -> list[Target]:
-    """What is promised, and what was seen."""
+    """Return all targets."""
     at = series(results.looks, "at")
     lines = {name: growth(series(results.looks, name), at) for name in UNITS}
 
@@ -151,20 +167,20 @@ def targets(results: Results) -> list[Target]:
         return None if line is None else line.rise
 
     return [
-        Target("requests and errands that went wrong", sum(results.errors.values()), "", "≤", 0),
-        Target("routes that were never asked", len(results.unasked), "", "≤", 0),
-        Target("memory of the service, growth", share(lines["service"]), "%", "≤", MEMORY_SHARE),
-        Target("memory of its learner, growth", share(lines["learner"]), "%", "≤", MEMORY_SHARE),
-        Target("memory of training processes, growth", share(lines["jobs"]), "%", "≤", MEMORY_SHARE),
-        Target("disk of the home, growth", share(lines["disk"]), "%", "≤", DISK_SHARE),
-        Target("descriptors, more", rise(lines["descriptors"]), "", "≤", DESCRIPTORS),
-        Target("threads, more", rise(lines["threads"]), "", "≤", THREADS),
-        Target("processes, more", rise(lines["processes"]), "", "≤", PROCESSES),
+        Target("failed requests and tasks", sum(results.errors.values()), "", "≤", 0),
+        Target("routes without a request", len(results.unasked), "", "≤", 0),
+        Target("memory of the service, growth", share(lines["service"]), "%", "≤", MAX_MEMORY_GROWTH),
+        Target("memory of its learner, growth", share(lines["learner"]), "%", "≤", MAX_MEMORY_GROWTH),
+        Target("memory of training processes, growth", share(lines["jobs"]), "%", "≤", MAX_MEMORY_GROWTH),
+        Target("disk of the home, growth", share(lines["disk"]), "%", "≤", MAX_DISK_GROWTH),
+        Target("descriptors, growth", rise(lines["descriptors"]), "", "≤", MAX_MORE_DESCRIPTORS),
+        Target("threads, growth", rise(lines["threads"]), "", "≤", MAX_MORE_THREADS),
+        Target("processes, growth", rise(lines["processes"]), "", "≤", MAX_MORE_PROCESSES),
     ]
 
 
 def grids(results: Results) -> list[Grid]:
-    """Every table, in order; those without rows are left out."""
+    """Return all tables with rows, in order."""
     found = [
         Grid("machine", ("", ""), list(results.facts.items()), texts=True),
         Grid(
@@ -172,25 +188,25 @@ def grids(results: Results) -> list[Grid]:
             ("", "times"),
             [(name, f"{count:,}") for name, count in results.done.items()],
         ),
-        Grid("what went wrong", ("", "times"), [(text, f"{count:,}") for text, count in results.errors.items()]),
-        Grid("never asked", ("",), [(route,) for route in results.unasked]),
-        _held(results),
-        replace(promises(targets(results)), columns=("", "promised", "measured", "")),
+        Grid("errors", ("", "times"), [(text, f"{count:,}") for text, count in results.errors.items()]),
+        Grid("routes without a request", ("",), [(route,) for route in results.unasked]),
+        _resources(results),
+        targets_grid(targets(results), ""),
     ]
     return [grid for grid in found if grid.rows]
 
 
-def _held(results: Results) -> Grid:
-    """Each figure's median in each fifth of what comes after the first tenth."""
+def _resources(results: Results) -> Grid:
+    """Return the median of each resource in each fifth after the first tenth."""
     end = results.looks[-1].at if results.looks else 0.0
-    edges = [end * (WARMING + (1 - WARMING) * fifth / 5) for fifth in range(6)]
+    edges = [end * (WARM_UP_SHARE + (1 - WARM_UP_SHARE) * fifth / 5) for fifth in range(6)]
     fifths = [[look for look in results.looks if a <= look.at <= b] for a, b in pairwise(edges)]
     rows = []
     for name, unit in UNITS.items():
         parts = [_median(series(fifth, name)) for fifth in fifths]
         rows.append((unit, *(f"{part:,.0f}" for part in parts), f"{max(series(results.looks, name), default=0):,.0f}"))
     columns = ("median of each fifth after the first tenth", "1", "2", "3", "4", "5", "largest")
-    return Grid("what was held", columns, rows if results.looks else [])
+    return Grid("resources", columns, rows if results.looks else [])
 
 
 def _median(values: Sequence[float]) -> float:
@@ -208,7 +224,7 @@ def draw(results: Results, path: Path) -> None:
     for name in ("descriptors", "threads"):
         below.plot(hours, series(results.looks, name), label=name, linewidth=0.8)
     for axes, unit in ((above, "MiB"), (below, "number")):
-        axes.axvspan(0.0, WARMING * results.hours, color="0.9", linewidth=0)
+        axes.axvspan(0.0, WARM_UP_SHARE * results.hours, color="0.9", linewidth=0)
         axes.set_ylim(bottom=0.0)
         axes.set_ylabel(unit)
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)

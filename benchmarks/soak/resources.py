@@ -1,4 +1,4 @@
-"""What a service holds while it is under load: memory, descriptors, threads, processes, disk. Linux only."""
+"""Resources of a service under load: memory, descriptors, threads, processes, disk. Linux only."""
 
 from __future__ import annotations
 
@@ -11,20 +11,29 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.processes import PROC, Watch, levels, resident, written
+from benchmarks.processes import PROC, PeriodicCall, levels, resident_mib, written_mib
 
-WARMING = 0.1
-"""Share of a run in which caches fill and processes start: what grows there is no leak."""
+WARM_UP_SHARE = 0.1
+"""Share of a run in which caches fill and processes start; growth there is no leak."""
 BLOCKS = 18
-"""Parts of the rest, each of which counts by its median: a passing peak is no growth."""
+"""Parts of the rest; each counts by its median, so that a short peak is no growth."""
+LEARNER_MIB = 60.0
+"""Min resident memory of the learner; the process that tracks shared memory has less."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """What there was at a moment. at: by the clock of the watch, s.
+    """Resources at one moment.
 
-    service, learner: memory that they have written, MiB, see `written`; jobs: that of all other processes below the
-    service; descriptors, threads: of service and learner; processes: below the service; disk: MiB of its home.
+    Attributes:
+        at: time of the watch's clock, s.
+        service: memory written by the service, MiB; see `written_mib`.
+        learner: memory written by its learner, MiB.
+        jobs: memory written by all other descendants of the service, MiB.
+        descriptors: file descriptors of service and learner.
+        threads: threads of service and learner.
+        processes: descendants of the service.
+        disk: size of the home, MiB.
     """
 
     at: float
@@ -37,11 +46,14 @@ class Look:
     disk: float
 
 
-class ResourceWatch(Watch):
-    """Looks every so many seconds while it is entered. home: of the service, not measured where None; clock: by which
-    looks are dated, s.
+class ResourceWatch(PeriodicCall):
+    """A context manager that reads the resources of a service every `period` seconds.
 
-    looks: what there was; none where the system does not tell, and without a learner before it has started.
+    Attributes:
+        pid: process id of the service.
+        home: home of the service; None: its disk is not measured.
+        clock: returns the time of a look, s.
+        looks: the resources over time; empty on other systems than Linux.
     """
 
     def __init__(
@@ -52,8 +64,8 @@ class ResourceWatch(Watch):
         self._learner: int | None = None
 
     def note(self) -> None:
-        """Take down what there is now, while the service lives."""
-        own = written(self.pid)
+        """Record the present resources, if the service runs."""
+        own = written_mib(self.pid)
         if own is None:
             return
         below = [pid for level in levels(self.pid)[1:] for pid in level]
@@ -63,8 +75,8 @@ class ResourceWatch(Watch):
             Look(
                 at=self.clock(),
                 service=own,
-                learner=0.0 if learner is None else written(learner) or 0.0,
-                jobs=sum(written(pid) or 0.0 for pid in below if pid != learner),
+                learner=0.0 if learner is None else written_mib(learner) or 0.0,
+                jobs=sum(written_mib(pid) or 0.0 for pid in below if pid != learner),
                 descriptors=sum(_descriptors(pid) for pid in main),
                 threads=sum(_threads(pid) for pid in main),
                 processes=len(below),
@@ -73,21 +85,17 @@ class ResourceWatch(Watch):
         )
 
     def _found(self, below: Sequence[int]) -> int | None:
-        """The learner: the process below the service that computes first, before any job is queued."""
+        """Return the learner: the first large descendant of the service, as no job is queued before it starts."""
         if self._learner not in below:
-            large = [pid for pid in below if (resident(pid) or 0.0) > LEARNER_MIB]
+            large = [pid for pid in below if (resident_mib(pid) or 0.0) > LEARNER_MIB]
             self._learner = large[0] if large else None
         return self._learner
-
-
-LEARNER_MIB = 60.0
-"""Resident memory by which a process that computes is told from the one that only keeps account of shared memory."""
 
 
 def _descriptors(pid: int) -> int:
     try:
         return len(os.listdir(PROC / str(pid) / "fd"))
-    except OSError:  # it has ended
+    except OSError:  # the process has ended
         return 0
 
 
@@ -99,9 +107,9 @@ def _threads(pid: int) -> int:
 
 
 def size(folder: Path) -> float:
-    """What a folder takes of the disk, MiB."""
+    """Return the disk space of a folder, MiB."""
     blocks = 0
-    for place, folders, files in os.walk(folder):  # which passes over what was deleted meanwhile
+    for place, folders, files in os.walk(folder):  # skips folders deleted meanwhile
         for name in (*folders, *files):
             with suppress(FileNotFoundError):
                 blocks += os.lstat(os.path.join(place, name)).st_blocks
@@ -109,33 +117,33 @@ def size(folder: Path) -> float:
 
 
 def series(looks: Sequence[Look], name: str) -> list[float]:
-    """One figure of all looks."""
+    """Return one figure of all looks."""
     return [float(asdict(look)[name]) for look in looks]
 
 
 @dataclass(frozen=True)
 class Growth:
-    """How a figure rises after the first tenth of a run, by the line of least squares. level: at the line's start."""
+    """Growth of a figure after the first tenth of a run, by linear regression; level: at the start of the line."""
 
     level: float
     rise: float
 
     @property
     def share(self) -> float:
-        """The rise over the level; 0 where there is nothing."""
+        """Rise over level; 0 if the level is 0."""
         return self.rise / self.level if self.level > 0 else 0.0
 
 
 def growth(looks: Sequence[float], at: Sequence[float] | None = None) -> Growth | None:
-    """The line through the medians of the parts after the first tenth; None for too few looks.
+    """Return the line through the medians of all blocks after the first tenth; None for too few looks.
 
-    at: when they were taken, by the clock whose first tenth is left out; evenly where None.
+    `at` holds the times of the looks; None: equal distances.
     """
     times = np.arange(len(looks), dtype=float) if at is None else np.asarray(at, dtype=float)
     if len(times) < 2 * BLOCKS or times[-1] <= times[0]:
         return None
     share = (times - times[0]) / (times[-1] - times[0])
-    part = np.floor(BLOCKS * (share - WARMING) / (1 - WARMING)).astype(int).clip(max=BLOCKS - 1)
+    part = np.floor(BLOCKS * (share - WARM_UP_SHARE) / (1 - WARM_UP_SHARE)).astype(int).clip(max=BLOCKS - 1)
     known = sorted(set(part[part >= 0].tolist()))
     medians = [float(np.median(np.asarray(looks)[part == number])) for number in known]
     slope, start = np.polyfit((np.array(known) + 0.5) / BLOCKS, medians, 1)

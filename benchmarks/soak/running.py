@@ -1,4 +1,4 @@
-"""The load from start to end: options in, results out."""
+"""The load benchmark from options to results."""
 
 from __future__ import annotations
 
@@ -29,17 +29,26 @@ from lipcore.model.torque_model import TorqueModel
 from service.contract.observations import LearningOptions
 
 KINDS = ("predict", "stream", "observe", "upload")
-QUERIES, UPLOADED = 200, 300
-"""Motions that are asked; samples of an uploaded recording."""
+QUERIES, UPLOADED_ROWS = 200, 300
+"""Number of queries; rows of an uploaded recording."""
 OBSERVED_RATE = 50.0
-"""Hz, of the streams that are taught: half a second a batch."""
+"""Rate of the observed streams, Hz: half a second a batch."""
 LEARNING = LearningOptions(on_change="learn", contact_threshold=100.0, auto_refresh=False, auto_promote=False)
-"""Every row is learnt, so that the clients know what the service must know."""
+"""All rows are learnt, so that the benchmark can compute the expected model."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How much load. pause: s between an answer and the next question; fit: of the model; robot, seed: of motion."""
+    """Scope of the load.
+
+    Attributes:
+        connections: simultaneous connections.
+        seconds: duration.
+        pause: wait between an answer and the next request, s.
+        robot: robot of the motion.
+        seed: seed of the motion.
+        fit: fit options of the model.
+    """
 
     connections: int = 64
     seconds: float = 120.0
@@ -51,10 +60,19 @@ class Options:
 
 @dataclass
 class Results:
-    """What was seen.
+    """All figures of the load.
 
-    timings: of exchanges by kind; errors: how often each went wrong, by kind; service, children: MiB each second, while
-    the load was on; before, after: the account before and after the service was started anew.
+    Attributes:
+        facts: machine and packages.
+        model: the served model.
+        mix: connections of each kind.
+        seconds: duration of the load.
+        timings: duration of exchanges, by kind.
+        errors: count of each error, by kind.
+        service: memory of the service every second, MiB.
+        children: memory of its learner every second, MiB.
+        before: account before the restart of the service.
+        after: account after the restart.
     """
 
     facts: dict[str, str]
@@ -70,18 +88,18 @@ class Results:
 
     @property
     def failed(self) -> int:
-        """How many exchanges went wrong."""
+        """Number of failed exchanges."""
         return sum(sum(found.values()) for found in self.errors.values())
 
     def write(self, path: Path, targets: list[dict[str, Any]]) -> None:
         """Write all figures as JSON."""
         errors = {kind: dict(found) for kind, found in self.errors.items()}
-        whole = replace(self, errors={})  # asdict makes pairs of a Counter's keys
+        whole = replace(self, errors={})  # asdict does not convert Counters
         path.write_text(json.dumps({**asdict(whole), "errors": errors, "targets": targets}, indent=2) + "\n")
 
 
 def run(options: Options, console: Console) -> Results:
-    """Serve, load, count; raise BenchError where a step fails."""
+    """Run the load and count writes; raise BenchError if a step fails."""
     scene, mix = Scene(options.robot, seed=options.seed), Mix.of(options.connections)
     machine = facts.machine()
     with tempfile.TemporaryDirectory(prefix="lipserve-bench-") as folder:
@@ -96,11 +114,11 @@ def run(options: Options, console: Console) -> Results:
             console.print(f"{mix.total} connections for {options.seconds:g} s", highlight=False)
             logs = _load(bed, base, options, mix, observed, queries, scene, results)
             results.before = Account.of(logs)
-            console.print("counting what is there", highlight=False)
+            console.print("counting stored writes", highlight=False)
             accounting.check(results.before, logs, bed.client)
             accounting.compare(results.before, logs, observed, base, queries, bed)
         with serving(home / "home") as bed:
-            console.print("counting again after a new start", highlight=False)
+            console.print("counting again after a restart", highlight=False)
             results.after = Account.of(logs)
             accounting.check(results.after, logs, bed.client)
             accounting.send_again(results.after, logs, observed, bed)
@@ -121,7 +139,7 @@ def _load(
     asked = queries.rows(slice(0, QUERIES))
     tau = base.predict(asked.q, asked.dq, asked.ddq).tau
     expected = Expected(asked.q, asked.dq, asked.ddq, tau)
-    recording = scene.history(UPLOADED / 10.0, 10.0)
+    recording = scene.history(UPLOADED_ROWS / 10.0, 10.0)
     parts = [clients.share(each, PROCESSES) for each in (mix.predict, mix.stream, mix.observe, mix.upload)]
     works, first = [], 0
     for number in range(PROCESSES):
@@ -143,7 +161,7 @@ def _load(
 
 
 def _observed(scene: Scene, options: Options, streams: int) -> dict[int, Samples]:
-    """What each connection that teaches sends, by its number: more than it will have the time for."""
+    """Return the samples of each observing connection, by its number; more than it can send."""
     batches = int(options.seconds / BATCH_PERIOD) + 2
     long = scene.more(streams * batches * BATCH_ROWS / OBSERVED_RATE)
     every = round(scene.rate / OBSERVED_RATE)

@@ -1,47 +1,45 @@
-"""Results of the load as tables, and what is promised of them."""
+"""Tables and targets of the load."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from benchmarks.latency.table import NOTHING, Grid, promises
+from benchmarks.latency.table import NOTHING, Grid, targets_grid
 from benchmarks.latency.targets import Target
 from benchmarks.soak.accounting import Account
 from benchmarks.soak.resources import growth
 from benchmarks.soak.running import Results
 
-GROWTH = 5.0
-"""Percent that memory may grow by."""
-TOLERANCE = 1e-8
+MAX_GROWTH = 5.0
+"""Max growth of memory, percent."""
+MAX_DIFFERENCE = 1e-8
 
 
 def targets(results: Results) -> list[Target]:
-    """What is promised, and what was seen."""
+    """Return all targets."""
     accounts = results.before, results.after
     grown = growth(results.service)
     below = growth(results.children)
     return [
-        Target("exchanges that went wrong", results.failed, "", "≤", 0),
+        Target("failed exchanges", results.failed, "", "≤", 0),
         Target("acknowledged writes lost", sum(each.lost for each in accounts), "", "≤", 0),
-        Target("stored otherwise than acknowledged", sum(each.changed for each in accounts), "", "≤", 0),
-        Target("there, but never acknowledged", sum(each.surplus for each in accounts), "", "≤", 0),
-        Target("learnt twice", results.after.twice, "", "≤", 0),
+        Target("stored, but not as acknowledged", sum(each.changed for each in accounts), "", "≤", 0),
+        Target("stored, but never acknowledged", sum(each.surplus for each in accounts), "", "≤", 0),
+        Target("batches learnt twice", results.after.twice, "", "≤", 0),
         Target(
             "largest difference from learning at once",
             max(each.difference for each in accounts),
             "relative",
             "≤",
-            TOLERANCE,
+            MAX_DIFFERENCE,
         ),
-        Target("memory of the service, growth", None if grown is None else 100 * grown.share, "%", "≤", GROWTH),
-        Target("memory of its learner, growth (not promised)", None if below is None else 100 * below.share, "%"),
+        Target("memory of the service, growth", None if grown is None else 100 * grown.share, "%", "≤", MAX_GROWTH),
+        Target("memory of its learner, growth (no target)", None if below is None else 100 * below.share, "%"),
     ]
 
 
 def grids(results: Results) -> list[Grid]:
-    """Every table, in order; those without rows are left out."""
+    """Return all tables with rows, in order."""
     found = [
         Grid("machine", ("", ""), list(results.facts.items()), texts=True),
         Grid("model", ("", ""), list(results.model.items()), texts=True),
@@ -49,7 +47,7 @@ def grids(results: Results) -> list[Grid]:
         _errors(results),
         _memory(results),
         _account(results),
-        replace(promises(targets(results)), columns=("", "promised", "measured", "")),
+        targets_grid(targets(results), ""),
     ]
     return [grid for grid in found if grid.rows]
 
@@ -64,13 +62,13 @@ def _exchanges(results: Results) -> Grid:
         rows.append(
             (kind, str(count), f"{timing.count:,}", f"{timing.count / results.seconds:,.0f}", *each, str(wrong))
         )
-    columns = ("", "connections", "exchanges", "a second", "p50 ms", "p99 ms", "largest ms", "wrong")
+    columns = ("", "connections", "exchanges", "exchanges/s", "p50 ms", "p99 ms", "largest ms", "errors")
     return Grid(f"{results.mix.total} connections for {results.seconds:g} s", columns, rows)
 
 
 def _errors(results: Results) -> Grid:
     rows = [(kind, text, str(count)) for kind, found in results.errors.items() for text, count in found.items()]
-    return Grid("what went wrong", ("", "", "times"), rows, texts=True)
+    return Grid("errors", ("", "", "times"), rows, texts=True)
 
 
 def _memory(results: Results) -> Grid:
@@ -80,24 +78,24 @@ def _memory(results: Results) -> Grid:
             parts = [float(np.median(part)) for part in np.array_split(looks, 4) if len(part)]
             rows.append((name, *(f"{value:,.0f}" for value in parts), f"{max(looks):,.0f}"))
     columns = ("MiB, median of", "first quarter", "second", "third", "last", "largest")
-    return Grid("memory written while loaded", columns, [row for row in rows if len(row) == len(columns)])
+    return Grid("memory written under load", columns, [row for row in rows if len(row) == len(columns)])
 
 
 def _account(results: Results) -> Grid:
     names = {
         "batches": "batches acknowledged",
-        "rows": "rows to be learnt",
-        "datasets": "data sets stored",
+        "rows": "rows accepted",
+        "datasets": "data sets uploaded",
         "deleted": "data sets deleted",
         "unsure": "writes without an answer",
         "lost": "lost",
-        "changed": "not as acknowledged",
-        "surplus": "never acknowledged",
-        "twice": "learnt again when sent again",
+        "changed": "stored, but not as acknowledged",
+        "surplus": "stored, but never acknowledged",
+        "twice": "repeated batches learnt twice",
     }
-    rows = [(said, _count(results.before, name), _count(results.after, name)) for name, said in names.items()]
+    rows = [(label, _count(results.before, name), _count(results.after, name)) for name, label in names.items()]
     rows.append(("difference of torques", f"{results.before.difference:.1e}", f"{results.after.difference:.1e}"))
-    return Grid("account", ("", "at the end", "after a new start"), rows)
+    return Grid("writes", ("", "after the load", "after a restart"), rows)
 
 
 def _count(account: Account, name: str) -> str:

@@ -1,1 +1,1 @@
-"""Scripts that print the figures of docs/numbers.md."""
+"""Scripts that print figures of docs/numbers.md and CHANGELOG.md, or that tuned a constant of lipcore."""

@@ -1,16 +1,17 @@
-"""How intervals are kept true while serving: ways of the literature beside ours, on streams of simulated arms.
+"""Comparison of methods that adapt prediction intervals online, on streams of simulated arms.
 
     python benchmarks/studies/adaptive_intervals.py report|tune [ARM:SEED...]
 
-A learnt arm answers a stream of 100 Hz, ten rows a batch, each answered with the scale known before its batch. Six
-minutes, one after the other: warming up, the motion it was trained on, with 1.5 kg, three times faster, from point to
-point with rests, and slow. Each arm clean (noise 0.05 N·m) and with `Dirt`; the model as trained, and learning all the
-while (forgetting 60 s, a new regime 2 s after the payload comes and goes). Rows at rest are judged, too.
+A learnt arm answers a stream of 100 Hz in batches of ten rows; each batch is answered with the scale known before it.
+The stream has six parts of a minute: warming up, the training motion, a payload of 1.5 kg, three times faster, moves
+with rests, slow. Each arm is simulated clean (noise 0.05 N·m) and with `Dirt`; the model is fixed, or learns online
+(forgetting 60 s, a new regime 2 s after each change of the payload). Rows at rest count, too.
 
-Minute: least and most coverage of the 95 % interval over all minutes, begun at any row, joints and streams. Payload:
-coverage from 0.3 to 1.3 s after it is taken up, of the worst stream and of the worst joint of all. Width: the mean over
-that of a fixed scale that knows the errors of its part, the median of all joints and parts, and the largest. Constants
-were chosen on the streams of `tune`; nobody has looked at those of `report` before.
+- Minute: lowest and highest coverage of the 95 % interval in any window of a minute, over all joints and streams.
+- Payload: coverage from 0.3 to 1.3 s after the payload is attached, of the worst stream and of the worst joint.
+- Width: mean scale over that of the best constant scale of the part; median and maximum over joints and parts.
+
+Constants were tuned on the streams of `tune` only.
 """
 
 import sys
@@ -53,12 +54,12 @@ MISS = 1 - LEVEL
 
 
 def measured(robot: Robot, stream: Simulation, seed: int, dirt: Dirt | None) -> Samples:
-    """A stream of a clean arm, or of a dirty one whose noise is in its dirt."""
+    """Return a stream of a clean arm, or of one with `dirt`, which includes the noise."""
     return simulate(robot, replace(stream, dirt=dirt, noise=0.0 if dirt else NOISE), seed)
 
 
 def played(arm: str, seed: int, dirty: bool, learning: bool) -> Array:
-    """Scores of all rows of all parts, (N, n), under the model of the moment."""
+    """Return the scores of all rows of all parts under the current model, (N, n)."""
     robot, warm = load_robot(arm), Dirt(seed=seed, warmth=0.0) if dirty else None
     history = measured(robot, TRAINED, 1000 * seed, warm)
     history = prepared(history) if dirty else history.rows(slice(None, None, 5))
@@ -84,51 +85,53 @@ def played(arm: str, seed: int, dirty: bool, learning: bool) -> Array:
 
 
 class Tracker(Protocol):
-    """Keeps a scale for each of n columns. scale: (n,)."""
+    """A method that adapts a scale for each of n columns; scale: (n,)."""
 
     scale: Array
 
     def step(self, score: Array) -> None:
-        """Follow a batch of scores, (N, n), that was answered with `scale`."""
+        """Update the scale with a batch of scores, (N, n)."""
 
 
-class Believed:
-    """What the model believes."""
+class Unadapted:
+    """The model's own interval."""
 
     def __init__(self, n: int) -> None:
         self.scale = np.ones(n)
 
     def step(self, score: Array) -> None:
-        """Believe on."""
+        """Do nothing."""
 
 
-class Ours:
-    """What the service does."""
+class Adaptive:
+    """The service's method."""
 
     def __init__(self, n: int) -> None:
         self._state, self._rows = AdaptiveScale.start(np.ones(n)), 0
 
     @property
     def scale(self) -> Array:
-        """Of the state."""
+        """Factors of the state."""
         return self._state.factor
 
     def step(self, score: Array) -> None:
-        """Follow the rows at their times."""
+        """Update the state with the rows at their times."""
         self._state = self._state.step((self._rows + np.arange(len(score))) / RATE, score)
         self._rows += len(score)
 
 
-class Level:
-    """ACI (Gibbs & Candès 2021): the quantile of recent scores whose level moves by gamma (0.05 − miss) a row. Below
-    a level of 0 the interval is infinite there, and twice the largest score here."""
+class Aci:
+    """ACI (Gibbs & Candès 2021): a quantile of recent scores; its level moves by gamma (0.05 − miss) a row.
+
+    If the level falls below 0, the original's interval is infinite; here the scale is twice the largest score.
+    """
 
     def __init__(self, n: int, gamma: float = 0.01, window: int = 1000) -> None:
         self.scale, self._alpha, self._gamma = np.ones(n), np.full(n, MISS), gamma
         self._recent, self._window = np.ones((1, n)), window
 
     def step(self, score: Array) -> None:
-        """Move the level by the batch, and take the quantile anew."""
+        """Move the level by the batch, and update the quantile."""
         self._alpha = self._alpha + self._gamma * (MISS - (score > self.scale)).sum(0)
         self._recent = np.concatenate([self._recent, score])[-self._window :]
         ranked, rows = np.sort(self._recent, axis=0), len(self._recent)
@@ -137,8 +140,8 @@ class Level:
         self.scale = np.where(place >= rows, 2 * ranked[-1], inside)
 
 
-class Experts:
-    """FACI (Gibbs & Candès 2024): quantile trackers of log s with several gains, weighed by their pinball losses."""
+class Faci:
+    """FACI (Gibbs & Candès 2024): quantile trackers of log s with several gains, weighted by their pinball losses."""
 
     gains, share, span = np.array([[0.005], [0.01], [0.02], [0.05], [0.1], [0.2]]), 1 / 500, 500
 
@@ -158,9 +161,11 @@ class Experts:
         self.scale = np.exp((self._weights * self._logs).sum(0))
 
 
-class Strongly:
-    """SAOCP (Bhatnagar et al. 2023): a tracker of log s begins with every batch and lives for 8 · 2^k of them; each is
-    scale-free gradient descent, and they are weighed by what they have won."""
+class Saocp:
+    """SAOCP (Bhatnagar et al. 2023): trackers of log s by scale-free gradient descent, weighted by their gains.
+
+    A tracker starts with every batch and lives for 8 · 2^k batches.
+    """
 
     def __init__(self, n: int) -> None:
         self.scale, self._n, self._batches = np.ones(n), n, 0
@@ -168,7 +173,7 @@ class Strongly:
         self._logs, self._squares, self._won, self._stake, self._weight = (np.zeros((0, n)) for _ in range(5))
 
     def step(self, score: Array) -> None:
-        """Move all that live by the batch, let one begin, and weigh them."""
+        """Move all live trackers by the batch, start one, and update the weights."""
         self._batches += 1
         size = np.log(np.maximum(score, 1e-3))[:, None]
         now = np.log(self.scale)
@@ -195,16 +200,19 @@ class Strongly:
         self.scale = np.exp((shares / shares.sum(0) * self._logs).sum(0))
 
 
-class Controlled:
-    """Conformal PID (Angelopoulos et al. 2023) without its scorecaster: the score's quantile, tracked with a tenth of
-    the largest recent score a row, and the sum of errors through a saturating tangent."""
+class ConformalPid:
+    """Conformal PID (Angelopoulos et al. 2023) without scorecaster.
+
+    The quantile of the score is tracked with a tenth of the largest recent score a row; the sum of errors adds a
+    saturated tangent.
+    """
 
     def __init__(self, n: int, gain: float = 0.1, window: int = 100) -> None:
         self.scale, self._level, self._sum, self._rows = np.ones(n), np.ones(n), np.zeros(n), 1
         self._recent, self._gain, self._window = np.ones((1, n)), gain, window
 
     def step(self, score: Array) -> None:
-        """Add the batch's errors."""
+        """Update quantile and integral with the batch."""
         error = ((score > self.scale) - MISS).sum(0)
         self._recent = np.concatenate([self._recent, score])[-self._window :]
         largest = self._recent.max(0)
@@ -215,30 +223,30 @@ class Controlled:
 
 
 METHODS: dict[str, Callable[[int], Tracker]] = {
-    "as the model believes": Believed,
-    "ACI, gain 0.005 of 10 s": lambda n: Level(n, 0.005),
-    "ACI, gain 0.01 of 3 s": lambda n: Level(n, 0.01, 300),
-    "FACI": Experts,
-    "SAOCP": Strongly,
-    "conformal PID": Controlled,
-    "ours": Ours,
+    "not adapted": Unadapted,
+    "ACI, gain 0.005, window 10 s": lambda n: Aci(n, 0.005),
+    "ACI, gain 0.01, window 3 s": lambda n: Aci(n, 0.01, 300),
+    "FACI": Faci,
+    "SAOCP": Saocp,
+    "conformal PID": ConformalPid,
+    "LIPServe": Adaptive,
 }
 
 
 @dataclass(frozen=True)
 class Figures:
-    """What came of a method on all streams."""
+    """Figures of a method on all streams; see the module's docstring."""
 
-    least: float
-    most: float
+    min_minute: float
+    max_minute: float
     stream: float
     joint: float
     width: float
-    widest: float
+    max_width: float
 
 
 def judged(method: Callable[[int], Tracker], score: Array, stream: Array) -> Figures:
-    """Follow all streams, their joints side by side (N, C), stream (C,) saying whose they are."""
+    """Judge a method on scores of C joints, (N, C), of the streams with these numbers, (C,)."""
     tracker, scale = method(score.shape[1]), np.empty_like(score)
     for first in range(0, len(score), BATCH):
         rows = slice(first, first + BATCH)
@@ -255,7 +263,7 @@ def judged(method: Callable[[int], Tracker], score: Array, stream: Array) -> Fig
 
 
 def main() -> None:
-    """Play the streams and print a Markdown table."""
+    """Simulate the streams and print a Markdown table."""
     threadpool_limits(1)
     kind, arms = sys.argv[1], sys.argv[2:] or STREAMS[sys.argv[1]]
     names = [(*arm.split(":"), dirty, learning) for arm in arms for dirty in (0, 1) for learning in (0, 1)]
@@ -265,14 +273,15 @@ def main() -> None:
 
 
 def show(kind: str, score: Array, stream: Array) -> None:
-    """Print what came of all methods."""
+    """Print the figures of all methods."""
     print(f"| {kind} | minute, % | payload: stream, joint, % | width: median, largest |\n|" + " --- |" * 4)
     for name, method in METHODS.items():
         found = judged(method, score, stream)
         coverage = (
-            f"{100 * found.least:.1f} to {100 * found.most:.1f} | {100 * found.stream:.0f}, {100 * found.joint:.0f}"
+            f"{100 * found.min_minute:.1f} to {100 * found.max_minute:.1f} | "
+            f"{100 * found.stream:.0f}, {100 * found.joint:.0f}"
         )
-        print(f"| {name} | {coverage} | {found.width:.2f}, {found.widest:.1f} |", flush=True)
+        print(f"| {name} | {coverage} | {found.width:.2f}, {found.max_width:.1f} |", flush=True)
 
 
 def _pinball(size: Array, level: Array) -> Array:

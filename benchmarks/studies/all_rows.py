@@ -1,12 +1,12 @@
-"""Whether a posterior of all rows answers better than one of the few that a fit chooses: error and coverage.
+"""Error and coverage of a posterior of all rows, compared with a posterior of the rows that a fit chooses.
 
     python benchmarks/studies/all_rows.py [ROBOT...]
 
 A simulated arm with friction that no estimator expresses exactly (a jump at zero speed) is learnt from episodes of 50
-seconds, at several rates and for several lengths. Each fit chooses its rows and its basis as a training job does. Then
-the same basis takes in all rows: each counted by the seconds that it stands for (see `data.independence`), and
-each in full. `worth` is the sum of what the rows count by their time. Judged on unseen trajectories of twice the
-bandwidth: nMSE, and coverage of the 95 % interval, noise included, each the mean over joints and trajectories.
+seconds at several rates. Each fit chooses its rows and its basis like a training job. Then the same basis is
+conditioned on all rows: with weights (see `lipcore.data.independence`), and with weight 1. `effective` is the sum of
+the weights. Test trajectories have twice the bandwidth; nMSE and coverage of the 95 % interval, noise included, are
+means over joints and trajectories.
 """
 
 import sys
@@ -22,7 +22,7 @@ from lipcore.data.metrics import evaluate
 from lipcore.training.conditioning import condition
 
 GRID = ((10.0, 1), (10.0, 2), (100.0, 1), (100.0, 2), (100.0, 4), (100.0, 20), (1000.0, 2))
-"""Hz, and episodes of SECONDS."""
+"""Rate in Hz, and number of episodes of SECONDS."""
 SECONDS = 50
 SPEEDS = (2.0, 10.0)
 CANDIDATES = 20_000
@@ -30,7 +30,7 @@ OPTIONS = lipcore.FitOptions(starts=1, max_iterations=60, statistics="chosen")
 
 
 def judge(model: lipcore.TorqueModel, scenes: list[Scene]) -> str:
-    """Mean nMSE and coverage on unseen trajectories."""
+    """Return mean nMSE and coverage on test trajectories."""
     errors, inside = [], []
     for scene in scenes:
         unseen = scene.unseen(0.0)
@@ -42,9 +42,9 @@ def judge(model: lipcore.TorqueModel, scenes: list[Scene]) -> str:
 
 
 def main() -> None:
-    """Print a Markdown table: nMSE (coverage) of each way to count."""
+    """Print a Markdown table: nMSE (coverage) of each posterior."""
     threadpool_limits(1)
-    print("| robot, speed | rows | worth | chosen | all, by their time | all, in full |\n| " + "--- | " * 6)
+    print("| robot, speed | rows | effective | chosen | all, weighted | all, weight 1 |\n| " + "--- | " * 6)
     for robot in sys.argv[1:] or ("panda", "ur5"):
         for speed in SPEEDS:
             scene = Scene(robot=robot, speed=speed)

@@ -1,9 +1,9 @@
-"""What wrong bodies of growing size cost: time, memory, and how long nothing else is answered.
+"""Time and memory that invalid request bodies cost, and the delay of other requests.
 
     python benchmarks/studies/bodies.py [MODEL_FOLDER]
 
-Each route of the OpenAPI document that takes JSON is sent bodies of 64 KiB to 2 MiB in several shapes, while another
-connection asks `/health/live` all the time. Printed for each shape is the route that took longest.
+Each route of the OpenAPI document that reads JSON gets bodies of 64 KiB to 2 MiB in several shapes, while another
+connection requests `/health/live` continuously. For each shape the slowest route is printed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import httpx
 
 import lipcore
 from benchmarks.online.bed import Bed, install, serving
-from benchmarks.processes import resident
+from benchmarks.processes import resident_mib
 from service.contract.observations import LearningOptions
 
 MODEL, SIZES = "panda-sim", (1 << 16, 1 << 18, 1 << 20, (1 << 21) - 4096)
@@ -40,7 +40,7 @@ Route = tuple[str, str, tuple[str, ...]]
 
 
 def routes(document: dict[str, Any]) -> Iterator[Route]:
-    """Routes that take JSON."""
+    """Yield the routes that read JSON."""
     schemas = document["components"]["schemas"]
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
@@ -58,7 +58,7 @@ class _Places(dict[str, str]):
 
 
 def shapes(size: int, lists: tuple[str, ...]) -> Iterator[tuple[str, bytes]]:
-    """Wrong bodies of about so many bytes, by what is wrong."""
+    """Yield name and content of invalid bodies of about `size` bytes."""
     many = b",".join(b'"k%d":0' % number for number in range(size // 12))
     yield "unknown fields", b"{" + many + b"}"
     yield "one field twice", b"{" + many + b',"k0":0}'
@@ -72,7 +72,7 @@ def shapes(size: int, lists: tuple[str, ...]) -> Iterator[tuple[str, bytes]]:
 
 @contextmanager
 def asking(bed: Bed) -> Iterator[list[float]]:
-    """Ask for nothing much all the time; the longest time that took, s, in a list."""
+    """Send cheap requests continuously; yield a list with the longest time, s."""
     over, longest = threading.Event(), [0.0]
 
     def ask() -> None:
@@ -92,16 +92,16 @@ def asking(bed: Bed) -> Iterator[list[float]]:
 
 
 def measured(bed: Bed, client: httpx.Client, route: Route, body: bytes) -> tuple[float, float, float, int]:
-    """Seconds until the answer, the longest of other answers, MiB more than before, and the status."""
-    Path(f"/proc/{bed.pid}/clear_refs").write_text("5")  # the peak begins anew
-    before = resident(bed.pid, "VmRSS") or 0.0
+    """Return seconds until the answer, the longest time of other answers, s, additional MiB, and the status."""
+    Path(f"/proc/{bed.pid}/clear_refs").write_text("5")  # reset the peak
+    before = resident_mib(bed.pid, "VmRSS") or 0.0
     with asking(bed) as longest:
         began = time.monotonic()
         status = client.request(
             route[0], route[1], content=body, headers={"content-type": "application/json"}
         ).status_code
         seconds = time.monotonic() - began
-    return seconds, longest[0], (resident(bed.pid, "VmHWM") or 0.0) - before, status
+    return seconds, longest[0], (resident_mib(bed.pid, "VmHWM") or 0.0) - before, status
 
 
 def main(folder: Path) -> None:

@@ -1,10 +1,10 @@
-"""What factor on the function's standard deviation makes 95 % intervals true on arms and trajectories never fitted.
+"""Coverage of 95 % intervals as a function of the factor on the function's standard deviation.
 
-Arms of example-robot-data get random masses (each link's inertia times 0.4 to 2.5), are trained on slow and on fast
-motion with few and many samples, and judged on unseen trajectories of twice the training's bandwidth.
+Arms of example-robot-data get random masses (each link's inertia times 0.4 to 2.5). Models are trained on slow and on
+fast motion with few and many samples, and tested on trajectories of twice the training's bandwidth.
 
-    calibration.py collect OUT.npz ESTIMATOR ROBOT...    # minutes: trains and stores errors and deviations
-    calibration.py report OUT.npz...                     # coverage against the factor
+    calibration.py collect OUT.npz ESTIMATOR ROBOT...    # train; store errors and standard deviations; minutes
+    calibration.py report OUT.npz...                     # print coverage for each factor
 """
 
 import sys
@@ -26,7 +26,7 @@ Z95 = 1.959964
 
 
 def randomised(robot: Robot, seed: int, low: float = 0.4, high: float = 2.5) -> Robot:
-    """The same arm with every link's mass and inertia scaled by its own random number from `low` to `high`."""
+    """Return the arm with mass and inertia of every link scaled by a random factor from `low` to `high`."""
     pin, model = pinocchio(), robot.model.copy()
     scales = np.exp(np.random.default_rng(seed).uniform(np.log(low), np.log(high), model.njoints))
     for index in range(1, model.njoints):
@@ -36,14 +36,14 @@ def randomised(robot: Robot, seed: int, low: float = 0.4, high: float = 2.5) -> 
 
 
 def _bodies(name: str, robot: Robot, estimator: str) -> RigidBody | None:
-    """What a user's URDF would say: the arm's geometry, with the nominal masses instead of the true ones."""
+    """Return the arm's geometry with the nominal masses, like a user's URDF."""
     if estimator not in ROBOT_ESTIMATORS:
         return None
     return RigidBody.from_profile(name, robot.joint_names, robot.joint_types)
 
 
 def collect(path: str, estimator: str, names: list[str]) -> None:
-    """Train on every arm, seed, speed and size; store residuals and standard deviations, calibration taken out."""
+    """Train on every arm, seed, speed and size; store residuals and uncalibrated standard deviations."""
     threadpool_limits(1)
     rows = []
     for name in names:
@@ -78,7 +78,7 @@ def collect(path: str, estimator: str, names: list[str]) -> None:
 
 
 def report(paths: list[str]) -> None:
-    """Print mean coverage for each factor, by size and speed, by arm, and over everything."""
+    """Print mean coverage for each factor: overall, by size and speed, and by arm."""
     rows, arms, estimators = [], [], set()
     for path in paths:
         with np.load(path) as file:

@@ -1,10 +1,10 @@
-"""The C++ client: its round trip at 1 kHz beside the Python client's, and a minute of asking and teaching at 1 kHz in
-which the service is killed and started again, under sanitizers.
+"""Round trip of the C++ and the Python client at 1 kHz, and a C++ client while the service is killed and restarted.
 
     python benchmarks/studies/cpp_client.py [COMPILER]
 
-The service runs on this machine with the shipped Panda. Round trips: ten seconds each, in turn, three times; of the
-minute: what was asked, answered and taught, what the service has acknowledged, and what its log holds in the end.
+The service runs on this machine with the shipped Panda. Round trips are measured in turn for ten seconds, three times.
+Then a client with sanitizers sends queries with measured torque for a minute; queries, answers, acknowledgements and
+the rows in the service's log are counted.
 """
 
 import json
@@ -38,7 +38,7 @@ SANITIZED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover
 
 @contextmanager
 def service(home: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A service that is ready, killed in the end."""
+    """Start a service and wait until it is ready; kill it in the end."""
     environment = {**os.environ, "LIPSERVE_HOME": str(home / "home"), "LIPSERVE_UDS": str(home / "socket")}
     with (home / "log").open("ab") as file:
         command = [sys.executable, "-m", "service", "serve", "--port", str(PORT)]
@@ -53,7 +53,7 @@ def service(home: Path) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def ready() -> bool:
-    """Whether the service answers."""
+    """Return whether the service answers."""
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{PORT}/health/ready", timeout=1) as answer:
             return bool(answer.status == 200)
@@ -62,7 +62,7 @@ def ready() -> bool:
 
 
 def compiled(compiler: str, folder: Path, *options: str) -> Path:
-    """The program that drives a client."""
+    """Compile the program that drives a client; return its path."""
     program = folder / f"drive{len(options)}"
     command = [compiler, "-std=c++17", *options, f"-I{CPP / 'include'}", str(CPP / "tests/drive.cpp"), "-o", program]
     subprocess.run(command, check=True)  # noqa: S603
@@ -70,7 +70,7 @@ def compiled(compiler: str, folder: Path, *options: str) -> Path:
 
 
 class Driver:
-    """A C++ client that does what it is told."""
+    """A C++ client that reads commands from standard input."""
 
     def __init__(self, program: Path, folder: Path, *options: str) -> None:
         arguments = [f"model={MODEL}", "joints=7", f"rows={folder / 'rows'}", *options]
@@ -79,32 +79,32 @@ class Driver:
         )
 
     def begin(self, line: str) -> None:
-        """Let it do something."""
+        """Send a command."""
         assert self.process.stdin is not None
         print(line, file=self.process.stdin, flush=True)
 
     def until(self, start: str) -> str:
-        """The next line that begins so."""
+        """Return the next line that starts with `start`."""
         assert self.process.stdout is not None
         while not (line := self.process.stdout.readline()).startswith(start):
             assert line, "the client has ended"
         return line
 
     def do(self, line: str) -> dict[str, float]:
-        """Do something, and return what has become of it."""
+        """Send a command and return its report."""
         self.begin(line)
         report: dict[str, float] = json.loads(self.until("{"))
         assert report["allocations"] == 0
         return report
 
     def end(self) -> int:
-        """End; return the exit code, by which sanitizers speak."""
+        """Stop the client; return its exit code, which is not 0 if a sanitizer found an error."""
         self.process.communicate("end\n")
         return self.process.returncode
 
 
 def cpp_round_trip(program: Path, folder: Path, url: str) -> tuple[float, float]:
-    """p50 and p99 of a C++ client's round trip, µs."""
+    """Return p50 and p99 of a C++ client's round trip, µs."""
     client = Driver(program, folder, f"url={url}")
     client.do("connect 10")
     report = client.do(f"loop-ask {TICKS} {PERIOD_S * 1e6:.0f} 1000000 0")
@@ -113,7 +113,7 @@ def cpp_round_trip(program: Path, folder: Path, url: str) -> tuple[float, float]
 
 
 def python_round_trip(motions: np.ndarray, **address: object) -> tuple[float, float]:
-    """p50 and p99 of the Python client's round trip, µs."""
+    """Return p50 and p99 of the Python client's round trip, µs."""
     trips, due = [], time.perf_counter()
     with StreamClient(MODEL, **address) as client:  # type: ignore[arg-type]
         for tick in range(TICKS):
@@ -144,7 +144,7 @@ def round_trips(program: Path, folder: Path, motions: np.ndarray) -> None:
 
 
 def minute(program: Path, folder: Path, expected: np.ndarray) -> None:
-    """Print what became of a minute of 1 kHz with a kill in its middle."""
+    """Print the counts of a minute at 1 kHz in which the service is killed."""
     with service(folder) as first:
         client = Driver(program, folder, f"url=http://127.0.0.1:{PORT}", f"stream_id={STREAM}")
         client.do("connect 10")
@@ -161,9 +161,9 @@ def minute(program: Path, folder: Path, expected: np.ndarray) -> None:
         found = logged(folder / "home")
     asked = {name: report.get(f"ask_{name}", 0) for name in ("ok", "timeout", "unreachable")}
     unique = {row.tobytes() for row in found}
-    print(f"\nkilled in the middle, ready again after {down:.1f} s; compiled with {' '.join(SANITIZED)}")
-    print(f"asked {CYCLES}: {asked}, p50 {report['p50_us']:.0f} µs, p99 {report['p99_us']:.0f} µs")
-    print(f"taught {flushed['taught']}, sent again {flushed['resent']}, connections {flushed['connections']}")
+    print(f"\nkilled and ready again after {down:.1f} s; compiled with {' '.join(SANITIZED)}")
+    print(f"queries {CYCLES}: {asked}, p50 {report['p50_us']:.0f} µs, p99 {report['p99_us']:.0f} µs")
+    print(f"rows sent {flushed['taught']}, sent again {flushed['resent']}, connections {flushed['connections']}")
     acknowledged = {name: flushed[name] for name in ("accepted", "duplicates", "rejected", "refused", "unsettled")}
     print(f"acknowledged {sum(list(acknowledged.values())[:3])}: {acknowledged}")
     print(f"in the log {len(found)}, lost {len(expected) - len(unique)}, twice {len(found) - len(unique)}, "
@@ -172,7 +172,7 @@ def minute(program: Path, folder: Path, expected: np.ndarray) -> None:
 
 
 def logged(home: Path) -> np.ndarray:
-    """Rows (N, 4, 7) of the stream that are durable."""
+    """Return the rows of the stream in the service's log, (N, 4, 7)."""
     database = Database.of(Settings(home=home))
     with database.session() as session:
         query = select(EventRow).where(EventRow.stream_id == STREAM, EventRow.kind == "batch")

@@ -1,10 +1,10 @@
-"""How long another model's batches take to be acknowledged beside streams that pick up and put down all the time.
+"""Time to the acknowledgement of one model's batches while another model's streams change their payload all the time.
 
     python benchmarks/studies/crowded.py [STREAMS]
 
-A service has two copies of the shipped Panda. One is sent ten batches of ten rows a second: for 10 s alone, then for
-12 s while STREAMS (8) simulated robots send as much to the other copy. Each of these picks 1.5 kg up for two of every
-four seconds.
+A service has two copies of the shipped Panda. The first gets ten batches of ten rows a second: for 10 s alone, then for
+12 s while STREAMS (8) simulated robots send as much to the second. Each of these carries 1.5 kg in two of every four
+seconds.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ MOTION = Simulation(int(100 * (ALONE_S + BESIDE_S)), 100.0, speed=5.0, noise=0.0
 
 
 def carrying(seed: int) -> Samples:
-    """A Panda that carries a mass in the second half of each cycle."""
+    """Return samples of a Panda that carries a payload in the second half of each cycle."""
     robot = load_robot("panda")
     free, full = (simulate(robot, each, seed) for each in (MOTION, replace(MOTION, payload=Payload(1.5, 0.0))))
     held = (free.t % CYCLE_S >= CYCLE_S / 2)[:, None]
@@ -41,13 +41,13 @@ def carrying(seed: int) -> Samples:
 
 
 def send(bed: Bed, requests: list[bytes], acks: list[Ack]) -> None:
-    """Send batches as a robot does."""
+    """Send batches in real time."""
     with HttpClient(bed.tcp) as client:
         acks += stream(client, requests, PERIOD_S)
 
 
-def told(what: str, acks: list[Ack]) -> None:
-    """Print how long acknowledgements took."""
+def print_times(what: str, acks: list[Ack]) -> None:
+    """Print the time to acknowledgement."""
     p50, p99, longest = (1e3 * np.quantile([ack.seconds for ack in acks], share) for share in (0.5, 0.99, 1.0))
     print(f"{what:24} {len(acks):5} batches, ms: p50 {p50:6.1f}  p99 {p99:6.1f}  largest {longest:6.1f}")
 
@@ -75,9 +75,9 @@ def main(streams: int) -> None:
             send(bed, own[alone:], busy)
             for thread in threads:
                 thread.join()
-    told("other model, alone", idle)
-    told("other model, beside", busy)
-    told(f"the {streams} streams", [ack for each in acks for ack in each])
+    print_times("first model, alone", idle)
+    print_times("first model, loaded", busy)
+    print_times(f"the {streams} streams", [ack for each in acks for ack in each])
 
 
 if __name__ == "__main__":

@@ -1,12 +1,14 @@
-"""Coverage of the 95 % interval on simulated arms with the dirt of real ones, on motion of three kinds.
+"""Coverage of the 95 % interval on simulated arms with `Dirt`, on three kinds of motion.
 
     python benchmarks/studies/dirty_arms.py ESTIMATOR SEEDS [ROBOT...]
 
-Every arm is trained on 10 s and on 60 s of random sinusoids at 100 Hz with `Dirt()`, prepared as recordings are (4 Hz
-low-pass, no delay), and judged on LEAST_S seconds or more of other motion of the same kind, of the same played three
-times faster, and of moves from point to point, about as fast as in training, with rests. Width: of the interval, over
-that of one that knows the spread of the errors it has to hold (their central 95 %, as Gaussian). A row is the mean over
-the seeds, `lowest` that of one seed and joint, `width` the median over seeds and joints; a cell is an arm's joint.
+Every arm is trained on 10 s and on 60 s of random sinusoids at 100 Hz, prepared like recordings (4 Hz low-pass without
+delay). It is tested on at least MIN_TEST_S of other motion of the same kind, of motion three times as fast, and of
+moves with rests, about as fast as in training.
+
+Coverage is the mean over the seeds; `lowest` is that of one seed and joint. `width` is the width of the interval over
+the central 95 % of a Gaussian with the standard deviation of the errors, the median over seeds and joints. A cell is a
+joint of an arm.
 """
 
 import sys
@@ -25,40 +27,39 @@ from lipcore.robots.simulation import Simulation, simulate
 
 ARMS = ("panda", "ur5", "ur10", "kinova", "xarm7", "z1", "tiago", "baxter-left")
 RATE, SPEED, SECONDS, KEEP = 100.0, 5.0, (10, 60), 5
-LEAST_S, RESTS_S = 20.0, 40.0
+MIN_TEST_S, RESTS_S = 20.0, 40.0
 CASES = ("same", "three times faster", "rests")
 
 
 def recording(seconds: float, dirt: Dirt) -> Simulation:
-    """What an arm is trained on."""
+    """Return the training stream of an arm."""
     return Simulation(round(seconds * RATE), RATE, speed=SPEED, noise=0.0, dirt=dirt)
 
 
 def unseen(robot: Robot, stream: Simulation, case: str, seed: int) -> Samples:
-    """Recordings of an arm, trained on such a stream, in motion of another kind: one of CASES."""
-    least = LEAST_S
+    """Return test recordings of an arm that was trained on `stream`, in motion of one of CASES."""
     if case == "three times faster":
         stream = replace(stream, n_samples=round(stream.n_samples / 3), speed=3 * SPEED)
     elif case == "rests":
         stream = replace(stream, n_samples=round(RESTS_S * RATE), course="rests", speed=0.5)
-    count = int(np.ceil(least / (stream.n_samples / RATE)))
+    count = int(np.ceil(MIN_TEST_S / (stream.n_samples / RATE)))
     return Samples.concatenate([recorded(robot, stream, 200 + 1000 * k + seed) for k in range(count)])
 
 
 def recorded(robot: Robot, stream: Simulation, seed: int) -> Samples:
-    """A recording: prepared, or where there is no dirt, as simulated, of the same rate."""
+    """Return a simulated recording, prepared if it has dirt, of the same rate in any case."""
     samples = simulate(robot, stream, seed)
     return samples.rows(slice(None, None, KEEP)) if stream.dirt is None else prepared(samples)
 
 
 def prepared(samples: Samples) -> Samples:
-    """As recordings are prepared: low-passed alike, acceleration from velocity; and every fifth row kept."""
+    """Filter samples like a recording, derive acceleration from velocity, and keep every fifth row."""
     q, dq, tau = (low_pass(signal, RATE) for signal in (samples.q, samples.dq, samples.tau))
     return replace(samples, q=q, dq=dq, ddq=differentiate(dq, RATE), tau=tau).rows(slice(None, None, KEEP))
 
 
 def main() -> None:
-    """Print a Markdown table, a row for each arm, duration and case; last the worst cell."""
+    """Print a Markdown table with a row for each arm, duration and case, then a summary."""
     threadpool_limits(1)
     estimator, seeds, names = sys.argv[1], int(sys.argv[2]), sys.argv[3:] or ARMS
     print("| arm | s | unseen motion | coverage, joint by joint, % | lowest | width |\n|" + " --- |" * 6)
@@ -87,7 +88,7 @@ def main() -> None:
         coverage, width = np.concatenate(rows, axis=1)
         print(
             f"{seconds} s, {case}: {coverage.size} cells, mean coverage {100 * coverage.mean():.1f} %, "
-            f"{(coverage < 0.85).sum()} below 85 %; widths {np.median(width):.2f}, {(width > 2).sum()} beyond 2"
+            f"{(coverage < 0.85).sum()} below 85 %; median width {np.median(width):.2f}, {(width > 2).sum()} above 2"
         )
 
 

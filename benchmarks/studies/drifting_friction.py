@@ -1,14 +1,15 @@
-"""Friction that drifts as an arm warms up: what a learnt arm knows after half an hour, with and without a walk.
+"""Accuracy of a learnt arm whose friction drifts for half an hour, with several options of online learning.
 
     python benchmarks/studies/drifting_friction.py SEED[,SEED...] [CASE[;CASE...]] [ROBOT]
 
-An arm is trained on 60 s at 100 Hz and then followed for 30 minutes at 100 Hz, of which every fifth row is learnt; each
-minute is a motion of its own. A row of the table is the mean over the seeds of the last five minutes: every stretch of
-EVERY_S seconds is predicted, compared, and learnt only then. nMSE of clean arms is that of the torque without noise.
-Moving: the same of the rows in which the joint is faster than MOVING; nearly all of a dirty arm's error is that of
-joints that have hardly broken away. Coverage is that of the model itself, without the factor that serving adds. Moved:
-the largest change of a mass or a step of the geometry since training, in trained standard deviations; opened: the
-largest ratio of their standard deviation to that of what is learnt as today.
+A model is trained on 60 s at 100 Hz and then learns every fifth row of 30 minutes; each minute is another motion. Every
+stretch of EVERY_S is predicted before it is learnt. The table has means over the seeds of the last five minutes:
+
+- nMSE; for clean arms against the torque without noise.
+- moving: nMSE of rows with a joint faster than MOVING_RAD_S; a dirty arm's error is mostly that of joints near rest.
+- coverage of the model's own 95 % interval, without the factor of the service.
+- moved: largest change of a mass or a length of the geometry since training, in trained standard deviations.
+- opened: largest ratio of their standard deviation to that with default options.
 """
 
 from __future__ import annotations
@@ -34,21 +35,26 @@ from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Simulation, simulate
 from lipcore.vocabulary import Code
 
-RATE, KEEP, EVERY_S, MINUTES, JUDGED = 100.0, 5, 2.0, 30, 5
+RATE, KEEP, EVERY_S, MINUTES, TEST_MINUTES = 100.0, 5, 2.0, 30, 5
 NOISE = 0.05
-"""Of a clean arm, N·m; a dirty one's is in its dirt."""
+"""Noise of a clean arm, N·m; `Dirt` includes noise."""
 STREAM = Simulation(round(60 * RATE), RATE, speed=5.0, noise=0.0)
-MOVING = 0.1
-"""rad/s."""
+MOVING_RAD_S = 0.1
 VISCOUS, COULOMB = 0.5, 0.3
 """Friction of a clean arm, N·m·s/rad and N·m."""
+DEFAULT = "default"
 NIGHT_S = 8 * 3600.0
 
 
 @dataclass(frozen=True)
 class Case:
-    """dirt: of the arm, None of a clean one; falls: share by which a clean arm's friction falls, evenly; cold: minute
-    before which it stands still for a night, having been warm so far, None where it begins cold."""
+    """Conditions of a stream.
+
+    Attributes:
+        dirt: dirt of the arm; None: clean.
+        falls: share by which a clean arm's friction falls linearly.
+        cold: minute before which the warm arm rests for a night; None: it starts cold.
+    """
 
     dirt: Dirt | None = None
     falls: float = 0.0
@@ -64,8 +70,8 @@ CASES = {
     "dirty, 30 % in 10 min": Case(WARMS),
     "dirty, the next morning": Case(WARMS, cold=20),
 }
-WAYS: dict[str, dict[str, float]] = {
-    "as today": {},
+OPTIONS: dict[str, dict[str, float]] = {
+    DEFAULT: {},
     "`forgetting_s` 300": {"forgetting_s": 300.0},
     "`forgetting_s` 1800": {"forgetting_s": 1800.0},
     "`friction_walk_s` 1800": {"friction_walk_s": 1800.0},
@@ -74,14 +80,14 @@ WAYS: dict[str, dict[str, float]] = {
 
 @dataclass(frozen=True)
 class Part:
-    """A minute. samples: as judged; tau: (N, n) N·m as measured, which is learnt."""
+    """A minute; samples: for the test, tau: measured torque to learn from, (N, n), N·m."""
 
     samples: Samples
     tau: Array
 
 
 def simulated(name: str, case: Case, seed: int) -> tuple[Samples, list[Part]]:
-    """The recording that an arm is trained on, and the minutes of the stream."""
+    """Return the training recording, and the minutes of the stream."""
     robot = load_robot(name)
     rng = np.random.default_rng(seed)
     known, parts = None, []
@@ -91,7 +97,7 @@ def simulated(name: str, case: Case, seed: int) -> tuple[Samples, list[Part]]:
             factor = 1 - case.falls * max(minute, 0) / (MINUTES - 1)
             stream = replace(stream, viscous=factor * VISCOUS, coulomb=factor * COULOMB)
         else:
-            since = -1 if case.cold is None else case.cold  # the minute in which it begins cold
+            since = -1 if case.cold is None else case.cold  # the minute of the cold start
             warmth = case.dirt.warmth * np.exp(-60.0 * (minute - since) / case.dirt.warm_s) if minute >= since else 0.0
             stream = replace(stream, dirt=replace(case.dirt, seed=seed, warmth=float(warmth)))
         samples = simulate(robot, stream, 1000 * seed + minute + 1)
@@ -112,14 +118,14 @@ def _noisy(tau: Array, rng: np.random.Generator) -> Array:
 
 
 def rows_of(part: Part) -> Rows:
-    """All rows, each with its weight."""
+    """Return all rows with their weights."""
     samples = part.samples
     codes = np.full(len(samples), Code.LEARNT, np.uint8)
     return Rows(samples.t, samples.q, samples.dq, samples.ddq, part.tau, codes, stream_weights(samples.t))
 
 
 def body(model: TorqueModel) -> tuple[Array, Array]:
-    """Masses and steps of the geometry, and their standard deviations, (p,) each."""
+    """Return masses and geometry, and their standard deviations, (p,) each."""
     term = model.estimator.terms["rigid_body"]
     assert isinstance(term, ArmKernel)
     weights = weight_posterior(model.posterior, term)
@@ -128,8 +134,7 @@ def body(model: TorqueModel) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Found:
-    """Of the last minutes: nmse, that of joints in motion and coverage, (n,); of the end: masses and geometry, and
-    their deviations, (p,)."""
+    """Figures of the last minutes, (n,), and mean and standard deviation of masses and geometry in the end, (p,)."""
 
     nmse: Array
     moving: Array
@@ -138,43 +143,43 @@ class Found:
     std: Array
 
 
-def followed(base: TorqueModel, parts: list[Part], way: dict[str, float]) -> Found:
-    """Learn a stream in one way, and judge its last minutes."""
-    online, model = OnlineModel.start(base, **way, since=0.0), base
+def followed(base: TorqueModel, parts: list[Part], options: dict[str, float]) -> Found:
+    """Learn a stream with these options, and test its last minutes."""
+    online, model = OnlineModel.start(base, **options, since=0.0), base
     step, answers = round(EVERY_S * RATE / KEEP), []
     for minute, part in enumerate(parts):
         rows = rows_of(part)
         for first in range(0, len(rows), step):
             chunk = rows.take(slice(first, first + step))
-            if minute >= MINUTES - JUDGED:
+            if minute >= MINUTES - TEST_MINUTES:
                 answer = model.predict(chunk.q, chunk.dq, chunk.ddq)
                 answers.append([answer.tau, answer.tau_std])
             online = online.learn(chunk)
             model = online.model()
     tau, std = (np.concatenate(each) for each in zip(*answers, strict=True))
-    judged = Samples.concatenate([part.samples for part in parts[-JUDGED:]])
-    squares, moves = (judged.tau - tau) ** 2 / judged.tau.var(axis=0), np.abs(judged.dq) > MOVING
-    measured = np.concatenate([part.tau for part in parts[-JUDGED:]])
+    test = Samples.concatenate([part.samples for part in parts[-TEST_MINUTES:]])
+    squares, moves = (test.tau - tau) ** 2 / test.tau.var(axis=0), np.abs(test.dq) > MOVING_RAD_S
+    measured = np.concatenate([part.tau for part in parts[-TEST_MINUTES:]])
     coverage = evaluate(measured, tau, std, base.noise_std).coverage
     return Found(squares.mean(axis=0), (squares * moves).sum(axis=0) / moves.sum(axis=0), coverage, *body(model))
 
 
 def main() -> None:
-    """Print a Markdown table, a row for each case and way."""
+    """Print a Markdown table with a row for each case and options."""
     threadpool_limits(1)
     seeds = [int(each) for each in sys.argv[1].split(",")]
     names = sys.argv[2].split(";") if len(sys.argv) > 2 and sys.argv[2] else list(CASES)
     robot = sys.argv[3] if len(sys.argv) > 3 else "panda"
-    print("| case | way | nMSE | moving | coverage, % | lowest | moved | opened |\n|" + " --- |" * 8)
+    print("| case | options | nMSE | moving | coverage, % | lowest | moved | opened |\n|" + " --- |" * 8)
     for name in names:
-        figures: dict[str, list[list[float]]] = {way: [] for way in WAYS}
+        figures: dict[str, list[list[float]]] = {way: [] for way in OPTIONS}
         for seed in seeds:
             known, parts = simulated(robot, CASES[name], seed)
             base = lipcore.train(known, load_robot(robot).joint_types, "rigid-body")
             trained, trained_std = body(base)
-            every = {way: followed(base, parts, options) for way, options in WAYS.items()}
+            every = {way: followed(base, parts, options) for way, options in OPTIONS.items()}
             for way, found in every.items():
-                moved, opened = np.abs(found.mean - trained) / trained_std, found.std / every["as today"].std
+                moved, opened = np.abs(found.mean - trained) / trained_std, found.std / every[DEFAULT].std
                 errors = [found.nmse.mean(), found.moving.mean()]
                 figures[way].append([*errors, found.coverage.mean(), found.coverage.min(), moved.max(), opened.max()])
         for way, rows in figures.items():

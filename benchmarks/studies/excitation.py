@@ -1,14 +1,13 @@
-"""What planning a motion is worth: the same training on random sinusoids and on motions that `lipserve excite` plans.
+"""Accuracy after training on motions planned by `lipserve excite`, compared with random sinusoids.
 
-Each seed has three recordings of a simulated Panda of equal length, rate and noise, over the same share of every
-joint's range: the paper's random sinusoids, the same at ten times their frequencies, and a motion planned without any
-data, as `lipserve excite --robot panda --seconds 50 --rate 10 --noise 0.01` plans it. Each trains a model with default
-options. All are tested on the same unseen trajectories: the paper's sums of 100 sinusoids, these at ten times their
-frequencies, and moves from pose to pose as tasks have them. nMSE is against the torque without noise; std is the root
-mean square of `tau_std`, N·m. Figures of a model are geometric means over joints and trajectories; the last lines of
-each test pair them by seed.
+    python benchmarks/studies/excitation.py [SEEDS…]      # 2 to 5 minutes a seed
 
-Run from the repository's root, 2 to 5 minutes a seed: `python benchmarks/studies/excitation.py [SEEDS…]`
+Each seed has three recordings of a simulated Panda with equal length, rate, noise and range of the joints: the paper's
+random sinusoids, the same at ten times the frequencies, and a motion planned without data, like `lipserve excite
+--robot panda --seconds 50 --rate 10 --noise 0.01`. Each trains a model with default options. Tests are the paper's sums
+of 100 sinusoids, the same at ten times the frequencies, and moves from pose to pose. nMSE is against the torque without
+noise; std is the root mean square of `tau_std`, N·m. Figures are geometric means over joints and trajectories; the last
+lines of each test compare them seed by seed.
 """
 
 import sys
@@ -35,13 +34,13 @@ ARMS = ("random", "random, fast", "planned")
 
 
 def random(robot: Robot, speed: float, count: int, seed: int) -> Motion:
-    """The paper's sinusoids over the whole range, which knows no acceleration limits."""
+    """Return the paper's sinusoids over the whole range, without acceleration limits."""
     stream = Simulation(len(T), RATE, count, "full", speed)
     return sinusoids(robot, stream, T, np.random.default_rng(seed))
 
 
 def moves(limits: Limits, seed: int) -> Motion:
-    """Moves of minimum jerk from pose to pose all over the range, at half to full speed, with short pauses."""
+    """Return minimum-jerk moves between random poses, at half to full speed, with short pauses."""
     rng, n = np.random.default_rng(seed), limits.n_joints
     q, dq, ddq = (np.zeros((len(T), n)) for _ in range(3))
     begin, pose = 0.0, rng.uniform(limits.lower, limits.upper)
@@ -61,14 +60,14 @@ def moves(limits: Limits, seed: int) -> Motion:
 
 
 def train(robot: Robot, motion: Motion, seed: int) -> lipcore.TorqueModel:
-    """Measure the motion and train on it with default options."""
+    """Simulate the measurement of a motion and train on it with default options."""
     tau = inverse_dynamics(robot, *motion) + NOISE * np.random.default_rng([seed, 1]).standard_normal(motion[0].shape)
     samples = lipcore.Samples(robot.joint_names, T, np.zeros(len(T), dtype=np.int64), *motion, tau)
     return lipcore.train(samples, robot.joint_types, "lip-chain")
 
 
 def score(robot: Robot, model: lipcore.TorqueModel, tests: list[Motion]) -> np.ndarray:
-    """nMSE and std, geometric means over joints and trajectories, and mean coverage of the 95 % interval: (3,)."""
+    """Return geometric means of nMSE and std, and mean coverage of the 95 % interval, (3,)."""
     nmse, std, covered = [], [], []
     for k, test in enumerate(tests):
         truth, answer = inverse_dynamics(robot, *test), model.predict(*test)
@@ -80,7 +79,7 @@ def score(robot: Robot, model: lipcore.TorqueModel, tests: list[Motion]) -> np.n
 
 
 def main(seeds: list[int]) -> None:
-    """Train and test for each seed, then print ratios planned / random of each pair."""
+    """Train and test for each seed; print figures and ratios planned / random."""
     threadpool_limits(1)
     robot, limits = load_robot("panda"), Limits.of_profile(profile("panda")).within(RANGE, SCALE)
     tests = {
@@ -103,8 +102,8 @@ def main(seeds: list[int]) -> None:
             figures = {name: score(robot, model, some) for name, some in tests.items()}
             for name, value in figures.items():
                 found[arm][name].append(value)
-            said = "; ".join(f"{name} {v[0]:.2e} / {v[1]:.3f} / {v[2]:.1%}" for name, v in figures.items())
-            print(f"  {arm:13} nMSE / std / coverage: {said} (trained in {took:.0f} s)", flush=True)
+            shown = "; ".join(f"{name} {v[0]:.2e} / {v[1]:.3f} / {v[2]:.1%}" for name, v in figures.items())
+            print(f"  {arm:13} nMSE / std / coverage: {shown} (trained in {took:.0f} s)", flush=True)
     for name in tests:
         print(f"tested on {name}:")
         for arm in ARMS:

@@ -1,10 +1,10 @@
-"""How many rows a second of a fast stream should count as independent: error and coverage for several numbers.
+"""Error and coverage for several numbers of rows a second that count as independent.
 
     python benchmarks/studies/independent_rows.py [SPEED...]
 
-A simulated Panda with friction that no estimator expresses exactly (a jump at zero speed) is learnt from a 1 kHz stream
-for 30 s; a payload of 1.5 kg is attached, and it is learnt for 30 s more. Judged on an unseen trajectory under the
-dynamics of the moment: nMSE, and coverage of the 95 % interval, noise included, each the mean over the joints.
+A simulated Panda with friction that no estimator expresses exactly (a jump at zero speed) learns from a 1 kHz stream
+for 30 s without and 30 s with a payload of 1.5 kg. The test is another trajectory under the same dynamics: nMSE, and
+coverage of the 95 % interval, noise included, are means over the joints.
 """
 
 import sys
@@ -26,7 +26,7 @@ BLOCK = 1000
 
 
 def judge(scene: Scene, online: OnlineModel, at: float) -> str:
-    """Mean nMSE and coverage on the unseen trajectory as of a time of the stream."""
+    """Return mean nMSE and coverage on the test trajectory at a time of the stream."""
     unseen = scene.unseen(at)
     answer = online.model().predict(unseen.q, unseen.dq, unseen.ddq)
     metrics = evaluate(scene.measured(unseen), *answer.interval)
@@ -35,7 +35,7 @@ def judge(scene: Scene, online: OnlineModel, at: float) -> str:
 
 
 def main() -> None:
-    """Learn with each number of independent rows a second and print a Markdown table."""
+    """Learn with each number of independent rows a second; print a Markdown table."""
     threadpool_limits(1)
     print("| speed | independent rows/s | 30 s, before the payload | 5 s after | 30 s after |\n| " + "--- | " * 5)
     for speed in map(float, sys.argv[1:] or ("2", "5", "10")):

@@ -1,15 +1,14 @@
-"""The learnt arm on simulated robots: accuracy, coverage, and how often the search finds the best geometry.
+"""Learnt arms of simulated robots: accuracy, coverage, latency, and success of the geometry search.
 
     learnt_arm.py rows [SEEDS]                accuracy and coverage of Panda, UR10, xArm7, Z1, TIAGo's arm
-    learnt_arm.py search [FIRST LAST SEEDS]   random arms: evidence against that of the true geometry
-    learnt_arm.py answer                      one query of the shipped model, beside Pinocchio's RNEA
-    learnt_arm.py transfer FIRST LAST [ROBOT...]  10 s of a second unit, from a sibling's posterior and from nothing
+    learnt_arm.py search [FIRST LAST SEEDS]   random arms: evidence minus that at the true geometry
+    learnt_arm.py answer                      latency of the shipped model and of Pinocchio's RNEA
+    learnt_arm.py transfer FIRST LAST [ROBOT...]  10 s of a second unit, with and without a sibling's posterior
 
-Training motions are those of the paper's experiment (50 sinusoids), tests have twice the bandwidth (100). Training
-seeds are 5001, 5002, …; test seeds a hundred more. What is reported are arms 1 to 20 of `search` and `rows`, with five
-training seeds each; nothing was tuned on them, but on arms above 1000. `transfer` moves as `dirty_arms.py` does; what
-is reported are seeds 0 to 2, tuned was on 50 and 51.
-The geometries of installed URDFs are not looked at (`known=()`), so that nothing but torque is used.
+Training motions are those of the paper's experiment (50 sinusoids); tests have twice the bandwidth (100). Training
+seeds are 5001, 5002, …; test seeds are 100 higher. Published figures are of arms 1 to 20 of `search` and of `rows`,
+with five training seeds; constants were tuned on arms above 1000. `transfer` has the motions of `dirty_arms.py`, with
+published seeds 0 to 2 and tuning seeds 50 and 51. The search does not use the geometries of installed URDFs.
 """
 
 import sys
@@ -48,16 +47,16 @@ ROWS = (
     ("tiago", 10.0, "middle", 500),
 )
 FRICTION, NOISE = 0.3, 0.05
-"""N·m·s/rad and N·m; N·m: of random arms."""
-MASSES = 0.1
-"""Share by which masses of a second unit differ."""
+"""Viscous (N·m·s/rad) and Coulomb friction (N·m), and noise (N·m), of random arms."""
+MASS_SHARE = 0.1
+"""Max relative difference of masses between two units."""
 LONG_S, SHORT_S = 60.0, 10.0
-FOUND = 1.0
-"""nats, by which the evidence found may be worse than that at the true geometry."""
+MAX_DEFICIT_NATS = 1.0
+"""Max deficit of evidence, against the true geometry, of a successful search."""
 
 
 def true_geometry(robot: Robot) -> Geometry:
-    """Geometry of a simulated robot."""
+    """Return the geometry of a simulated robot."""
     places = tuple(robot.model.jointPlacements)[1:]
     return Geometry(
         robot.joint_types,
@@ -69,7 +68,7 @@ def true_geometry(robot: Robot) -> Geometry:
 
 
 def best_known(robot: Robot, samples: Samples, options: FitOptions) -> float:
-    """Evidence that the true geometry leads to, nats, on the rows that a training looks at."""
+    """Return the evidence from the true geometry on the rows that a training uses, nats."""
     rows = spread_out(samples.motion(), options.posterior_samples)
     order = np.arange(robot.n_joints)
     problem = make_problem(samples.rows(rows), robot.joint_types, order, True, every=samples)
@@ -78,7 +77,7 @@ def best_known(robot: Robot, samples: Samples, options: FitOptions) -> float:
 
 
 def rows(seeds: int) -> None:
-    """Print nMSE and coverage of each joint, medians over training seeds, and the lowest coverage of a trajectory."""
+    """Print median nMSE and mean coverage of each joint over training seeds, and the lowest coverage."""
     for name, speed, motion, count in ROWS:
         robot, errors, covers, seconds = load_robot(name), [], [], []
         for seed in range(5001, 5001 + seeds):
@@ -99,7 +98,7 @@ def rows(seeds: int) -> None:
 
 
 def search(first: int, last: int, seeds: int) -> None:
-    """Print, for each random arm, how much worse the evidence found is than that of the true geometry."""
+    """Print the deficit of evidence against the true geometry for each random arm."""
     options, wins, total, covers = FitOptions(device="cpu"), 0, 0, []
     for number in range(first, last + 1):
         robot = random_arm(number, prismatic=1 if number % 5 == 0 else None)
@@ -116,7 +115,7 @@ def search(first: int, last: int, seeds: int) -> None:
             answer = found.predict(unseen.q, unseen.dq, unseen.ddq)
             cover = evaluate(unseen.tau, *answer.interval).coverage
             covers.append(cover.min())
-            wins, total = wins + (behind < FOUND), total + 1
+            wins, total = wins + (behind < MAX_DEFICIT_NATS), total + 1
             print(
                 f"arm {number}, {robot.n_joints} joints, seed {seed}: {behind:+.1f} nats in {seconds:.1f} s, best in "
                 f"{found.fit['search_times_best']} of {found.fit['search_starts'] + found.fit['search_hops']}, next "
@@ -128,10 +127,13 @@ def search(first: int, last: int, seeds: int) -> None:
 
 
 def units(robot: Robot, seed: int, dirty: bool) -> list[tuple[Robot, Simulation]]:
-    """Two units of a robot and how long streams of them are recorded: their friction differs, all masses by up to
-    MASSES. What is not dirty has viscous friction and white noise."""
+    """Return two units of a robot and their streams of LONG_S.
+
+    Friction differs between the units, and masses by up to MASS_SHARE. Clean units have viscous friction and white
+    noise.
+    """
     out = []
-    for number, unit in enumerate((robot, another_unit(robot, MASSES, seed))):
+    for number, unit in enumerate((robot, another_unit(robot, MASS_SHARE, seed))):
         dirt = Dirt(seed=2 * seed + number)
         stream, spread = (
             recording(LONG_S, dirt),
@@ -145,16 +147,18 @@ def units(robot: Robot, seed: int, dirty: bool) -> list[tuple[Robot, Simulation]
 
 
 def silent(stream: Simulation) -> Simulation:
-    """The same without noise."""
+    """Return the stream without noise."""
     return replace(stream, noise=0.0, dirt=None if stream.dirt is None else replace(stream.dirt, noise=0.0))
 
 
 def transfer(first: int, last: int, names: list[str]) -> None:
-    """Print, for each arm, simulator, unseen motion and way to train, nMSE (mean over joints and seeds), its ratio to
-    that of 60 s from nothing, this of torque without noise, and coverage (of each joint, mean over seeds; lowest of a
-    joint and seed)."""
+    """Print nMSE and coverage for each arm, simulator, test motion and training.
+
+    nMSE is the mean over joints and seeds. The ratios are those to 60 s without a base, with measured torque and with
+    torque without noise. Coverage is the mean over seeds; `lowest` is that of one joint and seed.
+    """
     print(
-        "| arm | simulator | unseen motion | trained on | nMSE | ratio | less noise | coverage by joint, % | lowest |"
+        "| arm | simulator | unseen motion | trained on | nMSE | ratio | noise-free | coverage by joint, % | lowest |"
     )
     print("|" + " --- |" * 9)
     for name in names:
@@ -188,7 +192,7 @@ def transfer(first: int, last: int, names: list[str]) -> None:
 
 
 def answer() -> None:
-    """Print the median time of an answer in process, µs, and that of Pinocchio's RNEA."""
+    """Print the median time of an answer in process and of Pinocchio's RNEA, µs."""
     robot, shipped = load_robot("panda"), lipcore.load(Path(__file__).parents[2] / "models/panda-sim")
     q, dq, ddq = (part[0] for part in motion_arrays(*np.random.default_rng(0).uniform(-1, 1, (3, 7))))
     motion, data = np.ascontiguousarray(np.stack([q, dq, ddq])), robot.model.createData()
@@ -207,7 +211,7 @@ def answer() -> None:
 
 
 def main() -> None:
-    """Run what is asked for."""
+    """Run the command of the first argument."""
     threadpool_limits(1)
     fit.known_geometries = auto.known_geometries = lambda types, gravity: ()  # type: ignore[assignment]
     what, numbers = sys.argv[1], [int(each) for each in sys.argv[2:] if each.isdigit()]

@@ -1,7 +1,7 @@
-"""Writes what the client shares with the service: `python clients/python/records.py`.
+"""Writes the modules that the client shares with the service: `python clients/python/records.py`.
 
-The client has no Pydantic and no server, but its records have the fields and descriptions of the server's schemas, and
-some modules are copies of the server's. A test fails while the files are not what this writes.
+The client depends on neither Pydantic nor the server. Its records have the fields and descriptions of the server's
+schemas; other modules are copies of the server's. A test fails if the written files are out of date.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ COPIES = {
     "media_types.py": "contract/media_types.py",
     "wording.py": "foundation/text.py",
 }
-"""Modules of the client, and those of the service that they are copies of."""
+"""Modules of the client, and the modules of the service that they copy."""
 WIDTH = 120
 ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
     "datasets": ("Data sets and their reports.", (datasets.Dataset,)),
@@ -40,7 +40,7 @@ ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
     "models": ("Models, their versions and aliases.", (models.Model, models.Version, models.Alias)),
     "jobs": ("Training jobs.", (training.Job,)),
     "observations": (
-        "Batches that a model learns from.",
+        "Observation batches.",
         (
             observing.ObservationResponse,
             learning.Observation,
@@ -50,15 +50,15 @@ ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
         ),
     ),
     "learning": (
-        "How well a model learns, and what its owner sees and decides.",
+        "Online learning: quality, options, decisions, alarms.",
         (learning.RolledBack, learning.Quality, learning.Learning, learning.Decided, learning.Alarm),
     ),
-    "payloads": ("What arms carry.", (payloads.Payloads,)),
-    "live": ("Events of a model followed live.", (learning.LiveStatus, learning.LiveLost)),
-    "overview": ("Models at a glance.", (overview.ModelOverview,)),
-    "audit": ("What changed models.", (audit.AuditEntry,)),
+    "payloads": ("Payloads.", (payloads.Payloads,)),
+    "live": ("Events of the live view of a model.", (learning.LiveStatus, learning.LiveLost)),
+    "overview": ("Summaries of models.", (overview.ModelOverview,)),
+    "audit": ("Audit log.", (audit.AuditEntry,)),
     "server": (
-        "The service, and what the Open Inference Protocol tells of it.",
+        "State of the service, and answers of the Open Inference Protocol.",
         (
             health.Health,
             health.Live,
@@ -71,13 +71,13 @@ ROOMS: dict[str, tuple[str, tuple[type[BaseModel], ...]]] = {
         ),
     ),
 }
-"""By module: what it holds, and the records that calls return; it also gets those that they are made of."""
+"""Docstring and records of each module; records that are nested in these are added."""
 SCALARS = {"string": "str", "integer": "int", "number": "float", "boolean": "bool", "null": "None"}
 Schema = Mapping[str, Any]
 
 
 def documents() -> dict[str, str]:
-    """The text of every module by its path in the client."""
+    """Return the text of every written module, by its path in the client."""
     roots = [(kind, "serialization") for _, kinds in ROOMS.values() for kind in kinds]
     _, document = models_json_schema(roots)  # type: ignore[arg-type]
     known: dict[str, Schema] = document["$defs"]
@@ -94,7 +94,7 @@ def documents() -> dict[str, str]:
 
 
 def _reached(name: str, known: Mapping[str, Schema]) -> Iterator[str]:
-    """The record with all that it is made of, those first."""
+    """Yield the names of nested records, then that of the record itself."""
     for part in _references(known[name].get("properties", {})):
         yield from _reached(part, known)
     yield name
@@ -153,7 +153,7 @@ def _described(schema: Schema, fields: Mapping[str, Schema]) -> str:
 
 
 def _type(schema: Schema) -> str:
-    """The type of a value as Python writes it."""
+    """Return the Python annotation of a schema."""
     if "$ref" in schema:
         return _named(schema)
     if "anyOf" in schema:

@@ -75,7 +75,7 @@ class CorruptRowsError(ValueError):
     """So many rows are corrupt that it is no accident. field, value, expected: what is wrong."""
 
     def __init__(self, value: str, expected: str) -> None:
-        super().__init__(f"rows are {value}, expected {expected}")
+        super().__init__(f"rows: {value}, expected {expected}")
         self.field, self.value, self.expected = "rows", value, expected
 
 
@@ -164,7 +164,7 @@ def find_corrupt_rows(
     if corrupt_rows.count > max_rows:
         first = ", ".join(str(each + 1) for each in corrupt_rows.first)
         raise CorruptRowsError(
-            f"{corrupt_rows.count} corrupt ones of {count}: the first are {first}, counted from 1",
+            f"{corrupt_rows.count} corrupt of {count} (the first are {first}, counted from 1)",
             f"at most {max_rows}",
         )
     return corrupt_rows
@@ -190,7 +190,7 @@ def find_in_blocks(rows: int, read_rows: Callable[[int, int], Samples], block: i
         try:
             inner_rows = find_in_samples(read_rows(begin, end))
         except CorruptRowsError as error:
-            raise CorruptRowsError(f"from row {begin + 1} on {error.value}", error.expected) from None
+            raise CorruptRowsError(f"from row {begin + 1} on: {error.value}", error.expected) from None
         parts.append(CorruptRows(inner_rows.rows[inner], inner_rows.why[inner]))
     return CorruptRows(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("rows", "why")))
 

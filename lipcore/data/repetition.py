@@ -146,7 +146,7 @@ def find_period(samples: Samples, joint_types: Sequence[str]) -> float | None:
 
     The median, over instants, of the time until the motion returns to a state that it left by twice the limit of
     likeness. At least a quarter of the instants must return, and 60 % of these within 5 % of that time. Tuned on
-    simulated arms (`tests/lipcore/test_repetition.py`).
+    simulated arms (`tests/lipcore/data/test_repetition.py`).
     """
     states = features(samples, joint_types)
     limits, lags, asked = _limits(states, states), [], 0

@@ -58,7 +58,7 @@ class Split:
         if self.blocks < 2:
             raise SplitError("blocks", self.blocks, "at least 2")
         if not 0 <= self.guard_s < float("inf"):
-            raise SplitError("guard_s", self.guard_s, "seconds, at least 0")
+            raise SplitError("guard_s", self.guard_s, "at least 0 s")
 
 
 @dataclass(frozen=True)
@@ -99,8 +99,7 @@ def split(episode: Numbers, t: Array, how: Split, stretches: Sequence[Sequence[i
     parts = apply_guard(episode, t, order, held, how.guard_s)
     for side, rows in (("held out", parts.held_out), ("to train on", parts.train)):
         if not rows.any():
-            expected = f"fewer: no row {side} is further than {how.guard_s:g} s from the other side"
-            raise SplitError("guarded rows", parts.guarded, expected)
+            raise SplitError("guard_s", how.guard_s, f"less: all rows {side} are closer than that to the other side")
     return parts
 
 
@@ -123,7 +122,7 @@ def choose_stretches(lengths: Numbers, share: float, seed: int) -> Mask:
     chosen if that brings the number of rows nearer to the share.
     """
     if len(lengths) < 2:
-        raise SplitError("episodes", len(lengths), "at least 2 to hold out whole ones of: hold out `last` or `blocks`")
+        raise SplitError("episodes", len(lengths), "at least 2: hold out `last` or `blocks` instead")
     # a hash, because random number generators may change from release to release, and the same rows must be held
     # out again
     order = sorted(range(len(lengths)), key=lambda each: sha256(f"{seed}/{each}".encode()).digest())
@@ -167,7 +166,7 @@ def _last(episode: Numbers, how: Split) -> Mask:
 
 def _blocks(episode: Numbers, how: Split) -> Mask:
     if how.blocks > len(episode):
-        raise SplitError("blocks", how.blocks, f"at most as many as there are rows, {len(episode)}")
+        raise SplitError("blocks", how.blocks, f"at most the number of rows, {len(episode)}")
     edges = np.linspace(0, len(episode), how.blocks + 1).round().astype(np.int64)
     lengths = edges[1:] - edges[:-1]
     return np.asarray(np.repeat(choose_stretches(lengths, how.share, how.seed), lengths))

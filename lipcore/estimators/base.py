@@ -61,17 +61,18 @@ def check_base(
     """
     robots = (AUTO, *ROBOT_ESTIMATORS)
     if order is None:
-        raise BaseMismatchError("base", name, f"a version whose estimator has an arm, {' or '.join(ROBOT_ESTIMATORS)}")
+        raise BaseMismatchError("base", name, f"a version of estimator {' or '.join(ROBOT_ESTIMATORS)}")
     if estimator not in robots:
-        raise BaseMismatchError("estimator", estimator, f"one of {', '.join(robots)} with a base")
+        raise BaseMismatchError("estimator", estimator, f"one of {', '.join(robots)} if a base is given")
     if (found := data.difference(base)) is not None:
         field, own, others = found
         raise BaseMismatchError("base", name, f"a version with the {field} of the data, {own}; it has {others}")
     if estimator == CHAINED_ARM and list(order) != list(range(len(order))):
-        raise BaseMismatchError("estimator", estimator, f"{' or '.join(robots[:2])}: the base's joints go another way")
+        expected = f"{' or '.join(robots[:2])}, as the joints of the base have another order"
+        raise BaseMismatchError("estimator", estimator, expected)
     if robot is not None:
-        raise BaseMismatchError("robot", robot, "none with a base, whose arm is expected")
+        raise BaseMismatchError("robot", robot, "none if a base is given: its arm is used")
     if options.geometry == "learn":
-        raise BaseMismatchError("options.geometry", "learn", "auto, calibrate or fixed with a base")
+        raise BaseMismatchError("options.geometry", "learn", "auto, calibrate or fixed if a base is given")
     if options.prior != "urdf":
-        raise BaseMismatchError("options.prior", options.prior, "the default with a base, whose masses are expected")
+        raise BaseMismatchError("options.prior", options.prior, "the default if a base is given: its masses are used")

@@ -87,7 +87,7 @@ def make_estimator(
     friction = FrictionKernel(len(types), arm is not None and arm.stribeck)
     terms = {**ESTIMATORS[name](types, tied), "friction": friction}
     if (name in ROBOT_ESTIMATORS) != (arm is not None):
-        raise ValueError(f"estimator {name!r}: expected an arm for {', '.join(ROBOT_ESTIMATORS)}, and for no other")
+        raise ValueError(f"estimator {name!r}: only {', '.join(ROBOT_ESTIMATORS)} need an arm, others must have none")
     if arm is None:
         return Estimator(name, terms)
     of_arm = tuple(arm.geometry.joint_types[place] for place in arm.place)
@@ -115,7 +115,8 @@ def check_estimator(
             )
         return
     if name not in (AUTO, *ROBOT_ESTIMATORS):
-        raise MissingRobotError(f"estimator {name!r} takes no robot, only {', '.join(ROBOT_ESTIMATORS)} and {AUTO} do")
+        users = ", ".join(ROBOT_ESTIMATORS)
+        raise MissingRobotError(f"estimator {name!r} does not use a robot, only {users} and {AUTO} do")
     if robot.joint_types != types:
         raise JointMismatchError(f"robot {robot.name!r} has joints {robot.joint_types}, the data have {types}")
     if name == "rigid-body+lip-chain" and robot.order != tuple(range(robot.n_joints)):

@@ -72,7 +72,7 @@ class FitOptions:
             if type(number) not in (int, float) or not 0 < number <= most:
                 raise ValueError(f"{name} is {number!r}, expected a number above 0, at most {most:g}")
         if self.geometry not in ("auto", *GEOMETRY_MODES):
-            raise ValueError(f"geometry is {self.geometry!r}, expected auto, {', '.join(GEOMETRY_MODES)}")
+            raise ValueError(f"geometry is {self.geometry!r}, expected one of auto, {', '.join(GEOMETRY_MODES)}")
         if self.prior not in PRIORS:
             raise ValueError(f"prior is {self.prior!r}, expected one of {', '.join(PRIORS)}")
 

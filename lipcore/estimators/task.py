@@ -50,7 +50,7 @@ class Task:
         samples, convention = self.samples, self.torque_convention
         types = check_joint_types(self.joint_types)
         if len(types) != samples.n_joints:
-            raise ValueError(f"joint_types has {len(types)} entries, expected {samples.n_joints}, one a joint")
+            raise ValueError(f"joint_types has {len(types)} entries, expected {samples.n_joints}, one for each joint")
         object.__setattr__(self, "joint_types", types)
         if convention not in TORQUE_CONVENTIONS:
             raise ValueError(f"torque_convention is {convention!r}, expected one of {', '.join(TORQUE_CONVENTIONS)}")

@@ -72,7 +72,7 @@ class Belief:
         tau = inverse_dynamics(robot, motion.q, motion.dq, motion.ddq)
         std = 0.01 * tau.std(0) if noise_std is None else np.broadcast_to(noise_std, tau.shape[1:])
         if not (np.isfinite(std).all() and (std > 0).all()):
-            raise ValueError(f"noise_std is {noise_std}, expected positive numbers, one or one a joint")
+            raise ValueError(f"noise_std is {noise_std}, expected positive numbers, one for all joints or one for each")
         tau += std * np.random.default_rng(seed).standard_normal(tau.shape)
         t, apart = np.arange(len(motion), dtype=np.float64), np.arange(len(motion), dtype=np.int64)
         samples = Samples(robot.joint_names, t, apart, motion.q, motion.dq, motion.ddq, tau)
@@ -87,16 +87,14 @@ class Belief:
         return np.zeros_like(self.noise_variance) if self.posterior is None else self.posterior.floor
 
     def cross(self, motion: Motion) -> Array:
-        """Return the prior covariance of the model's variables with all torques of N motions, (M, N n); M = 0 for a
-        prior."""
+        """Return the prior covariance of M variables with the torques of N motions, (M, N n); M = 0 for a prior."""
         if self.posterior is None:
             return np.zeros((0, len(motion) * self.kernel.n_joints))
         return self.posterior.cross(self.kernel, motion)
 
     @property
     def root(self) -> Array:
-        """Return Q, (M, M): for a cross covariance c, the square of Q c is the variance of these torques removed by
-        training."""
+        """Return Q, (M, M): for a cross covariance c, training removes the variance (Q c)² of these torques."""
         return np.zeros((0, 0)) if self.posterior is None else self.posterior.learnt
 
 
@@ -133,8 +131,7 @@ class Information:
         return self._share(self._after(explained))
 
     def slope(self, motion: Motion, repeats: float = 1.0) -> tuple[float, Motion]:
-        """Return the mean over joints of log `left`, and its derivatives by position, velocity and acceleration, each
-        (N, n).
+        """Return the mean over joints of log `left`, and its derivatives by the motion, each (N, n).
 
         With S = k(X, X) + R, D = k(X, r) and α = S⁻¹ D, the variance that X explains at r changes by 2 αᵀ dD − αᵀ dS α.
         """
@@ -180,6 +177,5 @@ class Information:
         return np.maximum(np.maximum(self.now - explained, self.floor), 1e-9 * self.now)
 
     def _share(self, after: Array) -> Array:
-        """Return the geometric mean over the references. An arithmetic mean would depend on the largest variances
-        alone."""
+        """Return the geometric mean over the references: the largest variances alone would decide an arithmetic one."""
         return np.asarray(np.exp(np.log(after / self.now).mean(0)))

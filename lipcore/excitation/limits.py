@@ -15,10 +15,10 @@ from lipcore.vocabulary import JointType
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of n joints, SI units, each (n,): position `lower` to `upper`, and the magnitudes of speed, acceleration
-    and torque. torque: infinite if unknown.
+    """Limits of n joints in SI units, each (n,).
 
-    Raise ValueError if shapes differ or a range is empty.
+    `lower` and `upper` limit the position, the others magnitudes. An unknown torque limit is infinite. Raise ValueError
+    if shapes differ or a range is empty.
     """
 
     joint_names: tuple[str, ...]
@@ -33,7 +33,7 @@ class Limits:
         for name in ("lower", "upper", "speed", "acceleration", "torque"):
             values = getattr(self, name)
             if values.shape != (n,):
-                raise ValueError(f"{name} has shape {values.shape}, expected {(n,)}, one a joint")
+                raise ValueError(f"{name} has shape {values.shape}, expected {(n,)}, one for each joint")
             finite = np.isfinite(values).all() if name != "torque" else not np.isnan(values).any()
             if not finite or (name not in ("lower", "upper") and (values <= 0).any()):
                 raise ValueError(f"{name} is {values.tolist()}, expected a positive number for every joint")
@@ -93,8 +93,7 @@ class Limits:
         return (self.upper - self.lower) / 2
 
     def within(self, position: float = 1.0, motion: float = 1.0, reach: float | None = None) -> Limits:
-        """Return a share of these limits: `position` of the range about its middle, `motion` of speed, acceleration,
-        torque.
+        """Return a share of these limits: of the range about its middle, and of speed, acceleration and torque.
 
         reach: max distance from the middle, rad or m. Raise ValueError for shares that are not above 0, 1 at most.
         """

@@ -1,5 +1,4 @@
-"""Generate motions within limits: Fourier series at rest at both ends, mapped from any vector of numbers, and
-references.
+"""Generate motions within limits: references, and Fourier series that start and end at rest.
 
 Swevers et al. (1997): a period of a finite Fourier series can be repeated, and enough instants bound its values between
 them. Let m > 2 K be the number of evenly spaced instants of a period. The maximum of a trigonometric polynomial of
@@ -72,8 +71,7 @@ def frequencies(seconds: float, harmonics: int) -> Array:
 
 
 def overshoot(harmonics: int, instants: int) -> float:
-    """Return the max factor by which a trigonometric polynomial exceeds its largest magnitude at evenly spaced
-    instants.
+    """Return the max factor by which a trigonometric polynomial exceeds its values at evenly spaced instants.
 
     harmonics: its degree K; 1 / cos(π K / m) (Ehlich & Zeller, 1964).
     """
@@ -115,8 +113,7 @@ class Shape:
         return 2 * harmonics + 1, n
 
     def coefficients(self, x: Array) -> Coefficients:
-        """Return the shift from the middle (n,), and sine and cosine amplitudes (K, n), within the limits. x: (2 K + 1,
-        n)."""
+        """Return the shift from the middle, (n,), and the amplitudes (K, n), within the limits. x: (2 K + 1, n)."""
         shift, sine, cosine = self._free(x)
         shrink, _ = self._shrink(shift, sine, cosine)
         return shift / shrink, sine / shrink, cosine / shrink
@@ -127,8 +124,7 @@ class Shape:
         return self.limits.middle + q, dq, ddq
 
     def adjoint(self, x: Array, t: Array, q: Array, dq: Array, ddq: Array) -> Array:
-        """Return the derivatives by x, (2 K + 1, n), given those by the results of `motion` at times t (N,), each (N,
-        n)."""
+        """Return the derivatives by x, (2 K + 1, n), given those by q, dq and ddq, each (N, n), at times t, (N,)."""
         free = self._free(x)
         shrink, by_shares = self._shrink(*free)
         slopes = self._motion_adjoint(t, q, dq, ddq)
@@ -171,8 +167,7 @@ class Shape:
         return np.asarray(waves - self.at_rest * (self.at_rest * waves).sum(1, keepdims=True))
 
     def _shrink(self, shift: Array, sine: Array, cosine: Array) -> tuple[Array, Array]:
-        """Return the divisor of each joint, (n,), and its derivatives by the motion at the watched instants, (3, m,
-        n)."""
+        """Return each joint's divisor, (n,), and its derivatives by the motion at the instants, (3, m, n)."""
         limits, m = self.limits, len(self._watched)
         unit = np.stack([limits.half, limits.speed, limits.acceleration])[:, None] / overshoot(len(self.omega), m)
         motion = np.stack(self._motion(shift, sine, cosine, self._watched))

@@ -151,8 +151,9 @@ def search(
     until: float,
     on_progress: Callable[[int, float], None] | None = None,
 ) -> SearchResult:
-    """Optimise the best of random starts by L-BFGS, for `iterations` iterations or until that time of the monotonic
-    clock.
+    """Optimise the best of random starts by L-BFGS.
+
+    It ends after `iterations`, or at a time of the monotonic clock.
 
     on_progress: receives iterations and the exponential of the lowest value so far.
     """

@@ -47,7 +47,7 @@ class LinearWeights:
         assert isinstance(arm, ArmKernel)
         assert isinstance(friction, FrictionKernel)
         if list(posterior.basis.linear) != [arm, friction]:
-            raise UnsupportedEstimatorError("the posterior holds more weights than those of rigid bodies and friction")
+            raise UnsupportedEstimatorError("the posterior has weights other than those of rigid bodies and friction")
         diagonals = [each.variances(posterior.params) for each in (arm, friction)]
         prior, centre, first = np.concatenate(diagonals), arm.prior_weights(), len(posterior.basis.outputs)
         assert centre is not None

@@ -24,10 +24,10 @@ Element = ElementTree.Element
 ROOT, BASE = "world", "base"
 HEADER_COMMENTS = (
     "Learnt from torque by LIPServe.",
-    "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.",
+    "Torque does not distinguish an arm from its mirror image, nor fix the place of a frame along its axis.",
     "Limits of position and velocity are the range of the training, not those of the drives.",
-    "No limit of torque is known: effort is far above what the arm needs.",
-    "Rotor inertia stands in the transmissions, as drake:rotor_inertia; offset torque in comments.",
+    "No torque limit is known: effort is set far above what the arm needs.",
+    "Rotor inertia is in the transmissions, as drake:rotor_inertia; offset torque is in comments.",
 )
 
 
@@ -145,7 +145,7 @@ def urdf_of_parameters(
         undetermined=undetermined,
     )
     off = ", ".join(f"{value:.2g}" for value in chain(inertia.plausible_deviation))
-    notes = [f"Torque of these bodies differs from what was learnt by {off} N·m (N), root mean square, base to tip."]
+    notes = [f"Torque of these bodies differs from the learnt torque by {off} N·m (N), root mean square, base to tip."]
     return urdf_text(arm.geometry(plausible=True), inertia.plausible()[order], joints, name, notes)
 
 
@@ -175,7 +175,7 @@ def _upright(gravity: Array) -> Array:
 def _gravity_comments(geometry: Geometry) -> list[str]:
     strength = float(np.linalg.norm(geometry.gravity))
     if strength == 0.0:
-        return ["Torque was measured without gravity: how the base stands is not known."]
+        return ["Torque was measured without gravity: the orientation of the base is unknown."]
     if abs(strength - STANDARD_GRAVITY) > 1e-9:
         return [f"Gravity is {strength!r} m/s² here: set it in the simulator."]
     return []
@@ -223,7 +223,7 @@ def _moving(joint: Element, axis: Array, joints: ArmJoints, k: int, effort: floa
     notes = [f"learnt {key} is {_text(value)}" for key, value in terms.items() if value < 0]
     notes += [f"offset torque {_text(joints.offset[k])}, rotor inertia {_text(joints.rotor[k])}"]
     if joints.undetermined and joints.undetermined[k]:
-        notes.append(f"torque does not tell: {', '.join(joints.undetermined[k])}")
+        notes.append(f"not identifiable from torque: {', '.join(joints.undetermined[k])}")
     _comments(joint, notes)
 
 

@@ -110,7 +110,7 @@ def _alternatives(tensors: Mapping[str, Array], geometry: Geometry, terms: int) 
         if value.shape != shape or not count:
             raise ValueError(f"tensor 'arm/other/{name}' has shape {value.shape}, expected {shape}")
     if not ((probability > 0) & (probability < 1)).all():
-        raise ValueError("tensor 'arm/other/probability' holds a number that is none between 0 and 1")
+        raise ValueError("tensor 'arm/other/probability' has a number outside 0 to 1")
     return tuple(
         Alternative(
             Geometry(geometry.joint_types, rotation[k], translation[k], axis[k], geometry.gravity),

@@ -150,7 +150,7 @@ class Parameters(Entry):
 
     def __post_init__(self) -> None:
         if len({each is UNSET for each in (self.inertia, self.rotor, self.geometry)}) > 1:
-            raise ValueError("inertia, rotor and geometry are not all there, expected all of them or none")
+            raise ValueError("inertia, rotor and geometry are not all present, expected all of them or none")
 
 
 def check_lengths(where: str, entry: Any, n: int) -> None:

@@ -192,7 +192,7 @@ class Manifest(Entry, kw_only=True):
         """Raise ValueError if entries contradict each other."""
         n = len(self.joint_names)
         if not n or len(set(self.joint_names)) < n:
-            raise ValueError(f"joint_names is {self.joint_names}, expected at least one, and names that differ")
+            raise ValueError(f"joint_names is {self.joint_names}, expected at least one name, and distinct names")
         check_lengths("", self, n)
         _check_known("options", self.options, FitOptions)
         try:

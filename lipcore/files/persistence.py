@@ -80,7 +80,7 @@ def encode(model: TorqueModel, lineage: Mapping[str, Any] | None = None) -> tupl
     """
     basis, statistics = model.posterior.basis, model.posterior.statistics
     if statistics is None:
-        raise ValueError("the model has learnt online since it was trained, expected one as trained")
+        raise ValueError("the model has learnt online, expected a model as trained")
     tensors: dict[str, Array | Indices] = {f"{PARAMS}{name}": value for name, value in model.posterior.params.items()}
     tensors |= {name: getattr(basis.inducing, name.rpartition("/")[2]) for name in INDUCING}
     tensors |= {OUTPUTS: basis.outputs, A: pack_symmetric(statistics.a), B: statistics.b}
@@ -238,9 +238,9 @@ def check_checksums(files: Mapping[str, bytes], checksums: Mapping[str, str]) ->
     """
     for name in sorted(files.keys() | checksums.keys()):
         if name not in files or name not in checksums:
-            raise ModelFormatError(f"{name} is {'missing' if name in checksums else 'one file too many'}", name)
+            raise ModelFormatError(f"{name} is {'missing' if name in checksums else 'unexpected'}", name)
         if sha256(files[name]) != checksums[name]:
-            raise ModelFormatError(f"{name} does not have the sha256 that was kept of it: it is damaged", name)
+            raise ModelFormatError(f"{name} is damaged: it does not match its stored sha256", name)
 
 
 def checksums(manifest: Mapping[str, Any]) -> dict[str, str]:

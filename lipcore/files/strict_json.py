@@ -52,7 +52,7 @@ def check_texts(where: str, value: Any) -> None:
     """Raise StrictJsonError for a text that a terminal or a log would not show unchanged."""
     if isinstance(value, str):
         if not all(each.isprintable() or each == "\N{NO-BREAK SPACE}" for each in value):
-            raise StrictJsonError(f"{where} is {quote(value)}, which has a character that cannot be printed")
+            raise StrictJsonError(f"{where} is {quote(value)}, which has an unprintable character")
     elif isinstance(value, dict):
         for name, each in value.items():
             check_texts("a name" + f" in {where}" * bool(where), name)

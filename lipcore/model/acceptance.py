@@ -10,6 +10,7 @@ from scipy.special import fdtri
 
 from lipcore.data.samples import Array
 from lipcore.data.splits import Mask
+from lipcore.model import texts
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class HeldOutFigures:
     coverage_high: Array
     """Upper end of the confidence interval of the coverage."""
     independent: Array
-    """Number of independent errors."""
+    """Number of effective samples."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +86,7 @@ def accept(figures: HeldOutFigures) -> Acceptance:
         >>> two = np.array([0.01, 0.98]), np.array([0.1, 1.0]), np.full(2, 0.05)
         >>> many = np.array([0.95, 0.95]), np.array([0.97, 0.97]), np.full(2, 60.0)
         >>> accept(HeldOutFigures(("hip", "knee"), *two, *many)).against
-        ('its error is not below that of the mean torque: knee 0.98 of its variance (60 independent errors)',)
+        ('the error is not below that of the mean torque: knee at 0.98 of the variance (60 effective samples)',)
 
     """
     return _check_error(figures) + _check_coverage(figures)
@@ -102,34 +103,28 @@ def _check_error(figures: HeldOutFigures) -> Acceptance:
     spread = figures.rmse / np.sqrt(np.where(varies, nmse, 1.0))
     judged = varies & (spread >= OPTIONS.min_signal * figures.torque_noise)
     if not judged.any():
-        return Acceptance(unknown=("no torque of what was held out stands out of its noise",))
+        return Acceptance(unknown=(texts.NO_SIGNAL,))
     large = judged & (nmse >= OPTIONS.max_error)
     open_ = judged & ~large & (nmse * fdtri(count, count, OPTIONS.level) >= OPTIONS.max_error)
-    texts = [
-        f"{value:.2g} of its variance ({number:.0f} independent errors)"
-        for value, number in zip(nmse, count, strict=True)
-    ]
-    against, unknown = (_list_joints(figures.joint_names, texts, which) for which in (large, open_))
+    joints = [texts.describe_joint_error(*each) for each in zip(nmse, count, strict=True)]
+    against, unknown = (_list_joints(figures.joint_names, joints, which) for which in (large, open_))
     if against:
-        return Acceptance(against=(f"its error is not below that of the mean torque: {against}",))
+        return Acceptance(against=(texts.describe_error_against(against),))
     if unknown:
-        return Acceptance(unknown=(f"too little was held out to tell its error from that of the mean: {unknown}",))
-    return Acceptance(speaks_for=(f"its error is at most {nmse[judged].max():.2g} of the variance of the torque",))
+        return Acceptance(unknown=(texts.describe_error_unknown(unknown),))
+    return Acceptance(speaks_for=(texts.describe_error(nmse[judged].max()),))
 
 
 def _check_coverage(figures: HeldOutFigures) -> Acceptance:
     """Check that the intervals have a coverage of `min_coverage`, within the sampling error of so few errors."""
-    least = f"{100 * OPTIONS.min_coverage:.0f} %"
-    texts = [
-        f"{100 * share:.0f} % (at most {100 * high:.0f} %, from {count:.0f} independent errors)"
-        for share, high, count in zip(figures.coverage, figures.coverage_high, figures.independent, strict=True)
-    ]
-    narrow = _list_joints(figures.joint_names, texts, figures.coverage_high < OPTIONS.min_coverage)
+    each = zip(figures.coverage, figures.coverage_high, figures.independent, strict=True)
+    joints = [texts.describe_joint_coverage(*joint) for joint in each]
+    narrow = _list_joints(figures.joint_names, joints, figures.coverage_high < OPTIONS.min_coverage)
     if narrow:
-        return Acceptance(against=(f"the 95 % intervals hold less than {least} of what was held out: {narrow}",))
-    return Acceptance(speaks_for=(f"its 95 % intervals hold {least} of what was held out, as far as that can tell",))
+        return Acceptance(against=(texts.describe_coverage_against(OPTIONS.min_coverage, narrow),))
+    return Acceptance(speaks_for=(texts.describe_coverage(OPTIONS.min_coverage),))
 
 
-def _list_joints(names: Sequence[str], texts: Sequence[str], which: Mask, most: int = 8) -> str:
-    chosen = [f"{name} {text}" for name, text, taken in zip(names, texts, which, strict=True) if taken]
-    return ", ".join([*chosen[:most], "…"] if len(chosen) > most else chosen)
+def _list_joints(names: Sequence[str], joints: Sequence[str], which: Mask) -> str:
+    chosen = [f"{name} at {text}" for name, text, taken in zip(names, joints, which, strict=True) if taken]
+    return texts.list_joints(chosen)

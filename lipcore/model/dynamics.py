@@ -41,8 +41,8 @@ class IndefiniteInertiaError(ValueError):
 
     def __init__(self, index: int) -> None:
         super().__init__(
-            f"the learnt inertia matrix at query {index} is not positive definite, expected a posture that the "
-            "training data tell the inertia of"
+            f"the learnt inertia matrix at query {index} is not positive definite, expected a posture near the "
+            "training data"
         )
         self.index = index
 

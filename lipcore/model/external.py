@@ -30,7 +30,7 @@ class External:
 
     @property
     def z(self) -> Array:
-        """e / s, (N, n): standard normal if nothing touches the arm."""
+        """Standardised error e / s, (N, n): standard normal if nothing touches the arm."""
         return self.rows[:, 2 * self._joints : 3 * self._joints]
 
     @property

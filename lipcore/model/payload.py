@@ -72,7 +72,7 @@ class Carrier:
     def __post_init__(self) -> None:
         if self.model.arm is None:
             raise NoArmError(
-                f"estimator {self.model.estimator.name!r} knows no rigid bodies, expected a model of estimator "
+                f"estimator {self.model.estimator.name!r} has no rigid bodies, expected a model of estimator "
                 f"{', '.join(ROBOT_ESTIMATORS)}"
             )
 

@@ -12,14 +12,13 @@ from lipcore.data.motion import Motion
 from lipcore.data.samples import Array
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.fast.arm import PARAMETERS
+from lipcore.model import texts
 from lipcore.model.parameters import weight_posterior
 from lipcore.model.torque_model import TorqueModel
 from lipcore.posterior.compression import checks
 
 RANGE_FACTOR = 2.0
 """Factor on the range and speed of the recording, at which alternative arms and shares of the fallback are compared."""
-MAX_LISTED_JOINTS = 8
-"""Max joints named in a sentence."""
 REFIT_ERROR = "refit_error"
 """Entry of a fit's report: the error of the last fit, on all rows."""
 
@@ -59,36 +58,24 @@ def warnings(model: TorqueModel, parameters: Mapping[str, Any]) -> list[str]:
     """
     arm, fit, out = model.arm, model.fit, _fallback(model)
     if REFIT_ERROR in fit:
-        out.append(
-            f"The last fit, on all rows, failed ({fit[REFIT_ERROR]}). The model has not learnt the rows held out."
-        )
+        out.append(texts.describe_failed_fit(str(fit[REFIT_ERROR])))
     moved = float(fit.get("motion_dimensions", model.n_joints))
-    together = (
-        f"Its joints moved together, like {moved:.1f} independent ones of {model.n_joints}: torque of other motion may "
-        "be off by more than tau_std says. A recording in which each moves by itself tells more."
-    )
+    together = texts.describe_dependent_motion(moved, model.n_joints)
     moved_together = moved < 0.7 * model.n_joints
     if arm is None:
         return [*out, together] if moved_together else out
     if len(arm.alternatives) > 1:
         out.append(_alternatives(model))
     if fit.get("search_ended") == "time":
-        limit = float(model.options.get("search_seconds", 0.0))
-        out.append(f"The search for the geometry ended at its time limit, {limit:g} s: a longer one may tell more.")
+        out.append(texts.describe_search_limit(float(model.options.get("search_seconds", 0.0))))
     if fit.get("search_explained") is False:
-        more = "" if "energy" in model.estimator.terms else " Compare with rigid-body+lip-chain."
-        out.append(
-            f"Rigid bodies leave more of the torque than the sensor's noise: it holds more than they explain.{more}"
-        )
+        out.append(texts.describe_unmodelled_torque("energy" in model.estimator.terms))
     joints = parameters.get("geometry", {}).get("joints", ())
     names = {each["joint"]: each["undetermined"] for each in joints if each["undetermined"]}
-    count = sum(map(len, names.values()))
-    several = count > 2  # no torque depends on the geometry's turn about gravity and its place along the first axis
+    # no torque depends on the geometry's turn about gravity and its place along the first axis
+    several = sum(map(len, names.values())) > 2
     if several:
-        listed = "; ".join([f"{joint}: {', '.join(each)}" for joint, each in names.items()][:MAX_LISTED_JOINTS])
-        listed += "; …" if len(names) > MAX_LISTED_JOINTS else ""
-        stand = "are those of the URDF or the base" if arm.mode == "calibrate" else "are only a guess"
-        out.append(f"The recording does not tell {count} numbers of the geometry, which {stand} ({listed}).")
+        out.append(texts.describe_unidentifiable(names, arm.mode == "calibrate"))
     if (several or arm.alternatives) and moved_together:
         out.append(together)
     return out
@@ -107,14 +94,7 @@ def _fallback(model: TorqueModel) -> list[str]:
     if share is None:
         return []
     names = [name for name, often in zip(model.joint_names, (share > 0).mean(axis=0), strict=True) if often > 0.5]
-    if not names:
-        return []
-    listed = ", ".join([*names[:MAX_LISTED_JOINTS], "…"] if len(names) > MAX_LISTED_JOINTS else names)
-    listed = " and ".join(listed.rsplit(", ", 1))
-    return [
-        f"Twice as far and as fast as recorded, the torque of {listed} is only gravity and friction, as far as the "
-        "recording identifies them. A recording of such motion identifies more."
-    ]
+    return [texts.describe_fallback(names, RANGE_FACTOR)] if names else []
 
 
 def _alternatives(model: TorqueModel) -> str:
@@ -136,21 +116,15 @@ def _alternatives(model: TorqueModel) -> str:
         q[:, joint] = middle + RANGE_FACTOR * (q[:, joint] - middle)
         dq[:, joint] *= RANGE_FACTOR
         ddq[:, joint] *= RANGE_FACTOR**2
-        where = f"{name} leaves {low[joint]:.2g} to {high[joint]:.2g} {length}"
+        where = f"{name} leaves the range {low[joint]:.2g} to {high[joint]:.2g} {length}"
         tried.append((_spread(term, replace(motion, q=q)), where))
-        where = f"{name} is faster than {fastest[joint]:.2g} {length}/s"
+        where = f"{name} moves faster than {fastest[joint]:.2g} {length}/s"
         tried.append((_spread(term, replace(motion, dq=dq, ddq=ddq)), where))
     spread, where = max(tried, key=lambda each: float((each[0] / model.noise_std).max()))
     most = int((spread / model.noise_std).argmax())
     unit = "N" if model.joint_types[most] == "prismatic" else "N·m"
     shares = sorted((each.probability for each in term.arm.alternatives), reverse=True)
-    percent = " and ".join(", ".join(f"{share:.0%}" for share in shares).rsplit(", ", 1))
-    counts = {2: "Two", 3: "Three", 4: "Four"}
-    return (
-        f"{counts.get(len(shares), str(len(shares)))} arms explain the recording about as well ({percent}); their "
-        f"difference is in tau_std. A recording in which {where} would tell: at twice that they differ by "
-        f"{spread[most]:.2g} {unit} in {model.joint_names[most]}."
-    )
+    return texts.describe_alternatives(shares, where, f"{spread[most]:.2g} {unit}", model.joint_names[most])
 
 
 def _spread(term: ArmKernel, motion: Motion) -> Array:

@@ -1,5 +1,4 @@
-"""Derive accelerations from the measured velocities of a live stream: a local slope with a known delay, computed across
-neighbouring batches."""
+"""Derive accelerations from a live stream's velocities: a local slope with a known delay, across batches."""
 
 from __future__ import annotations
 
@@ -30,8 +29,8 @@ class RateError(ValueError):
 class DerivationError(ValueError):
     """The accelerations of a batch cannot be derived: `field` has `value`, but `expected` is needed."""
 
-    def __init__(self, field: str, value: str, expected: str) -> None:
-        super().__init__(f"{field} is {value}, expected {expected}")
+    def __init__(self, field: str, value: str, expected: str, message: str) -> None:
+        super().__init__(message)
         self.field, self.value, self.expected = field, value, expected
 
 
@@ -51,7 +50,7 @@ def rate_of(t: Array) -> float:
     below MIN_RATE_HZ.
     """
     if len(t) < 2:
-        raise ValueError(f"t has {len(t)} times, expected at least 2 to tell a rate")
+        raise ValueError(f"t has {len(t)} times, expected at least 2")
     steps = np.diff(t)
     usual = float(np.median(steps))
     if not usual > 0:
@@ -69,8 +68,9 @@ def rate_of(t: Array) -> float:
 
 
 def window(rate: float) -> int:
-    """Return the half width h, in samples, of the window for accelerations at `rate` Hz; raise RateError if that is too
-    slow.
+    """Return the half width h of the window for accelerations at `rate` Hz, in samples.
+
+    Raise RateError if the rate is too low.
 
     h is 0.04 s, at least 2 samples. The slope over ±T passes a motion of frequency f with the gain 3 (sin x − x cos
     x)/x³ ≈ 1 − x²/10, x = 2π f T. At T = 0.04 s the gain is 0.994 at 1 Hz, 0.975 at 2 Hz, 0.903 at 4 Hz, 1/√2 at 7.2 Hz
@@ -87,8 +87,7 @@ def window(rate: float) -> int:
 
 
 def derive(t: Array, dq: Array, half: int) -> DerivedAccelerations:
-    """Return the slope of the least-squares quadratic through the 2·half + 1 velocities around each row
-    (Savitzky–Golay).
+    """Return the slope of the quadratic through the 2·half + 1 velocities around each row (Savitzky–Golay).
 
     ddq_k = Σ_j j dq_{k+j} / (dt Σ_j j²), j = −half … half. It is exact on quadratics, has no phase shift, and uses no
     row later than its delay, half·dt. t: (N,) s, evenly spaced (`rate_of`); dq: (N, n), finite. Fewer than 2·half + 1
@@ -119,8 +118,7 @@ def _check_rate(rate: float) -> None:
 
 @dataclass(frozen=True)
 class Derivation:
-    """How the accelerations of a batch are derived: from `half` rows on either side of a row, at `rate` rows per
-    second."""
+    """How accelerations of a batch are derived: from `half` rows on either side of each, at `rate` rows per second."""
 
     half: int
     rate: float
@@ -142,8 +140,10 @@ class Derivation:
 
 @dataclass(frozen=True)
 class DerivedRows:
-    """The rows of a batch with accelerations, and `carried` rows of other batches that it completes; own: places of the
-    batch's own rows."""
+    """Rows of a batch with accelerations, and `carried` rows of earlier batches that it completes.
+
+    own: places of the batch's own rows.
+    """
 
     rows: Rows
     own: slice
@@ -180,26 +180,30 @@ def derive_rows(
 
 
 def _batch_rate(t: Array) -> float:
-    """Return the rows per second in the longest stretch without a gap; event time is too coarse for this (0.2 µs
-    today). Raise DerivationError if accelerations cannot be derived at this rate, or time is too uneven."""
+    """Return the rows per second in the longest stretch without a gap; event time is too coarse for this (0.2 µs).
+
+    Raise DerivationError if accelerations cannot be derived at this rate, or if steps of time are too uneven.
+    """
     finite = t[np.isfinite(t)]
     if len(finite) < 2:
-        raise DerivationError("t", f"{len(finite)} times", "at least 2 rows with times, to derive ddq from dq with")
+        message = f"`t` has {len(finite)} times; at least 2 are needed to derive `ddq`."
+        raise DerivationError("t", f"{len(finite)} times", "at least 2 times", message)
     steps = np.diff(finite)
     rising = steps[steps > 0]
     step = float(np.median(rising)) if len(rising) else 0.0
     run = max(_runs(t, np.isfinite(t), step), key=len)
     if len(run) < 2 or 2 * np.count_nonzero(_even(steps, step)) < len(steps):
-        spread = f"uneven, with steps from {steps.min():.3g} to {steps.max():.3g} s"
-        raise DerivationError(
-            "t", spread, f"steps that differ by at most {100 * MAX_JITTER_SHARE:.0f} %, to derive ddq from dq with"
-        )
+        spread = f"steps from {steps.min():.3g} to {steps.max():.3g} s"
+        expected = f"steps that differ by at most {100 * MAX_JITTER_SHARE:.0f} %"
+        message = f"`ddq` cannot be derived, because `t` is uneven: it has {spread}, expected {expected}."
+        raise DerivationError("t", f"uneven, with {spread}", expected, message)
     rate = (len(run) - 1) / float(t[run[-1]] - t[run[0]])
     try:
         window(rate * (1 - 1e-9))  # rounding must not change the result later
     except RateError:
-        expected = f"measured accelerations, or at least {MIN_RATE_HZ:g} rows a second to derive them from"
-        raise DerivationError("ddq", f"missing, with {rate:.3g} rows a second", expected) from None
+        given, expected = f"{rate:.3g} rows per second", f"at least {MIN_RATE_HZ:g} rows per second"
+        message = f"`ddq` cannot be derived from {given}: send `ddq`, or {expected}."
+        raise DerivationError("ddq", f"missing, with {given}", f"accelerations, or {expected}", message) from None
     return rate
 
 

@@ -122,8 +122,7 @@ class AdaptiveScale:
 
 
 def scores(error: Array, std: Array, noise_std: Array) -> Array:
-    """Return |error| over the half width of the unscaled interval, (N, n): an interval of scale s contains scores up to
-    s.
+    """Return |error| over the unscaled interval's half width, (N, n); an interval of scale s contains scores up to s.
 
     error = tau − mean and std, the function's standard deviation, (N, n); noise_std: (n,), N·m.
     """

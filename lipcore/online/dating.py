@@ -73,8 +73,7 @@ class StreamTime:
         return StreamTime(offset or None, last, min(bounds, default=None), adjacent, arrived)
 
     def fix_offset(self, t: Array | None, usable: NDArray[np.bool_], gap: float) -> float:
-        """Return the offset, s. It is fixed now if these rows are the first with times. usable: rows with a plausible
-        time, (N,)."""
+        """Return the offset, s; it is fixed by the first rows with times. usable: rows with a plausible time, (N,)."""
         if self.offset is not None:
             return self.offset
         if t is None or not usable.any():
@@ -86,8 +85,10 @@ class StreamTime:
         return self.arrived - float(last[-1])
 
     def find_stray_times(self, t: Array, usable: NDArray[np.bool_], offset: float, gap: float) -> NDArray[np.bool_]:
-        """Return the rows (N,) with an isolated time in the future, after a gap and before another one or the end. Such
-        a time is most likely wrong: if it were accepted, all later rows would be late."""
+        """Return the rows, (N,), with an isolated time in the future: between gaps, or between a gap and the end.
+
+        Such a time is most likely wrong: if it were accepted, all later rows would be late.
+        """
         leaping = np.zeros(len(t), dtype=np.bool_)
         times = t[usable]
         start = self.after if self.adjacent and self.after is not None else times[:1]

@@ -95,8 +95,7 @@ def check_rows(
 
 
 def time_span(time: Array, code: Codes) -> tuple[float, float] | None:
-    """Return the first and last plausible time of a batch of rows, or None. Neighbouring batches must lie before and
-    after.
+    """Return the first and last plausible time of a batch, or None; neighbouring batches must lie outside of it.
 
     Rows coded `time_jump` do not count unless no other row has a time. In that case the clock itself was set, and the
     next batch must follow the new time. A wrong time at the end of a batch therefore costs one row; a clock set back
@@ -122,8 +121,7 @@ or N."""
 
 
 def is_implausible(tau: Array, mean: Array, noise_std: Array, gravity: bool) -> Mask:
-    """Return the rows, (N,) in order of time, whose torque cannot be a measurement; all rows if more than half are
-    such.
+    """Return the rows, (N,) in order of time, whose torque cannot be measured; all if more than half are such.
 
     tau, mean: (N, n), the torque sent as measured, and the model's; noise_std: (n,); gravity: whether torques contain
     it.
@@ -195,8 +193,7 @@ CONTACT_PATIENCE_S = 2.0
 
 @dataclass(frozen=True)
 class ContactGate:
-    """Gate that rejects rows far outside a stream's predictive interval, for as long as that can be a contact;
-    immutable.
+    """Gate that rejects rows far outside a stream's interval while that can be a contact; immutable.
 
     The gate is open while a changed robot is learnt again: it lets contacts through.
     """
@@ -274,8 +271,7 @@ def _time_jumps(t: Array, after: float | None, before: float | None) -> Mask:
 
 
 def _longest_increasing(values: list[float]) -> list[int]:
-    """Return the places of a longest strictly increasing subsequence: of equal values the first, of two ends the
-    lower."""
+    """Return places of a longest strictly increasing subsequence: of equal values the first, of ends the lower."""
     ends: list[float] = []
     places: list[int] = []
     previous = [-1] * len(values)

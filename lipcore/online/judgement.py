@@ -82,8 +82,7 @@ class LoggedJudgement:
 
     @staticmethod
     def from_json(report: Mapping[str, Any]) -> LoggedJudgement:
-        """Read what `to_json` returned, from the log's report of a batch. Release 0.2.0 did not store `doubted`,
-        `aside` and `accepted_scale`."""
+        """Read what `to_json` returned; release 0.2.0 did not store `doubted`, `aside` and `accepted_scale`."""
         departure, surprise, answered, scale = (
             report.get(name) for name in ("departure", "surprise", "answered", "accepted_scale")
         )
@@ -129,8 +128,10 @@ class ModelRecord:
         return replace(self, detector=detector, departure=logged.departure, held=logged.held)
 
     def follow(self, logged: LoggedJudgement, record: Record | None, recent: bool) -> ModelRecord:
-        """Return the record after a batch that was judged by another process or before a restart. recent: whether the
-        batch is still within the detector's window."""
+        """Return the record after a batch that was judged by another process or before a restart.
+
+        recent: whether the batch is still within the detector's window.
+        """
         before = self.decided() if self.held and not logged.waited else self
         if not recent:
             return replace(before, departure=logged.departure, held=logged.held)

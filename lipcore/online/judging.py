@@ -151,8 +151,7 @@ def judge(
 
 
 def gate_rows(batch: PredictedBatch, gate: ContactGate, waiting: bool, options: JudgeOptions) -> GateResult:
-    """Separate contacts from rows that fit. waiting: whether learning is paused by a change, which stops the gate,
-    too."""
+    """Separate contacts from rows that fit. waiting: whether a change paused learning, which stops the gate, too."""
     rows = batch.rows.take(batch.predicted)
     contact = is_contact(rows.tau, batch.mean, batch.std, batch.noise_std, options.contact_threshold)
     after = gate if waiting else gate.step(rows.time, contact)
@@ -231,7 +230,9 @@ def _follow_scale(
     batch: PredictedBatch, rows: Rows, known: ScaleRecord | None, options: JudgeOptions
 ) -> tuple[ScaleRecord | None, IntervalCoverage | None]:
     """Return the scale of a stream's intervals after a batch, and their coverage; None if intervals do not adapt.
-    Another version starts from its own scale."""
+
+    Another version starts from its own scale.
+    """
     if not options.adaptive_intervals or batch.interval_scores is None:
         return None, None
     if known is None or known.version != batch.version:
@@ -244,8 +245,10 @@ def _follow_scale(
 
 
 def _extend_opening(opening: Opening, batch: PredictedBatch, rows: Rows, carried: float | None) -> Opening:
-    """Return a stream's opening after these rows. Rows of a payload noticed in this batch were predicted without it,
-    and are left out."""
+    """Return a stream's opening after these rows, without those of a payload that was noticed in this batch.
+
+    Such rows were predicted without the payload.
+    """
     own = np.full(len(rows), True) if carried is None or batch.trained is None else rows.time < carried
     spread = batch.scale * np.sqrt(batch.bare**2 + batch.noise_std**2)
     return opening.step(rows.time[own], rows.weight[own], (rows.tau - batch.mean)[own], spread[own])

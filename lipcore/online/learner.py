@@ -62,7 +62,7 @@ class OnlineModel:
         _check(forgetting_s)
         statistics = base.posterior.statistics
         if statistics is None:
-            raise ValueError("the model has learnt online already, expected one as trained")
+            raise ValueError("the model has already learnt online, expected a model as trained")
         # (I + A) ŵ = b: samples with the mean ŵ have A ŵ = b − ŵ, and the prior around ŵ adds the rest
         centre = base.posterior.basis.root.T @ base.posterior.weights
         sums = Statistics(statistics.a, statistics.b - centre, 0.0)
@@ -106,8 +106,7 @@ class OnlineModel:
         return replace(self, before=self.now, now=fresh)
 
     def with_forgetting(self, forgetting_s: float | None) -> OnlineModel:
-        """Return the model with another forgetting from now on. forgetting_s: s, None for never; raise ValueError
-        unless positive."""
+        """Return the model with another forgetting time, s; None: never. Raise ValueError unless positive."""
         _check(forgetting_s)
         return replace(self, forgetting_s=forgetting_s)
 
@@ -129,8 +128,10 @@ class OnlineModel:
 
     @property
     def training_torque(self) -> TrainingTorque | None:
-        """Return the version's, for the fallback of predictions. It is None after a change and with forgetting: these
-        widen the variance of torques whose mean is still the best estimate."""
+        """Return the version's, for the fallback of predictions; None after a change and with forgetting.
+
+        These widen the variance of torques whose mean is still the best estimate.
+        """
         return self.base.training_torque if self.before is None and self.forgetting_s is None else None
 
     def model(self, floor: Array | None = None) -> TorqueModel:
@@ -216,8 +217,7 @@ class OnlineModel:
 
 
 def uncovered(base: TorqueModel, rows: Rows) -> NDArray[np.bool_]:
-    """Return which rows lie outside a version's basis, (N,): it leaves more variance of a torque open than the noise
-    has."""
+    """Return which rows, (N,), lie outside a version's basis: it leaves more variance of a torque than noise has."""
     basis, motion = base.posterior.basis, rows.motion()
     open_ = basis.uncovered(motion, basis.features(motion))
     novel = np.asarray((open_ > base.posterior.noise_variance).any(1))

@@ -26,8 +26,9 @@ MIN_FLOOR_STDS = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """Quality of predictions made before `rows` rows were learnt, per joint (n,). e = tau − mean, s² = std² +
-    noise_std².
+    """Quality of predictions made before `rows` rows were learnt, per joint (n,).
+
+    e = tau − mean, s² = std² + noise_std².
 
     Records add: `a + b` is the record of the rows of both, associative and commutative up to rounding. Means are stored
     instead of sums, and spread is merged by Chan's formula, so that a large constant torque does not cancel digits.

@@ -52,14 +52,13 @@ class Walk:
 
     @classmethod
     def of(cls, base: TorqueModel, time_s: float, since: float | None = None) -> Walk:
-        """Return the walk of a version as trained; raise ValueError for an invalid time, or an estimator without
-        friction."""
+        """Return the walk of a version as trained; raise ValueError if time is invalid or friction is not modelled."""
         if not 0 < time_s < math.inf:
             raise ValueError(f"friction_walk_s is {time_s!r}, expected a positive number of seconds, or None")
         basis = base.posterior.basis
         term = next((each for each in basis.linear if isinstance(each, FrictionKernel)), None)
         if term is None:
-            raise ValueError(f"estimator {base.estimator.name!r} has no friction that could drift")
+            raise ValueError(f"estimator {base.estimator.name!r} has no friction term")
         places = np.arange(len(basis))[basis.rows(term)]
         # whitened, a coefficient is in units of its prior deviation, and B is diagonal for it
         size = np.abs((basis.root.diagonal() * base.posterior.weights)[places]).clip(WALK.min_size)
@@ -113,8 +112,7 @@ class Regime:
         return self.folded(walk, 0).statistics
 
     def solve(self, walk: Walk | None = None, first: int = 0) -> Solution:
-        """Return the posterior of the whitened variables, with the friction of the newest epoch. first: see
-        `Solution`."""
+        """Return the posterior of the whitened variables, with the newest epoch's friction. first: see `Solution`."""
         return solve(self.sums(walk), self.centre, first)
 
     def folded(self, walk: Walk | None, kept: int = WALK.kept) -> Regime:
@@ -161,8 +159,10 @@ class Regime:
         return replace(self, statistics=past, epochs=tuple(epochs), shared=False)
 
     def detached(self, drifts: bool) -> Regime:
-        """Return the regime with sums of its own, which can be overwritten. drifts: whether there are epochs. They are
-        copied one by one when rows are added, because most of them get none."""
+        """Return the regime with sums of its own, which can be overwritten. drifts: whether there are epochs.
+
+        Epochs are copied one by one when rows are added, because most of them get none.
+        """
         epochs = tuple(replace(each, shared=True) for each in self.epochs)
         if drifts:
             return replace(self, epochs=epochs, shared=True)

@@ -63,8 +63,10 @@ class IntervalCoverage:
 
     @staticmethod
     def of(state: AdaptiveScale, seen: IntervalScores) -> IntervalCoverage:
-        """Return the coverage of a batch, by the scale before it. Every measurement counts: contacts, rows that await a
-        decision, and rows at rest."""
+        """Return the coverage of a batch, by the scale before it.
+
+        Every measurement counts: contacts, rows that await a decision, and rows at rest.
+        """
         rows, off = len(seen.score), outside(seen.score, applied_factor(state, seen)).sum(axis=0)
         return IntervalCoverage(rows, rows - off)
 
@@ -86,6 +88,5 @@ class IntervalCoverage:
 
 
 def applied_factor(state: AdaptiveScale, seen: IntervalScores) -> Array:
-    """Return the factors on half widths of the intervals that were returned: (n,), or (N, n) if the stream returned
-    them."""
+    """Return the factors on the half widths of returned intervals: (n,), or (N, n) if the stream returned them."""
     return state.factor if seen.factor is None else seen.factor

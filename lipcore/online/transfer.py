@@ -118,7 +118,7 @@ def load(base: TorqueModel, payload: bytes) -> OnlineModel:
         regimes = {name: _regime(tensors, name) for name in REGIMES if f"{name}/numbers" in tensors}
         walk_s, walk_since = tensors["walk"].tolist() if "walk" in tensors else (ABSENT, ABSENT)
     except (KeyError, SafetensorError, RuntimeError, TypeError, ValueError) as error:
-        raise ValueError(f"these bytes are no state of an online model: {error}") from error
+        raise ValueError(f"the bytes are not the state of an online model: {error}") from error
     if not same:
         raise ValueError("the state is of another version")
     size = len(base.posterior.basis)
@@ -133,8 +133,7 @@ def load(base: TorqueModel, payload: bytes) -> OnlineModel:
 
 
 def _trained(base: TorqueModel) -> Array:
-    """Return what identifies a version. It is read from the version's files, so that it is the same in every
-    process."""
+    """Return what identifies a version: read from its files, so that it is the same in every process."""
     statistics = base.posterior.statistics
     return base.posterior.weights if statistics is None else statistics.b
 

@@ -65,6 +65,5 @@ class Window:
         self._buckets = tuple((bucket[0] + moved, *bucket[1:]) for bucket in self._buckets)
 
     def _holds(self, number: int, now: float) -> bool:
-        """Whether a bucket lies in the window before a Unix time, s. Buckets that a wrong clock dated after it do
-        not."""
+        """Whether a bucket lies in the window before a Unix time, s; one that a wrong clock dated later does not."""
         return -self.seconds < (number + 1) * self._length - now <= 2 * self._length

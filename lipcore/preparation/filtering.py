@@ -61,7 +61,7 @@ def list_derived(given: tuple[str, ...]) -> tuple[str, ...]:
     """Return those of dq and ddq that must be derived; raise PreparationError if q or tau is missing."""
     for name in ("q", "tau"):
         if name not in given:
-            raise PreparationError(name, "missing", "columns of it, as nothing else tells")
+            raise PreparationError(name, "missing", "columns for it, as it cannot be derived")
     return tuple(name for name in ("dq", "ddq") if name not in given)
 
 

@@ -236,7 +236,7 @@ def _rows(
             kept[again] = False
             steps.append(record.describe_rows_left_out("repeated", repeated, int(again[0]) + 1))
     if not kept.any():
-        raise PreparationError("rows", 0, "rows without missing values")
+        raise PreparationError("rows", 0, "at least one row without missing values")
     times = np.arange(len(kept), dtype=np.float64) if t is None else t
     if kept.all():
         return _Rows(times, numbers, None, None, 0, None, 0)
@@ -251,12 +251,12 @@ def _check_times_are_not_needed(given: tuple[str, ...], to_derive: tuple[str, ..
     elif should_low_pass(given, recipe):
         why = "signals are to be low-passed"
     elif recipe.rate_hz is not None:
-        why = f"a rate of {recipe.rate_hz:g} Hz is asked for"
+        why = f"a rate of {recipe.rate_hz:g} Hz is requested"
     elif recipe.trim_s:
         why = "the ends of the recording are to be cut off"
     else:
         return
-    raise PreparationError("t", "missing", f"times, since {why}")
+    raise PreparationError("t", "missing", f"times, because {why}")
 
 
 def _lay_out(

@@ -49,7 +49,7 @@ def clock_of(t: Array, episode: Array, gap_steps: float, jitter: float, bridge_s
     step = np.diff(t)
     within = np.diff(episode) == 0
     if not within.any():
-        raise PreparationError("episode", "one sample each", "episodes of several samples")
+        raise PreparationError("episode", "another one for every sample", "episodes of several samples")
     usual = float(np.median(step[within]))
     if usual < 1 / MAX_RATE:
         raise PreparationError("t", f"in steps of {usual:g}", f"seconds, in steps of at least {1 / MAX_RATE:g}")

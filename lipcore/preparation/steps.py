@@ -13,8 +13,8 @@ def describe_rows_left_out(why: str, rows: int, first: int) -> Step:
     """Return the step of rows left out, the first of them counted from 1. why: "missing", "corrupt" or "repeated"."""
     reason = {
         "missing": "with missing values",
-        "corrupt": "that fit neither what went before nor what follows",
-        "repeated": "whose time stamp was there before",
+        "corrupt": "inconsistent with neighbouring rows",
+        "repeated": "with a repeated time stamp",
     }[why]
     text = f"{_count(rows, 'row')} {reason} left out, the first is row {first}"
     return {"step": "leave_out", "why": why, "rows": rows, "first_row": first, "text": text}
@@ -22,7 +22,7 @@ def describe_rows_left_out(why: str, rows: int, first: int) -> Step:
 
 def describe_episode_split(episodes: int) -> Step:
     """Return the step that separates episodes."""
-    return {"step": "split", "by": "episode", "episodes": episodes, "text": f"{episodes} episodes kept apart"}
+    return {"step": "split", "by": "episode", "episodes": episodes, "text": f"{episodes} episodes kept separate"}
 
 
 def describe_gap_split(gaps: int, longer_than_s: float) -> Step:
@@ -33,7 +33,7 @@ def describe_gap_split(gaps: int, longer_than_s: float) -> Step:
 
 def describe_resampling(rate: float, worst: float, bridged_s: float) -> Step:
     """Return the step that replaces uneven stamps by an even clock. bridged_s: longest step that is no gap."""
-    text = f"put on an even clock of {rate:.4g} Hz: steps of time differed from the usual one by up to {worst:.0%}"
+    text = f"resampled to an even {rate:.4g} Hz: time steps deviated from the usual one by up to {worst:.0%}"
     return {
         "step": "resample",
         "rate_hz": rate,
@@ -46,7 +46,7 @@ def describe_resampling(rate: float, worst: float, bridged_s: float) -> Step:
 
 def describe_low_pass(work: Filters, delay_s: float) -> Step:
     """Return the step of a Butterworth filter, run both ways or, as in a live stream, forwards only."""
-    late = "without delay" if work.form == "acausal" else f"as in a live stream, {delay_s:.3g} s late"
+    late = "without delay" if work.form == "acausal" else f"as in a live stream, with a delay of {delay_s:.3g} s"
     return {
         "step": "low_pass",
         "quantities": list(work.low_passed),

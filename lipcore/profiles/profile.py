@@ -136,8 +136,7 @@ class Profile:
     def explain_missing_urdf(self) -> str:
         """Return a sentence with the reason why rigid bodies cannot be built by this name."""
         return (
-            f"{self.title} has a profile, for data, but no URDF is installed for it: for rigid bodies upload its URDF "
-            "and give the id"
+            f"the profile of {self.title} has no URDF: to use its rigid bodies, upload a URDF and give its id as robot"
         )
 
 
@@ -174,7 +173,7 @@ def from_urdf(text: str, name: str) -> Profile:
         acceleration=np.full(n_joints, np.nan),
         torque=limits.torque,
         effort="unknown",
-        effort_note="A URDF does not say what the effort field means: say it with `effort`.",
+        effort_note="A URDF does not specify the meaning of the effort field: give it with `effort`.",
         torque_constants=None,
         joint_aliases=((),) * n_joints,
         urdf=text,

@@ -177,7 +177,9 @@ def _payload_mask(simulation: Simulation, t: Array) -> Array | None:
 def _per_joint(name: str, value: float | Sequence[float], robot: Robot) -> Array:
     array = np.asarray(value, dtype=np.float64)
     if array.shape not in ((), (robot.n_joints,)):
-        raise ValueError(f"{name} has shape {array.shape}, expected one number or {robot.n_joints}, one a joint")
+        raise ValueError(
+            f"{name} has shape {array.shape}, expected one number, or {robot.n_joints}, one for each joint"
+        )
     if not np.isfinite(array).all() or (array < 0).any():
         raise ValueError(f"{name} is {value}, expected finite numbers of at least 0")
     return np.broadcast_to(array, (robot.n_joints,))

@@ -109,7 +109,7 @@ class RigidBody:
             listed = f"; `joints` lists {', '.join(urdf_joints)}" if matched == "list" else ""
             raise _mismatch(robot, tuple(movable), names, listed)
         if len(types) != len(names):
-            raise ValueError(f"joint_types has {len(types)} entries, expected {len(names)}, one a joint")
+            raise ValueError(f"joint_types has {len(types)} entries, expected {len(names)}, one for each joint")
         for data_name, kind, joint in zip(names, types, (movable[joint] for joint in urdf_joints), strict=True):
             if MOVABLE[joint.kind] != kind:
                 raise JointMismatchError(

@@ -110,7 +110,7 @@ def _check_tree(links: Sequence[str], joints: Sequence[UrdfJoint]) -> None:
     """Raise UrdfError unless joints connect links to one tree, each with a unique name."""
     for kind, names in (("links", links), ("joints", [joint.name for joint in joints])):
         if twice := [name for name, count in Counter(names).items() if count > 1]:
-            raise UrdfError(f"two {kind} are called {twice[0]!r}, expected names of their own")
+            raise UrdfError(f"two {kind} are called {twice[0]!r}, expected distinct names")
     below: dict[str, list[str]] = {name: [] for name in links}
     moved: dict[str, str] = {}
     for joint in joints:
@@ -184,7 +184,7 @@ class _Scanner:
 
 def _name(text: str, what: str) -> str:
     if not text.isprintable():
-        raise UrdfError(f"{what} is called {text[:80]!r}, expected a name that can be printed")
+        raise UrdfError(f"{what} is called {text[:80]!r}, expected a printable name")
     return text
 
 

@@ -52,7 +52,7 @@ def train_auto(task: Task) -> TorqueModel:
     try:
         held = hold_out(task.samples, task.joint_types)
     except SplitError as error:
-        return _train_simplest(work, f"too little to hold some out and judge by: {error}")
+        return _train_simplest(work, f"no other estimator was trained, as too few samples can be held out: {error}")
     contest = EstimatorComparison(work, held)
     contest.run()
     chosen, reason = contest.verdict()
@@ -192,7 +192,7 @@ class EstimatorComparison:
     def verdict(self) -> tuple[str, str]:
         """Return the chosen estimator, and the reason."""
         if len(self.entries) == 1:
-            return RIGID, "it explains the held-out torque to the sensor's noise, so no other estimator was trained"
+            return RIGID, "it explains the held-out torque within the sensor noise, so no other estimator was trained"
         # the simplest first: an estimator with an arm has smaller errors away from the data
         answers = {name: self.entries[name].answer for name in (RIGID, LOCAL, CHAIN)}
         local = self.entries[LOCAL].model
@@ -239,7 +239,7 @@ class EstimatorComparison:
             answer = torque.interval
             density = -float(evaluate(samples.tau, *answer).nlpd.sum())
             if not np.isfinite(density):
-                raise ValueError("what it predicts is not finite")
+                raise ValueError("its predictions are not finite")
         except FAILURES as error:
             return EstimatorResult(time.monotonic() - began, error=error)
         return EstimatorResult(time.monotonic() - began, model, answer, density)

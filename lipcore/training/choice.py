@@ -50,7 +50,7 @@ def choose_estimator(held_out: HeldOutSamples, answers: Mapping[str, TorqueDistr
     for name in others:
         objection = _objection(held_out, answers[chosen], answers[name], surely=name != LOCAL)
         if objection is None:
-            better = "no worse here" if name == LOCAL else "better, also at the edge of the data"
+            better = "no worse on the held-out rows" if name == LOCAL else "better, also at the edge of the data"
             reasons.append(f"{name} replaces {chosen}: it is {better}")
             chosen = name
         else:
@@ -67,11 +67,11 @@ def _objection(
     """
     total = compare(held_out.samples, simple, other).total
     if surely and not total.mean[0] < -total.half_width[0]:
-        return "its log density is not higher beyond chance"
+        return "its log density is not significantly higher"
     if not total.mean[0] <= total.standard_error[0]:
         return "its log density is lower by more than one standard error"
     if surely and not held_out.edge.any():
-        return "no states at the edge of the data could be held out"
+        return "no rows at the edge of the data could be held out"
     places = ((held_out.nmse, ""), (held_out.edge_nmse, " at the edge of the data"))
     for nmse, place in places if held_out.edge.any() else places[:1]:
         if not _mean(nmse(other)) <= 1.02 * _mean(nmse(simple)):

@@ -73,7 +73,7 @@ def sum_samples(
     total = Total.empty(len(summing.basis))
     for first in range(0, len(samples), CHUNK):
         if cancelled is not None and cancelled():
-            raise FitCancelledError("cancelled while the samples were summed up")
+            raise FitCancelledError("cancelled while statistics were computed")
         part = slice(first, first + CHUNK)
         summing.add(total, samples.rows(part), None if weights is None else weights[part])
     motion = (samples.q, samples.dq, samples.ddq)

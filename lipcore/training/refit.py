@@ -69,7 +69,7 @@ def _choose_corrected(arm: TorqueModel, before: Selection, local: TorqueModel) -
     """Return an arm that `auto` chose before, or the corrected one if all rows show a gain."""
     if not corrected_joints(local.fit):
         return arm
-    reason = shortened(f"{LOCAL} replaces {RIGID}: of all rows it gains; before: {before['reason']}")
+    reason = shortened(f"{LOCAL} replaces {RIGID}: it is better on all rows; before: {before['reason']}")
     return replace(local, selection={**before, "chosen": LOCAL, "reason": reason})
 
 

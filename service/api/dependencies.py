@@ -1,4 +1,4 @@
-"""What endpoints ask for in their signatures: parts of the application, pages of lists, the name of a request."""
+"""Dependencies of endpoints: parts of the application, pages of lists, and the idempotency key."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.training.queue import JobQueue
 
 
 def of_app(name: str) -> Callable[[Request], Awaitable[Any]]:
-    """A dependency of routes: what the running application keeps under this name."""
+    """Return a dependency that reads an attribute of the application's state."""
 
     async def kept(request: Request) -> Any:
         return getattr(request.app.state, name)
@@ -48,8 +48,8 @@ StoppingDep = Annotated[StopState, Depends(of_app("stopping"))]
 
 
 def _page(
-    limit: Annotated[int | None, Query(ge=1, description=f"Most items of this page; {DEFAULT_PAGE} by default")] = None,
-    cursor: Annotated[str | None, Query(description="`next_cursor` of the page before")] = None,
+    limit: Annotated[int | None, Query(ge=1, description=f"Max items per page. Default: {DEFAULT_PAGE}")] = None,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page")] = None,
 ) -> Page:
     if limit is None:
         limit = min(DEFAULT_PAGE, MAX_PAGE)
@@ -68,8 +68,8 @@ KeyHeader = Annotated[
         alias=HEADER,
         max_length=100,
         pattern=r"^[!-~]+$",
-        description="A name that the client gives to this request, of printable characters without spaces, so that it "
-        "can send it again when the answer is lost: it is done once, and what it made is answered each time. Another "
-        "request under the same key is a conflict",
+        description="A unique key of this request, chosen by the client: printable characters without spaces. With it, "
+        "the request can be retried if the answer is lost: it runs once, and every retry returns the same result. "
+        "Another request with the same key is answered 409",
     ),
 ]

@@ -1,4 +1,4 @@
-"""One shape for the errors of every route, {"error": {code, message, detail}}; below /v2 it is {"error": message}."""
+"""Error responses: {"error": {code, message, detail}} for every route, and {"error": message} below /v2."""
 
 from __future__ import annotations
 
@@ -34,13 +34,15 @@ from service.storage import errors as storage_errors
 logger = logging.getLogger(__name__)
 
 OPEN_INFERENCE = "/v2"
-"""Routes below it speak the Open Inference Protocol, whose errors have a shape of their own."""
+"""Prefix of the Open Inference Protocol, whose errors have their own form."""
 ERROR_CODE = "lipserve.error_code"
-"""Key of the code in the ASGI scope of a request that ended in an error: for metrics and logs."""
+"""Key of the error code in the ASGI scope of a failed request, for metrics and logs."""
+UNEXPECTED_ERROR = "Unexpected error. See the service's log for details."
+"""Message of `internal_error`."""
 
 
 def responses(*errors: type[ServiceError]) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI responses of a route for the errors it can answer with."""
+    """Return the OpenAPI responses of a route for the errors that it can answer with."""
     out: dict[int | str, dict[str, Any]] = {}
     for error in errors:
         meaning = (error.__doc__ or "").strip()
@@ -51,7 +53,7 @@ def responses(*errors: type[ServiceError]) -> dict[int | str, dict[str, Any]]:
 
 
 def install(app: FastAPI) -> None:
-    """Make every error of the app take the one shape."""
+    """Install the error handlers in an application."""
     app.add_exception_handler(ServiceError, _service_error)
     app.add_exception_handler(MissingExtraError, _missing_extra)
     app.add_exception_handler(RequestValidationError, _validation_error)
@@ -63,18 +65,18 @@ def install(app: FastAPI) -> None:
 
 
 def answer_of(scope: Scope, error: ServiceError) -> JSONResponse:
-    """The answer to a request that ends in an error."""
+    """Return the response for an error."""
     answer = _answer(scope, error.status, error.code, error.message, error.detail)
     answer.headers.update(error.headers)
     return answer
 
 
 async def refuse(error: ServiceError, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer a request, or one for a WebSocket, with an error: for middleware, whose exceptions nobody handles."""
+    """Answer an HTTP or WebSocket request with an error, for middleware, whose exceptions have no handler."""
     answer = answer_of(scope, error)
     if scope["type"] == "websocket":
         await receive()  # the request to connect
-    # Starlette sends what is right for either, as long as the server takes denials of WebSockets in HTTP
+    # Starlette sends the right messages for both, if the server supports denial responses of WebSockets
     await answer(scope, receive, send)
 
 
@@ -99,7 +101,7 @@ async def _missing_extra(request: Request, error: Exception) -> JSONResponse:
 async def _validation_error(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
     detail = [_explain(item) for item in error.errors()[:20]]
-    message = sentence(detail[0]) if detail else "the request is not valid"
+    message = sentence(detail[0]) if detail else "The request is not valid."
     return _answer(request.scope, 422, "invalid_request", message, detail)
 
 
@@ -112,15 +114,15 @@ def _explain(item: dict[str, Any]) -> Problem:
     if isinstance(value, bytes):
         return problem("body", value, "JSON, with the content-type application/json")
     if kind == "missing":
-        return problem(field, "missing", "a value")
+        return problem(field, "missing", "a value", f"`{field}` is required.")
     if kind == "extra_forbidden":
-        return problem(field, value, "no field of that name")
+        return problem(field, value, "a known field", f"Unknown field `{readable(field[:200])}`.")
     return problem(field, value, message.removeprefix("Input should be ").replace("String should", "to", 1))
 
 
 async def _cut_off(request: Request, error: Exception) -> JSONResponse:
-    """The client went away before its body was there: nobody reads this, but it is no failure of the service."""
-    return answer_of(request.scope, invalid_request("body", "cut off", "the whole of it"))
+    """Answer a client that disconnected while sending its body, so that it does not count as a failure here."""
+    return answer_of(request.scope, invalid_request("body", "incomplete", "the whole body"))
 
 
 async def _http_error(request: Request, error: Exception) -> JSONResponse:
@@ -128,17 +130,17 @@ async def _http_error(request: Request, error: Exception) -> JSONResponse:
     codes = {404: "not_found", 405: "method_not_allowed", 408: "request_timeout", 413: "too_large", 429: "busy"}
     message = str(error.detail)
     if error.status_code in (404, 405):
-        message = f"no route {request.method} {readable(request.url.path[:200])}: /docs lists all"
+        message = f"There is no route {request.method} {readable(request.url.path[:200])}. /docs lists all routes."
     answer = _answer(request.scope, error.status_code, codes.get(error.status_code, "http_error"), message)
     answer.headers.update(error.headers or {})
-    # Starlette names the methods of one route, but others have the same path; it knows those of a folder
+    # Starlette only lists the methods of one route, but several have the same path; it is right for mounted folders
     if error.status_code == 405 and (methods := _methods(request)):
         answer.headers["allow"] = ", ".join(methods)
     return answer
 
 
 def _methods(request: Request) -> list[str]:
-    """What may be asked for at the path of a request."""
+    """Return the allowed methods at the path of a request."""
     allowed: set[str] = set()
     for route in iter_route_contexts(request.app.routes):
         pattern, methods = getattr(route, "path_regex", None), getattr(route, "methods", None)
@@ -150,14 +152,14 @@ def _methods(request: Request) -> list[str]:
 async def _storage_error(request: Request, error: Exception) -> JSONResponse:
     answer = storage_errors.translate_error(error)
     if answer is None and isinstance(error, FileNotFoundError) and not request.app.state.storage.files.in_place():
-        answer = StorageUnavailableError("files cannot be read or written now: the home of the service is gone")
+        answer = StorageUnavailableError("Files cannot be read or written: the home folder of the service is missing.")
     if answer is None:
-        raise error  # as unexpected as any other
+        raise error  # an unexpected error
     logger.error("%s at %s: %s", answer.code, request.scope["path"], error)
     return answer_of(request.scope, answer)
 
 
 async def _unexpected_error(request: Request, error: Exception) -> JSONResponse:
-    if request.scope.get(ERROR_CODE) != "internal_error":  # else answered before, and seen again on its way out
+    if request.scope.get(ERROR_CODE) != "internal_error":  # else already answered: the exception is raised again
         logger.error("unexpected error at %s %s", request.method, request.url.path, exc_info=error)
-    return _answer(request.scope, 500, "internal_error", "an unexpected error; the service's log says more")
+    return _answer(request.scope, 500, "internal_error", UNEXPECTED_ERROR)

@@ -1,4 +1,4 @@
-"""What monitoring reads at /metrics, in the format of Prometheus: computed when it is asked for."""
+"""The route `/metrics` for Prometheus, and the metrics of the system and of requests. Computed on request."""
 
 from __future__ import annotations
 
@@ -24,21 +24,24 @@ from service.telemetry.readiness import Readiness
 
 
 class System(Collector):
-    """Of one service. Its own process has Prometheus's usual `process_…` metrics. Not for the event loop."""
+    """Metrics of one service and its processes. Not for the event loop.
 
-    build = MetricKind("gauge", "lipserve_build_info", "1; the version of LIPServe", ("version",))
+    The service's own process has the usual `process_…` metrics of Prometheus.
+    """
+
+    build = MetricKind("gauge", "lipserve_build_info", "Always 1; the label is the version of LIPServe", ("version",))
     parts = MetricKind(
-        "gauge", "lipserve_ready", "1 where a part is in order, 0 where /health/ready names it", ("part",)
+        "gauge", "lipserve_ready", "1 if a part of the service works, 0 if /health/ready reports it", ("part",)
     )
-    used = MetricKind("gauge", "lipserve_disk_used_bytes", "Bytes of the home's files, by what they are of", ("what",))
-    free = MetricKind("gauge", "lipserve_disk_free_bytes", "Bytes that the disk of the home has free")
+    used = MetricKind("gauge", "lipserve_disk_used_bytes", "Size of the files in the home folder, by kind", ("what",))
+    free = MetricKind("gauge", "lipserve_disk_free_bytes", "Free bytes on the disk of the home folder")
     memory = MetricKind(
-        "gauge", "lipserve_process_memory_bytes", "Resident memory of the processes that learn and train", ("process",)
+        "gauge", "lipserve_process_memory_bytes", "Resident memory of learner and training processes", ("process",)
     )
     cpu = MetricKind(
         "counter",
         "lipserve_process_cpu_seconds_total",
-        "CPU time of the processes that learn and train which run now, s",
+        "CPU time of the running learner and training processes, s",
         ("process",),
     )
 
@@ -47,7 +50,7 @@ class System(Collector):
         self._own = ProcessCollector(registry=None)
 
     def describe(self) -> list[Metric]:
-        """Nothing: what there is depends on the platform."""
+        """Return nothing: the metrics depend on the platform."""
         return []
 
     def collect(self) -> Iterator[Metric]:
@@ -57,7 +60,7 @@ class System(Collector):
         yield self.parts.of(([part.name], float(part.state != "failed")) for part in parts)
         files, usage = self._storage.files, self._storage.disk.usage()
         used = {what: measure(folder) for what, folder in files.folders.items()}
-        used["other"] = max(usage.used - sum(used.values()), 0)  # the database above all; measured a moment before
+        used["other"] = max(usage.used - sum(used.values()), 0)  # mainly the database; measured slightly earlier
         yield self.used.of(([what], size) for what, size in used.items())
         yield self.free.of([((), usage.free)])
         yield from self._own.collect()
@@ -65,7 +68,7 @@ class System(Collector):
 
 
 def _processes() -> Iterator[Metric]:
-    """What the processes take that the service has started, where the platform says."""
+    """Yield memory and CPU time of the service's child processes, if the platform reports them."""
     kinds = {"process_resident_memory_bytes": System.memory, "process_cpu_seconds": System.cpu}
     figures: dict[str, dict[str, float]] = defaultdict(lambda: defaultdict(float))
     for process in multiprocessing.active_children():
@@ -78,12 +81,12 @@ def _processes() -> Iterator[Metric]:
 
 
 class Traffic(Collector):
-    """What the meters have counted since the service started."""
+    """Metrics of requests and streams since the service started."""
 
     duration = MetricKind(
         "histogram",
         "lipserve_request_duration_seconds",
-        "Time from a request's arrival until its answer began, s; of a stream, until it was accepted",
+        "Time from a request's arrival to the start of its answer, s; for a stream, until it was accepted",
         ("method", "route", "model"),
     )
     requests = MetricKind(
@@ -93,26 +96,26 @@ class Traffic(Collector):
         ("method", "route", "status"),
     )
     errors = MetricKind(
-        "counter", "lipserve_errors_total", "Requests that were answered with an error, by its code", ("route", "code")
+        "counter", "lipserve_errors_total", "Requests answered with an error, by error code", ("route", "code")
     )
-    in_flight = MetricKind("gauge", "lipserve_requests_in_flight", "Requests that are being answered now")
-    streams = MetricKind("gauge", "lipserve_streams_open", "WebSocket connections that are open now")
+    in_flight = MetricKind("gauge", "lipserve_requests_in_flight", "Requests that are being answered")
+    streams = MetricKind("gauge", "lipserve_streams_open", "Open WebSocket connections")
     frames = MetricKind(
         "histogram",
         "lipserve_stream_frame_duration_seconds",
-        "Time from the arrival of a stream's frame until its answer was ready, s; frames that were refused left out",
+        "Time from the arrival of a stream's frame until its answer was ready, s; without frames that failed",
         ("model",),
     )
     late = MetricKind(
         "counter",
         "lipserve_stream_late_total",
-        "Answers of streams after their deadline: the frame's budget, else LIPSERVE_STREAM_DEADLINE_S",
+        "Stream answers after their deadline: the frame's budget or else LIPSERVE_STREAM_DEADLINE_S",
         ("model",),
     )
     frame_errors = MetricKind(
         "counter",
         "lipserve_stream_errors_total",
-        "Frames that were answered with an error, by its code",
+        "Frames answered with an error, by error code",
         ("model", "code"),
     )
 
@@ -120,7 +123,7 @@ class Traffic(Collector):
         self._meters = meters
 
     def describe(self) -> list[Metric]:
-        """Nothing: what there is depends on the requests."""
+        """Return nothing: the metrics depend on the requests."""
         return []
 
     def collect(self) -> Iterator[Metric]:
@@ -164,19 +167,20 @@ router = APIRouter(tags=["health"], route_class=Route)
 
 @router.get(
     "/metrics",
-    summary="Metrics for Prometheus",
+    summary="Retrieve metrics for Prometheus",
     response_class=PlainTextResponse,
     responses={
         200: {
-            "description": "Text of Prometheus, or OpenMetrics where that is accepted",
+            "description": "Metrics in Prometheus text format, or OpenMetrics if the request accepts it",
             "content": {"text/plain": {"example": EXAMPLE}},
         }
     },
 )
 @needs(READ)
 def metrics(request: Request) -> Response:
-    """Latency and errors of requests and streams, training jobs, quality and lag of models that learn, disk, memory,
-    and which parts of the service are in order. docs/reference/metrics.md lists all.
+    """Return metrics of requests, streams, training jobs, learning models, disk, memory and readiness.
+
+    docs/reference/metrics.md lists all metrics.
     """
     registry = CollectorRegistry()
     for collector in request.app.state.collectors:

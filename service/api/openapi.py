@@ -1,5 +1,4 @@
-"""What the OpenAPI document says of keys and scopes, and of errors that more than one route answers; the table of all
-error codes."""
+"""Adds API keys, scopes and common errors to the OpenAPI document, and the table of all error codes."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ from starlette.routing import Route as StarletteRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.api.access.scopes import SCOPES, Rules
-from service.api.errors import OPEN_INFERENCE
+from service.api.errors import OPEN_INFERENCE, UNEXPECTED_ERROR
 from service.foundation import errors
 from service.foundation.errors import ServiceError
 
@@ -30,17 +29,17 @@ POLICY = (
     "default-src 'self'; script-src 'self'{scripts}; style-src 'self' 'unsafe-inline'; img-src 'self' data:; "
     "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
 )
-"""Nothing comes from other hosts, no other site frames it, and only the scripts run that the page came with."""
+"""Content security policy: nothing from other hosts, no frames on other sites, only the page's own scripts."""
 
 
 class Guarded:
-    """A page of the documentation, or a file of it, with a policy of what it may do."""
+    """A page or file of the documentation with a content security policy."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer as the application does, which makes pages in one piece."""
+        """Answer as the application, which sends pages in one piece, and add the policy."""
         started: Message | None = None
 
         async def with_policy(message: Message) -> None:
@@ -62,15 +61,14 @@ class Guarded:
 
 
 def policy(page: bytes) -> str:
-    """The policy of one or more pages: of the scripts that stand in them each runs as it is, by its sha256."""
+    """Return the policy of one or more pages, which allows their inline scripts by sha256."""
     scripts = sorted(set(re.findall(rb"(?s)<script>(.*?)</script>", page)))
     hashes = (b64encode(hashlib.sha256(each).digest()).decode() for each in scripts)
     return POLICY.format(scripts="".join(f" 'sha256-{each}'" for each in hashes))
 
 
 def install(app: FastAPI, keys_needed: bool) -> None:
-    """Complete the document that the application makes of its routes, once it is asked for; see `add_scopes`. Guard the
-    pages that show it."""
+    """Complete the application's OpenAPI document on first use, and add a policy to the pages that show it."""
     pages = ("/docs", "/docs/oauth2-redirect", "/static-offline-docs")
     for route in app.router.routes:
         if isinstance(route, Mount | StarletteRoute) and route.path in pages:
@@ -89,9 +87,9 @@ def install(app: FastAPI, keys_needed: bool) -> None:
 
 
 def add_scopes(document: dict[str, Any], rules: Rules, keys_needed: bool) -> None:
-    """Write the scheme of keys into the document, and into every operation the scope that it needs.
+    """Add the API key scheme to the document, and the needed scope to every operation.
 
-    keys_needed: whether the service that is described asks for keys; one that does not takes requests without as well.
+    If not `keys_needed`, requests without a key are allowed as well.
     """
     schemes = document.setdefault("components", {}).setdefault("securitySchemes", {})
     schemes[SCHEME] = {"type": "http", "scheme": "bearer", "description": DESCRIPTION}
@@ -107,13 +105,13 @@ def add_scopes(document: dict[str, Any], rules: Rules, keys_needed: bool) -> Non
 
 METHODS = ("get", "put", "post", "delete")
 BEFORE_ROUTES = {
-    (405, "method_not_allowed"): "The path is there, the method is not: the header `Allow` lists those that are."
+    (405, "method_not_allowed"): "The path does not support the method. The header `Allow` lists the supported ones."
 }
-"""Errors that are no class, because no route raises them."""
+"""Errors that no route raises, so they have no class."""
 
 
 def error_table() -> str:
-    """All error codes with status and meaning, in Markdown."""
+    """Return a Markdown table of all error codes with status and meaning."""
     rows = {(kind.status, kind.code): _meaning(kind) for kind in _below(ServiceError)}
     rows |= BEFORE_ROUTES | {(ServiceError.status, ServiceError.code): _meaning(ServiceError)}
     lines = [f"| {status} | `{code}` | {meaning} |" for (status, code), meaning in sorted(rows.items())]
@@ -129,13 +127,13 @@ def _add_errors(document: dict[str, Any], rules: Rules) -> None:
 
 
 def _add(path: str, method: str, operation: dict[str, Any], rules: Rules) -> None:
-    """Add to an operation's answers those that are not its own."""
+    """Add the common errors to an operation's responses."""
     kinds: list[type[ServiceError]] = [
         errors.InvalidRequestError,  # of an unknown query parameter
         *(errors.ForbiddenError, errors.RateLimitedError, ServiceError, errors.NotReadyError),
     ]
     if rules.table[method.upper(), path].scope is not None:
-        # routes without a key use no database either
+        # routes without a key do not use the database
         kinds += (errors.UnauthorizedError, errors.StorageUnavailableError)
     if "requestBody" in operation:
         kinds += (errors.RequestTimeoutError, errors.TooLargeError, errors.UnsupportedMediaTypeError)
@@ -152,7 +150,7 @@ def _add(path: str, method: str, operation: dict[str, Any], rules: Rules) -> Non
         if status not in own or (not protocol and f"`{kind.code}`" not in answer["description"]):
             answer["description"] = f"{answer['description']} {meaning}".strip()
     for status, answer in answers.items():
-        if int(status) >= 400:  # FastAPI thinks of the media type of what is answered without an error
+        if int(status) >= 400:  # FastAPI sets the media type of the successful answer
             (schema,) = answer["content"].values()
             answer["content"] = {"application/json": schema}
     operation["responses"] = dict(sorted(answers.items()))
@@ -165,7 +163,7 @@ def _answer(schema: str) -> dict[str, Any]:
 
 def _meaning(kind: type[ServiceError]) -> str:
     if kind is ServiceError:
-        return "An unexpected error: the service's log says more."
+        return UNEXPECTED_ERROR
     return " ".join((kind.__doc__ or "").split())
 
 

@@ -1,5 +1,4 @@
-"""The outermost middleware: every request gets an id, is counted, and logged where that tells something; and what is
-reported to OpenTelemetry."""
+"""The outermost middleware: request ids, metrics and request log; and the settings of OpenTelemetry."""
 
 from __future__ import annotations
 
@@ -27,13 +26,13 @@ MONITORING = frozenset(
     }
 )
 QUIET = frozenset({f"{_OF_CALLS}ModelInfer"})
-"""Routes of control loops that no request over HTTP reaches."""
+"""gRPC routes of control loops."""
 
 
 def telemetry(settings: Settings) -> TelemetryConfig:
-    """What FastAPI shall report; raise MissingExtraError.
+    """Return FastAPI's telemetry settings; raise MissingExtraError.
 
-    Metrics are at /metrics, and what went wrong is in the log, with the id of the request: neither goes this way.
+    Only traces are exported. Metrics are at /metrics, and errors are in the log with the id of the request.
     """
     on = settings.opentelemetry
     if on:
@@ -52,30 +51,31 @@ request_lines = logging.getLogger("service.requests")
 logger = logging.getLogger(__name__)
 
 MAX_REFUSALS_PER_S = 10
-"""Refused requests of one route and code that are logged in a second; the others are counted."""
+"""Max log lines per second for refused requests of one route, status and code. Further ones are only counted."""
 
 
 class RequestLog:
-    """One line for each request, with three exceptions.
+    """The request log: one line per request, with two exceptions.
 
-    Queries and batches of a control loop, and what monitoring asks for, are logged from `slow_s` on or where they fail:
-    a line takes longer than an answer. Of equal refusals, `most_refusals` a second are logged and the others counted:
-    a loop that asks wrong, or without a key, must not fill the disk. quiet: routes of control loops.
+    - Requests of control loops (`quiet`) and of monitoring are logged only if they fail or take `slow_s` or longer: a
+      log line takes longer than their answer.
+    - Of equal refusals, `max_refusals` a second are logged and the others counted, so that a control loop with wrong
+      requests does not fill the disk.
     """
 
-    def __init__(self, quiet: Iterable[str], slow_s: float, most_refusals: int) -> None:
-        self.quiet, self.slow_s, self.most_refusals = frozenset(quiet) | QUIET | MONITORING, slow_s, most_refusals
-        self._refusals: dict[tuple[str, int, str], tuple[int, int]] = {}  # the second, and how many there were in it
+    def __init__(self, quiet: Iterable[str], slow_s: float, max_refusals: int) -> None:
+        self.quiet, self.slow_s, self.max_refusals = frozenset(quiet) | QUIET | MONITORING, slow_s, max_refusals
+        self._refusals: dict[tuple[str, int, str], tuple[int, int]] = {}  # the current second and the number in it
 
     def may_log(self, route: str, seconds: float) -> bool:
-        """Whether a request that was not refused may be worth a line: a quick look, before more is made of it."""
+        """Return whether a successful request may be logged: a quick check before `log_end`."""
         return route not in self.quiet or seconds >= self.slow_s or request_lines.isEnabledFor(logging.DEBUG)
 
-    def answered(self, scope: Scope, kind: Kind, seconds: float) -> None:
-        """Log a request that has been answered; of a stream, its end."""
+    def log_end(self, scope: Scope, kind: Kind, seconds: float) -> None:
+        """Log an answered request or the end of a stream."""
         slow, missed = seconds >= self.slow_s and kind.status != 101, 0
         if kind.status >= 400:
-            level, missed = logging.INFO if kind.status < 500 else logging.WARNING, self._missed(kind)
+            level, missed = logging.INFO if kind.status < 500 else logging.WARNING, self._count_skipped(kind)
         else:
             level = logging.DEBUG if kind.route in self.quiet and not slow else logging.INFO
         if missed < 0 or not request_lines.isEnabledFor(level):
@@ -88,24 +88,24 @@ class RequestLog:
         if missed:
             fields["not_logged"] = missed
         what = "stream closed" if kind.status == 101 else "request"
-        request_lines.log(level, what, extra={"fields": _of(scope, kind.route) | fields})
+        request_lines.log(level, what, extra={"fields": _request_fields(scope, kind.route) | fields})
 
-    def opened(self, scope: Scope, route: str) -> None:
-        """Log a stream that begins."""
+    def log_open(self, scope: Scope, route: str) -> None:
+        """Log the start of a stream."""
         if request_lines.isEnabledFor(logging.INFO):
-            request_lines.info("stream opened", extra={"fields": _of(scope, route)})
+            request_lines.info("stream opened", extra={"fields": _request_fields(scope, route)})
 
-    def _missed(self, kind: Kind) -> int:
-        """How many equal refusals were not logged before this one; -1 where this one is not either."""
+    def _count_skipped(self, kind: Kind) -> int:
+        """Return how many equal refusals were skipped before this one; -1 if this one is skipped too."""
         now, sort = int(monotonic()), (kind.route, kind.status, kind.code)
         second, count = self._refusals.get(sort, (now, 0))
-        missed, count = (0, count) if second == now else (max(count - self.most_refusals, 0), 0)
+        missed, count = (0, count) if second == now else (max(count - self.max_refusals, 0), 0)
         self._refusals[sort] = now, count + 1
-        return missed if count < self.most_refusals else -1
+        return missed if count < self.max_refusals else -1
 
 
-def _of(scope: Scope, route: str) -> dict[str, Any]:
-    """What a line says of a request: its address without the query, cut, as clients choose both."""
+def _request_fields(scope: Scope, route: str) -> dict[str, Any]:
+    """Return the log fields of a request. Path and method are cut, as clients choose them."""
     fields = {"route": route, "path": scope["path"][:200]}
     if "method" in scope:
         fields["method"] = scope["method"][:16]
@@ -117,14 +117,14 @@ def _of(scope: Scope, route: str) -> dict[str, Any]:
 
 
 WEBSOCKET = "WEBSOCKET"
-"""Stands for the method of a request for a stream."""
+"""Stands in for the method of a WebSocket request."""
 
 
 class RequestContext:
-    """Names a request, answers the name in `X-Request-ID`, and measures how long the answer took to begin.
+    """Middleware that gives a request an id, returns it in `X-Request-ID`, and measures the time until the answer.
 
-    What the application did not expect is answered here, so that this answer too has its id and is counted; the
-    exception goes on, as servers and tests want to see it.
+    Unexpected exceptions are answered here, so that these answers have an id and are counted too. The exception is then
+    raised again for the server and for tests.
     """
 
     def __init__(self, app: ASGIApp, meters: Meters, log: RequestLog, tracing: bool = False) -> None:
@@ -145,7 +145,7 @@ class RequestContext:
         status, began = 0, perf_counter()
         answered = began
 
-        # no coroutine of its own, which would cost every frame of a stream
+        # a plain function: a coroutine would take time for every frame of a stream
         def note_status(message: Message) -> Awaitable[None]:
             nonlocal status, answered
             if not status and (begun := _status_of(message)):
@@ -153,7 +153,7 @@ class RequestContext:
                 message["headers"] = [*message.get("headers", ()), (REQUEST_ID, name.encode())]
                 if begun == 101:
                     self.requests.streams += 1
-                    self.log.opened(scope, _template(scope))
+                    self.log.log_open(scope, _template(scope))
             return send(message)
 
         self.requests.in_flight += method is not WEBSOCKET
@@ -167,7 +167,7 @@ class RequestContext:
             self.requests.streams -= status == 101
             now = perf_counter()
             if not status:
-                status, answered = 499, now  # the client went away
+                status, answered = 499, now  # the client disconnected
             path, seconds = _template(scope), now - began
             model: str = scope["path_params"].get("model", "") if path else ""
             kind = (method, path, model, status, scope.get(ERROR_CODE, ""))
@@ -176,10 +176,10 @@ class RequestContext:
                 durations = self.requests.find(Kind(*kind), status < 400 or _exists(scope, model))
             durations.add(answered - began)
             if status >= 400 or self.log.may_log(path, seconds):
-                self.log.answered(scope, Kind(*kind), seconds)
+                self.log.log_end(scope, Kind(*kind), seconds)
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send, error: Exception, begun: bool) -> None:
-        """Answer a request that failed unexpectedly, unless its answer has begun."""
+        """Answer a request after an unexpected exception, unless its answer has begun."""
         if begun or scope["type"] != "http":
             logger.error("unexpected error at %s", scope["path"][:200], exc_info=error)
             return
@@ -189,7 +189,7 @@ class RequestContext:
 
 
 def _status_of(message: Message) -> int:
-    """Status of the answer that a message begins, 0 where it begins none."""
+    """Return the status of the answer that a message starts, 0 for other messages."""
     kind: str = message["type"]
     if kind.endswith("http.response.start"):
         status: int = message["status"]
@@ -198,13 +198,13 @@ def _status_of(message: Message) -> int:
 
 
 def _template(scope: Scope) -> str:
-    """Path of the route that a request has reached, with the names of its parameters; empty where it reached none."""
-    route = scope.get("route") or scope.get("endpoint")  # Starlette names no route of a WebSocket
+    """Return the path template of the request's route, empty if no route matched."""
+    route = scope.get("route") or scope.get("endpoint")  # Starlette sets no route for a WebSocket
     path: str = getattr(route, "path", "")
     return path
 
 
 def _exists(scope: Scope, model: str) -> bool:
-    """Whether the model of a refused request is known to exist: not where nobody has asked for it since the start."""
+    """Return whether the model of a refused request is known. Models not used since the start are unknown."""
     loaded = getattr(scope["app"].state, "loaded", None)
     return loaded is not None and loaded.newest(model) is not None

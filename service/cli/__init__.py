@@ -1,4 +1,4 @@
-"""The command line: `lipserve`. One file per command, imported when it is run; `main` lists them."""
+"""Command line `lipserve`: `main` lists the commands, the other modules hold them."""
 
 from service.cli.main import app, main
 

@@ -1,4 +1,4 @@
-"""`lipserve predict`, `lipserve evaluate`, and `lipserve bench`: how long this machine takes to answer."""
+"""`lipserve predict`, `lipserve evaluate` and `lipserve bench`."""
 
 from __future__ import annotations
 
@@ -24,38 +24,37 @@ predict_app = alone()
 def predict(
     model: Model,
     q: Annotated[str, typer.Option("--q", help="Positions, rad, separated by commas.")],
-    dq: Annotated[str | None, typer.Option("--dq", help="Velocities, rad/s; zero by default.")] = None,
-    ddq: Annotated[str | None, typer.Option("--ddq", help="Accelerations, rad/s²; zero by default.")] = None,
+    dq: Annotated[str | None, typer.Option("--dq", help="Velocities, rad/s. Default: zero.")] = None,
+    ddq: Annotated[str | None, typer.Option("--ddq", help="Accelerations, rad/s². Default: zero.")] = None,
     components: Annotated[
         str | None,
         typer.Option(
-            help=f"Parts of the dynamics, separated by commas: {', '.join(COMPONENTS)}.",
+            help=f"Components to return too, separated by commas: {', '.join(COMPONENTS)}.",
             autocompletion=lambda: COMPONENTS,
         ),
     ] = None,
     tau: Annotated[str | None, typer.Option("--tau", help="Torques, N·m, for forward_dynamics.")] = None,
     payload: Annotated[
         str | None,
-        typer.Option(
-            help="What the arm carries: kg, and x,y,z of its centre of mass in the frame of the last link, m."
-        ),
+        typer.Option(help="Payload mass,x,y,z: mass, kg, and centre of mass in the frame of the last link, m."),
     ] = None,
     payload_inertia: Annotated[
         str | None,
-        typer.Option(help="Its inertia xx,xy,xz,yy,yz,zz about that centre, kg·m²; that of a point by default."),
+        typer.Option(help="Payload inertia xx,xy,xz,yy,yz,zz about its centre of mass, kg·m². Default: a point mass."),
     ] = None,
     version: Version = None,
     alias: Alias = None,
     min_revision: Annotated[
-        int | None, typer.Option(min=0, help="Answer with this revision or a later one: what was taught is in it.")
+        int | None,
+        typer.Option(min=0, help="Min revision of the answer, to include acknowledged observations."),
     ] = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Ask a model for the torque at one motion.
+    """Predict the torque at one motion.
 
-    tau_std is how well the model knows the torque, noise_std what a measurement scatters around it: an interval that
-    shall hold measurements needs both.
+    tau_std is the standard deviation of the model's torque, noise_std that of a measurement around it. A prediction
+    interval for measurements needs both.
     """
     position = numbers("--q", q)
     zeros = [0.0] * len(position)
@@ -79,17 +78,17 @@ def predict(
     if as_json:
         print_json(answer)
         return
-    from service.cli.tables import prediction_tables  # noqa: PLC0415 - takes long to import; help needs none
+    from service.cli.tables import prediction_tables  # noqa: PLC0415 - slow import, not needed for help
 
     for table in prediction_tables(answer):
         out.print(table)
 
 
 def _body(payload: str | None, inertia: str | None) -> dict[str, Any] | None:
-    """A payload of the numbers that options give; raise CommandError where they are not as many as they should be."""
+    """Return the payload that the options describe; raise CommandError for a wrong number of values."""
     if payload is None:
         if inertia is not None:
-            raise CommandError("--payload-inertia is given, expected --payload beside it")
+            raise CommandError("--payload-inertia requires --payload")
         return None
     mass, *com = _as_many("--payload", payload, "mass,x,y,z")
     body: dict[str, Any] = {"mass": mass, "com": com}
@@ -117,44 +116,45 @@ def evaluate(
     version: Version = None,
     alias: Alias = None,
     robot: Annotated[
-        str | None, typer.Option(help="Of a recording: a profile such as panda, or the id of an uploaded URDF.")
+        str | None,
+        typer.Option(help="Robot of a recording to upload: profile such as panda, or id of an uploaded URDF."),
     ] = None,
     held_out: Annotated[
-        bool, typer.Option("--held-out", help="Only on what the training of the version held out of it.")
+        bool, typer.Option("--held-out", help="Evaluate only on the part that the version's training held out.")
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Compare a model with a recording, joint by joint. On what it was trained on, the figures flatter."""
+    """Evaluate a model on a recording, joint by joint. On training data, the figures are too optimistic."""
     with connected(url) as client:
         dataset = dataset_of(client, data, **given(robot=robot))
         answer = client.evaluate(model, dataset, version, alias, "held_out" if held_out else "all")
     if as_json:
         print_json(answer)
         return
-    from service.cli.tables import evaluation_table  # noqa: PLC0415 - takes long to import; help needs none
+    from service.cli.tables import evaluation_table  # noqa: PLC0415 - slow import, not needed for help
 
     out.print(evaluation_table(answer))
     print_warnings(answer.warnings)
 
 
-bench_app = group("Measure this machine.")
-bench_app.callback()(lambda: None)  # a group, of its one command
+bench_app = group("Measure the latency of a service from this machine.")
+bench_app.callback()(lambda: None)  # makes it a group although it has one command
 WARM_UP = 20
-"""Queries of each way before those that are timed."""
+"""Number of queries before the timed ones, for each transport."""
 
 
 @bench_app.command()
 def latency(
     model: Model,
-    queries: Annotated[int, typer.Option(min=1, max=1_000_000, help="Of each way to ask.")] = 2000,
+    queries: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of queries for each transport.")] = 2000,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Time torque queries with tau_std, one after another, over a stream and over HTTP.
+    """Measure the latency of sequential torque queries with tau_std, over a stream and over HTTP.
 
-    Motions are drawn from the range that the model was trained on. Times include Python's client.
+    Motions are random, within the training range of the model. Times include the Python client.
     """
-    import numpy as np  # noqa: PLC0415 - takes long to import; help needs none
+    import numpy as np  # noqa: PLC0415 - slow import, not needed for help
 
     with connected(url) as client:
         served = client.model(model)
@@ -174,7 +174,7 @@ def latency(
         print_json({"model": model, "version": version.version, "queries": queries, "milliseconds": figures})
         return
     table = Table(
-        "ms a query",
+        "ms per query",
         "p50",
         "p99",
         "largest",
@@ -186,7 +186,7 @@ def latency(
 
 
 def _timed(ask: Callable[[int], object], queries: int) -> list[float]:
-    """Milliseconds of each query; ask: sends query number k and waits for its answer."""
+    """Return the time of each query, ms. ask: sends query k and waits for its answer."""
     times = []
     for number in range(queries + WARM_UP):
         began = time.perf_counter()

@@ -1,4 +1,4 @@
-"""`lipserve audit`: who changed what of which model."""
+"""`lipserve audit`: list changes to models."""
 
 from __future__ import annotations
 
@@ -20,22 +20,24 @@ if TYPE_CHECKING:
     from lipserve.records.audit import AuditEntry
 
 app = alone()
-WIDEST = 60
-"""Characters of a value that the table shows; JSON has all."""
+MAX_VALUE_CHARACTERS = 60
+"""Max length of a value in the table; JSON has the whole value."""
 
 
 @app.command()
 def audit(
     model: Annotated[str | None, typer.Option(help="Only this model.", autocompletion=connecting.models)] = None,
-    key: Annotated[str | None, typer.Option(help="Only changes by the API key of this id.")] = None,
-    change: Annotated[str | None, typer.Option(help="Only one kind of change, as `alias moved`.")] = None,
-    since: Annotated[str | None, typer.Option(help="Only from this moment on, as 2026-11-24T08:00:00Z.")] = None,
-    until: Annotated[str | None, typer.Option(help="Only before this moment.")] = None,
+    key: Annotated[str | None, typer.Option(help="Only changes made with the API key of this id.")] = None,
+    change: Annotated[str | None, typer.Option(help="Only this kind of change, e.g. `alias moved`.")] = None,
+    since: Annotated[
+        str | None, typer.Option(help="Only changes at or after this time, e.g. 2026-11-24T08:00:00Z.")
+    ] = None,
+    until: Annotated[str | None, typer.Option(help="Only changes before this time.")] = None,
     limit: Limit = 50,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """List who changed what of which model, newest first: versions, aliases, how it learns. Needs the scope admin."""
+    """List changes to versions, aliases and learning options, newest first. Requires the scope admin."""
     with connected(url) as client:
         entries = list(islice(client.audit(model, key, change, since, until), limit))
     if as_json:
@@ -58,4 +60,4 @@ def _what(entry: AuditEntry) -> str:
 
 def _value(value: Any) -> str:
     text = "-" if value is None else json.dumps(value, ensure_ascii=False)
-    return text if len(text) <= WIDEST else f"{text[: WIDEST - 1]}…"
+    return text if len(text) <= MAX_VALUE_CHARACTERS else f"{text[: MAX_VALUE_CHARACTERS - 1]}…"

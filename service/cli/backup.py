@@ -1,4 +1,4 @@
-"""`lipserve backup` and `lipserve restore`: a home in one file, taken while a service runs on it, and back."""
+"""`lipserve backup` and `lipserve restore`."""
 
 from __future__ import annotations
 
@@ -21,33 +21,37 @@ ERRORS = (HomeError, DatabaseError)
 
 @backup_app.command("backup")
 def backup_(
-    file: Annotated[Path, typer.Argument(help="File to write, a new one.")],
+    file: Annotated[Path, typer.Argument(help="File to write. It must not exist.")],
     as_json: Json = False,
 ) -> None:
-    """Copy the home LIPSERVE_HOME into one file, as of one moment; also while the service runs.
+    """Copy the home LIPSERVE_HOME into one consistent file. Works while the service is running.
 
-    All that was acknowledged before the command began is in it. Keep it as secret as the home.
+    The backup contains everything that was acknowledged before the command started. It contains secrets: protect it
+    like the home.
     """
     _say("copied", backup(_own("back up").home, file), as_json)
 
 
 @restore_app.command("restore")
 def restore_(
-    file: Annotated[Path, typer.Argument(help="File that `lipserve backup` has written.")],
+    file: Annotated[Path, typer.Argument(help="File written by `lipserve backup`.")],
     as_json: Json = False,
 ) -> None:
-    """Make the home LIPSERVE_HOME, which has to be empty, of a backup. API keys revoked since are valid again."""
+    """Restore a backup into the home LIPSERVE_HOME, which must be empty.
+
+    API keys that were revoked after the backup are valid again.
+    """
     _say("restored", restore(_own("restore").home, file), as_json)
 
 
-def _own(what: str) -> Settings:
-    """Settings of a home that holds everything; raise CommandError where it shares a database and files."""
+def _own(action: str) -> Settings:
+    """Return the settings; raise CommandError if services share a database and files instead of one home."""
     settings = settings_of()
     if settings.database_url is not None:
         raise CommandError(
-            f"LIPSERVE_DATABASE_URL is set: there is no home to {what}, but a database and files that services share",
-            "use pg_dump and pg_restore for PostgreSQL, and versioning of the bucket (or snapshots of the mounted "
-            "folder) for files: docs/scaling.md",
+            f"cannot {action} a home: LIPSERVE_DATABASE_URL is set, so data are in a shared database and shared files",
+            "use pg_dump and pg_restore for PostgreSQL, and bucket versioning (or snapshots of the mounted folder) for "
+            "files: docs/scaling.md",
         )
     return settings
 

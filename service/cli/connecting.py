@@ -1,6 +1,7 @@
-"""A client of the service for a command: what the service refuses is shown with what to do about it, and a training job
-is watched until it ends. And names that a shell completes: those of a running service, if it answers within a second;
-they are asked for with the least of a client, as nothing may be imported that takes time."""
+"""Access of commands to a service: errors with hints, uploads, waiting for jobs, shell completion.
+
+Completion must be fast: it queries a running service for at most a second and imports no client.
+"""
 
 from __future__ import annotations
 
@@ -48,9 +49,9 @@ class _UnixConnection(http.client.HTTPConnection):
 
 
 def ask(url: str, path: str, timeout: float = 1.0) -> Any:
-    """Return the JSON at a path of a service, with the key in LIPSERVE_API_KEY.
+    """Return the JSON at a path of a service; send the key in LIPSERVE_API_KEY.
 
-    Raise OSError, HTTPException or ValueError where none answers in time, it refuses, or it is no such service.
+    Raise OSError, HTTPException or ValueError if there is no valid answer in time.
     """
     parts = urlsplit(url)
     connection: http.client.HTTPConnection
@@ -70,36 +71,39 @@ def ask(url: str, path: str, timeout: float = 1.0) -> Any:
 
 
 Names = list[str | tuple[str, str]]
-"""What may stand there, with what it is."""
+"""Completions, with descriptions if there are any."""
 
 
 def models(context: typer.Context) -> Names:
-    """Names of models."""
+    """Complete names of models."""
     return _listed(
         context,
         "/v1/models?limit=100",
-        lambda each: (each["name"], f"version {each['serving_version'] or 'none'} answers"),
+        lambda each: (each["name"], f"serving version: {each['serving_version'] or 'none'}"),
     )
 
 
 def datasets(context: typer.Context) -> Names:
-    """Ids of data sets with their names."""
+    """Complete ids of data sets."""
     return _listed(context, "/v1/datasets?limit=100", lambda each: (each["id"], each["name"]))
 
 
 def jobs(context: typer.Context) -> Names:
-    """Ids of jobs with what they train."""
+    """Complete ids of jobs."""
     return _listed(context, "/v1/jobs?limit=100", lambda each: (each["id"], f"{each['state']}: {each['model']}"))
 
 
 def versions(context: typer.Context) -> Names:
-    """Versions of the model that the command line names."""
+    """Complete versions of the model on the command line."""
     return [(str(each["version"]), each["estimator"]) for each in _model(context).get("versions", ())]
 
 
 def aliases(context: typer.Context) -> Names:
-    """Aliases of the model that the command line names."""
-    return [("serving", "what answers"), *((name, f"version {at}") for name, at in _model(context)["aliases"].items())]
+    """Complete aliases of the model on the command line."""
+    return [
+        ("serving", "the serving version"),
+        *((name, f"version {at}") for name, at in _model(context)["aliases"].items()),
+    ]
 
 
 def _model(context: typer.Context) -> dict[str, Any]:
@@ -121,14 +125,14 @@ def _asked(context: typer.Context, path: str) -> Any:
         return None
 
 
-MOST_NAMES = 20
-"""Models that a hint lists, at most."""
+MAX_HINT_MODELS = 20
+"""Max number of models that a hint lists."""
 
 
 @contextmanager
 def connected(url: str) -> Iterator[Client]:
-    """A client of the service at `url`; raise CommandError with a hint where it refuses or is not there."""
-    # takes long to import, and help needs none of it
+    """Yield a client of the service at `url`; raise CommandError with a hint if it fails or refuses a request."""
+    # slow imports, not needed for help
     from lipserve import ApiError, Client, ServiceUnreachableError  # noqa: PLC0415
     from lipserve.exchange import StreamError  # noqa: PLC0415
 
@@ -143,18 +147,18 @@ def connected(url: str) -> Iterator[Client]:
 
 
 def dataset_of(client: Client, data: str, **reading: Any) -> str:
-    """Return the id or name of a data set: one that is given, or the id of that of a recording, which is uploaded."""
+    """Return the id or name of a data set; a recording is uploaded first."""
     path = recording_of(data)
     if path is None and reading:
-        expected = "expected a recording: a data set was read when it was uploaded"
-        raise CommandError(f"data is {data!r} beside {', '.join(FLAGS[name] for name in reading)}, {expected}")
+        options = ", ".join(FLAGS[name] for name in reading)
+        raise CommandError(f"data is {data!r}: {options} can only be used with a recording, not with a data set")
     if path is None:
         return data
     if not reading and (made := _made_of(client, path)) is not None:
         note(f"{path.name} is data set {made.id}")
         return made.id
     adding = f"`lipserve data add {shlex.quote(data)}`"
-    hint = f"{adding} takes options that say how to read it; then give the recording here again"
+    hint = f"upload it with {adding}, which has options for reading; then run this command again"
     with advised(hint):
         dataset = upload(client, [path], **reading)
     note(f"{path.name} is data set {dataset.id}")
@@ -162,8 +166,7 @@ def dataset_of(client: Client, data: str, **reading: Any) -> str:
 
 
 def _made_of(client: Client, path: Path) -> Dataset | None:
-    """The data set that a file was made before, however it was read; None where there is none. Raise CommandError where
-    it was read in several ways."""
+    """Return the data set that was made from a file earlier, or None; raise CommandError if several differ."""
     with path.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     made = list(islice(client.datasets(digest), 50))
@@ -171,8 +174,9 @@ def _made_of(client: Client, path: Path) -> Dataset | None:
     if len(alike) > 1:
         listed = ", ".join(f"{each.id} ({_reading_of(each)})" for each in reversed(alike.values()))
         raise CommandError(
-            f"{path.name} was uploaded before, read in {len(alike)} ways: expected the id of one of them: {listed}",
-            "`lipserve data show ID` tells how a data set was read; `lipserve data delete ID` forgets one",
+            f"{path.name} was uploaded before and read in {len(alike)} different ways: give the id of one data set: "
+            f"{listed}",
+            "`lipserve data show ID` shows how a data set was read; `lipserve data delete ID` deletes one",
         )
     return next(iter(alike.values()), None)
 
@@ -184,7 +188,7 @@ def _reading_of(dataset: Dataset) -> str:
 
 @contextmanager
 def advised(hint: str | None) -> Iterator[None]:
-    """Say what to do about a recording that the service cannot read; raise CommandError."""
+    """Add a hint to the error if the service cannot read a recording; raise CommandError."""
     from lipserve import ApiError  # noqa: PLC0415 - as above
 
     try:
@@ -197,22 +201,22 @@ def advised(hint: str | None) -> Iterator[None]:
 
 
 def recording_of(data: str) -> Path | None:
-    """The file that an argument names; None where it names a data set. Raise CommandError for a file that is none."""
+    """Return the file that an argument names, None if it names a data set; raise CommandError for a missing file."""
     path = Path(data)
     if path.is_file():
         return path
     if path.is_dir() or (path.suffix.lower() in SUFFIXES and path.name != data):
         raise CommandError(
             f"data is {data!r}, expected a recording, or the id or name of a data set",
-            "`lipserve data list` shows the data sets that exist",
+            "`lipserve data list` shows the data sets",
         )
     return None
 
 
 def upload(client: Client, paths: Sequence[Path], name: str | None = None, **reading: Any) -> Dataset:
-    """Upload a recording; the same content, called and read alike, is the same data set each time.
+    """Upload a recording; the same content with the same name and options gives the same data set.
 
-    paths: its file, or tables of text that are to be joined.
+    paths: one file, or text tables to be joined.
     """
     content = hashlib.sha256(json.dumps([name or paths[0].name, reading], sort_keys=True).encode())
     for path in paths:
@@ -226,7 +230,7 @@ def upload(client: Client, paths: Sequence[Path], name: str | None = None, **rea
         joined = Path(folder) / "joined.zip"
         with zipfile.ZipFile(joined, "w") as archive:
             for path in paths:
-                entry = zipfile.ZipInfo(path.name)  # of no date: equal files make equal archives
+                entry = zipfile.ZipInfo(path.name)  # without date: equal files give equal archives
                 entry.compress_type = zipfile.ZIP_DEFLATED
                 with path.open("rb") as file, archive.open(entry, "w", force_zip64=True) as member:
                     shutil.copyfileobj(file, member)
@@ -235,37 +239,46 @@ def upload(client: Client, paths: Sequence[Path], name: str | None = None, **rea
 
 
 def _existing(url: str, message: str) -> str | None:
-    """What there is instead of what was not found."""
+    """Return a hint that lists existing items when one was not found."""
     if message.startswith("no model"):
         try:
-            names = [each["name"] for each in ask(url, f"/v1/models?limit={MOST_NAMES}")["items"]]
-        except (OSError, HTTPException, ValueError, KeyError):  # a hint is no reason to fail otherwise
+            names = [each["name"] for each in ask(url, f"/v1/models?limit={MAX_HINT_MODELS}")["items"]]
+        except (OSError, HTTPException, ValueError, KeyError):  # keep the original error
             return None
         return (
-            f"models that exist: {', '.join(names)}" if names else "there is no model yet: `lipserve train` makes one"
+            f"existing models: {', '.join(names)}" if names else "there are no models yet: `lipserve train` makes one"
         )
     return next((hint for start, hint in _LISTS.items() if message.startswith(start)), None)
 
 
 _LISTS = {
-    "no dataset": "`lipserve data list` shows the data sets that exist; a recording is given by its path",
-    "no job": "`lipserve jobs list` shows the jobs that exist",
-    "no version": "`lipserve models show MODEL` shows the versions that exist",
-    "no alias": "`lipserve models show MODEL` shows the aliases that exist",
+    "no dataset": "`lipserve data list` shows the data sets; to use a recording, give its path",
+    "no job": "`lipserve jobs list` shows the jobs",
+    "no version": "`lipserve models show MODEL` shows the versions",
+    "no alias": "`lipserve models show MODEL` shows the aliases",
 }
 
 
 PATIENCE, PAUSE = 300.0, 1.0
-"""Longest wait for a service that has gone away, and between two looks for it, s."""
+"""Max time to wait for an unreachable service, and time between two attempts, s."""
 
 
 def watch(client: Client, job: Job, cancels: bool, patience: float = PATIENCE) -> tuple[Job, bool]:
-    """Show a job's progress on standard error until it ends; return it, and whether Ctrl-C ended the watching.
+    """Show a job's progress on standard error until it ends or Ctrl-C is pressed.
 
-    cancels: Ctrl-C cancels the job and waits for its end, a second one does not wait; else the job goes on. patience:
-    longest wait for a service that is away, s; raise CommandError beyond.
+    Args:
+        client: Client of the service.
+        job: The job.
+        cancels: Whether Ctrl-C cancels the job and waits for its end; a second Ctrl-C does not wait.
+        patience: Max time to wait for an unreachable service, s.
+
+    Returns:
+        The job as last seen, and whether Ctrl-C was pressed.
+
+    Raises:
+        CommandError: The service is unreachable for longer than `patience`.
     """
-    from lipserve.progress import job_bar  # noqa: PLC0415 - takes long to import; help needs none
+    from lipserve.progress import job_bar  # noqa: PLC0415 - slow import, not needed for help
 
     try:
         with job_bar(err) as show:
@@ -273,13 +286,13 @@ def watch(client: Client, job: Job, cancels: bool, patience: float = PATIENCE) -
     except KeyboardInterrupt:
         if not cancels:
             return client.job(job.id), True
-        note(f"cancelling {job.id} …")
+        note(f"Cancelling {job.id} …")
         client.cancel(job.id)
         return client.wait(job.id), True
 
 
 def _waited(client: Client, job: str, show: Callable[[Job], None], patience: float) -> Job:
-    """The job as it ended; a service that restarts is waited for, as the job goes on with it."""
+    """Wait for a job to end and return it; if the service restarts, wait for it, because the job continues."""
     from lipserve import ApiError, ServiceUnreachableError  # noqa: PLC0415 - as above
 
     gone: float | None = None
@@ -288,21 +301,21 @@ def _waited(client: Client, job: str, show: Callable[[Job], None], patience: flo
         nonlocal gone
         if gone is not None:
             gone = None
-            note("the service is back")
+            note("the service is reachable again")
         show(seen)
 
     while True:
         try:
             return client.wait(job, look)
         except (ApiError, ServiceUnreachableError) as error:
-            # of a service that starts or ends, or of a proxy in its place
+            # the service is starting or stopping, or a proxy answers instead
             if isinstance(error, ApiError) and error.status not in (429, 502, 503, 504):
                 raise
             now = time.monotonic()
             if gone is None:
                 gone = now
-                note(f"{error}; {job} goes on when the service is back: waiting up to {patience:.0f} s")
+                note(f"{error}; {job} continues when the service is back: waiting up to {patience:.0f} s")
             if now - gone >= patience:
-                hint = f"the job may go on: `lipserve jobs follow {job}` once the service is back"
-                raise CommandError(f"the service has been away for {patience:.0f} s", hint) from error
+                hint = f"the job may continue: run `lipserve jobs follow {job}` when the service is back"
+                raise CommandError(f"the service has been unreachable for {patience:.0f} s", hint) from error
             time.sleep(min(PAUSE, patience))

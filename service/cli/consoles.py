@@ -1,6 +1,6 @@
-"""Where commands print: results to standard output, all else to standard error.
+"""Output of commands: results on standard output, everything else on standard error.
 
-When a command cannot go on, that is what is wrong, then what to do about it.
+An error message says what is wrong; its hint says what to do.
 """
 
 from __future__ import annotations
@@ -16,25 +16,25 @@ from typing import Any, NamedTuple
 from rich.console import Console
 from rich.markup import escape
 
-# room for the inertia matrix of seven joints, where no terminal shows the table
+# without a terminal, wide enough for the inertia matrix of seven joints
 out = Console(soft_wrap=True, width=None if sys.stdout.isatty() else 160)
 err = Console(stderr=True, soft_wrap=True)
 
 
 def echo(text: str) -> None:
-    """Print a line of a result as it is: neither marked up, nor coloured, nor wrapped."""
+    """Print a line of a result without markup, colour or wrapping."""
     out.print(escape(text), highlight=False, soft_wrap=True)
 
 
 def note(text: str) -> None:
-    """Print a line that is no result to standard error."""
+    """Print a line to standard error, without markup."""
     err.print(escape(text), highlight=False, soft_wrap=True)
 
 
 def print_warnings(texts: Iterable[str]) -> None:
-    """Print what to be careful with, a line each."""
+    """Print warnings, one per line."""
     for text in texts:
-        out.print(f"[yellow]careful:[/yellow] {escape(text)}", highlight=False, soft_wrap=True)
+        out.print(f"[yellow]warning:[/yellow] {escape(text)}", highlight=False, soft_wrap=True)
 
 
 def print_json(value: Any, one_line: bool = False) -> None:
@@ -45,7 +45,7 @@ def print_json(value: Any, one_line: bool = False) -> None:
 
 
 def print_result(value: Any, as_json: bool, *lines: str) -> None:
-    """Print a result: as JSON, or else in lines."""
+    """Print a result as JSON, or else as lines of text."""
     if as_json:
         print_json(value)
         return
@@ -54,12 +54,12 @@ def print_result(value: Any, as_json: bool, *lines: str) -> None:
 
 
 def plain(value: Any) -> Any:
-    """Return records, arrays, paths and numbers as JSON knows them; numbers that are not finite become null."""
+    """Convert records, arrays and paths to JSON types; numbers that are not finite become None."""
     if hasattr(value, "as_dict"):  # a record or a result of the client
         return value.as_dict()
     if is_dataclass(value) and not isinstance(value, type):
         return {each.name: plain(getattr(value, each.name)) for each in fields(value)}
-    if hasattr(value, "tolist"):  # of NumPy
+    if hasattr(value, "tolist"):  # a NumPy array or scalar
         return plain(value.tolist())
     if isinstance(value, Mapping):
         return {str(name): plain(each) for name, each in value.items()}
@@ -71,18 +71,18 @@ def plain(value: Any) -> Any:
 
 
 INTERRUPTED = 130
-"""Exit code of what Ctrl-C has ended."""
+"""Exit code after Ctrl-C."""
 
 
 class Explained(NamedTuple):
-    """An error in words. message: what is wrong; hint: what to do about it, where that can be said."""
+    """Error text for the user: what is wrong and, if known, what to do."""
 
     message: str
     hint: str | None = None
 
 
 class CommandError(RuntimeError):
-    """A command cannot go on, and knows what to say."""
+    """Error of a command, with a message and a hint for the user."""
 
     def __init__(self, message: str, hint: str | None = None) -> None:
         super().__init__(message)
@@ -90,9 +90,11 @@ class CommandError(RuntimeError):
 
 
 def explain(error: Exception, expected: tuple[type[Exception], ...] = ()) -> Explained | None:
-    """Return what to say of an error; None for one that is no user's business: a fault, or the shell's broken pipe.
+    """Return the text of an error that the user can act on; None for faults of the program and broken pipes.
 
-    expected: errors that a command's module says are the user's, beside ValueError, OSError and MissingExtraError.
+    Args:
+        error: The error.
+        expected: Errors that the user can act on, beside ValueError, OSError and MissingExtraError.
     """
     if isinstance(error, CommandError):
         return error.explained
@@ -107,38 +109,38 @@ def explain(error: Exception, expected: tuple[type[Exception], ...] = ()) -> Exp
 
 
 def _refusals() -> tuple[type[Exception], ...]:
-    """Errors that tell what a service has said."""
+    """Return the error classes that carry an answer of the service."""
     return _imported({"lipserve.sending": "ApiError", "lipserve.exchange": "StreamError"})
 
 
 def _missing() -> tuple[type[Exception], ...]:
-    """The error of an extra that is not installed."""
+    """Return the error class of an extra that is not installed."""
     return _imported({"lipcore.extras": "MissingExtraError"})
 
 
 def _imported(kinds: Mapping[str, str]) -> tuple[type[Exception], ...]:
-    """Errors by their modules, of those that are imported: others cannot have been raised."""
+    """Return error classes from modules that are imported: others cannot have been raised."""
     return tuple(getattr(sys.modules[module], name) for module, name in kinds.items() if module in sys.modules)
 
 
-START = "start a service with `lipserve serve`, or name another by --url or LIPSERVE_URL"
+START = "start a service with `lipserve serve`, or set the address with --url or LIPSERVE_URL"
 
 
 def hint_of(code: str, status: int | None = None) -> str | None:
-    """What to do where the service refuses with this code and status of HTTP."""
+    """Return what to do about an error code and HTTP status of the service, or None."""
     if status == 401 or code == "unauthorized":
         return (
-            "the service asks for an API key: put yours into LIPSERVE_API_KEY; `lipserve keys create --name me --scope "
-            "admin`, run where the service's home is, makes one"
+            "set LIPSERVE_API_KEY to your API key. To create a key, run `lipserve keys create --name me --scope admin` "
+            "on the machine with the service's home"
         )
     if status == 403 or code == "forbidden":
-        return "this key may not do that: `lipserve keys create --name … --scope …` makes one that may"
+        return "this API key lacks a scope: create one with `lipserve keys create --name … --scope …`"
     if status in (429, 503):
-        return "try again in a moment: the service says that it is busy"
+        return "the service is busy: try again in a moment"
     if code == "unreachable":
         return START
     if code == "closed":
-        return "open the stream again once the service is back: what it has acknowledged is kept"
+        return "open the stream again when the service is back: acknowledged torques are stored"
     return None
 
 

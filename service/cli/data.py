@@ -1,4 +1,4 @@
-"""`lipserve data`: upload recordings, list them, read their reports, and delete them."""
+"""`lipserve data`: add, list, show and delete data sets."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from service.foundation.text import counted
 if TYPE_CHECKING:
     from lipserve.records.datasets import Dataset
 
-app = group("Recordings and their reports: add, list, show and delete them.")
+app = group("Add, list, show and delete data sets (recordings).")
 
 
 def _preparation(help_: str) -> Any:
@@ -32,47 +32,54 @@ def _preparation(help_: str) -> Any:
 @app.command()
 def add(
     files: Annotated[
-        list[Path], typer.Argument(exists=True, dir_okay=False, help=f"Recordings: {', '.join(SUFFIXES)}.")
+        list[Path], typer.Argument(exists=True, dir_okay=False, help=f"Recordings to upload: {', '.join(SUFFIXES)}.")
     ],
-    name: Annotated[str | None, typer.Option(help="A name for people; the file's by default.")] = None,
-    robot: Annotated[str | None, typer.Option(help="A profile such as panda, or the id of an uploaded URDF.")] = None,
-    joint_names: Annotated[str | None, typer.Option(help="Of joints 1..n, separated by commas.")] = None,
-    joints: Annotated[str | None, typer.Option(help="Those to keep, in this order.")] = None,
-    drop_joints: Annotated[str | None, typer.Option("--drop", help="Joints to leave out.")] = None,
-    effort: Annotated[str | None, typer.Option(help="What tau is: measured, commanded or current.")] = None,
-    torque_constants: Annotated[str | None, typer.Option(help="N·m/A of each joint, for motor currents.")] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the data set. Default: the file's name.")] = None,
+    robot: Annotated[str | None, typer.Option(help="Profile such as panda, or id of an uploaded URDF.")] = None,
+    joint_names: Annotated[str | None, typer.Option(help="Names of joints 1 to n, separated by commas.")] = None,
+    joints: Annotated[str | None, typer.Option(help="Joints to keep, in this order.")] = None,
+    drop_joints: Annotated[str | None, typer.Option("--drop", help="Joints to drop. They must not move.")] = None,
+    effort: Annotated[str | None, typer.Option(help="Meaning of tau: measured, commanded or current.")] = None,
+    torque_constants: Annotated[
+        str | None, typer.Option(help="Torque constant of each joint, N·m/A, for motor currents.")
+    ] = None,
     torque_factors: Annotated[
-        str | None, typer.Option(help="By which each joint's torque is multiplied: -1 where its sign is opposite.")
+        str | None, typer.Option(help="Factor on each joint's torque: -1 reverses its sign.")
     ] = None,
     torque_convention: Annotated[str | None, typer.Option(help="gravity_included or gravity_compensated.")] = None,
     column: Annotated[
         list[str] | None,
-        typer.Option(help="What the file calls a quantity: q={joint}/position, or names separated by commas; repeat."),
+        typer.Option(
+            help="Columns of a quantity: a pattern, e.g. q={joint}/position, or names separated by commas. Repeatable."
+        ),
     ] = None,
-    unit: Annotated[list[str] | None, typer.Option(help="Unit of a quantity: q=deg, t=ms; repeat.")] = None,
-    topic: Annotated[str | None, typer.Option(help="Of a bag.")] = None,
-    delimiter: Annotated[str | None, typer.Option(help="Of a CSV.")] = None,
+    unit: Annotated[list[str] | None, typer.Option(help="Unit of a quantity, e.g. q=deg or t=ms. Repeatable.")] = None,
+    topic: Annotated[str | None, typer.Option(help="Topic of a bag to read.")] = None,
+    delimiter: Annotated[str | None, typer.Option(help="Delimiter of a CSV file.")] = None,
     column_names: Annotated[
-        str | None, typer.Option("--columns", help="Names of all columns, of text without any: t,q1..q7,tau1..tau7.")
+        str | None,
+        typer.Option("--columns", help="Names of all columns, for text without a header: t,q1..q7,tau1..tau7."),
     ] = None,
-    dt: Annotated[float | None, typer.Option(help="s from row to row, of a file without times.")] = None,
+    dt: Annotated[float | None, typer.Option(help="Time step, s, for files without times.")] = None,
     join: Annotated[
         bool,
         typer.Option(
             "--join",
-            help="The files are one recording: tables side by side, such as positions.txt torques.txt.",
+            help="Join the files into one recording: tables side by side, such as positions.txt and torques.txt.",
         ),
     ] = False,
-    cutoff: Annotated[float | None, _preparation("Of the low-pass, Hz; 4 by default.")] = None,
-    filtering: Annotated[str | None, _preparation("derived (default), always or never.")] = None,
-    form: Annotated[str | None, _preparation("acausal (default), or causal as on a live stream.")] = None,
-    rate: Annotated[float | None, _preparation("Of the samples, Hz.")] = None,
-    gap: Annotated[float | None, _preparation("Steps that a gap is longer than; 1.5 by default.")] = None,
-    trim: Annotated[float | None, _preparation("Cut off at both ends of every part, s.")] = None,
+    cutoff: Annotated[float | None, _preparation("Cutoff of the low-pass filter, Hz. Default: 4.")] = None,
+    filtering: Annotated[
+        str | None, _preparation("When to low-pass filter: derived (default), always or never.")
+    ] = None,
+    form: Annotated[str | None, _preparation("Filter type: acausal (default), or causal as on a live stream.")] = None,
+    rate: Annotated[float | None, _preparation("Rate of the samples, Hz.")] = None,
+    gap: Annotated[float | None, _preparation("A pause longer than this many steps is a gap. Default: 1.5.")] = None,
+    trim: Annotated[float | None, _preparation("Time to cut off at both ends of every part, s.")] = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Upload recordings, one data set each or, with --join, all as one, and print their reports."""
+    """Upload recordings, one data set each (with --join: one for all), and print their reports."""
     given = {
         "robot": robot,
         "joint_names": names(joint_names),
@@ -97,7 +104,7 @@ def add(
     }
     reading: Reading = {key: value for key, value in given.items() if value is not None}  # type: ignore[assignment]
     parts = [files] if join else [[each] for each in files]
-    hint = "--join takes files for one recording" if len(parts) > 1 else None
+    hint = "if the files are parts of one recording, add --join" if len(parts) > 1 else None
     with connected(url) as client, advised(hint):
         made = [upload(client, part, name, **reading) for part in parts]
     if as_json:
@@ -116,7 +123,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
         print_json(datasets)
         return
     if not datasets:
-        echo("no data set yet: `lipserve data add FILE` uploads a recording")
+        echo("no data sets yet: `lipserve data add FILE` uploads a recording")
     for each in datasets:
         rate = "" if each.report.rate_hz is None else f" at {each.report.rate_hz:.4g} Hz"
         joints = counted(len(each.joint_names), "joint")
@@ -141,8 +148,8 @@ def delete(
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Delete data sets for good; versions that were trained on them stay."""
-    confirm(f"delete {', '.join(datasets)} for good?", yes)
+    """Delete data sets permanently. Versions trained on them stay."""
+    confirm(f"Delete {', '.join(datasets)} permanently?", yes)
     with connected(url) as client:
         for each in datasets:
             client.delete_dataset(each)
@@ -150,7 +157,7 @@ def delete(
 
 
 def _print(dataset: Dataset) -> None:
-    from service.cli import tables  # noqa: PLC0415 - takes long to import; help needs none
+    from service.cli import tables  # noqa: PLC0415 - slow import, not needed for help
 
     report = dataset.report
     out.print(f"[bold]{dataset.id}[/bold]  {escape(dataset.name)}  torque: {dataset.torque_convention}")

@@ -1,4 +1,4 @@
-"""`lipserve excite`: the motion that tells most of what a model does not know, within the limits of its robot."""
+"""`lipserve excite`: plan the motion that reduces a model's uncertainty most, within the limits of its robot."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ MAX_URDF_BYTES = 16 * 1024 * 1024
 
 @dataclass(frozen=True)
 class Arm:
-    """What is known of a robot. robot: its dynamics, None without a URDF; bodies: for estimators of rigid bodies."""
+    """Limits and dynamics of a robot. robot: None without a URDF; bodies: for rigid-body estimators."""
 
     name: str
     limits: Limits
@@ -51,13 +51,13 @@ class Arm:
 
 
 def find(given: str | None, model: TorqueModel | None) -> Arm:
-    """The robot that is given, by name or as a .urdf file, or else the one that the model's joints tell.
+    """Return the given robot (a name or .urdf file), or else the one that matches the model's joints.
 
-    Its joints are called as the model's. Raise ValueError or OSError where there is no such robot or it does not fit.
+    Its joints get the model's names. Raise ValueError or OSError if there is no such robot or it does not fit.
     """
     if given is None:
         if model is None:
-            raise ValueError("neither --robot nor --model is given, expected one of them: whose limits are to be kept?")
+            raise ValueError("give --robot or --model: the limits of the robot are needed")
         return _of_model(model)
     if not given.endswith(".urdf"):
         return _named(given, model)
@@ -66,7 +66,7 @@ def find(given: str | None, model: TorqueModel | None) -> Arm:
         raise ValueError(f"{given} has {size} bytes, expected at most {MAX_URDF_BYTES}")
     profile = profiles.from_urdf(path.read_text(encoding="utf-8"), path.stem)
     names = profile.joint_names
-    if model is not None and set(model.joint_names) <= set(names):  # others, as of grippers, stand still
+    if model is not None and set(model.joint_names) <= set(names):  # other joints, such as grippers, do not move
         names = model.joint_names
     return _of_urdf(profile, names, None if model is None else model.joint_names)
 
@@ -77,10 +77,10 @@ def _of_model(model: TorqueModel) -> Arm:
         return _of_urdf(profile, model.robot.urdf_joints, model.joint_names)
     names = profiles.recognise(model.joint_names)
     if len(names) != 1:
-        fit = f"several robots have: {', '.join(names)}" if names else "no robot that is known has"
+        found = f"several robots: {', '.join(names)}" if names else "no known robot"
         raise ValueError(
-            f"the model has the joints {', '.join(model.joint_names)}, which {fit}. Name the robot by --robot: "
-            f"a .urdf file or one of {', '.join(profiles.names())}"
+            f"the model's joints {', '.join(model.joint_names)} match {found}. Set --robot to a .urdf file or one of "
+            f"{', '.join(profiles.names())}"
         )
     return _named(names[0], model)
 
@@ -94,21 +94,21 @@ def _named(name: str, model: TorqueModel | None) -> Arm:
     if name in ROBOTS:
         try:
             robot = load_robot(name)
-        except MissingExtraError:  # limits are known all the same
+        except MissingExtraError:  # the limits are known without it
             return Arm(name, limits, None, None)
         bodies = RigidBody.from_profile(name, robot.joint_names, robot.joint_types)
     return Arm(name, limits, robot, bodies)
 
 
 def _of_urdf(profile: Profile, joints: Sequence[str], names: tuple[str, ...] | None) -> Arm:
-    """joints: of the URDF, those that move; names: what the data call them."""
+    """joints: moving joints of the URDF; names: their names in the data."""
     if profile.urdf is None:
         raise ValueError(f"robot {profile.name!r} has no URDF")
     places = [profile.joint_names.index(joint) for joint in joints]
     types = [profile.joint_types[place] for place in places]
     bodies = RigidBody.from_urdf(profile.urdf, joints, types, name=profile.name)
     if bodies.order != tuple(range(len(bodies.order))):
-        raise ValueError(f"the joints of {profile.name!r} are {', '.join(joints)}, expected them from base to tip")
+        raise ValueError(f"the joints of {profile.name!r} are not ordered from base to tip: {', '.join(joints)}")
     called = bodies.joint_names if names is None else names
     _check(profile, bodies.joint_names, called)
     every = Limits.of_profile(profile)
@@ -119,12 +119,12 @@ def _of_urdf(profile: Profile, joints: Sequence[str], names: tuple[str, ...] | N
 
 
 def _check(profile: Profile, own: Sequence[str], called: Sequence[str]) -> None:
-    """The model's joints are the robot's, in the same order, whatever they are called."""
+    """Check that the model has the robot's joints in the same order; their names may differ."""
     known = profile.official_names(called)
     if len(own) != len(called) or (known is not None and known != tuple(own)):
         raise ValueError(
-            f"robot {profile.name!r} has the joints {', '.join(own)}; the model has {', '.join(called)}, expected as "
-            "many in the same order"
+            f"robot {profile.name!r} has the joints {', '.join(own)}; the model has {', '.join(called)}, expected the "
+            "same joints in the same order"
         )
 
 
@@ -138,20 +138,20 @@ MEMBER_LIMITS: Mapping[str, int] = {
 
 
 def find_model(given: str, url: str) -> TorqueModel:
-    """The model in a folder of that path, or of that name from the service at `url`.
+    """Load a model from a folder, or fetch it by name from the service at `url`.
 
-    Raise ModelFormatError for what is no model, ApiError or ServiceUnreachableError where the service has none.
+    Raise ModelFormatError for an invalid model, ApiError or ServiceUnreachableError if the service cannot provide it.
     """
     folder = Path(given)
     if (folder / MANIFEST).is_file():
         return lipcore.load(folder)
     if folder.is_dir():
-        raise ModelFormatError(f"{given} holds no {MANIFEST}, expected the folder of a saved model", MANIFEST)
+        raise ModelFormatError(f"{given} has no {MANIFEST}: it is not the folder of a saved model", MANIFEST)
     return fetch(given, url)
 
 
 def fetch(name: str, url: str) -> TorqueModel:
-    """A served model as it is now, with all that it has learnt online."""
+    """Return a served model in its present state, including what it learnt online."""
     with TemporaryDirectory(prefix="lipserve-excite-") as folder, Client(url) as client:
         path = client.export(name, Path(folder) / "model.tar")
         try:
@@ -165,18 +165,18 @@ def fetch(name: str, url: str) -> TorqueModel:
 
 app = alone()
 ERRORS = (ApiError, NotPositiveDefiniteError)
-"""What a user is told without a traceback, beside ValueError and OSError."""
-COMPARED = 5
-"""Random motions whose expected value the planned one is compared with."""
+"""Errors that are printed without a traceback, beside ValueError and OSError."""
+RANDOM_MOTIONS = 5
+"""Number of random motions that the planned motion is compared with."""
 WARNING = (
-    "The plan knows joint limits only, neither obstacles nor the robot's own links: watch it in a simulator or slowly "
-    "before you drive a robot along it."
+    "The plan respects joint limits only. It does not check for obstacles or self-collisions: run it in a simulator or "
+    "at low speed first."
 )
 
 
 @dataclass(frozen=True)
 class Random:
-    """What the paper's random sinusoids would leave of the variance, mean over draws: (n,) each."""
+    """Share of variance that the paper's random sinusoids would leave, mean over draws: (n,) each."""
 
     slow: Array
     fast: Array
@@ -184,38 +184,43 @@ class Random:
 
 @app.command()
 def excite(
-    out: Annotated[Path, typer.Option(help="CSV file to write: t, q1…, dq1…, ddq1….", dir_okay=False)],
+    out: Annotated[Path, typer.Option(help="CSV file to write, with columns t, q1…, dq1…, ddq1….", dir_okay=False)],
     model: Annotated[
-        str | None, typer.Option(help="What is known already: a saved model's folder, or the name of a served model.")
+        str | None, typer.Option(help="Model to improve: the folder of a saved model, or the name of a served one.")
     ] = None,
     robot: Annotated[
         str | None,
-        typer.Option(help=f"A .urdf file or one of {', '.join(names())}. By default as the model's joints tell."),
+        typer.Option(help=f"A .urdf file or one of {', '.join(names())}. Default: the robot with the model's joints."),
     ] = None,
-    seconds: Annotated[float, typer.Option(help="Length of the motion.")] = 50.0,
-    rate: Annotated[float, typer.Option(help="Samples a second.")] = 100.0,
-    position: Annotated[float, typer.Option("--range", help="Share of each joint's range that may be used.")] = 0.95,
-    reach: Annotated[float | None, typer.Option(help="At most so far from the middle of the range, rad (m).")] = None,
-    scale: Annotated[float, typer.Option(help="Share of the speed, acceleration and torque limits.")] = 0.9,
+    seconds: Annotated[float, typer.Option(help="Duration of the motion, s.")] = 50.0,
+    rate: Annotated[float, typer.Option(help="Sample rate, Hz.")] = 100.0,
+    position: Annotated[float, typer.Option("--range", help="Share of each joint's range to use, at most.")] = 0.95,
+    reach: Annotated[float | None, typer.Option(help="Max distance from the middle of the range, rad (m).")] = None,
+    scale: Annotated[
+        float, typer.Option(help="Share of the speed, acceleration and torque limits to use, at most.")
+    ] = 0.9,
     noise: Annotated[
-        float | None, typer.Option(help="Std of the torque noise expected without a model, N·m; 1 % of the torque's.")
+        float | None,
+        typer.Option(help="Std of the torque noise without a model, N·m. Default: 1 % of the torque's."),
     ] = None,
     estimator: Annotated[
-        str, typer.Option(help=f"What will be trained, without a model: one of {', '.join(ESTIMATORS)}.")
+        str, typer.Option(help=f"Estimator to plan for without a model: one of {', '.join(ESTIMATORS)}.")
     ] = "rigid-body",
     harmonics: Annotated[
-        int | None, typer.Option(min=2, help="Of the Fourier series; by default as the limits allow.")
+        int | None, typer.Option(min=2, help="Harmonics of the Fourier series. Default: as many as the limits allow.")
     ] = None,
-    iterations: Annotated[int, typer.Option(min=0, help="Of the search.")] = PlanOptions.iterations,
-    budget: Annotated[float, typer.Option(help="Most seconds of the search.")] = PlanOptions.budget_s,
-    seed: Annotated[int, typer.Option(min=0, help="Equal seeds give equal motions where the budget suffices.")] = 0,
-    plot: Annotated[Path | None, typer.Option(dir_okay=False, help="Also draw the motion, .png or .svg.")] = None,
+    iterations: Annotated[int, typer.Option(min=0, help="Iterations of the search.")] = PlanOptions.iterations,
+    budget: Annotated[float, typer.Option(help="Max duration of the search, s.")] = PlanOptions.budget_s,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Random seed. Equal seeds give equal motions if the budget suffices.")
+    ] = 0,
+    plot: Annotated[Path | None, typer.Option(dir_okay=False, help="Also plot the motion, .png or .svg.")] = None,
     url: Annotated[str, typer.Option("--url", envvar=URL_VARIABLE, help="Address of the service.")] = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Plan a motion within a robot's limits that tells most of what its model does not know yet."""
+    """Plan the motion, within a robot's limits, that reduces its model's uncertainty most."""
     if plot is not None:
-        plotting.pyplot()  # before a minute of planning
+        plotting.pyplot()  # fail before a minute of planning
     known = None if model is None else find_model(model, url)
     arm = find(robot, known)
     limits = arm.limits.within(position, scale, reach)
@@ -229,9 +234,7 @@ def excite(
             limits,
             options,
             arm.robot,
-            lambda step, left: status.update(
-                f"planning, step {step}: {percent(left, 2)} of the variance would be left"
-            ),
+            lambda step, left: status.update(f"planning, step {step}: remaining variance {percent(left, 2)}"),
         )
     write(out, made)
     if plot is not None:
@@ -243,12 +246,12 @@ def excite(
     console.print(table(made, random), highlight=False)
     console.print(summary(made, "the model" if known is not None else f"a {estimator} prior"), highlight=False)
     for path in filter(None, (out, plot)):
-        console.print(f"written to {path}", highlight=False)
+        console.print(f"wrote {path}", highlight=False)
     console.print(WARNING, style="yellow", highlight=False)
 
 
 def write(path: Path, made: Plan) -> None:
-    """Write the motion as CSV: t, then q1 … qn, dq1 … dqn, ddq1 … ddqn in the order of the joints, SI units."""
+    """Write the motion as CSV in SI units: t, q1 … qn, dq1 … dqn, ddq1 … ddqn, in the order of the joints."""
     t, *parts = made.table()
     joints = range(1, made.limits.n_joints + 1)
     header = ["t", *(f"{name}{joint}" for name in ("q", "dq", "ddq") for joint in joints)]
@@ -256,9 +259,9 @@ def write(path: Path, made: Plan) -> None:
 
 
 def random_motion(made: Plan) -> Random:
-    """What the paper's random sinusoids of the same length, range and speed limits would leave."""
+    """Return the variance left by the paper's random sinusoids of the same length, range and speed limits."""
     limits, options = made.limits, made.options
-    kinds: list[JointType] = ["revolute"] * limits.n_joints  # of no consequence here
+    kinds: list[JointType] = ["revolute"] * limits.n_joints  # has no effect here
     bare = Robot("", None, limits.joint_names, tuple(kinds), limits.lower, limits.upper, limits.speed)
     samples = min(options.samples, 500)
     t = np.arange(samples) * options.seconds / samples
@@ -266,14 +269,14 @@ def random_motion(made: Plan) -> Random:
 
     def left(speed: float) -> Array:
         stream = Simulation(motion="full", speed=speed)
-        draws = (sinusoids(bare, stream, t, np.random.default_rng([options.seed, k])) for k in range(COMPARED))
+        draws = (sinusoids(bare, stream, t, np.random.default_rng([options.seed, k])) for k in range(RANDOM_MOTIONS))
         return np.asarray(np.mean([made.left_by(*motion, repeats) for motion in draws], axis=0))
 
     return Random(left(1.0), left(FAST_SPEED))
 
 
 def document(made: Plan, random: Random, out: Path, plot: Path | None) -> dict[str, Any]:
-    """The plan for JSON: per joint the shares of variance expected to be left, and of the limits that are used."""
+    """Return the plan for JSON: expected share of remaining variance and share of the limits used, per joint."""
     start = made.series.at(np.zeros(1))[0][0]
     return {
         "files": [each for each in (out, plot) if each is not None],
@@ -293,8 +296,8 @@ def document(made: Plan, random: Random, out: Path, plot: Path | None) -> dict[s
 
 
 def table(made: Plan, random: Random) -> Table:
-    """What is expected of the motion, joint by joint, and how much of the limits it uses."""
-    grid = Table(title="share of the torque's variance that is expected to be left, and of the limits that is used")
+    """Return a table of the expected remaining variance and the limits used, one row per joint."""
+    grid = Table(title="expected remaining share of the torque variance, and share of the limits used")
     columns = ("planned", "random", "random, fast", "position", "speed", "acceleration", "torque")
     grid.add_column("joint")
     for heading in columns:
@@ -309,24 +312,24 @@ def table(made: Plan, random: Random) -> Table:
 
 
 def summary(made: Plan, known: str) -> str:
-    """In words: what was planned, for what, and from where the robot starts."""
+    """Describe the plan: its purpose, the search, and the start position."""
     start = ", ".join(f"{value:.3f}" for value in made.series.at(np.zeros(1))[0][0])
     options = made.options
     ended = f"{counted(made.iterations, 'iteration')} in {made.seconds:.0f} s"
     if made.out_of_time:
-        ended += ", which the budget ended"
+        ended += ", stopped by --budget"
     return (
-        f"{options.seconds:g} s at {options.rate:g} Hz, {made.series.harmonics} harmonics, for what {known} does not "
-        f"know; {ended}. Random: the paper's sums of 50 sinusoids, mean of {COMPARED}, at their own and at "
-        f"{FAST_SPEED:g} times their frequencies. Starts and ends at rest at q = {start}."
+        f"{options.seconds:g} s at {options.rate:g} Hz, {made.series.harmonics} harmonics, planned for {known}; "
+        f"{ended}. Random: the paper's sums of 50 sinusoids, mean of {RANDOM_MOTIONS} draws, at their own frequencies "
+        f"and (fast) at {FAST_SPEED:g} times these. The motion starts and ends at rest at q = {start}."
     )
 
 
 def _prior(arm: Arm, limits: Limits, noise: float | None, estimator: str, seed: int) -> Belief:
     if arm.robot is None:
         raise ValueError(
-            f"no URDF of robot {arm.name!r} is installed, so nothing tells how large its torques are: give --model, "
-            "or a .urdf file as --robot"
+            f"no URDF of robot {arm.name!r} is installed, so its torques are unknown: set --model, or set --robot to a "
+            ".urdf file"
         )
     bodies = arm.bodies if estimator.startswith("rigid-body") else None
     return Belief.prior(arm.robot, limits, noise, estimator, bodies, seed)

@@ -1,4 +1,4 @@
-"""`lipserve jobs` and `lipserve train`: what is trained, was trained, or failed to be."""
+"""`lipserve jobs` and `lipserve train`."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ if TYPE_CHECKING:
 
 
 Patience = Annotated[
-    float, typer.Option(min=0, help="Longest wait for a service that is away, s: the job goes on when it is back.")
+    float,
+    typer.Option(min=0, help="Max time to wait for an unreachable service, s. The job continues when it is back."),
 ]
 
-app = group("Training jobs: list, show, follow, cancel and retry them.")
+app = group("List, show, follow, cancel and retry training jobs.")
 
 
 @app.command("list")
@@ -40,11 +41,11 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
         print_json(jobs)
         return
     if not jobs:
-        echo("no job yet: `lipserve train FILE --model NAME` queues one")
+        echo("no jobs yet: `lipserve train FILE --model NAME` queues one")
         return
     from service.cli.tables import judged  # noqa: PLC0415 - takes long to import; help needs none
 
-    figures = ("nMSE held out", "in 95 %")
+    figures = ("held-out nMSE", "coverage")
     table = Table(Column("id", no_wrap=True), "model", "estimator", "state", "done", "version", *figures, "queued")
     for job in jobs:
         version = "-" if job.version is None else str(job.version)
@@ -56,37 +57,39 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
 
 @app.command()
 def show(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
-    """Print a job: how far it is, and what happened to it."""
+    """Print a job with its progress and history."""
     with connected(url) as client:
         _print(client.job(job), as_json)
 
 
 @app.command()
 def cancel(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
-    """Cancel a job that waits or runs."""
+    """Cancel a queued or running job."""
     with connected(url) as client:
         _print(client.cancel(job), as_json)
 
 
 @app.command()
 def retry(job: JobId, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
-    """Queue a new job that repeats one that failed or was cancelled."""
+    """Queue a failed or cancelled job again, as a new job."""
     with connected(url) as client:
         _print(client.retry(job), as_json)
 
 
 @app.command()
 def follow(job: JobId, patience: Patience = PATIENCE, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
-    """Show a job's progress until it ends, also over a restart of the service; Ctrl-C stops watching, and the job goes
-    on."""
+    """Show a job's progress until it ends, even if the service restarts.
+
+    Ctrl-C stops watching; the job continues.
+    """
     with connected(url) as client:
         ended, interrupted = watch(client, client.job(job), cancels=False, patience=patience)
     _print(ended, as_json)
     if interrupted:
-        note(f"{ended.id} goes on: `lipserve jobs cancel {ended.id}` ends it")
+        note(f"{ended.id} continues: `lipserve jobs cancel {ended.id}` cancels it")
         raise typer.Exit(INTERRUPTED)
     if ended.state != "succeeded":
-        raise CommandError(f"{ended.id} has {ended.state}" + (f": {ended.error.message}" if ended.error else ""))
+        raise CommandError(f"{ended.id}: {ended.state}" + (f": {ended.error.message}" if ended.error else ""))
 
 
 def _print(job: Job, as_json: bool) -> None:
@@ -96,7 +99,7 @@ def _print(job: Job, as_json: bool) -> None:
     made = "" if job.version is None else f", version {job.version}"
     echo(f"{job.id}  {job.model} ({job.estimator}): {job.state}{made}")
     at = job.progress
-    left = "" if not at.remaining_s else f", at most about {at.remaining_s:.0f} s left"
+    left = "" if not at.remaining_s else f", about {at.remaining_s:.0f} s left at most"
     echo(f"  {at.stage}, {percent(at.fraction)} after {at.elapsed_s:.0f} s{left}; data sets {', '.join(job.datasets)}")
     for change in job.history:
         echo(f"  {change.at[:19].replace('T', ' ')}  {change.state}: {change.message}")
@@ -111,53 +114,57 @@ train_app = alone()
 def train(
     data: Annotated[
         list[str],
-        typer.Argument(
-            help="Recordings, which are uploaded, and ids or names of data sets.", autocompletion=connecting.datasets
-        ),
+        typer.Argument(help="Recordings to upload, or ids or names of data sets.", autocompletion=connecting.datasets),
     ],
     model: Annotated[
-        str, typer.Option(help="Name of the model; a new version of it is made.", autocompletion=connecting.models)
+        str, typer.Option(help="Name of the model. The job adds a version.", autocompletion=connecting.models)
     ],
     url: Url = DEFAULT_URL,
     estimator: Annotated[
         str | None,
         typer.Option(
-            help=f"One of {', '.join(ESTIMATOR_CHOICES)}; {AUTO} by default, which compares arms and `lip-chain` "
-            "on held-out rows and takes the simplest unless another one is surely better.",
+            help=f"One of {', '.join(ESTIMATOR_CHOICES)}. Default: {AUTO}, which compares rigid-body estimators and "
+            "`lip-chain` on held-out rows and selects the simplest unless another is significantly better.",
             autocompletion=lambda: list(ESTIMATOR_CHOICES),
         ),
     ] = None,
     joint_types: Annotated[
-        str | None, typer.Option(help="One a joint, separated by commas; all revolute by default.")
+        str | None,
+        typer.Option(
+            help="One joint type per joint, separated by commas. Default: those of the data's robot, else revolute."
+        ),
     ] = None,
     robot: Annotated[
-        str | None, typer.Option(help="Of rigid bodies: a profile such as panda, the id of a URDF, or a .urdf file.")
+        str | None,
+        typer.Option(
+            help="Robot for rigid-body estimators: a profile such as panda, the id of a URDF, or a .urdf file."
+        ),
     ] = None,
     base: Annotated[
         str | None,
         typer.Option(
-            help="Of rigid bodies: a version of another unit of the same robot to start from, as MODEL:3, MODEL@ALIAS "
-            "or MODEL.",
+            help="Version of another unit of the same robot to start from, for rigid-body estimators: MODEL:3, "
+            "MODEL@ALIAS or MODEL.",
             autocompletion=connecting.models,
         ),
     ] = None,
     prior: Annotated[
         str | None,
-        typer.Option(help="Of rigid bodies: around the parameters of the `urdf` (default) or around `zero`."),
+        typer.Option(help="Mean of the prior of rigid-body parameters: `urdf` (default) or `zero`."),
     ] = None,
     option: Annotated[
         list[str] | None,
-        typer.Option(help="How to fit, as max_iterations=100: see `options` of POST /v1/jobs; repeat."),
+        typer.Option(help="Fit option, e.g. max_iterations=100 (see `options` of POST /v1/jobs). Repeatable."),
     ] = None,
     hold_out: Annotated[
         float | None,
-        typer.Option(help="Share of the samples to hold out and evaluate the model on; 0.3 by default, 0 for nothing."),
+        typer.Option(help="Share of the samples to hold out for evaluation. Default: 0.3; 0 disables it."),
     ] = None,
     hold_out_by: Annotated[
         str | None,
         typer.Option(
-            help="What is held out: the `last` part, whole `episodes`, some of ten `blocks`; or `auto` (default), the "
-            "last part, unless that repeats what is trained on and other motion does not.",
+            help="Part to hold out: the `last` part, whole `episodes`, or some of ten `blocks`. Default: `auto`, the "
+            "last part, unless it repeats the training motion and other parts do not.",
             autocompletion=lambda: HELD_OUT_BY,
         ),
     ] = None,
@@ -165,16 +172,16 @@ def train(
         bool,
         typer.Option(
             "--hold-out-only",
-            help="Never learn what is held out. By default the version is judged without it, then trained on all rows.",
+            help="Never train on the held-out part. Default: evaluate without it, then train on all rows.",
         ),
     ] = False,
     promotion: Promotion = None,
     patience: Patience = PATIENCE,
-    wait: Annotated[bool, typer.Option(help="Wait for the job's end; --no-wait leaves it to `lipserve jobs`.")] = True,
+    wait: Annotated[bool, typer.Option(help="Wait for the job to end. With --no-wait, use `lipserve jobs`.")] = True,
     as_json: Json = False,
 ) -> None:
     """Upload recordings and train a model on them. Ctrl-C cancels the job."""
-    # the client takes long to import; help needs none
+    # slow import, not needed for help
     from lipserve.call import new_key  # noqa: PLC0415
 
     options: dict[str, Any] = {name: value(text) for name, text in pairs("--option", option).items()}
@@ -204,11 +211,11 @@ def train(
         try:
             job = queue()
         except KeyboardInterrupt:
-            client.cancel(queue().id)  # the same job, whether the first request has arrived or not
+            client.cancel(queue().id)  # same idempotency key: the same job even if the first request was lost
             raise
         interrupted = False
         if wait:
-            note(f"{job.id} is queued: `lipserve jobs follow {job.id}` follows it, too")
+            note(f"{job.id} is queued: `lipserve jobs follow {job.id}` also follows it")
             job, interrupted = watch(client, job, cancels=True, patience=patience)
         made = None if job.version is None else client.version(model, job.version)
     if as_json:
@@ -217,8 +224,8 @@ def train(
         note(f"{job.id} is cancelled")
         raise typer.Exit(INTERRUPTED)
     if wait and job.version is None:
-        message = f"{job.id} has {job.state}" + (f": {job.error.message}" if job.error else "")
-        raise CommandError(message, f"`lipserve jobs show {job.id}` tells its history")
+        message = f"{job.id}: {job.state}" + (f": {job.error.message}" if job.error else "")
+        raise CommandError(message, f"`lipserve jobs show {job.id}` shows its history")
     if as_json:
         return
     if not wait:
@@ -228,21 +235,21 @@ def train(
         return
     judged = made.promotion
     waits = judged is not None and not judged.answers
-    echo(f"{model} version {job.version} is trained and {'waits as candidate' if waits else 'answers'}")
+    echo(f"{model} version {job.version} trained: {'candidate, not serving' if waits else 'now serving'}")
     if made.selection is not None:
         print_selection(made.selection)
     if made.lineage.get("holdout") is not None:
         print_held_out(made)
     print_promotion(made)
     if waits:
-        note(f"`lipserve models promote {model} {job.version}` lets it answer all the same")
+        note(f"`lipserve models promote {model} {job.version}` makes it the serving version")
 
 
 def _holdout(share: float | None, kind: str | None, only: bool) -> dict[str, Any] | Literal[False] | None:
-    """The `holdout` of a request to train: False for nothing, None for the service's default; raise CommandError."""
+    """Return `holdout` of a training request: False for none, None for the service's default; raise CommandError."""
     if share == 0:
         if only:
-            raise CommandError("--hold-out-only needs rows that are held out: set --hold-out above 0, or leave it out")
+            raise CommandError("--hold-out-only needs held-out rows", "set --hold-out above 0, or omit it")
         return False
     given = (("share", share), ("kind", kind), ("only", only or None))
     return {name: value for name, value in given if value is not None} or None

@@ -1,4 +1,4 @@
-"""`lipserve keys`: make, list and revoke API keys, also while the service runs."""
+"""`lipserve keys`: create, list and revoke API keys."""
 
 from __future__ import annotations
 
@@ -22,34 +22,35 @@ from service.foundation.settings import Settings
 from service.storage.database import ApiKeyRow, Database
 from service.storage.storage import HomeError, explain_home_errors
 
-app = group("API keys of the home LIPSERVE_HOME.")
+app = group("Create, list and revoke API keys of the home LIPSERVE_HOME. Works while the service is running.")
 ERRORS = (HomeError, InvalidRequestError)
-LONGEST_DAYS = 36_500.0
+MAX_DAYS = 36_500.0
 
 
 @app.command()
 def create(
-    name: Annotated[str, typer.Option(help="What the key is for, as lists show it.")],
+    name: Annotated[str, typer.Option(help="Name of the key, shown in lists.")],
     scope: Annotated[
-        list[str], typer.Option(help=f"What it may do: {', '.join(SCOPES)}; several separated by commas or repeated.")
+        list[str],
+        typer.Option(help=f"Scopes of the key: {', '.join(SCOPES)}. Separate several by commas or repeat the option."),
     ],
-    days: Annotated[float | None, typer.Option(help="Days after which it expires, never by default.")] = None,
+    days: Annotated[float | None, typer.Option(help="Days until the key expires. Default: never.")] = None,
     rate: Annotated[
         float | None,
         typer.Option(
-            help="Most requests per s, in place of LIPSERVE_MAX_REQUESTS_PER_S; at once up to ten seconds' worth, and "
-            "LIPSERVE_MAX_REQUEST_BURST. A stream counts once."
+            help="Max requests per second, instead of LIPSERVE_MAX_REQUESTS_PER_S. Bursts: ten seconds' worth, at most "
+            "LIPSERVE_MAX_REQUEST_BURST. A stream counts as one request."
         ),
     ] = None,
     file: Annotated[
         Path | None,
-        typer.Option(help="File with a key to store, made elsewhere: lip_ and 43 or more letters. It is not printed."),
+        typer.Option(help="File with an existing key to store: lip_ and 43 or more letters. It is not printed."),
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Make a key and print it: the only time that it can be seen. What else is to be said goes to standard error."""
-    if days is not None and not 0 < days <= LONGEST_DAYS:
-        raise ValueError(f"days is {days:g}, expected more than 0 and at most {LONGEST_DAYS:g}")
+    """Create a key and print it to standard output. It cannot be shown again."""
+    if days is not None and not 0 < days <= MAX_DAYS:
+        raise ValueError(f"days is {days:g}, expected more than 0 and at most {MAX_DAYS:g}")
     expires = None if days is None else datetime.now(UTC) + timedelta(days=days)
     with _database() as (database, settings):
         scopes = [part.strip() for given in scope for part in given.split(",")]
@@ -60,10 +61,10 @@ def create(
         return
     if given is None:
         typer.echo(secret)
-    until = f"until {row.expires_at}" if row.expires_at else "until it is revoked"
+    expiry = f"expires {row.expires_at}" if row.expires_at else "no expiry"
     where = settings.home if settings.database_url is None else "the database LIPSERVE_DATABASE_URL"
     note(
-        f"{row.id} may {', '.join(row.scopes)} {until}; a service that runs on {where} knows it after "
+        f"{row.id} created: scope {', '.join(row.scopes)}, {expiry}; running services on {where} accept it after "
         f"{keys.REFRESH_S:g} s"
     )
 
@@ -72,11 +73,11 @@ def create(
 def list_(as_json: Json = False) -> None:
     """List all keys, without the keys themselves."""
     with _database() as (database, _):
-        rows = keys.stored(database)
+        rows = keys.list_keys(database)
     if as_json:
         print_json([_document(row) for row in rows])
         return
-    table = Table(Column("id", no_wrap=True), "name", "scopes", "state", "per s", "made", "expires", "last used")
+    table = Table(Column("id", no_wrap=True), "name", "scopes", "state", "max req/s", "created", "expires", "last used")
     for row in rows:
         document = _document(row)
         times = (_minute(document[field]) for field in ("created_at", "expires_at", "used_at"))
@@ -87,16 +88,16 @@ def list_(as_json: Json = False) -> None:
 
 @app.command()
 def revoke(
-    key: Annotated[str, typer.Argument(help="Id of the key, as `lipserve keys list` shows it: key_…")],
+    key: Annotated[str, typer.Argument(help="Id of the key, key_…; see `lipserve keys list`.")],
     as_json: Json = False,
 ) -> None:
-    """End a key for good. A running service refuses it, and closes its streams, within a second or so."""
+    """Revoke a key permanently. Running services reject it and close its streams within about a second."""
     with _database() as (database, _):
         row = keys.revoke(database, key)
     if as_json:
         print_json(_document(row))
         return
-    note(f"{row.id} is revoked; a running service refuses it after {keys.REFRESH_S:g} s")
+    note(f"{row.id} revoked; running services reject it after {keys.REFRESH_S:g} s")
 
 
 @contextmanager

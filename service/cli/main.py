@@ -1,7 +1,7 @@
-"""The command line: `lipserve`. Modules of commands are imported when one of them is run, and not to list them.
+"""Command line `lipserve`: the list of commands.
 
-Exit codes: 0 done; 1 refused or failed, standard error says why; 2 the command line cannot be read; 130 ended by
-Ctrl-C.
+The module of a command is imported when the command runs, not when commands are listed.
+Exit codes: 0 success; 1 failure, explained on standard error; 2 invalid command line; 130 interrupted by Ctrl-C.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from service.runtime.remote import import_without_gc
 
 
 class Entry(NamedTuple):
-    """Where a command is: a Typer application of a module, and what lists say of it."""
+    """Module and Typer application of a command, and its help in lists."""
 
     module: str
     help: str
@@ -28,10 +28,9 @@ class Entry(NamedTuple):
 
 
 class LazyGroup(TyperGroup):
-    """Commands by name in `entries`; lists and help show them as they are described there.
+    """Group whose commands are imported when they run; lists and help show the texts in `entries`.
 
-    What a command's module names in `ERRORS` is told to the user without a traceback, beside ValueError, OSError and
-    MissingExtraError.
+    Errors in a module's `ERRORS` are printed without a traceback, as are ValueError, OSError and MissingExtraError.
     """
 
     entries: ClassVar[Mapping[str, Entry]] = {}
@@ -44,7 +43,7 @@ class LazyGroup(TyperGroup):
         }
 
     def load(self, name: str) -> Any:
-        """Import a command and return it; raise KeyError for an unknown one."""
+        """Import a command and return it; raise KeyError if it is unknown."""
         entry = self.entries[name]
         if entry.module not in sys.modules:
             import_without_gc(entry.module)
@@ -53,12 +52,12 @@ class LazyGroup(TyperGroup):
         return command
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
-        """Find the command that is to be run, or whose options are to be completed; unknown ones are refused."""
+        """Return the command to run or to complete; reject unknown names."""
         name, described, rest = super().resolve_command(ctx, args)
         return name, described if name is None else self.load(name), rest
 
     def invoke(self, ctx: Any) -> Any:
-        """Run a command; what a user can act on is told in words, and ends it with 1."""
+        """Run a command; print errors that the user can act on and exit with code 1."""
         try:
             return super().invoke(ctx)
         except Exception as error:
@@ -71,53 +70,57 @@ class LazyGroup(TyperGroup):
             raise typer.Exit(1) from error
 
 
-RUN, DATA, MODELS, ANSWERS, ROBOT, CHECK = (
-    "The service",
+RUN, DATA, MODELS, PREDICTION, ROBOT, BENCHMARK = (
+    "Service",
     "Recordings",
     "Training and models",
-    "Answers",
-    "Robots",
-    "Measuring",
+    "Prediction",
+    "Robots and online learning",
+    "Benchmarks",
 )
 
 
 class Commands(LazyGroup):
-    """The commands, in the order that help lists them."""
+    """All commands, in the order of the help."""
 
     entries = {  # noqa: RUF012 - declared by the group
         "serve": Entry("service.cli.serve", "Serve models and run training jobs.", RUN),
-        "worker": Entry("service.cli.worker", "Run jobs of services on a Dask cluster.", RUN),
-        "settings": Entry("service.cli.settings", "List all settings: values, defaults, units.", RUN),
-        "status": Entry("service.cli.status", "Whether a service is ready, and what is not installed there.", RUN),
+        "worker": Entry("service.cli.worker", "Run training jobs for services that share a Dask cluster.", RUN),
+        "settings": Entry("service.cli.settings", "List all settings with values, defaults and units.", RUN),
+        "status": Entry("service.cli.status", "Show whether a service is ready, and its missing extras.", RUN),
         "open": Entry("service.cli.open", "Print the address of the dashboard.", RUN),
-        "demo": Entry(
-            "service.cli.demo", "Serve, simulate a Panda, upload, train, evaluate and ask: two minutes.", RUN
+        "demo": Entry("service.cli.demo", "Run a two-minute demo: simulate a Panda, train, evaluate, predict.", RUN),
+        "keys": Entry("service.cli.keys", "Create, list and revoke API keys of the home LIPSERVE_HOME.", RUN),
+        "verify": Entry("service.cli.verify", "Check all data in the home and report damage.", RUN),
+        "backup": Entry(
+            "service.cli.backup", "Copy the home into one file, even while it is in use.", RUN, "backup_app"
         ),
-        "keys": Entry("service.cli.keys", "API keys of the home LIPSERVE_HOME: create, list, revoke.", RUN),
-        "verify": Entry("service.cli.verify", "Read all that the home stores and report what is damaged.", RUN),
-        "backup": Entry("service.cli.backup", "Copy the home into one file, also while it is used.", RUN, "backup_app"),
-        "restore": Entry("service.cli.backup", "Make a home of a backup.", RUN, "restore_app"),
-        "audit": Entry("service.cli.audit", "List who changed what of which model.", RUN),
-        "data": Entry("service.cli.data", "Recordings and their reports: add, list, show, delete.", DATA),
+        "restore": Entry("service.cli.backup", "Restore a home from a backup.", RUN, "restore_app"),
+        "audit": Entry("service.cli.audit", "List changes to models, and who made them.", RUN),
+        "data": Entry("service.cli.data", "Add, list, show and delete data sets (recordings).", DATA),
         "train": Entry("service.cli.jobs", "Train a model on recordings. Ctrl-C cancels the job.", MODELS, "train_app"),
-        "jobs": Entry("service.cli.jobs", "Training jobs: list, show, follow, cancel, retry.", MODELS),
+        "jobs": Entry("service.cli.jobs", "List, show, follow, cancel and retry training jobs.", MODELS),
         "models": Entry(
             "service.cli.models",
-            "Models: list, show, promote, rollback, alias, compare, export, import, delete.",
+            "List, show, promote, roll back, alias, compare, export, import and delete models.",
             MODELS,
         ),
-        "predict": Entry("service.cli.answers", "Ask a model for the torque at one motion.", ANSWERS, "predict_app"),
+        "predict": Entry("service.cli.answers", "Predict the torque at one motion.", PREDICTION, "predict_app"),
         "evaluate": Entry(
-            "service.cli.answers", "Compare a model with a recording, joint by joint.", ANSWERS, "evaluate_app"
+            "service.cli.answers", "Evaluate a model on a recording, joint by joint.", PREDICTION, "evaluate_app"
         ),
-        "stream": Entry("service.cli.stream", "Play a motion to a model in real time, and teach it.", ANSWERS),
-        "learning": Entry("service.cli.learning", "Whether a model learns; decide about what it waits for.", ROBOT),
-        "alarms": Entry("service.cli.learning", "What the owner of a model should know.", ROBOT, "alarms_app"),
-        "robots": Entry("service.cli.robots", "Robots by name and URDFs: list, show, add, delete.", ROBOT),
-        "payload": Entry("service.cli.payload", "Show what the arm carries, declare it, or that it is gone.", ROBOT),
-        "simulate": Entry("service.cli.simulate", "Simulate a robot's stream and write it as a recording.", ROBOT),
-        "excite": Entry("service.cli.excite", "Plan the motion that tells most of what is not known.", ROBOT),
-        "bench": Entry("service.cli.answers", "Time the answers of a service on this machine.", CHECK, "bench_app"),
+        "stream": Entry(
+            "service.cli.stream", "Play a motion to a model in real time; it can learn from it.", PREDICTION
+        ),
+        "learning": Entry("service.cli.learning", "Show and control online learning of a model.", ROBOT),
+        "alarms": Entry("service.cli.learning", "List the alarms of a model.", ROBOT, "alarms_app"),
+        "robots": Entry("service.cli.robots", "List, show, add and delete robots and URDFs.", ROBOT),
+        "payload": Entry("service.cli.payload", "Show, declare or remove the payload of an arm.", ROBOT),
+        "simulate": Entry("service.cli.simulate", "Simulate a robot and write a recording.", ROBOT),
+        "excite": Entry("service.cli.excite", "Plan the motion that reduces a model's uncertainty most.", ROBOT),
+        "bench": Entry(
+            "service.cli.answers", "Measure the latency of a service from this machine.", BENCHMARK, "bench_app"
+        ),
     }
 
 
@@ -126,14 +129,14 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     help="Learn a manipulator's inverse dynamics and serve torques with uncertainty.",
-    epilog="Exit codes: 0 done; 1 refused or failed, standard error says why; 2 the command line cannot be read; "
-    "130 ended by Ctrl-C. Commands that ask a service find it by --url or LIPSERVE_URL, their key in LIPSERVE_API_KEY.",
+    epilog="Exit codes: 0 success; 1 failure, explained on standard error; 2 invalid command line; 130 interrupted by "
+    "Ctrl-C. Set the address of the service with --url or LIPSERVE_URL, and the API key with LIPSERVE_API_KEY.",
 )
 
 
 def main() -> None:
     """Run the command line; see `LazyGroup.invoke` for errors."""
-    app(prog_name="lipserve")  # however it was started: completion goes by the name
+    app(prog_name="lipserve")  # shell completion needs this name
 
 
 @app.callback(invoke_without_command=True)

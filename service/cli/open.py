@@ -21,16 +21,20 @@ app = alone()
 @app.command("open")
 def open_(
     model: Annotated[
-        str | None, typer.Argument(help="A model, for its page.", autocompletion=connecting.models)
+        str | None, typer.Argument(help="Model whose page to open.", autocompletion=connecting.models)
     ] = None,
-    live: Annotated[bool, typer.Option("--live", help="The page that follows what is streamed.")] = False,
-    browser: Annotated[bool, typer.Option("--browser", help="Also open it in this machine's browser.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Use the live page, which shows streamed data.")] = False,
+    browser: Annotated[
+        bool, typer.Option("--browser", help="Also open the address in this machine's browser.")
+    ] = False,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Print the address of the dashboard, or of a model's page in it."""
+    """Print the address of the dashboard or of a model's page."""
     if url.startswith(UNIX):
-        raise CommandError(f"url is {url!r}, expected http://…: a browser needs a port", "`lipserve serve --port 8000`")
+        raise CommandError(
+            f"url is {url!r}, expected http://…: browsers cannot use Unix sockets", "`lipserve serve --port 8000`"
+        )
     try:
         ask(url, "/health/live")
     except (OSError, HTTPException, ValueError) as error:

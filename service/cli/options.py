@@ -1,4 +1,4 @@
-"""Options and arguments that several commands have, and names that help and completion list."""
+"""Options and arguments shared by commands, and names for help and completion."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ HELD_OUT_BY = ["auto", "last", "episodes", "blocks"]
 Promotion = Annotated[
     str | None,
     typer.Option(
-        help="Whether the version answers: `ask`, if it does well on what was held out, or `always`; by default as the "
-        "service is set.",
+        help="When the version becomes the serving version: `ask` (if it passes the check on held-out data) or "
+        "`always`. Default: the service's setting.",
         autocompletion=lambda: ["ask", "always"],
     ),
 ]
@@ -39,56 +39,57 @@ Url = Annotated[
     str, typer.Option("--url", envvar=URL_VARIABLE, help="Address of the service: http://… or unix:///path.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
-Limit = Annotated[int, typer.Option(min=1, help="Most that are listed.")]
-Yes = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask whether that is meant.")]
+Limit = Annotated[int, typer.Option(min=1, help="Max number of items to list.")]
+Yes = Annotated[bool, typer.Option("--yes", "-y", help="Skip confirmation.")]
 Model = Annotated[str, typer.Argument(help="Name of the model.", autocompletion=connecting.models)]
 DatasetId = Annotated[str, typer.Argument(help="Id or name of a data set.", autocompletion=connecting.datasets)]
 JobId = Annotated[str, typer.Argument(help="Id of a job.", autocompletion=connecting.jobs)]
 Data = Annotated[
     str,
-    typer.Argument(
-        help="A recording, which is uploaded, or the id or name of a data set.", autocompletion=connecting.datasets
-    ),
+    typer.Argument(help="Recording to upload, or id or name of a data set.", autocompletion=connecting.datasets),
 ]
 Version = Annotated[
-    int | None, typer.Option(help="A version; the one that serves by default.", autocompletion=connecting.versions)
+    int | None, typer.Option(help="Version number. Default: the serving version.", autocompletion=connecting.versions)
 ]
-Alias = Annotated[str | None, typer.Option(help="A version by its alias.", autocompletion=connecting.aliases)]
+Alias = Annotated[str | None, typer.Option(help="Alias of the version to use.", autocompletion=connecting.aliases)]
 
 
 def simulation(help_: str, *names: str, **limits: Any) -> Any:
-    """An option that describes a simulated stream."""
+    """Return an option in the help panel `Simulation`."""
     return typer.Option(*names, help=help_, rich_help_panel="Simulation", **limits)
 
 
-Seed = Annotated[int, simulation("Equal seeds give equal streams.", min=0)]
-Sinusoids = Annotated[int, simulation("50 for training, 100 for testing in the paper.", min=1)]
-Range = Annotated[str, simulation("middle (±0.5 rad) or full.")]
-Along = Annotated[str, simulation("sinusoids, periodic, or rests: from point to point.")]
-Fast = Annotated[bool, simulation("The faster-moving variant.", "--fast")]
+Seed = Annotated[int, simulation("Random seed. Equal seeds give equal streams.", min=0)]
+Sinusoids = Annotated[int, simulation("Number of sinusoids; in the paper 50 for training, 100 for testing.", min=1)]
+Range = Annotated[str, simulation("Range of motion: middle (±0.5 rad) or full.")]
+Along = Annotated[str, simulation("Kind of motion: sinusoids, periodic, or rests (from point to point).")]
+Fast = Annotated[bool, simulation("Use the faster variant of the motion.", "--fast")]
 Noise = Annotated[float, simulation("Std of the torque noise, N·m.")]
 Viscous = Annotated[float, simulation("Viscous friction, N·m·s/rad.")]
 Coulomb = Annotated[float, simulation("Coulomb friction, N·m.")]
-Mass = Annotated[float, simulation("Payload, kg.")]
-MassAt = Annotated[float, simulation("When the payload is attached, s.")]
+Mass = Annotated[float, simulation("Mass of the payload, kg.")]
+MassAt = Annotated[float, simulation("Time when the payload is attached, s.")]
 DirtShare = Annotated[
     float,
-    simulation("Friction with memory, ripple, coloured noise, encoders: 1 is an industrial arm's.", min=0.0),
+    simulation(
+        "Scale of real-world effects (friction with memory, ripple, coloured noise, encoders); 1: industrial arm.",
+        min=0.0,
+    ),
 ]
 
 
 def group(help_: str) -> typer.Typer:
-    """An application of several commands."""
+    """Return a Typer application for several commands."""
     return typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False, help=help_)
 
 
 def alone() -> typer.Typer:
-    """An application of one command."""
+    """Return a Typer application for one command."""
     return typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
 
 def settings_of(**given: Any) -> Settings:
-    """Settings, those that are given and else those of the environment; raise CommandError."""
+    """Return the settings of the environment, overridden by those given; raise CommandError if they are invalid."""
     try:
         check_environment(os.environ)
         return Settings(**{name: value for name, value in given.items() if value is not None})
@@ -100,14 +101,14 @@ def settings_of(**given: Any) -> Settings:
 
 
 def start_logs(settings: Settings) -> None:
-    """Log as the settings say from now on, and warn of variables that were removed."""
+    """Configure logging from the settings, and warn about removed environment variables."""
     logs.configure(logs.LogOptions(settings.log_level, settings.log_format))
     for warning in check_environment(os.environ):
         logger.warning(warning)
 
 
 def numbers(option: str, text: str) -> list[float]:
-    """Numbers separated by commas; raise CommandError."""
+    """Parse numbers separated by commas; raise CommandError if that fails."""
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
@@ -115,23 +116,23 @@ def numbers(option: str, text: str) -> list[float]:
 
 
 def names(text: str | None) -> list[str] | None:
-    """Names separated by commas; None where none are given."""
+    """Split names separated by commas; return None for None."""
     return None if text is None else [part.strip() for part in text.split(",")]
 
 
 def pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
-    """Values by name of an option that is given as name=value, repeatedly; raise ValueError."""
+    """Parse a repeatable option of the form name=value; raise ValueError if that fails."""
     values = {}
     for text in given or ():
         name, equals, value = text.partition("=")
         if not equals or not value:
-            raise ValueError(f"{option} is {text!r}, expected a quantity, = and what it is, as q=deg")
+            raise ValueError(f"{option} is {text!r}, expected NAME=VALUE")
         values[name.strip()] = value.strip()
     return values
 
 
 def value(text: str) -> Any:
-    """A number, a truth value or None where it is one."""
+    """Parse a number, true, false or null; return other text as it is."""
     for kind in (int, float):
         try:
             return kind(text)
@@ -141,6 +142,6 @@ def value(text: str) -> Any:
 
 
 def confirm(question: str, yes: bool) -> None:
-    """Ask whether something is meant, unless that is said; end the command where it is not."""
+    """Ask for confirmation unless `yes`; end the command if the user declines."""
     if not yes:
         typer.confirm(question, abort=True, err=True)

@@ -1,4 +1,4 @@
-"""`lipserve payload`: what arms carry, as far as their streams tell; declared, or said to be gone."""
+"""`lipserve payload`: show, declare and remove payloads."""
 
 from __future__ import annotations
 
@@ -21,34 +21,41 @@ if TYPE_CHECKING:
 
 app = alone()
 STATES = {
-    "none": "nothing new",
+    "none": "no change",
     "payload": "payload",
     "contact": "contact",
-    "friction": "friction has changed",
+    "friction": "friction changed",
 }
 
 
 @app.command()
 def payload(
     model: Model,
-    mass: Annotated[float | None, typer.Option(help="Declare a payload: its mass, kg.")] = None,
+    mass: Annotated[float | None, typer.Option(help="Mass of the payload to declare, kg.")] = None,
     com: Annotated[
         str | None,
-        typer.Option(help="Its centre of mass in the frame of the last link, m, separated by commas: 0,0,0.12."),
+        typer.Option(help="Its centre of mass x,y,z in the frame of the last link, m, e.g. 0,0,0.12."),
     ] = None,
     inertia: Annotated[
         str | None,
-        typer.Option(help="Its inertia about that, kg·m²: ixx,ixy,ixz,iyy,iyz,izz; that of a point by default."),
+        typer.Option(
+            help="Its inertia ixx,ixy,ixz,iyy,iyz,izz about the centre of mass, kg·m². Default: a point mass."
+        ),
     ] = None,
-    remove: Annotated[bool, typer.Option("--remove", help="Say that nothing is carried any more.")] = False,
-    stream: Annotated[str | None, typer.Option(help="Only this robot, by its stream_id.")] = None,
+    remove: Annotated[bool, typer.Option("--remove", help="Remove the payload.")] = False,
+    stream: Annotated[
+        str | None, typer.Option(help="stream_id of one robot. Default: all streams of the model.")
+    ] = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Print what the arms of a model carry, stream by stream; with --mass and --com declare it. No safety function."""
+    """Print the payloads of a model, stream by stream; declare one with --mass and --com.
+
+    This is not a safety function.
+    """
     declared = [name for name, value in (("--mass", mass), ("--com", com), ("--inertia", inertia)) if value is not None]
     if remove and declared:
-        raise CommandError(f"--remove and {declared[0]} are given, expected one of them")
+        raise CommandError(f"give either --remove or {declared[0]}, not both")
     with connected(url) as client:
         if remove:
             known = client.remove_payload(model, stream)
@@ -56,7 +63,7 @@ def payload(
             tensor = None if inertia is None else _matrix(numbers("--inertia", inertia))
             known = client.declare_payload(model, mass, numbers("--com", com), tensor, stream)
         elif declared:
-            raise CommandError(f"{declared[0]} is given, expected --mass and --com together")
+            raise CommandError("--mass and --com must be given together")
         else:
             known = client.payload(model)
     streams = [each for each in known.streams if stream in (None, each.stream_id)]
@@ -67,7 +74,7 @@ def payload(
 
 
 def _matrix(values: Sequence[float]) -> list[list[float]]:
-    """The symmetric matrix of ixx, ixy, ixz, iyy, iyz, izz; raise CommandError."""
+    """Return the symmetric matrix of ixx, ixy, ixz, iyy, iyz, izz; raise CommandError."""
     if len(values) != 6:
         raise CommandError(f"--inertia has {len(values)} numbers, expected 6: ixx,ixy,ixz,iyy,iyz,izz")
     xx, xy, xz, yy, yz, zz = values
@@ -76,29 +83,31 @@ def _matrix(values: Sequence[float]) -> list[list[float]]:
 
 def _print(known: Payloads, streams: Sequence[StreamPayload]) -> None:
     if known.reason is not None:
-        echo(f"payloads of {known.model} are not watched: {known.reason}")
+        echo(f"payloads of {known.model} are not estimated: {known.reason}")
     if known.default is not None:
-        echo(f"declared for all of {known.model}: {_mass(known.default)} at {_vector(known.default.com)} m")
+        echo(f"declared for all streams of {known.model}: {_mass(known.default)} at {_vector(known.default.com)} m")
     if len(streams) == 1:
         _print_stream(streams[0])
     elif streams:
-        table = Table("stream", "state", "carries", "centre of mass m", "since", "rows", title=f"{known.model} carries")
+        table = Table(
+            "stream", "state", "payload", "centre of mass m", "since", "rows", title=f"{known.model} payloads"
+        )
         for each in streams:
             place = "-" if each.payload is None else _vector(each.payload.com)
             cells = [STATES[each.state], _mass(each.payload), place, _since(each), f"{each.rows:,}"]
             table.add_row(escape(each.stream_id), *cells)
         out.print(table)
     elif known.reason is None and known.default is None:
-        echo(f"no stream has told yet what an arm of {known.model} carries")
+        echo(f"no payload estimates of {known.model} yet")
     if any(each.payload is not None for each in streams):
-        frame = "as it was learnt" if known.frame == "learnt" else "as the URDF has it"
-        echo(f"centres of mass: in the frame of the link behind {known.link}, {frame}")
+        frame = "as estimated" if known.frame == "learnt" else "as in the URDF"
+        echo(f"centres of mass are in the frame of the link after joint {known.link}, {frame}")
         if known.frame == "learnt":
-            echo("check the estimate: an arm learnt from torque alone knows kilograms only as well as its lengths")
+            echo("check the mass: the geometry is estimated from torque, so kilograms are only as accurate as lengths")
 
 
 def _print_stream(stream: StreamPayload) -> None:
-    echo(f"stream {stream.stream_id} carries {_mass(stream.payload)}{', declared' if stream.declared else ''}")
+    echo(f"stream {stream.stream_id}: payload {_mass(stream.payload)}{', declared' if stream.declared else ''}")
     echo(f"  state           {STATES[stream.state]}")
     if stream.payload is not None:
         echo(f"  centre of mass  {_vector(stream.payload.com)} m")
@@ -106,15 +115,15 @@ def _print_stream(stream: StreamPayload) -> None:
             echo(f"  at the tip      {_vector(stream.payload.com_tip)} m")
     echo(f"  since           {_since(stream)}")
     if stream.payload is not None:
-        echo(f"  seen on         {counted(stream.rows, 'row')}")
+        echo(f"  estimated from  {counted(stream.rows, 'row')}")
 
 
 def _mass(body: PayloadBody | None) -> str:
-    return "nothing" if body is None else f"{body.mass.mean:.2f} ± {body.mass.std:.2f} kg"
+    return "none" if body is None else f"{body.mass.mean:.2f} ± {body.mass.std:.2f} kg"
 
 
 def _vector(vector: Vector) -> str:
-    """Three numbers with what is not known of each."""
+    """Format three numbers with their standard deviations."""
     pairs = zip(vector.mean, vector.std, strict=True)
     return ", ".join(f"{round(mean, 3) + 0.0:.3f} ± {std:.3f}" for mean, std in pairs)
 

@@ -1,4 +1,4 @@
-"""Playing a motion to a model in real time: what is played, the loop that plays it, and figures of its answers."""
+"""Motions that are played to a model in real time, the loop that plays them, and figures of the answers."""
 
 from __future__ import annotations
 
@@ -36,21 +36,28 @@ from service.storage.disk import Disk
 
 
 class Tally:
-    """What answers were like, as sums: a stream may last for hours. noise_std: (n) N·m, of a measurement."""
+    """Error figures of answers, kept as sums because a stream may last for hours.
+
+    noise_std: (n,) standard deviation of a measurement, N·m.
+    """
 
     def __init__(self, noise_std: Array) -> None:
         self._noise = noise_std
         self.rows, self.late, self.received_late, self.behind_s = 0, 0, 0, 0.0
         self.refused = Counter[str]()
         self._trips = array("d")
-        # answers inside the band, squared errors, torques, squared torques, inside the band as the model itself has it
+        # inside the scaled interval, squared errors, torques, squared torques, inside the model's own interval
         self._sums = np.zeros((5, len(noise_std)))
 
     def add(self, answer: StreamAnswer, tau: Array, seconds: float, behind_s: float, deadline: float = np.inf) -> None:
-        """Count an answer with its std.
+        """Add an answer.
 
-        tau: (n) measured there; seconds: of the round trip; behind_s: how long after it was due the row was sent;
-        deadline: s, after which the answer is late, by the service's clock or by this one.
+        Args:
+            answer: The answer, with its standard deviation.
+            tau: (n,) measured torque, N·m.
+            seconds: Round-trip time.
+            behind_s: Delay of the row when it was sent, s.
+            deadline: Time after which the answer is late, s, for the service's clock and for this one.
         """
         error = tau - answer.tau
         self.rows += 1
@@ -68,7 +75,7 @@ class Tally:
         self._sums += np.array((inside, error**2, tau, tau**2, own))
 
     def merge(self, other: Tally) -> None:
-        """Add the figures of another stretch of the same stream."""
+        """Add the figures of another part of the same stream."""
         self.rows += other.rows
         self.late += other.late
         self.received_late += other.received_late
@@ -78,10 +85,11 @@ class Tally:
         self._sums += other._sums
 
     def figures(self) -> dict[str, Any]:
-        """The figures for JSON: rmse in N·m over all joints, coverage of the 95 % band; None without answers; late by
-        the service's clock, and received late by this one, which has the network in it.
+        """Return the figures for JSON; errors and coverage are None without answers.
 
-        All compare answers with torque that the model had not learnt yet when it answered.
+        rmse is in N·m, over all joints. coverage is that of the 95 % interval. Answers are computed before the model
+        learns from their rows. `late` goes by the service's clock; `received_late` by this one, so it includes the
+        network.
         """
         p50, p99 = (np.percentile(self._trips, (50, 99)) * 1e3).tolist() if self.rows else (None, None)
         return {
@@ -96,12 +104,12 @@ class Tally:
         }
 
     def opening(self, seconds: float) -> Opening:
-        """What the model's own band, which no stream has widened, held of the first seconds of a stream."""
+        """Return the coverage of the model's own interval, not widened by streams, in the first seconds."""
         rows = min(OPENING.rows * seconds, float(self.rows))
         return Opening(rows, rows * self._sums[4] / max(self.rows, 1))
 
     def joints(self, joint_names: Sequence[str]) -> list[dict[str, Any]]:
-        """Figures of each joint: rmse N·m, nmse (None where the torque does not vary), coverage of the 95 % band."""
+        """Return rmse (N·m), nmse (None for constant torque) and coverage of the 95 % interval of each joint."""
         if not self.rows:
             return []
         coverage, squared, mean, mean_square = self._sums[:4] / self.rows
@@ -118,7 +126,7 @@ class Tally:
 
 
 def learnt_figures(learnt: StreamLearnt) -> dict[str, Any]:
-    """What has become of the torques that were sent, for JSON."""
+    """Return what happened to the torques that were sent, for JSON."""
     return {
         "accepted": learnt.accepted,
         "duplicates": learnt.duplicates,
@@ -128,7 +136,7 @@ def learnt_figures(learnt: StreamLearnt) -> dict[str, Any]:
 
 
 def refused_figures(refusals: Sequence[StreamRefusal]) -> list[dict[str, Any]]:
-    """Torques that were not logged, for JSON: those that follow each other for the same reason together."""
+    """Return torques that were not logged, for JSON; consecutive ones with the same message are merged."""
     told: list[dict[str, Any]] = []
     for each in refusals:
         if told and (told[-1]["through"] + 1, told[-1]["message"]) == (each.first, each.message):
@@ -138,13 +146,13 @@ def refused_figures(refusals: Sequence[StreamRefusal]) -> list[dict[str, Any]]:
     return told
 
 
-FEWEST = 10
-"""Rows of a recording."""
+MIN_ROWS = 10
+"""Min rows of a recording."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Rows to play. t: (N,) s; q, dq, ddq, tau: (N, n) in SI units, tau as measured."""
+    """Rows to play: times (N,), s; q, dq, ddq and measured tau (N, n), SI units."""
 
     t: Array
     q: Array
@@ -159,13 +167,13 @@ class Motion:
 
     @property
     def step(self) -> float:
-        """Usual time between two rows, s."""
+        """Median time between two rows, s."""
         return float(np.median(np.diff(self.t)))
 
     def ordered(self, joint_names: Sequence[str]) -> tuple[Motion, bool]:
-        """The motion in the order of a model's joints, and whether its names were these; raise CommandError.
+        """Return the motion in a model's joint order, and whether the names match.
 
-        Joints of other names are taken in their order, where there are as many.
+        If the names differ, the joints keep their order. Raise CommandError if their number differs.
         """
         if len(joint_names) != len(self.joint_names):
             raise CommandError(
@@ -180,18 +188,18 @@ class Motion:
 
 
 def simulated(robot: str, stream: Simulation, seed: int = 0) -> Motion:
-    """A simulated robot's stream.
+    """Return the motion of a simulated robot.
 
-    Raise MissingExtraError where what simulates is not installed, ValueError for other robots.
+    Raise MissingExtraError if the simulator is not installed, ValueError for unknown robots.
     """
     made = simulate(load_robot(robot), stream, seed)
     return Motion(made.t, made.q, made.dq, made.ddq, made.tau, tuple(made.joint_names), "gravity_included")
 
 
 def recorded(path: Path, seconds: float | None = None) -> Motion:
-    """A recording, prepared as the service prepares an upload; its first seconds where these are given.
+    """Return (the first seconds of) a recording, prepared like an upload.
 
-    Raise CommandError where it cannot be read or has no times.
+    Raise CommandError if it cannot be read or has no times.
     """
     with tempfile.TemporaryDirectory() as folder:
         try:
@@ -204,28 +212,28 @@ def recorded(path: Path, seconds: float | None = None) -> Motion:
         names = staged.joint_names
     t = t[rows]
     if len(t) < 2 or not np.all(np.diff(t) > 0):
-        raise CommandError(f"{path.name} has no times that rise from row to row, expected a column t in seconds")
+        raise CommandError(f"{path.name} has no increasing times: a column `t` in seconds is required")
     return Motion(t=t, **parts, joint_names=names, torque_convention=convention)
 
 
 def _staged(path: Path, folder: Path) -> tuple[Staged, TorqueConvention]:
-    """Columns of a recording in a folder, and what its torque is."""
+    """Return the columns of a recording, staged in a folder, and its torque convention."""
     settings, options = Settings(home=folder, max_home_bytes=None), UploadOptions()
     disk = Disk(settings)
     with open_table(path, None, options.read, settings) as table:
-        recording = read(table, folder, options, None, settings, disk, FEWEST)
-    return prepare(recording.staged, folder, options.recipe, FEWEST, disk).staged, recording.torque_convention
+        recording = read(table, folder, options, None, settings, disk, MIN_ROWS)
+    return prepare(recording.staged, folder, options.recipe, MIN_ROWS, disk).staged, recording.torque_convention
 
 
 class Stop:
-    """Whether Ctrl-C was pressed. The first lets the row that is under way be answered; the second ends it at once."""
+    """Flag set by Ctrl-C. The first press lets the current row be answered; the second stops at once."""
 
     def __init__(self) -> None:
         self.asked = False
 
     @contextmanager
     def listening(self) -> Iterator[Stop]:
-        """Listen for Ctrl-C, in the main thread, which alone hears it."""
+        """Handle Ctrl-C in the block; does nothing outside the main thread, which alone gets signals."""
         if threading.current_thread() is not threading.main_thread():
             yield self
             return
@@ -250,18 +258,28 @@ def play(
     each_second: Callable[[int, Tally], None],
     total: Tally,
 ) -> None:
-    """Ask for the torque at each row when it is due, and send what was measured there where it is to be learnt.
+    """Query the torque at each row when it is due, and send the measured torque if the model is to learn from it.
 
-    A row that is refused is counted and the next one is sent; rows that are due already follow without a pause. Raise
-    StreamError where the stream is lost. each_second: is told which second of the playing has ended, and its figures.
-    total: gets the figures of all rows, also where the stream is lost.
+    Rejected rows are counted. Rows that are overdue follow without a pause.
+
+    Args:
+        stream: The open stream.
+        motion: The rows to play.
+        learn: Whether to send the measured torque.
+        deadline: Time after which an answer is late, s.
+        stop: Ends the loop when Ctrl-C was pressed.
+        each_second: Called at the end of each second with its number and figures.
+        total: Receives the figures of all rows, also if the stream is lost.
+
+    Raises:
+        StreamError: The stream is lost.
     """
     part = Tally(stream.hello.noise_std)
     due = motion.t - motion.t[0]
     begin, second = time.perf_counter(), 1
     for row in range(len(motion)):
         while (wait := begin + due[row] - time.perf_counter()) > 0 and not stop.asked:
-            time.sleep(min(wait, 0.05))  # a Ctrl-C is handled after this time at the latest
+            time.sleep(min(wait, 0.05))  # short, so that Ctrl-C is handled soon
         if stop.asked:
             break
         sent = time.perf_counter()
@@ -273,7 +291,7 @@ def play(
         tau = motion.tau[row] if learn else None
         try:
             stream.send(motion.q[row], motion.dq[row], motion.ddq[row], deadline=deadline, tau=tau)
-            answer = stream.receive()  # its own, however late
+            answer = stream.receive()  # the answer to this row, even if late
         except StreamError as error:
             if error.sequence is None:
                 total.merge(part)

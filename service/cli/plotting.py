@@ -1,4 +1,4 @@
-"""Drawing planned motions, and measured and predicted torque. Needs matplotlib (extra `plot`)."""
+"""Plots of planned motions and of measured and predicted torque. Requires matplotlib (extra `plot`)."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from service.foundation.text import percent
 
 
 def pyplot() -> Any:
-    """Matplotlib's plotting module; raise MissingExtraError."""
+    """Import and return `matplotlib.pyplot`; raise MissingExtraError if it is not installed."""
     import_extra("matplotlib", "plot").use("agg")
     return import_extra("matplotlib.pyplot", "plot")
 
 
 def draw_motion(path: Path, made: Plan) -> None:
-    """Draw each joint's position, speed and acceleration with their limits, and what is expected to be left."""
+    """Draw each joint's position, speed and acceleration with their limits, and the expected remaining variance."""
     plt, limits = pyplot(), made.limits
     t, *parts = made.table()
     bounds = ((limits.lower, limits.upper), (-limits.speed, limits.speed), (-limits.acceleration, limits.acceleration))
@@ -40,7 +40,7 @@ def draw_motion(path: Path, made: Plan) -> None:
     for axis in axes[-1]:
         axis.set_xlabel("s", fontsize=8)
     mean = float(np.exp(np.log(made.left).mean()))
-    figure.suptitle(f"planned motion: {percent(mean, 2)} of the torque's variance expected to be left", fontsize=9)
+    figure.suptitle(f"planned motion: expected remaining torque variance {percent(mean, 2)}", fontsize=9)
     figure.tight_layout()
     figure.savefig(path, dpi=100)
     plt.close(figure)

@@ -1,4 +1,4 @@
-"""`lipserve robots`: robots that are known by name, and URDFs that were uploaded."""
+"""`lipserve robots`: robot profiles and uploaded URDFs."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from service.cli.consoles import CommandError, echo, out, print_json, print_resu
 from service.cli.options import Json, Limit, Url, Yes, confirm, group
 from service.foundation.text import counted
 
-app = group("Robots: list those that are known, show one, add and delete URDFs.")
-Robot = Annotated[str, typer.Argument(help="A profile such as panda, or the id of an uploaded URDF.")]
+app = group("List and show robots; add and delete URDFs.")
+Robot = Annotated[str, typer.Argument(help="Profile such as panda, or id of an uploaded URDF.")]
 RobotId = Annotated[str, typer.Argument(help="Id of an uploaded URDF.")]
 
 
 @app.command("list")
 def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
-    """List robots: uploaded URDFs, newest first, then those that are known by name."""
+    """List robots: uploaded URDFs, newest first, then profiles."""
     with connected(url) as client:
         uploaded, profiles = list(islice(client.robots(), limit)), client.profiles()
     if as_json:
@@ -39,7 +39,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
 
 @app.command()
 def show(robot: Robot, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
-    """Print the joints of a robot with their limits; of a URDF also when it was uploaded, and its hash."""
+    """Print the joints and limits of a robot; for a URDF also its upload time and hash."""
     with connected(url) as client:
         known = client.profile(robot)
         uploaded = client.robot(robot) if robot.startswith("urdf_") else None
@@ -62,18 +62,18 @@ def add(
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Upload a URDF, so that recordings and trainings can name it."""
+    """Upload a URDF for use with recordings and training."""
     if path.suffix != ".urdf":
         raise CommandError(f"path is {str(path)!r}, expected a .urdf file")
     with connected(url) as client:
         robot = client.upload_robot(path)
-    print_result(robot, as_json, f"{path.name} is uploaded as {robot.id}: `lipserve train … --robot {robot.id}`")
+    print_result(robot, as_json, f"{path.name} uploaded as {robot.id}: `lipserve train … --robot {robot.id}`")
 
 
 @app.command()
 def delete(robot: RobotId, yes: Yes = False, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
-    """Delete an uploaded URDF. Models that were trained with it keep their copy."""
-    confirm(f"delete {robot} for good?", yes)
+    """Delete an uploaded URDF. Models trained with it keep a copy."""
+    confirm(f"Delete {robot} permanently?", yes)
     with connected(url) as client:
         client.delete_robot(robot)
-    print_result({"deleted": robot}, as_json, f"{robot} is deleted")
+    print_result({"deleted": robot}, as_json, f"{robot} deleted")

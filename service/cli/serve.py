@@ -24,23 +24,23 @@ ERRORS = (HomeError,)
 def serve(
     host: Annotated[str | None, typer.Option(help="Address to listen on (LIPSERVE_HOST).")] = None,
     port: Annotated[int | None, typer.Option(help="Port to listen on (LIPSERVE_PORT).")] = None,
-    grpc_port: Annotated[int | None, typer.Option(help="Port to listen on for gRPC, too (LIPSERVE_GRPC_PORT).")] = None,
-    uds: Annotated[Path | None, typer.Option(help="Unix-domain socket to listen on too (LIPSERVE_UDS).")] = None,
+    grpc_port: Annotated[int | None, typer.Option(help="Port for gRPC (LIPSERVE_GRPC_PORT).")] = None,
+    uds: Annotated[Path | None, typer.Option(help="Also listen on this Unix-domain socket (LIPSERVE_UDS).")] = None,
 ) -> None:
     """Serve models and run training jobs."""
     settings = settings_of(host=host, port=port, grpc_port=grpc_port, uds=uds)
     sockets.check_port(settings.host, settings.port)
     limit_free_memory()
     start_logs(settings)
-    check_home(settings)  # before the app opens it for good: what is wrong is said without a traceback
+    check_home(settings)  # before the app opens it, so that errors are printed without a traceback
     served = create_app(settings)
     rpc.check_port(settings)
     config = uvicorn.Config(
         served,
         host=settings.host,
         port=settings.port,
-        log_config=None,  # as configured above
-        access_log=False,  # the service's own says more
+        log_config=None,  # configured by `start_logs`
+        access_log=False,  # the service logs requests itself
         loop="uvloop",
         http=guarded(settings),
         ws=StreamProtocol,

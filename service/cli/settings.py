@@ -14,7 +14,7 @@ app = alone()
 
 @app.command()
 def settings(as_json: Json = False) -> None:
-    """List all settings with the values that a service started here has. Passwords are not shown."""
+    """List all settings with the values that a service started here uses. Passwords are hidden."""
     found = describe(settings_of())
     if as_json:
         print_json([each._asdict() for each in found])

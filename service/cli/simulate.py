@@ -1,4 +1,4 @@
-"""`lipserve simulate`: streams as files that the service reads, and the options that describe a simulation."""
+"""`lipserve simulate`: write a simulated motion as a recording."""
 
 from __future__ import annotations
 
@@ -32,14 +32,11 @@ from service.cli.options import (
 from service.foundation.text import counted
 
 COLUMNS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torque"}
-"""What stands behind a joint's name in the columns of a CSV."""
+"""Second part of a CSV column's name, after that of the joint."""
 
 
 def write_recording(path: Path, samples: Samples) -> None:
-    """Write samples as CSV or NPZ by the path's ending, with the names of the joints, so that an upload has them.
-
-    Raise ValueError for another ending.
-    """
+    """Write samples with their joint names as CSV or NPZ, by the suffix; raise ValueError for other suffixes."""
     if path.suffix == ".npz":
         names = ("t", "episode", "q", "dq", "ddq", "tau")
         arrays = {name: getattr(samples, name) for name in names}
@@ -67,7 +64,7 @@ def described(
     payload_at: float,
     dirt: float,
 ) -> Simulation:
-    """What the options of a simulation ask for; `simulate` checks it."""
+    """Return the simulation that the options describe; `simulate` checks it."""
     return Simulation(
         n_samples=samples,
         rate=rate,
@@ -90,8 +87,8 @@ app = alone()
 def simulate_(
     robot: Annotated[str, typer.Argument(help=f"One of {', '.join(ROBOTS)}.", autocompletion=lambda: list(ROBOTS))],
     output: Annotated[Path, typer.Argument(help="File to write, .csv or .npz.", dir_okay=False)],
-    samples: Annotated[int, typer.Option(min=2, help="How many.")] = 500,
-    rate: Annotated[float, simulation("Hz.")] = 10.0,
+    samples: Annotated[int, typer.Option(min=2, help="Number of samples.")] = 500,
+    rate: Annotated[float, simulation("Sample rate, Hz.")] = 10.0,
     seed: Seed = 0,
     sinusoids: Sinusoids = 50,
     motion: Range = "middle",
@@ -105,7 +102,7 @@ def simulate_(
     dirt: DirtShare = 0.0,
     as_json: Json = False,
 ) -> None:
-    """Simulate a robot's stream with Pinocchio and write it as a recording."""
+    """Simulate a robot with Pinocchio and write its motion as a recording."""
     stream = described(
         samples, rate, sinusoids, motion, course, fast, noise, viscous, coulomb, payload, payload_at, dirt
     )

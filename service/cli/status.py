@@ -12,9 +12,9 @@ app = alone()
 
 @app.command()
 def status(url: Url = DEFAULT_URL, as_json: Json = False) -> None:
-    """Print whether a service is ready, part by part, and which extras are not installed there.
+    """Print whether a service is ready, part by part, and which extras are not installed.
 
-    Ends with 1 where it is not ready.
+    Exits with code 1 if the service is not ready.
     """
     with connected(url) as client:
         health, extras = client.health(), client.abilities()
@@ -28,4 +28,4 @@ def status(url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     for each in health.checks:
         echo(f"  {each.name:{wide}}  {each.state:7}  {each.message}")
     for extra in extras.missing:
-        echo(f"not installed there: {extra.install} to {extra.gives}")
+        echo(f"not installed: {extra.install} to {extra.gives}")

@@ -1,4 +1,4 @@
-"""Answers as tables for the terminal."""
+"""Tables of predictions, evaluations and reports for the terminal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.foundation.text import counted, percent
 
 
 def prediction_tables(answer: Prediction) -> list[Table]:
-    """Tables of the answer to one query: joints, then components that are matrices, then those that are numbers."""
+    """Return tables of a prediction: joints, then matrix components, then scalar components."""
     columns = {"tau N·m": _texts(answer.tau), "tau_std": _texts(answer.tau_std), "noise_std": _texts(answer.noise_std)}
     matrices, numbers = [], Table("", "mean", "std")
     for name, values in (answer.components or {}).items():
@@ -38,45 +38,46 @@ def prediction_tables(answer: Prediction) -> list[Table]:
 
 
 FIGURES = ("nmse", "rmse", "coverage", "coverage_low", "coverage_high", "independent", "interval_width", "nlpd")
-"""Of each joint."""
+"""Figures of each joint."""
 
 
 def evaluation_table(result: Evaluation) -> Table:
-    """Figures of an evaluation, joint by joint."""
+    """Return a table of the figures of an evaluation, one row per joint."""
     figures = {name: getattr(result, name).tolist() for name in FIGURES}
     return figures_table(result.title, result.joint_names, figures)
 
 
 def judged(quality: HeldOutQuality | None) -> tuple[str, str]:
-    """Mean nMSE and mean coverage of the joints on what was held out, as cells of a list."""
+    """Return the joints' mean held-out nMSE and mean coverage as cells of a list."""
     if quality is None:
         return NOTHING, NOTHING
     return _figure(_mean(quality.nmse), ".2e"), _figure(_mean(quality.coverage), ".0%")
 
 
 def figures_table(title: str, joint_names: Sequence[str], figures: Mapping[str, Sequence[float | None]]) -> Table:
-    """Figures per joint, as an evaluation or a version's lineage tells them; that of an import may have fewer."""
-    table = Table("joint", "nMSE", "RMSE N·m", "in 95 %", "known to be", "width N·m", "NLPD nats", title=title)
+    """Return a table of figures, one row per joint; figures that are missing (older imports) show as `-`."""
+    table = Table(
+        "joint", "nMSE", "RMSE N·m", "coverage (95 %)", "95 % CI of coverage", "width N·m", "NLPD nats", title=title
+    )
     columns = [figures.get(name) or [None] * len(joint_names) for name in FIGURES]
     for joint, nmse, rmse, coverage, low, high, count, width, nlpd in zip(joint_names, *columns, strict=True):
-        known = "-" if count is None else f"{percent(low)} to {percent(high)}, by {counted(round(count), 'error')}"
-        cells = [_figure(nmse, ".2e"), _figure(rmse, ".4f"), _figure(coverage, ".1%"), known]
+        ci = "-" if count is None else f"{percent(low)} to {percent(high)} ({round(count):,} effective)"
+        cells = [_figure(nmse, ".2e"), _figure(rmse, ".4f"), _figure(coverage, ".1%"), ci]
         table.add_row(joint, *cells, _figure(width, ".3f"), _figure(nlpd, ".3f"))
     return table
 
 
 def selection_table(selection: Selection) -> Table:
-    """How the estimators did that `auto` has chosen from."""
+    """Return a table of the estimators that `auto` compared."""
     held = selection.held_out
-    title = "not judged"
+    title = "not evaluated"
     if held.blocks:
-        stretches = counted(held.blocks, "stretch", "stretches")
-        title = f"judged on {stretches} held out, {held.edge_blocks} at the edge of the data"
+        title = f"evaluated on {counted(held.blocks, 'held-out block')}, {held.edge_blocks} at the edge of the data"
     table = Table(
-        "estimator", "log density nats", "less than the best", "mean nMSE", "at the edge", "in 95 %", title=title
+        "estimator", "log density nats", "below best", "mean nMSE", "nMSE at edge", "coverage (95 %)", title=title
     )
     for each in selection.table:
-        name = f"{each.estimator} (chosen)" if each.estimator == selection.chosen else each.estimator
+        name = f"{each.estimator} (selected)" if each.estimator == selection.chosen else each.estimator
         if each.error is not None:
             table.add_row(name, f"failed: {escape(each.error)}", "", "", "", "")
             continue
@@ -89,7 +90,7 @@ def selection_table(selection: Selection) -> Table:
 
 
 def _mean(values: Sequence[float | None] | None) -> float | None:
-    """Of the joints that have a figure."""
+    """Return the mean over joints that have a figure, None if none has."""
     known = [each for each in values or () if each is not None]
     return sum(known) / len(known) if known else None
 
@@ -113,10 +114,10 @@ def _pairs(means: ArrayLike, stds: ArrayLike) -> list[str]:
 
 
 def comparison_table(comparison: Comparison) -> Table:
-    """Figures of two versions, joint by joint."""
+    """Return a table of the figures of two versions, one row per joint."""
     title = f"{comparison.model} on {counted(comparison.samples_used, 'sample')} of {comparison.dataset}"
     numbers = [f"version {each.version}" for each in comparison.versions]
-    heads = [f"{figure}, {number}" for figure in ("nMSE", "RMSE N·m", "in 95 %") for number in numbers]
+    heads = [f"{figure}, {number}" for figure in ("nMSE", "RMSE N·m", "coverage") for number in numbers]
     table = Table("joint", *heads, title=title)
     for at, joint in enumerate(comparison.joint_names):
         cells = [
@@ -129,7 +130,7 @@ def comparison_table(comparison: Comparison) -> Table:
 
 
 def arm_tables(arm: Arm) -> list[Table]:
-    """Where the joints of an arm lie, what they carry and their friction, a row a joint from base to tip."""
+    """Return tables of joint frames, bodies and friction, one row per joint from base to tip."""
     tables = []
     for title, columns in arm.tables().items():
         table = Table(*columns, title=title)
@@ -143,18 +144,18 @@ NOTHING = "–"
 
 
 def overview(report: DatasetReport) -> Iterator[str]:
-    """What was read and what was done to it, a sentence each."""
+    """Yield sentences on how a recording was read and prepared."""
     yield from report.reading
     yield from report.preparation
     rate = NOTHING if report.rate_hz is None else f"{report.rate_hz:.4g} Hz"
     parts, gaps = counted(report.episodes, "episode"), counted(report.gaps, "gap")
-    yield f"{report.rows:,} of {report.rows_uploaded:,} rows are samples, in {parts}, at {rate}"
+    yield f"{report.rows:,} of {report.rows_uploaded:,} rows are used as samples, in {parts}, at {rate}"
     if report.timing.jitter_p99 is not None:
-        yield f"jitter: 99 % of the steps within {percent(report.timing.jitter_p99, 1)} of the usual one; {gaps}"
+        yield f"jitter: 99 % of time steps within {percent(report.timing.jitter_p99, 1)} of the median; {gaps}"
 
 
 def report_tables(report: DatasetReport, joint_names: Sequence[str]) -> Iterator[Table]:
-    """What is known of each joint: motion, torque, and what the data tell of it."""
+    """Yield tables of the joints: signals, friction, and comparison with the robot."""
     yield _joints(report, joint_names)
     yield _friction(report.excitation.joints)
     if report.against_robot is not None:
@@ -162,7 +163,7 @@ def report_tables(report: DatasetReport, joint_names: Sequence[str]) -> Iterator
 
 
 def _joints(report: DatasetReport, joint_names: Sequence[str]) -> Table:
-    table = Table("joint", "q", "|dq|", "|ddq|", "tau N·m", "noise N·m", "lag ms", "of range", title="signals")
+    table = Table("joint", "q", "|dq|", "|ddq|", "tau N·m", "noise N·m", "lag ms", "range used", title="signals")
     limits = {each.joint: each for each in report.limits}
     noise = {each.joint: each for each in report.noise}
     lag = {each.joint: each for each in report.lag}
@@ -184,14 +185,14 @@ def _joints(report: DatasetReport, joint_names: Sequence[str]) -> Table:
 
 
 def _friction(joints: Sequence[JointExcitation]) -> Table:
-    table = Table("joint", "reversals", "viscous", "Coulomb", "offset", title="what the data tell of friction")
+    table = Table("joint", "reversals", "viscous", "Coulomb", "offset", title="identifiability of friction")
     for each in joints:
         table.add_row(each.joint, str(each.reversals), *map(_weight, (each.viscous, each.coulomb, each.offset)))
     return table
 
 
 def _against(found: AgainstRobot) -> Table:
-    table = Table("joint", "gravity", "inertia", "explained", title=f"torque, times that of {found.robot}")
+    table = Table("joint", "gravity", "inertia", "explained", title=f"torque relative to {found.robot}")
     for each in found.joints:
         times = [_times(each.gravity, each.gravity_std), _times(each.inertia, each.inertia_std)]
         table.add_row(each.joint, *times, percent(each.explained))

@@ -1,4 +1,4 @@
-"""Reading everything that a home stores, to find what is damaged before it is needed."""
+"""`lipserve verify`: check everything that a home stores."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from service.storage.storage import WAIT_S, HomeError, explain_home_errors
 
 
 class Damage(NamedTuple):
-    """Something stored that cannot be used. kind, name: of what; reason: why."""
+    """Stored item that cannot be used, and the reason."""
 
     kind: str
     name: str
@@ -44,26 +44,31 @@ class Damage(NamedTuple):
 
 @dataclass
 class Verified:
-    """What was read, how many of each kind, and what of it is damaged."""
+    """Number of items read, by kind, and those that are damaged."""
 
     read: dict[str, int] = field(default_factory=dict)
     damages: list[Damage] = field(default_factory=list)
 
     def document(self) -> dict[str, Any]:
-        """The findings for JSON."""
+        """Return the findings for JSON."""
         return {"read": self.read, "damaged": [each._asdict() for each in self.damages]}
 
 
 def verify_home(settings: Settings) -> Verified:
-    """Read a home whole: the database, data sets, robots, versions, what they have learnt and the log of observations.
+    """Read the database, data sets, robots, versions, snapshots and logged observations of a home.
 
-    It may run beside the service: what that deletes meanwhile is not damaged. Nothing is changed but a database of an
-    earlier release, which is brought up to date. Where services share a database and files, all of these are read, and
-    no copies of them. Raise FileNotFoundError where the home has no database, FilesUnreachableError where the shared
-    files cannot be read now.
+    It may run beside the service: an item that the service deletes meanwhile does not count as damaged. Nothing is
+    changed, except that a database of an earlier release is migrated. If services share a database and files, those are
+    read, not local copies.
+
+    Raises:
+        FileNotFoundError: The home has no database.
+        FilesUnreachableError: The shared files cannot be read now.
     """
     if settings.database_url is None and not (settings.home / FILE).is_file():
-        raise FileNotFoundError(f"home is {str(settings.home)!r}, expected a folder with the database of a service")
+        raise FileNotFoundError(
+            f"home is {str(settings.home)!r}, expected a folder with the database of a service: set LIPSERVE_HOME"
+        )
     threadpool_limits(SERVING_THREADS)
     database = Database.of(settings, WAIT_S)
     try:
@@ -89,7 +94,7 @@ def _verify(database: Database, files: Files) -> Verified:
 
 
 _Finding = tuple[str, Callable[[Session], bool], str | None]
-"""Name of what was read, how to tell whether it has been deleted since, and why it is damaged, None where it is not."""
+"""Name of an item, a check whether it was deleted meanwhile, and its damage (None if it is intact)."""
 
 
 def _datasets(database: Database, files: Files) -> Iterator[_Finding]:
@@ -102,7 +107,7 @@ def _datasets(database: Database, files: Files) -> Iterator[_Finding]:
 def _read_dataset(files: Files, row: DatasetRow) -> None:
     samples = files.read_samples(row.id, row.joint_names, row.sha256)
     if len(samples) != row.rows:
-        raise ValueError(f"it has {len(samples)} rows, expected {row.rows}")
+        raise ValueError(f"the file has {len(samples)} rows, expected {row.rows}")
 
 
 def _robots(database: Database, files: Files) -> Iterator[_Finding]:
@@ -110,7 +115,7 @@ def _robots(database: Database, files: Files) -> Iterator[_Finding]:
         rows = list(session.scalars(select(RobotRow).options(undefer(RobotRow.urdf))))
     for row in rows:
         same = hashlib.sha256(row.urdf.encode()).hexdigest() == row.sha256
-        yield row.id, _gone(RobotRow, row.seq), None if same else "its URDF has another sha256 than was kept"
+        yield row.id, _gone(RobotRow, row.seq), None if same else "the sha256 of its URDF has changed"
 
 
 def _versions(database: Database, files: Files) -> Iterator[_Finding]:
@@ -124,7 +129,7 @@ def _versions(database: Database, files: Files) -> Iterator[_Finding]:
 def _read_version(files: Files, row: VersionRow) -> None:
     probe(files.load_version(row.folder, row.checksums))
     if files.read_version(row.folder, persistence.read_manifest) != registry.manifest_on_disk(row):
-        raise ValueError("manifest.json is not the manifest that the database has")
+        raise ValueError("manifest.json differs from the manifest in the database")
 
 
 def _snapshots(database: Database, files: Files) -> Iterator[_Finding]:
@@ -141,7 +146,7 @@ def _snapshots(database: Database, files: Files) -> Iterator[_Finding]:
 
 
 def _base(files: Files, row: VersionRow | None) -> lipcore.TorqueModel | None:
-    """The version as trained, None where it cannot be read, which is said of the version."""
+    """Return the version as trained, or None if it cannot be read: that is reported for the version."""
     try:
         return None if row is None else files.load_version(row.folder, row.checksums)
     except lipcore.ModelFormatError:
@@ -170,14 +175,14 @@ def _observations(database: Database, files: Files) -> Iterator[_Finding]:
 def _read_event(row: EventRow) -> None:
     rows = decode(row.payload or b"")
     if len(rows) != row.rows:
-        raise ValueError(f"it has {len(rows)} rows, expected {row.rows}")
+        raise ValueError(f"the batch has {len(rows)} rows, expected {row.rows}")
 
 
 def _reason(read: Callable[..., None], *arguments: Any) -> str | None:
-    """Why something cannot be read, None where it can."""
+    """Return why an item cannot be read, or None if it can."""
     try:
         read(*arguments)
-    except FilesUnreachableError:  # which says nothing of the file
+    except FilesUnreachableError:  # says nothing about the file itself
         raise
     except (ValueError, OSError, DamagedDataError) as error:
         return str(error)
@@ -203,7 +208,7 @@ ERRORS = (HomeError,)
 
 @app.command()
 def verify(as_json: Json = False) -> None:
-    """Read everything that the home LIPSERVE_HOME stores and report what is damaged; also while the service runs."""
+    """Check everything stored in the home LIPSERVE_HOME and report damage. Works while the service is running."""
     settings = settings_of()
     with explain_home_errors(settings):
         findings = verify_home(settings)

@@ -1,4 +1,4 @@
-"""What the service says of an upload or a job, with the options of the command line in place of those of the API."""
+"""Replaces field names of the API by command line options in messages of the service."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ FLAGS = {
     **{"column_names": "--columns", "dt": "--dt"},
     **{"holdout.share": "--hold-out", "holdout.kind": "--hold-out-by", "holdout.only": "--hold-out-only"},
 }
-"""Options of the command line by the fields of the API."""
+"""Command line options by API field."""
 QUANTITIES_BY_NAME = ("columns", "units", "options")
-"""Fields that hold values by name: their options are given as name=value, repeatedly."""
+"""Fields with named values; their options have the form name=value and can be repeated."""
 
 _GIVEN = re.compile(rf"\b({'|'.join(QUANTITIES_BY_NAME)})=(?=\{{)")
 _VALUE = re.compile(rf"(?<![\w.-])({'|'.join(map(re.escape, FLAGS))})=([^\s{{}}`]*[^\s{{}}`.,;:?!])")
@@ -29,7 +29,7 @@ _FIELD = re.compile(rf"^({'|'.join(map(re.escape, FLAGS))})(?:\.(\w+))? is ")
 
 
 def in_shell(text: str) -> str:
-    """A sentence of the service as the shell has it: `units={"q": "deg"}` becomes `--unit q=deg`."""
+    """Replace API fields in a message by options: `units={"q": "deg"}` becomes `--unit q=deg`."""
     text = _FIELD.sub(_field, text)
     text = _VALUE.sub(lambda match: _option(match[1], match[2]), _objects(text))
     text = _MARKED.sub(lambda match: f"`{FLAGS[match[1]]}`", text)
@@ -44,7 +44,7 @@ def _field(match: re.Match[str]) -> str:
 
 
 def _objects(text: str) -> str:
-    """A sentence whose values by name, which are JSON, are options."""
+    """Replace fields whose value is a JSON object by options."""
     out, at = "", 0
     while (match := _GIVEN.search(text, at)) is not None:
         try:

@@ -16,18 +16,19 @@ app = alone()
 
 @app.command()
 def worker(
-    gpus: Annotated[int, typer.Option(min=0, help="GPUs of this worker, for jobs that ask for one.")] = 0,
-    name: Annotated[str | None, typer.Option(help="Name in the cluster; its address by default.")] = None,
+    gpus: Annotated[int, typer.Option(min=0, help="Number of GPUs of this worker, for jobs that need one.")] = 0,
+    name: Annotated[str | None, typer.Option(help="Name in the cluster. Default: its address.")] = None,
 ) -> None:
-    """Run training jobs and shards of statistics for services that share a cluster, LIPSERVE_CLUSTER.
+    """Run training jobs and shards of statistics for services that share the cluster LIPSERVE_CLUSTER.
 
-    It needs the same LIPSERVE_DATABASE_URL and LIPSERVE_FILES_URL as they, and a home of its own for copies of files.
+    Set LIPSERVE_DATABASE_URL and LIPSERVE_FILES_URL as for the services. Give each worker its own LIPSERVE_HOME for
+    copies of files.
     """
     settings = settings_of()
     if settings.cluster is None:
-        raise CommandError("LIPSERVE_CLUSTER is not set, expected the address of a scheduler such as tcp://host:8786")
+        raise CommandError("LIPSERVE_CLUSTER is not set", "set it to the address of a scheduler: tcp://host:8786")
     start_logs(settings)
-    # before numerics are imported: they start their threads then
+    # numerical libraries read these variables when they are imported
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, str(settings.training_threads)))
     from service.training import hosting  # noqa: PLC0415
 

@@ -1,1 +1,1 @@
-"""What crosses the border: every object of the API, declared once."""
+"""Objects of the API, each declared once."""

@@ -1,4 +1,4 @@
-"""Lines of the audit log, as the API shows them."""
+"""Entries of the audit log."""
 
 from __future__ import annotations
 
@@ -28,23 +28,25 @@ class AuditEntry(BaseModel):
 
     id: int
     at: str
-    key: str | None = Field(description="API key of who did it; null where keys are not needed, and of the service")
-    key_name: str | None = Field(description="Its name")
+    key: str | None = Field(description="Id of the API key; null without keys and for changes by the service")
+    key_name: str | None = Field(description="Name of the API key")
     what: str = Field(
-        description="Method and route of the request, `job` and its id, or `service` for what that does by itself",
+        description="Origin of the change: method and route of the request, `job` and its id, or `service`",
         examples=["PUT /v1/models/{model}/aliases/{alias}"],
     )
-    request_id: str | None = Field(description="Of that request, as in the log; of a job the one that queued it")
+    request_id: str | None = Field(
+        description="Id of the request, as in the service's log; for a job, of the request that queued it"
+    )
     model: str
     change: Change
-    version: int | None = Field(description="The version that it is about, null where it is about the model")
-    alias: str | None = Field(description="The alias that was moved; `serving` is what answers by default")
-    before: Any = Field(description="What was: a version, a revision, options; null where nothing was")
-    after: Any = Field(description="What is from then on; null where nothing is")
+    version: int | None = Field(description="Changed version; null if the change concerns the whole model")
+    alias: str | None = Field(description="Alias that was moved; `serving` is the default version")
+    before: Any = Field(description="Value before the change: a version, a revision or options; null if there was none")
+    after: Any = Field(description="Value after the change; null if there is none")
 
 
 class AuditPage(BaseModel):
     """One page of the audit log."""
 
     items: list[AuditEntry]
-    next_cursor: str | None = Field(description="Names the page after this one; null on the last")
+    next_cursor: str | None = Field(description="Cursor of the next page; null on the last page")

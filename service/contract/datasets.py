@@ -9,155 +9,169 @@ from pydantic import BaseModel, Field
 from lipcore.vocabulary import JointType, TorqueConvention
 
 Verdict = Literal["well", "poorly", "not determined"]
-"""How well the data tell a weight, see `FrictionOptions` for the thresholds."""
+"""How well the data determine a friction coefficient; `FrictionOptions` has the thresholds."""
 
 Share = float
 
-MOST_STARTS = 2000
-"""Most starts of episodes in a preview."""
+MAX_PREVIEW_STARTS = 2000
+"""Max episode starts in a preview."""
 
 
 class Gap(BaseModel):
-    """A pause within a recording."""
+    """A gap in time within a recording."""
 
-    t: float = Field(description="Time of the last sample before it, s")
-    seconds: float = Field(description="How long it lasts")
+    t: float = Field(description="Time of the last sample before the gap, s")
+    seconds: float = Field(description="Duration of the gap, s")
 
 
 class Timing(BaseModel):
-    """When samples were taken. Shares are of the usual step of time."""
+    """Sampling times of the recording. Jitter is a share of the median time step."""
 
-    rate_hz: float | None = Field(description="Usual rate of what was uploaded; null where no times were given")
-    duration_s: float | None = Field(description="Time that the episodes cover, gaps left out")
-    jitter_p50: Share | None = Field(description="Median deviation of a step from the usual one")
-    jitter_p99: Share | None = Field(description="Deviation that 99 % of the steps stay within")
-    jitter_max: Share | None = Field(description="Largest deviation of a step that is no gap")
+    rate_hz: float | None = Field(description="Median sampling rate of the upload, Hz; null if it has no times")
+    duration_s: float | None = Field(description="Total duration without gaps, s")
+    jitter_p50: Share | None = Field(description="Median deviation of a time step from the median step")
+    jitter_p99: Share | None = Field(description="99 % quantile of that deviation")
+    jitter_max: Share | None = Field(description="Largest deviation of a time step that is not a gap")
     gaps: list[Gap] = Field(description="The longest gaps, at most 20, in order of time")
-    repeated_stamps: int = Field(description="Rows left out as their time had been there before")
-    missing_rows: int = Field(description="Rows left out as a value was missing")
+    repeated_stamps: int = Field(description="Rows dropped because their time stamp repeats an earlier one")
+    missing_rows: int = Field(description="Rows dropped because a value is missing")
 
 
 class JointSaturation(BaseModel):
-    """Signs that a joint's torque was cut off. Shares are of its samples."""
+    """Signs that a joint's torque was saturated. Shares are of its samples."""
 
     joint: str
     at_largest: Share = Field(description="Share of samples at the largest or the smallest torque")
-    flat: Share = Field(description="Share that stays there for five samples and longer while the joint moves")
-    at_limit: Share | None = Field(description="Share at 99 % of the robot's torque limit and above")
+    flat: Share = Field(description="Share of samples that stay there for at least five samples while the joint moves")
+    at_limit: Share | None = Field(
+        description="Share of samples at or above 99 % of the torque limit; null if it is unknown"
+    )
 
 
 class JointLimits(BaseModel):
-    """A joint against the robot's limits; null where a limit is not known."""
+    """A joint compared with the robot's limits. Values are null if the limit is unknown."""
 
     joint: str
-    range_used: Share | None = Field(description="Share of the range of positions between smallest and largest")
-    speed_used: Share | None = Field(description="Largest speed over the limit")
-    torque_used: Share | None = Field(description="Largest torque over the limit")
-    beyond_range: Share | None = Field(description="Share of samples beyond the limits of position")
-    beyond_speed: Share | None = Field(description="Share of samples beyond the limit of speed")
-    beyond_torque: Share | None = Field(description="Share of samples beyond the limit of torque")
+    range_used: Share | None = Field(description="Largest less smallest position, as a share of the joint's range")
+    speed_used: Share | None = Field(description="Largest speed divided by the speed limit")
+    torque_used: Share | None = Field(description="Largest torque divided by the torque limit")
+    beyond_range: Share | None = Field(description="Share of samples beyond the position limits")
+    beyond_speed: Share | None = Field(description="Share of samples beyond the speed limit")
+    beyond_torque: Share | None = Field(description="Share of samples beyond the torque limit")
 
 
 class Lag(BaseModel):
-    """How long the torque comes after the motion that it belongs to; negative where it comes before."""
+    """Time lag of the torque behind the motion; negative if the torque is ahead."""
 
-    joint: str | None = Field(description="Null for all joints together")
-    seconds: float | None = Field(None, description="Null where the data cannot tell")
-    std_s: float | None = Field(None, description="Its standard deviation, from leaving out an eighth at a time")
-    cost: Share | None = Field(None, description="Share of the torque's variance that the lag turns into error")
-    reason: str | None = Field(None, description="Why the data cannot tell")
+    joint: str | None = Field(description="Joint; null for all joints combined")
+    seconds: float | None = Field(None, description="Lag, s; null if the data do not determine it")
+    std_s: float | None = Field(
+        None, description="Standard deviation of the lag, s, from leaving out one eighth of the data at a time"
+    )
+    cost: Share | None = Field(None, description="Share of the torque's variance that becomes error because of the lag")
+    reason: str | None = Field(None, description="Why the lag is unknown; null if it is known")
     improves: list[str] = Field(
         [],
-        description="Of a lag that differs from 0: joints whose torque, taken so much later, is clearly predicted "
-        "better on parts held out",
+        description="Joints whose torque is predicted clearly better on held-out parts if the lag is corrected. Empty "
+        "unless the lag differs from 0",
     )
 
 
 class JointNoise(BaseModel):
-    """White noise of the signals as recorded; null where there are too few samples."""
+    """White noise of the signals as recorded; null if there are too few samples."""
 
     joint: str
-    torque: float | None = Field(description="Standard deviation, N·m; null where the torque was smoothed, too")
-    torque_share: Share | None = Field(description="Of the torque's spread")
-    velocity: float | None = Field(description="Standard deviation, rad/s; null where it was not recorded")
-    velocity_share: Share | None = Field(description="Of the velocity's spread")
-    smoothed: bool = Field(False, description="Torque without noise: low-passed, or simulated; nothing tells its noise")
+    torque: float | None = Field(description="Standard deviation of the torque noise, N·m; also null if `smoothed`")
+    torque_share: Share | None = Field(description="Torque noise divided by the standard deviation of the torque")
+    velocity: float | None = Field(
+        description="Standard deviation of the velocity noise, rad/s; also null if not recorded"
+    )
+    velocity_share: Share | None = Field(description="Velocity noise divided by the standard deviation of the velocity")
+    smoothed: bool = Field(
+        False, description="The torque was low-passed or simulated, so its noise cannot be estimated"
+    )
 
 
 class Weight(BaseModel):
-    """A weight of a joint's friction: how well these data would tell it."""
+    """A friction coefficient of a joint, and how well these data determine it."""
 
-    value: float | None = Field(None, description="Its estimate, N·m·s/rad or N·m, beside rigid bodies; else null")
-    std: float | None = Field(description="Standard deviation that they leave; null where they say nothing")
-    share: Share | None = Field(description="Torque of that deviation over the spread of the joint's torque")
+    value: float | None = Field(None, description="Estimate, N·m·s/rad or N·m; null unless rigid bodies are fitted too")
+    std: float | None = Field(description="Standard deviation; null if the data say nothing about it")
+    share: Share | None = Field(
+        description="Torque error at one `std`, divided by the standard deviation of the torque"
+    )
     verdict: Verdict
-    implausible: bool = Field(False, description="Clearly negative friction: no joint has that")
+    implausible: bool = Field(False, description="True if friction is clearly negative, which is physically impossible")
 
 
 class JointExcitation(BaseModel):
-    """How a joint was moved, and what that says of it."""
+    """How a joint moved, and how well its motion determines friction."""
 
     joint: str
     span: float = Field(description="Largest less smallest position, rad or m")
-    visited: Share | None = Field(description="Share of the robot's range, in 20 equal parts, with samples in it")
-    speed_std: float = Field(description="rad/s or m/s")
-    acceleration_std: float = Field(description="rad/s² or m/s²")
-    forwards: Share = Field(description="Share of samples that move forwards, faster than 0.02 rad/s or m/s")
-    backwards: Share = Field(description="Share that move backwards")
-    still: Share | None = Field(None, description="Share that does neither")
-    reversals: int = Field(description="Changes of direction within an episode")
+    visited: Share | None = Field(
+        description="Share of 20 equal parts of the joint's range that have samples; null if unknown"
+    )
+    speed_std: float = Field(description="Standard deviation, rad/s or m/s")
+    acceleration_std: float = Field(description="Standard deviation, rad/s² or m/s²")
+    forwards: Share = Field(description="Share of samples with a velocity above 0.02 rad/s or m/s")
+    backwards: Share = Field(description="Share of samples with a velocity below −0.02 rad/s or m/s")
+    still: Share | None = Field(None, description="Share of samples that move neither way")
+    reversals: int = Field(description="Changes of direction within episodes")
     slow_forwards: Share = Field(description="Share of samples that move forwards slower than 0.1 rad/s or m/s")
-    slow_backwards: Share = Field(description="Share that move backwards as slowly")
+    slow_backwards: Share = Field(description="Share of samples that move backwards slower than 0.1 rad/s or m/s")
     viscous: Weight
     coulomb: Weight
     offset: Weight
     collinear: Share = Field(
-        description="Largest share of one of dq, sign dq, ddq, cos q, sin q that the other four explain"
+        description="Of dq, sign dq, ddq, cos q and sin q, the largest share of one that the other four explain"
     )
-    collinear_term: str = Field(description="Which one that is")
+    collinear_term: str = Field(description="The feature with that share")
 
 
 class WholeExcitation(BaseModel):
-    """How well the data tell the robot's inertial parameters; needs a robot with a URDF."""
+    """How well the data determine the robot's inertial parameters. Needs a robot with a URDF."""
 
-    parameters: int = Field(description="Base parameters: combinations of inertial parameters that torques depend on")
-    rank: int = Field(description="How many of them are excited at least a hundredth as much as by random motion")
-    condition: float | None = Field(description="Condition of the base regressor, columns of equal norm")
-    weakest: Share = Field(description="Excitation of the least excited one over that of random motion")
-    weakest_body: str = Field(description="Joint that moves the body which the least excited one mostly belongs to")
+    parameters: int = Field(
+        description="Number of base parameters: combinations of inertial parameters that affect torque"
+    )
+    rank: int = Field(description="Number of base parameters excited more than 1 % as much as by random motion")
+    condition: float | None = Field(description="Condition number of the base regressor, columns scaled to equal norm")
+    weakest: Share = Field(description="Excitation of the least excited one divided by that of random motion")
+    weakest_body: str = Field(description="Joint that moves the body with the least excited parameters")
 
 
 class Excitation(BaseModel):
-    """How well the data determine what is to be learnt."""
+    """How well the motion determines friction and inertial parameters."""
 
     friction_beside: Literal["rigid bodies", "any motion"] = Field(
-        description="What explains the rest of the torque where the friction's weights are judged: the robot's rigid "
-        "bodies with unknown parameters, or, without them, any smooth function of the motion, which leaves less certain"
+        description="Model of the remaining torque while friction is estimated. `rigid bodies`: the robot's, with "
+        "unknown parameters. `any motion`: any smooth function of the motion, which leaves friction less certain"
     )
     joints: list[JointExcitation]
     standstill: Share | None = Field(None, description="Share of samples in which no joint moves")
     motion_dimensions: float | None = Field(
-        None, description="Independent joints' worth of motion: 1 where all move together, n where each moves by itself"
+        None, description="Number of independent motions: 1 if all joints move together, n if each moves on its own"
     )
     whole: WholeExcitation | None
-    text: str = Field(description="The same in words")
+    text: str = Field(description="Summary in words")
 
 
 class JointAgainstRobot(BaseModel):
-    """A joint's torque against what the robot's rigid bodies need, friction apart; null where nothing tells it."""
+    """A joint's torque, without friction, compared with the robot's rigid bodies; null if it cannot be determined."""
 
     joint: str
-    gravity: float | None = Field(description="Gravity's torque over the robot's: 1 as the URDF has it, 0 where absent")
+    gravity: float | None = Field(description="Gravity torque divided by that of the URDF: 1 if equal, 0 if absent")
     gravity_std: float | None
-    inertia: float | None = Field(description="The same of inertia and velocities; rotors make it larger")
+    inertia: float | None = Field(description="The same for inertial and velocity torques; rotors increase it")
     inertia_std: float | None
-    explained: Share = Field(description="Share of the torque's variance that both and friction explain")
+    explained: Share = Field(description="Share of the torque's variance that rigid bodies and friction explain")
 
 
 class AgainstRobot(BaseModel):
-    """Torque against that of a robot's rigid bodies."""
+    """Measured torque compared with the torque of a robot's rigid bodies."""
 
-    robot: str = Field(description="The robot of the upload, else the one that the names of the joints suggest")
+    robot: str = Field(description="Robot of the upload, else the robot that the joint names suggest")
     joints: list[JointAgainstRobot]
 
 
@@ -168,47 +182,53 @@ Cause = Literal[
 
 
 class Remedy(BaseModel):
-    """What ruins a model, and the options of an upload of the same file that put it right."""
+    """A fault that would spoil a model, and the upload options that correct it."""
 
     cause: Cause
-    joints: list[str] = Field(description="Those concerned")
+    joints: list[str] = Field(description="Affected joints")
     text: str
-    options: dict[str, str] | None = Field(description="Of the upload's query, to be added; null where none would do")
+    options: dict[str, str] | None = Field(
+        description="Query parameters to add when the file is uploaded again; null if none would help"
+    )
 
 
 class DatasetReport(BaseModel):
-    """What was found in the recording and what was done to it."""
+    """Findings about a recording, and how it was prepared."""
 
     rows_uploaded: int
-    rows: int = Field(description="Samples kept")
-    episodes: int = Field(description="Contiguous recordings")
-    rate_hz: float | None = Field(description="Usual sampling rate; null where no times were given")
-    gaps: int = Field(description="Gaps in time, where the recording was split")
-    derived: list[str] = Field(description="Quantities that were not given and had to be derived")
-    preparation: list[str] = Field(description="Every step that changed the data")
-    ranges: dict[str, dict[str, list[float]]] = Field(description="Smallest and largest value per joint")
+    rows: int = Field(description="Samples after preparation")
+    episodes: int = Field(description="Number of contiguous parts")
+    rate_hz: float | None = Field(description="Sampling rate after preparation, Hz; null without times")
+    gaps: int = Field(description="Number of gaps in time at which the recording was split")
+    derived: list[str] = Field(description="Quantities that were not uploaded and were derived")
+    preparation: list[str] = Field(description="Steps that changed the data, one sentence each")
+    ranges: dict[str, dict[str, list[float]]] = Field(description="Smallest and largest value by quantity and joint")
     torque_noise_estimate: list[float] = Field(
-        description="White noise on the torque per joint, as prepared, N·m; as recorded: see noise"
+        description="White noise of the prepared torque per joint, N·m. `noise` has that of the recording"
     )
     warnings: list[str]
-    reading: list[str] = Field(description="What was found while the file was read, and what columns were taken as")
-    source: dict[str, Any] | None = Field(None, description="What the file's columns were taken as, in figures")
-    recipe: dict[str, Any] = Field(description="The choices that the preparation was made with")
-    steps: list[dict[str, Any]] = Field(description="The steps of `preparation` with their parameters")
+    reading: list[str] = Field(description="How the file was read: columns, units, joints and other notes")
+    source: dict[str, Any] | None = Field(None, description="How the file's columns were read, for programs")
+    recipe: dict[str, Any] = Field(description="Options of the preparation")
+    steps: list[dict[str, Any]] = Field(description="Steps of `preparation` with their parameters")
     joint_types: list[JointType] | None = Field(
-        None, description="Of the robot's joints: what a training job takes where it says nothing else"
+        None, description="Joint types of the robot, which training jobs use by default; null if unknown"
     )
-    robot: str | None = Field(None, description="Robot whose limits the data were compared with")
-    upload_sha256: str | None = Field(None, description="Hash of the uploaded file; null for those of earlier releases")
+    robot: str | None = Field(None, description="Robot whose limits were compared with the data; null if none")
+    upload_sha256: str | None = Field(
+        None, description="Hash of the uploaded file; null if an earlier release stored it"
+    )
     timing: Timing
     saturation: list[JointSaturation]
     limits: list[JointLimits]
-    lag: list[Lag] = Field(description="All joints together first, then joint by joint")
+    lag: list[Lag] = Field(description="All joints combined first, then each joint")
     noise: list[JointNoise]
     excitation: Excitation
     against_robot: AgainstRobot | None = Field(None, description="Null without a robot's URDF")
-    remedies: list[Remedy] = Field(description="What `warnings` and `advice` say of the upload's options, to act on")
-    advice: list[str] = Field(description="What to record next, or to correct, one sentence each")
+    remedies: list[Remedy] = Field(
+        description="Corrections of the upload's options that `warnings` and `advice` mention"
+    )
+    advice: list[str] = Field(description="What to record next or to correct, one sentence each")
 
 
 class Dataset(BaseModel):
@@ -231,21 +251,21 @@ class DatasetPage(BaseModel):
 
 
 class PreviewColumn(BaseModel):
-    """Points of one quantity of one joint, in order of rows."""
+    """Points of one quantity of one joint, in row order."""
 
     quantity: str = Field(description="q, dq, ddq or tau")
     joint: str
     unit: str
-    rows: list[int] = Field(description="Rows that the points are, counted from 0")
-    t: list[float] = Field(description="Their times, s")
+    rows: list[int] = Field(description="Row of each point, counted from 0")
+    t: list[float] = Field(description="Time of each point, s")
     values: list[float]
 
 
 class Preview(BaseModel):
-    """Columns of a data set, thinned so that no extreme is lost."""
+    """Columns of a data set, thinned for plots. Extremes are kept."""
 
     samples: int = Field(description="Rows of the data set")
     starts: list[int] = Field(
-        description=f"First rows of the episodes, for breaks in the lines; at most {MOST_STARTS}, evenly chosen"
+        description=f"First row of each episode, to break lines there; at most {MAX_PREVIEW_STARTS}, evenly chosen"
     )
     columns: list[PreviewColumn]

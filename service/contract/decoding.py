@@ -1,4 +1,4 @@
-"""Fast JSON for models of the contract that have arrays. All that a model declares is declared there alone."""
+"""Fast JSON decoding of pydantic models with arrays. Fields are declared in the models only."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def struct_of(model: type[BaseModel], types: Mapping[str, Any] | None = None) -> type[Struct]:
-    """Make a struct with the fields, types and defaults of a model, but for the types given. It is encoded without what
-    is left at its default."""
+    """Make a struct with the fields and defaults of a model, encoded without defaults. types: replacements by field."""
     fields: list[Any] = []
     for name, field in model.model_fields.items():
         default = () if field.is_required() else (field.get_default(call_default_factory=True),)
@@ -32,14 +31,15 @@ def struct_of(model: type[BaseModel], types: Mapping[str, Any] | None = None) ->
 
 
 class HotDecoder(Generic[Model]):
-    """Decodes JSON bodies of a model, and returns None for a body that is not surely right. Pydantic, which is slower,
-    then reads it again and says what is wrong.
+    """Decoder of a model's JSON bodies that returns None for a body that may be invalid.
 
-    msgspec reads the arrays; what an array is in JSON says the `json_schema_input_type` of its validator. The model
-    itself checks all other fields, if the body has any, with all their constraints and validators.
+    The caller then decodes this body with pydantic, which is slower and reports the error.
 
-    apart: whether each array is read by itself. The interpreter's lock is let go in between, for which a control loop
-    may wait.
+    msgspec decodes the arrays; the `json_schema_input_type` of an array's validator declares its JSON type. The model
+    validates all other fields, if the body has any.
+
+    apart: whether each array is decoded separately. The interpreter's lock is released in between, so that a control
+    loop waits less.
     """
 
     def __init__(self, model: type[Model], apart: bool = False) -> None:
@@ -53,10 +53,10 @@ class HotDecoder(Generic[Model]):
         struct = struct_of(model, types | dict.fromkeys(self._apart, Raw))
         self._decoder = msgspec.json.Decoder(struct, dec_hook=_read_model)
         self._min_quotes = 2 * len(required) if required <= types.keys() else None
-        """Quotes of a body that has the required arrays and no other field; None if other fields are required."""
+        """Number of quotes in a body with the required arrays only; None if other fields are required."""
 
     def decode(self, body: bytes) -> Any:
-        """Return an object with the fields of the model, arrays as JSON has them, or None; see `request`."""
+        """Return an object with the fields of the model and undecoded arrays for `request`, or None."""
         try:
             value = self._decoder.decode(body)
             if body.count(b'"') == self._min_quotes:
@@ -67,7 +67,7 @@ class HotDecoder(Generic[Model]):
         return checked if has_unique_fields(body) else None
 
     def request(self, decoded: Any) -> Model | None:
-        """Return what was decoded as the model, null in arrays as NaN, or None if an array is empty or ragged."""
+        """Return the decoded object as the model, null in arrays as NaN, or None if an array is empty or ragged."""
         fields = {name: getattr(decoded, name) for name in self._model.model_fields}
         try:
             for name in self._arrays:
@@ -92,7 +92,7 @@ def _array(value: Any) -> NDArray[np.float64]:
 
 
 def _type_in_json(annotation: Any) -> Any:
-    """What msgspec reads for a field that a validator makes an array of; None for any other field."""
+    """Return the JSON type of a field that a validator turns into an array, None for any other field."""
     members = _members(annotation)
     marks = [mark for member in members for mark in getattr(member, "__metadata__", ())]
     inputs = [mark.json_schema_input_type for mark in marks if isinstance(mark, PlainValidator)]
@@ -100,7 +100,7 @@ def _type_in_json(annotation: Any) -> Any:
     lists = [get_args(kind)[0] for kind in kinds if get_origin(kind) is list]
     if not lists:
         return None
-    # msgspec knows no union of lists, but a list of what is in either: numpy tells whether all are the same
+    # msgspec has no union of lists, so the list holds either item; numpy rejects mixed ones
     merged = GenericAlias(list, (reduce(or_, lists),))
     others = [kind for kind in (*kinds, *members) if kind in (float, NoneType)]
     return reduce(or_, others, merged)

@@ -1,102 +1,106 @@
 """Binary frames of `WS /v1/models/{model}/stream`, layout 1.
 
-One binary message a frame, little-endian and without padding; numbers are 8-byte aligned. n is the number of joints.
+Each frame is one binary message, little-endian and without padding; numbers are 8-byte aligned. n is the number of
+joints.
 
 Request, 16 + 24 n bytes, or 16 + 32 n with tau:
 
     offset  type     field
     0       u32      sequence: chosen by the client, repeated in the answer
-    4       u16      flags: 1 = answer tau_std too; 2 = learn from tau; 4 = answer the external torque of tau
+    4       u16      flags: 1 = return tau_std; 2 = learn from tau; 4 = return the external torque of tau
     6       u16      n
-    8       f64      deadline budget in s, counted from the frame's arrival in the service; 0 = none
+    8       f64      deadline in s after the frame's arrival in the service; 0 = none
     16      f64 n    q, rad (prismatic: m)
     …       f64 n    dq, rad/s (m/s)
     …       f64 n    ddq, rad/s² (m/s²)
-    …       f64 n    with flag 2 or 4: tau, N·m (prismatic: N), as measured at this motion
+    …       f64 n    with flag 2 or 4: tau, N·m (prismatic: N), measured at this motion
 
-So the joints of a request begin at 16 (q), 16 + 8 n (dq), 16 + 16 n (ddq) and 16 + 24 n (tau).
+The arrays of a request begin at 16 (q), 16 + 8 n (dq), 16 + 16 n (ddq) and 16 + 24 n (tau).
 
-Answer, 32 + 8 n bytes, 8 n more with tau_std, 8 n with scale, 24 n + 16 with external torque, 16 with payload:
+Answer, 32 + 8 n bytes; plus 8 n with tau_std, 8 n with scale, 24 n + 16 with external torque, 16 with payload:
 
     offset  type     field
     0       u32      sequence of the request
-    4       u16      flags: 1 = tau_std follows tau; 2 = late; 4 = error; 8 = no sequence;
-                     16 = scale follows; 32 = external torque follows; 64 = payload follows, last;
-                     128 = fallback: some torque is not, or not fully, determined by the training
+    4       u16      flags: 1 = has tau_std after tau; 2 = late; 4 = error; 8 = no sequence;
+                     16 = has scale; 32 = has external torque; 64 = has payload, at the end;
+                     128 = fallback: training does not, or not fully, determine some torque
     6       u16      n; 0 in an error
-    8       u32      version that answers
-    12      u32      answers of this connection that missed their deadlines so far
+    8       u32      serving version
+    12      u32      late answers of this connection so far
     16      u64      revision: online updates applied to the version
     24      f64      seconds from the frame's arrival to the answer's departure
     32      f64 n    tau, N·m (prismatic: N): mean torque
-    …       f64 n    tau_std, N·m: standard deviation of the function, where asked for
-    …       f64 n    scale, where asked for: factor on the half width of intervals that hold measurements
-    …       f64 n    tau_external, where asked for, as all that follows, N·m: the request's tau less the
-                     mean, that of the full model with flag 128
+    …       f64 n    tau_std, if requested, N·m: standard deviation of the function
+    …       f64 n    scale, if requested: factor on the half width of intervals for measurements
+    …       f64 n    tau_external, if requested, N·m: the request's tau minus the mean; with flag 128, the mean
+                     of the full model
     …       f64 n    tau_external_std, N·m: scale · √(tau_std² + noise_std²)
     …       f64 n    tau_external_z: tau_external / tau_external_std
-    …       f64      tau_external_statistic: of the arm as one, T = eᵀ C⁻¹ e, e = tau_external; C has the squares of
-                     tau_external_std on its diagonal, and scaled alike the function's covariance between the joints
+    …       f64      tau_external_statistic of the whole arm: T = eᵀ C⁻¹ e, e = tau_external. The diagonal of C has
+                     the squares of tau_external_std; elsewhere, C has the function's covariance between the
+                     joints, with the same scale
     …       f64      tau_external_p: P(χ² with n degrees of freedom > T)
-    …       f64 2    payload, where asked for: mass that this stream_id carries as far as is known, mean and standard
-                     deviation, kg; both NaN where it carries nothing
+    …       f64 2    payload, if requested: estimated payload mass of this stream_id, mean and standard deviation, kg;
+                     both NaN without a payload
 
-An error has the same header, and instead of numbers UTF-8 JSON: {"error": {code, message, detail}}. The connection goes
-on. Flag 8 says that the request was too short, or no binary message, so that its sequence is unknown (and 0 here).
+An error has the same header, followed by UTF-8 JSON: {"error": {code, message, detail}}. The connection stays open.
+Flag 8: the request was too short or not a binary message, so its sequence is unknown (0 in the answer).
 
-Every request has exactly one binary answer, in the order of the requests. When the connection opens, and before the
+Every request gets exactly one binary answer, in the order of the requests. When the connection opens, and before the
 first answer of another version, the service sends one text message, a JSON object:
 
     {"layout": 1, "model", "version", "revision", "joint_names", "torque_convention", "noise_std", "max_position"}
 
-A frame arrives when the service has read its last byte, and an answer leaves when it is handed to the socket; seconds
-is the time between both. An answer is late where seconds is more than the deadline of its request: flag 2 says so, and
-late_answers counts the answers of the connection with flag 2. That is the service's clock. On the client's clock an
-answer is late where more than the deadline passes between sending the request and having the answer. The network and
-the sockets' buffers are in that, and what is late for the service is late for its client, too.
+Deadlines. A frame arrives when the service has read its last byte. An answer leaves when it is handed to the socket.
+`seconds` is the time between both. An answer is late, with flag 2, if `seconds` exceeds the deadline of its request. On
+the client's clock, the network and the socket buffers add to this time: an answer that is late for the service is late
+for its client too.
 
-Flag 128 says that the training does not determine some joint's torque at this motion. That torque then goes back to
-gravity, offset and friction, or to the training's mean; the `fallback` of `POST /v1/models/{model}/predict` says which
-joints, and how far. tau_std, external torque and learning are those of the full model.
+Fallback. With flag 128, training does not determine some joint's torque at this motion. This torque falls back to
+gravity, offset and friction, or to the training mean. The `fallback` of `POST /v1/models/{model}/predict` has the share
+per joint. tau_std, external torque and learning are those of the full model.
 
-External torque is no safety function. It is what the model does not explain: a touch, a payload, a fault of the sensor
-or of the model. tau must be finite then; nothing is learnt of it without flag 2.
+External torque is not a safety function. It is the torque that the model does not explain: a contact, a payload, or an
+error of the sensor or of the model. It needs a finite tau. Without flag 2, nothing is learnt from it.
 
-Learning. A request with flag 2 is answered like any other: the answer is made before the service learns of its torque.
-It needs `stream_id` in the address, the name of the robot or recording that the torque comes from, and no `version`:
-who pins a version only asks. Its sequence is its identity within that stream_id for good: among the requests with flag
-2 of a connection it must go up, gaps allowed. A torque that is not finite is answered, and counted as not learnt. The
-service gathers such requests and logs LIPSERVE_STREAM_FLUSH_ROWS of them at a time, or what has come when the first has
-waited for LIPSERVE_STREAM_FLUSH_S. Once they are durable it says in a text message
+Learning. A request with flag 2 is answered like any other, before the service learns from its torque. It needs
+`stream_id` in the address, the name of the robot or recording, and no `version`: a pinned version does not learn. Its
+sequence identifies it permanently within the stream_id. Among the requests with flag 2 of a connection, the sequence
+must increase; gaps are allowed. A request with a torque that is not finite is answered, and counted as not learnt. The
+service logs such requests in batches of LIPSERVE_STREAM_FLUSH_ROWS, or after the first one has waited
+LIPSERVE_STREAM_FLUSH_S. Once they are durable, it sends a text message
 
     {"learnt": {"through": sequence, "accepted", "duplicates", "rejected": {code: count}, "revision"}}
 
-of those since the last such message, of which `through` is the newest: how many are new and learnt from, were known
-already, and were kept out by code; answers of `revision` and above contain them. What cannot be logged is told by
+for the requests since the last such message, with `through` the newest one: how many are accepted, duplicates, and
+rejected by code. Answers of `revision` and above contain them. Requests that cannot be logged are reported by
 
     {"refused": {"first": sequence, "through": sequence, "error": {code, message, detail}}}
 
-Requests that got an error for an answer are in neither. These texts come between answers, after those of the requests
-they speak of; requests without flag 2 cause none. At the end of a connection what is left is logged, and not told. So
-after a lost one send again what is above the last `through`, under the same sequences: what is in the log counts as
-duplicate and is applied once. What was refused is lost, unless it is sent again under new sequences. While ten times
-LIPSERVE_STREAM_FLUSH_ROWS wait to be logged, the service reads no further.
+Requests that got an error are in neither. These messages come between answers, after the answers of their requests.
+Requests without flag 2 cause none. When a connection ends, pending requests are logged, but not reported. After a lost
+connection, send all requests above the last `through` again, with the same sequences: requests that are already logged
+count as duplicates and are learnt once. Refused requests are lost unless they are sent again with new sequences. While
+ten times LIPSERVE_STREAM_FLUSH_ROWS requests wait to be logged, the service stops reading.
 
-The query of the address: `version` pins one, else the newest answers as soon as it is there, between two frames;
-`alias` follows what that points to; `min_revision` waits until the version that answers has learnt that much;
-`std=1` answers tau_std to every frame, as if each had flag 1; `scale=1` answers the scale to every frame: tau ± 1.96 ·
-scale · √(tau_std² + noise_std²) holds 95 % of what is measured, by what this stream_id has taught until then, or where
-there is none by what all recent ones have; `payload=1` answers to every frame what the arm carries; `stream_id` names
-the source of torques to learn from, in up to 64 letters, digits, dots, underscores and hyphens, a letter or digit
-first. What this stream_id's arm carries is part of its answers with or without `payload`.
+Query parameters of the address:
 
-The service reads no further while an answer waits to be written, so a client that sends but does not read is slowed
-down by its own socket, and cut off when it reads nothing for 10 s. A frame of more than 64 KiB
-ends the connection with code 1009, LIPSERVE_STREAM_IDLE_S without a frame with 1000, a
-service that stops with 1001, an API key that is revoked or expires with 1008. A connection that cannot be had is
-refused before the upgrade, in HTTP, with an error of the same shape: 401 (no API key where one is needed), 403 (a key
-without the scope `predict` or, with stream_id, `update`; a web page of another site), 404, 422 (a wrong parameter), 429
-(LIPSERVE_MAX_STREAMS are open).
+    version       pin a version; by default the serving version answers, and changes between two frames
+    alias         follow the version of an alias
+    min_revision  wait until the version has learnt this revision
+    std=1         return tau_std for every frame, as with flag 1
+    scale=1       return the scale for every frame: tau ± 1.96 · scale · √(tau_std² + noise_std²) is the 95 % interval
+                  of a measurement, by the rows of this stream_id so far, or of all recent streams if it has none
+    payload=1     return the payload for every frame; predictions of this stream_id include it in any case
+    stream_id     stream to learn from: up to 64 letters, digits, dots, underscores and hyphens, a letter or digit first
+
+Flow control. The service stops reading while an answer waits to be written. A client that sends but does not read is
+slowed down by its own socket, and disconnected if it reads nothing for 10 s.
+
+Closing codes: 1009 after a frame of more than 64 KiB, 1000 after LIPSERVE_STREAM_IDLE_S without a frame, 1001 when the
+service stops, 1008 when the API key expires or is revoked. A connection may be refused before the upgrade with an HTTP
+error of the same form: 401 (an API key is required), 403 (a key without the scope `predict` or, with stream_id,
+`update`; a web page of another site), 404, 422 (an invalid parameter), 429 (LIPSERVE_MAX_STREAMS are open).
 """
 
 from __future__ import annotations
@@ -106,7 +110,7 @@ from struct import Struct
 LAYOUT = 1
 
 REQUEST = Struct("<IHHd")
-"""sequence, flags, n, deadline budget."""
+"""sequence, flags, n, deadline."""
 ASK_STD = 1
 ASK_LEARN = 2
 ASK_EXTERNAL = 4
@@ -126,5 +130,5 @@ NUMBER = "<f8"
 
 
 def request_bytes(n_joints: int, torque: bool = False) -> int:
-    """Length of a request of so many joints; torque: with tau."""
+    """Return the size of a request in bytes. torque: with tau."""
     return REQUEST.size + (4 if torque else 3) * 8 * n_joints

@@ -1,4 +1,4 @@
-"""What the routes of health answer."""
+"""Responses of the health routes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lipcore.extras import EXTRAS
 
 
 class Live(BaseModel):
-    """The process answers."""
+    """The process is running."""
 
     status: Literal["alive"] = "alive"
 
@@ -19,12 +19,12 @@ class Part(BaseModel):
     """One part of the service."""
 
     name: str = Field(examples=["database"])
-    state: Literal["ok", "warning"] = Field(description="warning: some clients may notice something")
+    state: Literal["ok", "warning"] = Field(description="`warning`: some clients may be affected")
     message: str = Field(examples=["can be read and written"])
 
 
 class Ready(BaseModel):
-    """The service can do what it is for."""
+    """The service is ready."""
 
     status: Literal["ready"] = "ready"
     version: str
@@ -32,29 +32,30 @@ class Ready(BaseModel):
 
 
 class Missing(BaseModel):
-    """What the service cannot do for want of an extra."""
+    """An extra that is not installed."""
 
     extra: str = Field(examples=["ingest"])
-    gives: str = Field(description="What it is for, in words", examples=["use URDFs"])
+    gives: str = Field(description="Purpose of the extra", examples=["use URDFs"])
     install: str = Field(
-        description="What installs it, where the service runs", examples=["pip install 'lipserve[ingest]'"]
+        description="Command that installs it, to be run where the service runs",
+        examples=["pip install 'lipserve[ingest]'"],
     )
 
 
 class Health(BaseModel):
-    """The process answers, and what it can do."""
+    """The process is running, and its capabilities."""
 
     status: Literal["alive"] = "alive"
     version: str
     can: dict[str, bool] = Field(
-        description="What is installed besides serving, teaching and training of learnt arms, by the name of its "
-        "extra: " + "; ".join(f"`{name}`, to {extra.gives}" for name, extra in EXTRAS.items()),
+        description="Installed extras by name, besides serving, online learning and training of learnt arms: "
+        + "; ".join(f"`{name}`, to {extra.gives}" for name, extra in EXTRAS.items()),
         examples=[{"train": True, "robots": True, "ingest": False}],
     )
-    missing: list[Missing] = Field(description="Of what is not installed")
+    missing: list[Missing] = Field(description="Extras that are not installed")
     confined: dict[str, bool] = Field(
         {},
-        description="What this system has to keep the process in which an upload is read from harm: limits of `memory` "
-        "and `processor`; `landlock`, from files; `seccomp`, from the network and other processes",
+        description="Available confinement of the process that reads uploads: limits of `memory` and `processor` time; "
+        "`landlock` blocks files; `seccomp` blocks the network and other processes",
         examples=[{"memory": True, "processor": True, "landlock": True, "seccomp": True}],
     )

@@ -1,4 +1,4 @@
-"""Training jobs as the API takes and shows them."""
+"""Training jobs."""
 
 from __future__ import annotations
 
@@ -13,56 +13,62 @@ from service.contract.states import JobState, PromotionOption
 from service.foundation.fields import MAX_NAME_CHARS, MAX_NAMES
 
 MAX_OPTIONS = {"hyperparameter_samples": 500, "posterior_samples": 1000, "max_inducing_outputs": 4000}
-"""Max values of options of a fit. Its time grows with the cube of the samples, that of an answer with the outputs."""
+"""Max values of fit options. Fit time grows with the cube of the samples, prediction time with the outputs."""
 _DEFAULTS, _HOLDOUT = FitOptions(), Holdout()
 
 
 class Options(BaseModel):
-    """How to fit; the defaults suit most recordings."""
+    """Options of the fit. The defaults suit most recordings."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
     hyperparameter_samples: int = Field(
-        _DEFAULTS.hyperparameter_samples, ge=10, description="Samples that hyperparameters are fitted on"
+        _DEFAULTS.hyperparameter_samples, ge=10, description="Samples for the fit of the hyperparameters"
     )
     posterior_samples: int = Field(
-        _DEFAULTS.posterior_samples, ge=10, description="Samples the model stands on: of more, the most spread-out"
+        _DEFAULTS.posterior_samples, ge=10, description="Samples in the posterior; of more, the most spread-out ones"
     )
     max_iterations: int = Field(_DEFAULTS.max_iterations, ge=1, le=10_000)
     starts: int = Field(
-        _DEFAULTS.starts, ge=1, le=20, description="Points the search is tried from; the best by evidence is followed"
+        _DEFAULTS.starts,
+        ge=1,
+        le=20,
+        description="Starting points of the search; the one with the best evidence is continued",
     )
-    tied: bool = Field(_DEFAULTS.tied, description="Of `lip`: links share kernel shapes; false is the paper's form")
+    tied: bool = Field(
+        _DEFAULTS.tied, description="For `lip`: links share kernel shapes; false is the form of the paper"
+    )
     prior: Literal["urdf", "zero"] = Field(
-        "urdf", description="Of rigid bodies: expect the URDF's inertial parameters, or none"
+        "urdf", description="For rigid bodies: prior inertial parameters, from the URDF or zero"
     )
     geometry: GeometryOption = Field(
         _DEFAULTS.geometry,
-        description="Of rigid bodies, where the joint axes lie: `learn` from torque alone, `calibrate` around the "
-        "robot's URDF or the base, `fixed` as that has it; `auto`: calibrate where there is one, else learn",
+        description="For rigid bodies, the geometry of the joint axes: `learn` from torque alone, `calibrate` around "
+        "the robot's URDF or `base`, or `fixed` to it; `auto`: calibrate if there is one, else learn",
     )
     search_seconds: float = Field(
-        _DEFAULTS.search_seconds, gt=0, le=MAX_SEARCH_SECONDS, description="Time limit of the search for a geometry, s"
+        _DEFAULTS.search_seconds, gt=0, le=MAX_SEARCH_SECONDS, description="Time limit of the geometry search, s"
     )
     device: Literal["auto", "cpu", "cuda"] = Field(
-        "auto", description=f"Only {', '.join(TORCH_ESTIMATORS)} use a GPU: `auto` if there is one, `cuda` always"
+        "auto",
+        description=f"Only {', '.join(TORCH_ESTIMATORS)} use a GPU: `auto` uses one if available, `cuda` requires one",
     )
     compact_tolerance: float = Field(
         _DEFAULTS.compact_tolerance,
         gt=0,
         le=1,
-        description="Largest deviation of the served posterior from the exact one, in its standard deviations",
+        description="Max deviation of the served posterior from the exact one, in its standard deviations",
     )
     max_inducing_outputs: int = Field(
         _DEFAULTS.max_inducing_outputs,
         ge=1,
-        description="Most inducing outputs, which answers take the longer for; with fewer than the tolerance needs, "
-        "the version's `compact` says how far it deviates",
+        description="Max inducing outputs; more make predictions slower. If the tolerance needs more, `compact` of the "
+        "version has the deviation",
     )
     statistics: Standing = Field(
         _DEFAULTS.statistics,
-        description="What the posterior stands on in the end: the samples that were `chosen`, or `all`, each for the "
-        "time that it stands for; `auto`: all, where that is worth more than `posterior_samples` independent ones",
+        description="Samples of the final posterior: the `chosen` ones, or `all`, each weighted by the time it "
+        "represents; `auto`: all, if they have more than `posterior_samples` effective samples",
     )
 
 
@@ -70,7 +76,7 @@ DatasetName = Annotated[str, Field(max_length=MAX_NAME_CHARS)]
 
 
 class JobRequest(BaseModel):
-    """What to train on what."""
+    """A model to train, its data sets and options."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -78,18 +84,18 @@ class JobRequest(BaseModel):
         json_schema_extra={"examples": [{"model": "my-panda", "datasets": ["ds_0123456789abcdef"]}]},
     )
 
-    model: ModelName = Field(description="Name of the model; a new version of it is made")
+    model: ModelName = Field(description="Name of the model, which gets a new version")
     datasets: list[DatasetName] = Field(min_length=1, max_length=MAX_NAMES, description="Ids or names of data sets")
     estimator: str = Field(
         AUTO,
         max_length=40,
         description=f"One of {', '.join(ESTIMATOR_CHOICES)}; `auto` compares arms and `lip-chain` on held-out rows and "
-        "takes the simplest unless another one is surely better",
+        "chooses the simplest unless another one is clearly better",
     )
     joint_types: list[JointType] | None = Field(
         None,
         max_length=MAX_NAMES,
-        description="One a joint; by default those of the robot that a data set was uploaded with, else revolute",
+        description="One per joint; by default those of the data set's robot, else revolute",
     )
     robot: str | None = Field(
         None,
@@ -100,59 +106,60 @@ class JobRequest(BaseModel):
         None,
         pattern=VERSION,
         description="Version of another unit of the same robot to start from: `model:3`, `model@alias`, or `model` for "
-        f"the one that serves. For {', '.join(ROBOT_ESTIMATORS)} and {AUTO}; its arm is expected, friction is not. It "
-        "may be deleted after the job",
+        f"the serving version. For {', '.join(ROBOT_ESTIMATORS)} and {AUTO}. Its arm is the prior, its friction is "
+        f"not. "
+        "It can be deleted after the job",
     )
     options: Options = Field(default_factory=Options)
     holdout: Holdout | None = Field(
         default_factory=Holdout,
-        description="What to hold out of the data sets, to judge the version on: its lineage keeps the figures. The "
-        f"version is then trained on all samples, unless `only` is true. By default {100 * _HOLDOUT.share:.0f} %, as "
-        f"`{_HOLDOUT.kind}` chooses; null: nothing",
+        description="Part of the data sets to hold out for the evaluation, whose figures are in the version's lineage. "
+        "The version is then trained on all samples, unless `only` is true. "
+        f"By default {100 * _HOLDOUT.share:.0f} %, chosen by `{_HOLDOUT.kind}`; null: nothing",
     )
     promotion: PromotionOption | None = Field(
         None,
-        description="Whether the version answers by itself: `ask`, if on what was held out its 95 % intervals hold "
-        "90 % on every joint, as far as can be told, and it is not worse than the version that serves, else it waits "
-        "under the alias `candidate`; `always`, in any case. The setting LIPSERVE_PROMOTION by default",
+        description="When the version becomes the serving version. `ask`: if coverage on the held-out part is at least "
+        "90 % on every joint, within sampling error, and it is not worse than the serving version; else it gets the "
+        "alias `candidate`. `always`: in any case. By default the setting LIPSERVE_PROMOTION",
     )
 
 
 class JobDraft(JobRequest):
-    """What somebody means to train on what, maybe on recordings that are not uploaded yet."""
+    """A draft of a job, possibly before its recordings are uploaded."""
 
     datasets: list[DatasetName] = Field(
         [],
         max_length=MAX_NAMES,
-        description="Those that are there already; without any, what depends on the data is not checked",
+        description="Data sets that are already uploaded; without any, checks that need data are skipped",
     )
 
 
 class JobProgress(BaseModel):
-    """How far a job is."""
+    """Progress of a job."""
 
     stage: str = Field(
         description="waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, all_rows, saving "
-        "or done. `all_rows` is the last fit, on the rows held out, too"
+        "or done. `all_rows` is the final fit, held-out rows included"
     )
-    estimator: str | None = Field(None, description="The one at work, where `auto` trains several")
+    estimator: str | None = Field(None, description="Estimator in training, if `auto` trains several")
     iteration: int = 0
     max_iterations: int = 0
-    objective: float | None = Field(None, description="Penalised negative log evidence, nats: falls during the fit")
+    objective: float | None = Field(None, description="Penalised negative log evidence, nats; decreases during the fit")
     fraction: float = Field(0.0, ge=0, le=1)
     elapsed_s: float = 0.0
     remaining_s: float | None = Field(
         None,
-        description="Roughly the seconds that are left; null until that can be told. Taken to need all iterations, "
-        "though a fit often converges earlier",
+        description="Estimated remaining time, s; null until it is known. It assumes all iterations, but fits often "
+        "converge earlier",
     )
 
 
 class JobChange(BaseModel):
-    """One thing that happened to a job."""
+    """One change of a job's state."""
 
     at: str
-    state: JobState = Field(description="From then on")
+    state: JobState = Field(description="New state")
     message: str
 
 
@@ -164,13 +171,13 @@ class JobError(BaseModel):
 
 
 class Refresh(BaseModel):
-    """A job that trains a version anew on the data of an earlier one and what has been observed since."""
+    """Refresh: a job that retrains a version on its data and later observations."""
 
-    version: int = Field(description="The version that is refreshed")
-    through: int = Field(description="Last event of the model's log that it learns from")
+    version: int = Field(description="Version to refresh")
+    through: int = Field(description="Last event of the model's log that is used")
     trigger: Literal["novelty", "linearisation", "asked"] = Field(
-        description="Why: much of the motion was beyond what the version knows, its learnt arm had left where its "
-        "torque is linear, or somebody asked for it"
+        description="Reason: `novelty`, much motion outside the known region; `linearisation`, the learnt arm drifted "
+        "past its linearisation; `asked`, a request"
     )
 
 
@@ -181,30 +188,30 @@ class Job(BaseModel):
     state: JobState
     model: str
     estimator: str
-    robot: str | None = Field(description="Profile or id of an uploaded URDF, of estimators with rigid bodies")
-    base: str | None = Field(None, description="The version that it starts from, as `model:3`")
+    robot: str | None = Field(description="Profile or id of an uploaded URDF, for estimators with rigid bodies")
+    base: str | None = Field(None, description="Version that it starts from, as `model:3`")
     datasets: list[str]
     holdout: Holdout | None = Field(
-        None, description="What it holds out of the data sets; a refresh holds out what its version held out"
+        None, description="Held-out part of the data sets; a refresh uses that of its version"
     )
     promotion: PromotionOption | None = Field(
-        None, description="What was asked for; the version's `promotion` says what came of it"
+        None, description="Requested promotion; `promotion` of the version has the outcome"
     )
-    refresh: Refresh | None = Field(None, description="What it refreshes; null for a job with data sets alone")
+    refresh: Refresh | None = Field(None, description="Refreshed version; null for a job with data sets only")
     progress: JobProgress
-    attempts: int = Field(description="Times it was started; more than one after an interruption")
-    version: int | None = Field(description="The version it made, once succeeded")
+    attempts: int = Field(description="Number of starts; more than one after an interruption")
+    version: int | None = Field(description="Version that the job made; null unless it succeeded")
     quality: HeldOutQuality | None = Field(
-        None, description="Of that version, on what the job held out; null where that is nothing"
+        None, description="Quality of that version on the held-out part; null if nothing was held out"
     )
     error: JobError | None
     created_at: str
     started_at: str | None
-    heartbeat_at: str | None = Field(description="When the training process last said that it lives")
+    heartbeat_at: str | None = Field(description="Time of the training process's last heartbeat")
     finished_at: str | None
-    history: list[JobChange] = Field(description="What happened to it, oldest first")
-    retry_of: str | None = Field(description="The job that it repeats")
-    request_id: str | None = Field(description="Id of the request that queued it, as the service's log names it")
+    history: list[JobChange] = Field(description="State changes, oldest first")
+    retry_of: str | None = Field(description="Job that this one repeats; null if none")
+    request_id: str | None = Field(description="Id of the request that queued it, as in the service's log")
 
 
 class JobPage(BaseModel):

@@ -1,4 +1,4 @@
-"""Models, versions, aliases and what was held out of their training, as the API shows them."""
+"""Models, versions, aliases and the held-out parts of their training."""
 
 from __future__ import annotations
 
@@ -16,129 +16,130 @@ ModelName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._-]{0,63
 VersionNumber = Annotated[int, Field(ge=1, lt=2**31)]
 ALIAS = r"^[a-z][a-z0-9._-]{0,63}$"
 VERSION = r"^[a-z0-9][a-z0-9._-]{0,63}(:[1-9][0-9]{0,8}|@[a-z][a-z0-9._-]{0,63})?$"
-"""A version as one text: `model:3`, `model@alias`, or `model` for the one that serves."""
+"""A version in one text: `model:3`, `model@alias`, or `model` for the serving version."""
 AliasName = Annotated[str, StringConstraints(pattern=ALIAS)]
-"""Lower-case letters, digits, dots, underscores and hyphens after a letter: never taken for a version's number."""
+"""Lower-case letters, digits, dots, underscores and hyphens after a letter, unlike a version number."""
 
 
 class SelectionCandidate(BaseModel):
-    """How an estimator did on what was held out to choose by; null where it was not judged."""
+    """Quality of an estimator on the part held out for the choice; null if it was not evaluated."""
 
     estimator: str
     log_density: float | None = Field(description="Log predictive density, summed over the joints, nats a sample")
-    difference: float | None = Field(description="Of the log density from that of the best")
-    standard_error: float | None = Field(description="Of that difference")
-    nmse: list[float | None] | None = Field(description="Of each joint; null where its torque does not vary")
+    difference: float | None = Field(description="Log density less that of the best estimator")
+    standard_error: float | None = Field(description="Standard error of the difference")
+    nmse: list[float | None] | None = Field(description="nMSE per joint; null if its torque is constant")
     edge_nmse: list[float | None] | None = Field(
         None,
-        description="Of each joint, squared error at the edge of the data over the torque's variance in all rows that "
-        "were held out; null if none of them are at the edge, and for versions of earlier releases",
+        description="Per joint, mean squared error at the edge of the data / variance of the torque in all held-out "
+        "rows; null without rows at the edge, and for versions of earlier releases",
     )
-    coverage: list[float | None] | None = Field(description="Share within the 95 % interval, of each joint")
+    coverage: list[float | None] | None = Field(description="Coverage of the 95 % interval per joint")
     seconds: float
-    error: str | None = Field(description="Why it could not be trained")
+    error: str | None = Field(description="Why it could not be trained; null if it was")
 
 
 class SelectionHeldOut(BaseModel):
-    """What `auto` held out to choose by; the chosen estimator has learnt it afterwards."""
+    """Part that `auto` held out for the choice; the chosen estimator was then trained on it too."""
 
     rows: int
-    blocks: int = Field(description="Contiguous stretches that these rows are")
+    blocks: int = Field(description="Number of contiguous stretches of these rows")
     repeats: bool = Field(
-        description="All motion of the recording repeats other motion of it: figures flatter, except at the edge"
+        description="Whether all motion of the recording repeats itself, so that figures are too good, except at the "
+        "edge"
     )
-    edge_rows: int = Field(0, description="Rows at the edge of the data: their states are the furthest from all others")
-    edge_blocks: int = Field(0, description="Contiguous stretches that the rows at the edge are")
+    edge_rows: int = Field(0, description="Rows at the edge of the data, whose states are furthest from all others")
+    edge_blocks: int = Field(0, description="Number of contiguous stretches of the rows at the edge")
 
 
 class Selection(BaseModel):
-    """How `auto` has chosen the estimator."""
+    """Choice of the estimator by `auto`."""
 
     asked: str
     chosen: str
     reason: str
     held_out: SelectionHeldOut
-    table: list[SelectionCandidate] = Field(description="The estimators that were trained, the simplest first")
+    table: list[SelectionCandidate] = Field(description="Trained estimators, simplest first")
 
 
 class Promotion(BaseModel):
-    """Whether a version that was trained answers by itself, and why: judged by what its training held out."""
+    """Whether a new version became the serving version, and why. The held-out part of its training decides."""
 
-    answers: bool = Field(description="Whether it answered once it was trained; else it waits under alias `candidate`")
+    answers: bool = Field(description="Whether it started to serve after training; else it got the alias `candidate`")
     passed: bool | None = Field(
-        description="Whether its error is below that of the mean torque on every joint, its intervals hold 90 %, and "
-        "it is not worse than the version that serves; null where that cannot be told"
+        description="Whether its error is below that of the mean torque on every joint, coverage is at least 90 %, and "
+        "it is not worse than the serving version; null if that cannot be determined"
     )
-    serving: int | None = Field(description="The version that answered until then; null where none did")
+    serving: int | None = Field(description="Serving version until then; null if there was none")
     reason: str
 
     @classmethod
     def of(cls, found: Acceptance, serving: int | None, option: PromotionOption = "ask") -> Promotion:
-        """What becomes of a version: it answers if it has passed, or if its owner wants that in any case."""
+        """Decide whether a version serves: if it has passed, or if its owner always wants it."""
         passed, reason = found.passed, found.reason
         if not passed and option == "always":
-            reason += "; it answers as was asked for"
+            reason += "; it serves, because `promotion` is always"
         return cls(answers=passed is True or option == "always", passed=passed, serving=serving, reason=reason)
 
 
 class HeldOutQuality(BaseModel):
-    """How well the judged fit of a version predicts what was held out, per joint; null where torque does not vary."""
+    """Quality of the evaluated fit of a version on the held-out part, per joint; null if torque is constant."""
 
-    samples: int = Field(description="Samples that the figures are of")
+    samples: int = Field(description="Number of held-out samples")
     nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
     coverage: list[float | None] = Field(description="Share of measurements inside the 95 % interval")
-    coverage_low: list[float] = Field(description="Lower end of the coverage's confidence interval")
-    coverage_high: list[float] = Field(description="Its upper end")
+    coverage_low: list[float] = Field(description="Lower end of the confidence interval of the coverage")
+    coverage_high: list[float] = Field(description="Upper end of this confidence interval")
 
 
 class Version(BaseModel):
-    """An immutable trained version."""
+    """An immutable, trained version."""
 
     model: str
     version: int
     created_at: str
-    job: str | None = Field(description="The job that made it; null for one that was imported or came with LIPServe")
+    job: str | None = Field(description="Job that trained it; null for an imported or shipped version")
     estimator: str
     joint_names: list[str]
     joint_types: list[JointType]
     torque_convention: TorqueConvention
     noise_std: list[float] = Field(description="Standard deviation of the measured torque, N·m")
-    training_range: dict[str, dict[str, list[float]]] = Field(description="Where the samples lie that it stands on")
+    training_range: dict[str, dict[str, list[float]]] = Field(
+        description="Range of the training samples by quantity and joint"
+    )
     options: dict[str, Any]
-    fit: dict[str, Any] = Field(description="What the fit reported")
+    fit: dict[str, Any] = Field(description="Report of the fit")
     compact: dict[str, Any] = Field(
-        description="Size of the served posterior, and how far it deviates from the exact one: `mean_rms`, `mean_max`, "
-        "`std_max` in standard deviations of the function, at `queries` motions"
+        description="Size of the served posterior and its deviation from the exact one at `queries` motions: "
+        "`mean_rms`, `mean_max` and `std_max`, in standard deviations of the function"
     )
     calibration: dict[str, Any] = Field(
-        description="`function_std_factor`: what `tau_std` was multiplied by so that intervals hold on unseen motion"
+        description="`function_std_factor`: factor on `tau_std` that calibrates intervals on unseen motion"
     )
     conformal: dict[str, Any] | None = Field(
         None,
-        description="What `blocks` of the training, left out in turn, say of its intervals: `scale`, the factor on the "
-        "half width of each joint's, and `guaranteed`, the share of measurements that they hold then, at least; null "
-        "for the shipped model",
+        description="Calibration of intervals on `blocks` of the training data, held out in turn: `scale`, the factor "
+        "on the half width per joint, and `guaranteed`, the min share of measurements inside; null for the shipped "
+        "model",
     )
     hyperparameters: dict[str, Any] = Field(description="Hyperparameters by name, mostly logarithms")
     warnings: list[str] = Field(
-        description="What to be careful with: what the recording leaves open of a learnt arm, and how its fit ended"
+        description="Limits of the version, such as unidentifiable parameters of a learnt arm or a fit that did not "
+        "converge"
     )
     lineage: dict[str, Any] = Field(
-        description="Data sets with their hashes, when and with which `software` it was trained, and how well it fits "
-        "them (`training_metrics`); also the version of another unit that it started from (`base`), and of an imported "
-        "version where it comes from (`imported`)"
+        description="Data sets with their hashes, time and `software` of the training, and `training_metrics`; also "
+        "the version it started from (`base`) and the origin of an imported version (`imported`)"
     )
     promotion: Promotion | None = Field(
-        None, description="Whether it answers by itself; null for one that was refreshed or shipped"
+        None, description="Whether it became the serving version; null for a refreshed or shipped version"
     )
-    selection: Selection | None = Field(
-        None, description="How the estimator was chosen; null where it was named when the training was asked for"
-    )
-    robot: dict[str, Any] | None = Field(None, description="The URDF of an estimator with rigid bodies, and its prior")
+    selection: Selection | None = Field(None, description="Choice of the estimator; null if the request named it")
+    robot: dict[str, Any] | None = Field(None, description="URDF and prior of an estimator with rigid bodies")
     parameters: dict[str, Any] = Field(
-        description="`friction`; of rigid bodies also `inertia`, `rotor` and `geometry`, with standard deviations and "
-        "with what torque does not tell (`undetermined`). `geometry.joints` run from base to tip, `geometry.order` "
-        "names the model's joint at each place; all else is in the order of the model's joints",
+        description="`friction`; for rigid bodies also `inertia`, `rotor` and `geometry`, with standard deviations and "
+        "unidentifiable parameters (`undetermined`). `geometry.joints` run from base to tip, and `geometry.order` has "
+        "the model's joint at each place. All else is in the order of the model's joints",
     )
 
 
@@ -149,23 +150,23 @@ class VersionSummary(BaseModel):
     created_at: str
     estimator: str
     quality: HeldOutQuality | None = Field(
-        None, description="On what its training held out; null where that was nothing"
+        None, description="Quality on the held-out part of its training; null if nothing was held out"
     )
     promotion: Promotion | None = Field(
-        None, description="Whether it answers by itself, and why; null for one that was refreshed or shipped"
+        None, description="Whether it became the serving version, and why; null for a refreshed or shipped version"
     )
 
 
 class Model(BaseModel):
-    """A named model. Queries are answered by the version that serves unless they name another."""
+    """A named model. Queries go to its serving version unless they name another one."""
 
     name: str
     created_at: str
-    latest_version: int = Field(description="The newest version")
+    latest_version: int = Field(description="Newest version")
     serving_version: int | None = Field(
-        description="The version that answers where none is named; null where all wait as candidates"
+        description="Version that serves queries without a version; null if all versions are candidates"
     )
-    aliases: dict[str, int] = Field(description="Names that were given to versions, `serving` aside")
+    aliases: dict[str, int] = Field(description="Versions by alias, without `serving`")
     versions: list[VersionSummary]
 
 
@@ -177,37 +178,37 @@ class ModelPage(BaseModel):
 
 
 class AliasRequest(BaseModel):
-    """Where an alias shall point: to a version, or to where another alias points now."""
+    """Target of an alias: a version, or the present target of another alias."""
 
     model_config = ConfigDict(
         extra="forbid", strict=True, json_schema_extra={"examples": [{"version": 2}, {"alias": "candidate"}]}
     )
 
     version: VersionNumber | None = Field(None, description="A version of the model")
-    alias: AliasName | None = Field(None, description="Another alias of the model, instead of a number")
+    alias: AliasName | None = Field(None, description="Another alias of the model, instead of a version")
 
 
 class AliasMove(BaseModel):
     """One move of an alias."""
 
-    version: int | None = Field(description="Where to; null where the alias was removed")
-    before: int | None = Field(description="Where from; null where the alias was new")
+    version: int | None = Field(description="New target; null if the alias was removed")
+    before: int | None = Field(description="Old target; null if the alias was new")
     at: str
-    rollback: bool = Field(description="Whether it took back an earlier move")
+    rollback: bool = Field(description="Whether it undid an earlier move")
 
 
 class Alias(BaseModel):
-    """A name of a version, which can be moved to another one."""
+    """A movable name of a version."""
 
     alias: str
     version: int
     changed_at: str
-    previous: int | None = Field(description="Where a rollback would lead; null where there is nothing to go back to")
-    history: list[AliasMove] = Field(description="The last moves, newest first")
+    previous: int | None = Field(description="Version after a rollback; null if no rollback is possible")
+    history: list[AliasMove] = Field(description="Latest moves, newest first")
 
 
 class AliasList(BaseModel):
-    """Every alias of a model, `serving` first; all are on one page."""
+    """All aliases of a model, `serving` first, on one page."""
 
     items: list[Alias]
     next_cursor: None = None
@@ -217,110 +218,112 @@ _DEFAULTS = Split()
 
 
 HoldoutKind = Literal["auto", "stretches", Kind]
-"""How a part is chosen to be held out; `auto` looks at the motion, `stretches` are named."""
+"""Choice of the held-out part; `auto` depends on the motion, `stretches` are given."""
 Row = Annotated[int, Field(ge=0, lt=2**63)]
 Stretch = Annotated[list[Row], Field(min_length=2, max_length=2)]
-"""Rows of a data set in order of episode and time: the first, and the last, exclusive."""
+"""Rows of a data set in order of episode and time: first, and last (exclusive)."""
 
 
 class Holdout(BaseModel):
-    """Part of the data that the version is judged on before it learns it: never rows at random."""
+    """Part of the data that is held out to evaluate a version: contiguous rows, not random ones."""
 
     model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [{"share": 0.3}]})
 
     kind: HoldoutKind = Field(
         "auto",
-        description="Of each data set: whole `episodes`, chosen by the seed; its `last` part; some of many equal "
-        "`blocks`, chosen by the seed; or `auto`, the last part, unless that repeats motion that is learnt from and "
-        "there are periods, episodes or stretches of motion that do not: then some of these, chosen by the seed. Of "
-        "several data sets of one episode each, `episodes` holds out whole data sets. `stretches`: rows that are named",
+        description="Held-out part of each data set. `last`: its last part. `episodes`: whole episodes, chosen by the "
+        "seed; of several data sets with one episode each, whole data sets. `blocks`: some of many equal blocks, "
+        "chosen by the seed. `auto`: the last part, unless that repeats motion of the training part and other periods, "
+        "episodes or stretches do not; then some of these, chosen by the seed. `stretches`: the given rows",
     )
     share: float = Field(
-        _DEFAULTS.share, gt=0, lt=1, description="Of the samples, as nearly as whole episodes or blocks allow"
+        _DEFAULTS.share, gt=0, lt=1, description="Share of the samples, as closely as whole episodes or blocks allow"
     )
-    blocks: int = Field(_DEFAULTS.blocks, ge=2, le=1000, description="Equal stretches that `blocks` chooses from")
+    blocks: int = Field(
+        _DEFAULTS.blocks, ge=2, le=1000, description="Number of equal blocks from which `blocks` chooses"
+    )
     guard_s: float | None = Field(
         None,
         ge=0,
         le=3600,
-        description="Samples as near as that to the other side are left out of both, s; by default one period of the "
-        "low-pass that the data set was prepared with. Of a data set without times 25 samples are",
+        description="Samples closer than this to the other part are in neither part, s; by default one period of the "
+        "data set's low-pass. In a data set without times, 25 samples",
     )
-    seed: int = Field(_DEFAULTS.seed, ge=0, lt=2**31, description="Of the choice")
+    seed: int = Field(_DEFAULTS.seed, ge=0, lt=2**31, description="Seed of the random choice")
     stretches: dict[str, Annotated[list[Stretch], Field(min_length=1, max_length=1000)]] | None = Field(
         None,
         max_length=10_000,
-        description="With `kind` `stretches`: by the ids of data sets, which rows to hold out, first and last "
-        "(exclusive) in order of episode and time. Data sets that are not named are learnt from",
-        exclude_if=lambda value: value is None,  # lineages written before there were any compare as equal
+        description="For `kind` `stretches`: rows to hold out by data set id, first and last (exclusive), in order of "
+        "episode and time. Other data sets are used for training only",
+        exclude_if=lambda value: value is None,  # so that lineages of earlier releases compare as equal
     )
     only: bool = Field(
         False,
-        description="Whether the version never learns these samples. By default it is judged without them, and then "
-        "trained on all samples",
+        description="Whether the version is never trained on these samples. By default it is evaluated without them "
+        "and then trained on all samples",
         exclude_if=lambda value: not value,  # as above
     )
 
 
 class HeldOutSet(BaseModel):
-    """What was held out of one data set: enough to find the same samples again."""
+    """Held-out part of one data set, in enough detail to find the same samples again."""
 
     model_config = ConfigDict(strict=True)
 
     id: str = Field(max_length=40)
     sha256: str = Field(max_length=64)
-    whole: bool = Field(description="Whether all of it was held out")
-    guard: float = Field(ge=0, description="See `guard_unit`")
+    whole: bool = Field(description="Whether the whole data set was held out")
+    guard: float = Field(ge=0, description="Distance between the parts, in `guard_unit`")
     guard_unit: Literal["s", "rows"]
-    rows: int = Field(ge=1, lt=2**63, description="Samples held out")
-    guarded: int = Field(ge=0, lt=2**63, description="Samples left out of both sides")
+    rows: int = Field(ge=1, lt=2**63, description="Held-out samples")
+    guarded: int = Field(ge=0, lt=2**63, description="Samples in neither part")
     stretches: list[Stretch] | None = Field(
         None,
         max_length=1000,
-        description="Which rows these were before the guard, first and last exclusive, in order of episode and "
-        "time; null where the split alone says it",
+        description="Held-out rows before the guard was removed, first and last (exclusive), in order of episode and "
+        "time; null if the split alone determines them",
     )
 
 
 class Interval(BaseModel):
-    """What the central intervals of one probability hold, per joint."""
+    """Coverage and width of central intervals of one probability, per joint."""
 
-    level: float = Field(description="Probability that the interval promises")
+    level: float = Field(description="Nominal probability of the interval")
     coverage: list[float] = Field(description="Share of measurements inside the interval, noise included")
     interval_width: list[float] = Field(description="Mean width of the interval, N·m")
 
 
 class Reliability(BaseModel):
-    """Reliability curve: observed equals nominal where uncertainty is true, and lies below where it is too small."""
+    """Reliability curve: `observed` equals `nominal` if uncertainty is right, and is below if it is too small."""
 
-    nominal: list[float] = Field(description="Probabilities that intervals promise")
+    nominal: list[float] = Field(description="Nominal probabilities of the intervals")
     observed: list[list[float]] = Field(
-        description="Share of measurements inside: for each joint one list, like nominal"
+        description="Share of measurements inside: one list per joint, as long as `nominal`"
     )
 
 
 class Stretches(BaseModel):
-    """How the error is spread over the recording: nMSE stretch by stretch, for a box plot."""
+    """Distribution of the error over the recording: nMSE by stretch, for a box plot."""
 
     kind: Literal["episodes", "equal"] = Field(
-        description="`episodes` where the samples have 5 to 200 of them, else `equal`: ten stretches of as many samples"
+        description="`episodes` if there are 5 to 200, else `equal`: ten stretches of equal length"
     )
-    samples: list[int] = Field(description="Samples compared of each stretch, in order of rows")
+    samples: list[int] = Field(description="Compared samples of each stretch, in row order")
     nmse: list[list[float | None]] = Field(
-        description="For each joint one list, like samples: mean squared error within the stretch / variance of the "
-        "measured torque over *all* samples compared, so that a stretch in which a joint hardly moves does not stand "
-        "out; weighted by `samples` they average to the joint's `nmse`. null where the torque does not vary"
+        description="One list per joint, as long as `samples`: mean squared error within the stretch / variance of the "
+        "measured torque over *all* compared samples, so that a stretch with little motion does not stand out. The "
+        "mean weighted by `samples` is the joint's `nmse`. Null if the torque is constant"
     )
 
 
 class Evaluation(BaseModel):
-    """How well torques of a data set, or of part of it, were predicted, per joint."""
+    """Prediction quality on a data set, or on part of it, per joint."""
 
     samples: int = Field(description="Samples of the data set, or of the part")
-    samples_used: int = Field(description="Samples compared: evenly thinned where there are more than the limit")
-    level: float = Field(description="Probability that the interval promises")
+    samples_used: int = Field(description="Compared samples, evenly thinned above the limit")
+    level: float = Field(description="Nominal probability of the interval")
     nmse: list[float | None] = Field(description="Mean squared error / variance of the measured torque")
-    rmse: list[float] = Field(description="N·m")
+    rmse: list[float] = Field(description="Root mean squared error, N·m")
     coverage: list[float] = Field(description="Share of measurements inside the interval, noise included")
     nlpd: list[float] = Field(description="Mean negative log predictive density, nats")
     interval_width: list[float] = Field(description="Mean width of the interval, N·m")
@@ -328,26 +331,31 @@ class Evaluation(BaseModel):
     reliability: Reliability
     stretches: Stretches
     independent: list[float] = Field(
-        description="Independent errors that the coverage stands on: neighbouring ones tell the same"
+        description="Effective samples of the coverage; fewer than `samples_used`, as neighbouring errors are "
+        "correlated"
     )
-    coverage_low: list[float] = Field(description="Lower end of the coverage's 95 % confidence interval, from these")
-    coverage_high: list[float] = Field(description="Its upper end: where it is below 0.9, intervals are too narrow")
+    coverage_low: list[float] = Field(description="Lower end of the 95 % confidence interval of the coverage")
+    coverage_high: list[float] = Field(
+        description="Upper end of this confidence interval. If it is below 0.9, intervals are too narrow"
+    )
     repeats_training: float | None = Field(
-        description="Share of the samples whose motion (position, velocity and acceleration) repeats what the version "
-        "was trained on, so that figures flatter; null where it was trained on these samples, and where its data sets "
-        "are gone"
+        description="Share of the samples whose motion (position, velocity and acceleration) repeats training motion, "
+        "so that figures are too good; null if the version was trained on these samples, or if its data sets were "
+        "deleted"
     )
-    period_s: float | None = Field(description="Time after which that motion repeats itself, s; null where it does not")
-    warnings: list[str] = Field(description="What else makes the figures flatter")
+    period_s: float | None = Field(description="Period of this motion, s; null if it is not periodic")
+    warnings: list[str] = Field(description="Other reasons why the figures may be too good")
 
 
 class HeldOutBlocks(BaseModel):
-    """Scores of the judged fit in blocks of the samples held out: a later version is compared with them, see
-    `lipcore.data.metrics.BlockScores`."""
+    """Scores of the evaluated fit in blocks of held-out samples, with which a later version is compared.
+
+    See `lipcore.data.metrics.BlockScores`.
+    """
 
     model_config = ConfigDict(strict=True)
 
-    rows: list[Annotated[int, Field(ge=1, lt=2**63)]] = Field(min_length=1, description="Of each block")
+    rows: list[Annotated[int, Field(ge=1, lt=2**63)]] = Field(min_length=1, description="Rows of each block")
     nlpd: list[FiniteFloat] = Field(description="Sum over these rows of the negative log density of all joints, nats")
     nmse: list[FiniteFloat | None] = Field(description="Sum over these rows of squared error / variance of the torque")
 
@@ -359,9 +367,9 @@ class HeldOutBlocks(BaseModel):
 
 
 class HoldoutLineage(BaseModel):
-    """What a version's lineage says of it; the figures that go with it are shown and not read.
+    """Held-out part of a training, in the lineage of its version.
 
-    The figures are those of the judged fit, which was trained without the samples held out.
+    Figures are those of the evaluated fit, which was trained without the held-out samples.
     """
 
     model_config = ConfigDict(strict=True)
@@ -370,9 +378,9 @@ class HoldoutLineage(BaseModel):
     datasets: list[HeldOutSet] = Field(min_length=1, max_length=10_000)
     rows: int = Field(ge=1, lt=2**63)
     guarded: int = Field(ge=0, lt=2**63)
-    learnt: bool = Field(False, description="Whether the version was trained on these samples after it was judged")
-    judged_rows: int | None = Field(None, ge=0, lt=2**63, description="Samples that the judged fit was trained on")
+    learnt: bool = Field(False, description="Whether the version was trained on these samples after the evaluation")
+    judged_rows: int | None = Field(None, ge=0, lt=2**63, description="Training samples of the evaluated fit")
     evaluations: dict[str, Evaluation] = Field(
-        {}, max_length=10_000, description="By data set, if `learnt`: how the judged fit predicts what was held out"
+        {}, max_length=10_000, description="If `learnt`: quality of the evaluated fit on the held-out part, by data set"
     )
-    blocks: HeldOutBlocks | None = Field(None, description="If `learnt`: what a later version is compared with")
+    blocks: HeldOutBlocks | None = Field(None, description="If `learnt`: scores with which a later version is compared")

@@ -1,4 +1,4 @@
-"""Observations as the API takes, acknowledges and refuses them, and the options of learning."""
+"""Observation batches, their acknowledgements and errors, and the learning options."""
 
 from __future__ import annotations
 
@@ -13,81 +13,83 @@ from service.foundation.errors import ServiceError
 from service.foundation.fields import MAX_NAMES, numbers, rows_of_numbers
 
 CONTACT_THRESHOLD = (3.0, 100.0)
-"""Bounds of the gate of contacts. Within three standard deviations lie the errors of an honest model, so that the gate
-would choose what is learnt; beyond a hundred nothing is gated: what would be learnt is no torque of this robot."""
+"""Bounds of the contact threshold, standard deviations. Below 3, ordinary errors of a good model would be rejected.
+Above 100, even torques that are not of this robot would be learnt."""
 TORQUE_LIMIT = (1e-3, MAX_TORQUE)
 FORGETTING_S = (1.0, 1e9)
-"""Up to thirty years: a longer memory is none that forgets."""
+"""Bounds of the forgetting time, s: up to thirty years."""
 FRICTION_WALK_S = (10.0, 1e9)
-"""From ten epochs of a second each."""
+"""Bounds of the friction walk time, s: at least ten epochs of 1 s."""
 TorqueLimit = Annotated[float, Field(ge=TORQUE_LIMIT[0], le=TORQUE_LIMIT[1], allow_inf_nan=False)]
 
 
 class LearningOptions(BaseModel):
-    """How a model learns from observations."""
+    """Options of online learning."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
     enabled: bool = Field(
-        True, description="False: learning is paused. Rows are judged, compared and logged, but not learnt"
+        True, description="False pauses learning: rows are predicted, checked and logged, but not learnt"
     )
     forgetting_s: float | None = Field(
         None,
         ge=FORGETTING_S[0],
         le=FORGETTING_S[1],
         allow_inf_nan=False,
-        description="Age in s at which a sample counts 1/e of a new one, in event time; null: nothing is forgotten",
+        description="Age at which a sample counts 1/e of a new one, s of event time; null: nothing is forgotten",
     )
     friction_walk_s: float | None = Field(
         None,
         ge=FRICTION_WALK_S[0],
         le=FRICTION_WALK_S[1],
         allow_inf_nan=False,
-        description="Time in s over which friction may change by about 30 %, as that of an arm that warms up does: it "
-        "is followed, and masses and geometry are not opened. 1800 suits most arms; null: friction stays as learnt",
+        description="Time over which friction may drift by about 30 %, s, as in an arm that warms up. Learning follows "
+        "it, and masses and geometry do not become less certain. 1800 suits most arms; null: friction does not drift",
     )
     on_change: Literal["hold", "adapt", "learn"] = Field(
         "hold",
-        description="What follows a detected change of the robot, or a stream whose first second lies outside the 95 % "
-        "band. `hold`: nothing is learnt until its owner decides, nor of that second; `adapt`: a new regime begins; "
-        "`learn`: learning goes on as before",
+        description="Reaction to a detected change of the robot, or to a stream whose first second is outside the 95 % "
+        "interval. `hold`: learning, also of that second, is paused until the owner decides. `adapt`: a new regime "
+        "begins. `learn`: learning continues as before",
     )
     torque_limits: list[TorqueLimit] | None = Field(
         None,
         max_length=MAX_NAMES,
-        description="Largest |tau| of each joint's actuator in N·m, to tell saturated samples; null: not known",
+        description="Max |tau| of each joint's actuator, N·m, to reject saturated samples; null: unknown",
     )
     contact_threshold: float = Field(
         8.0,
         ge=CONTACT_THRESHOLD[0],
         le=CONTACT_THRESHOLD[1],
         allow_inf_nan=False,
-        description="Predictive standard deviations, noise included, beyond which a torque is taken for a contact",
+        description="Predictive standard deviations, noise included, beyond which a torque counts as a contact",
     )
     adaptive_intervals: bool = Field(
         True,
-        description="Widen and narrow intervals at once, so that 95 % of what streams measure lies inside: the `scale` "
-        "of answers. Otherwise it is 1, as the model itself believes",
+        description="Adapt interval widths online, by the `scale` of responses, so that 95 % of the streams' "
+        "measurements are inside. If false, the scale is 1",
     )
     payloads: bool = Field(
         True,
-        description="Notice what the arm takes up and puts down, and answer with it at once; for models that know the "
-        "arm. Meanwhile rows teach the payload, and not the arm",
+        description="Detect payloads that the arm picks up and puts down, and include them in predictions at once; for "
+        "models with arm geometry. While a payload is carried, rows update the payload, not the arm",
     )
-    auto_refresh: bool = Field(True, description="Train a new version by itself where motion leaves what is known")
-    auto_promote: bool = Field(True, description="Let such a version serve if it predicts better")
+    auto_refresh: bool = Field(
+        True, description="Retrain in the background when motion leaves the known region or the arm its linearisation"
+    )
+    auto_promote: bool = Field(True, description="Serve the retrained version if it predicts better")
 
 
-MOST_SEQUENCE = 2**53 - 1
-"""The largest whole number that every JSON reader takes for what it is."""
+MAX_SEQUENCE = 2**53 - 1
+"""Largest integer that every JSON reader keeps exact."""
 State = Literal["learnt", "unlearnt", "rolled_back"]
 
 StreamId = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
-SequenceNumber = Annotated[int, Field(strict=True, ge=0, le=MOST_SEQUENCE)]
+SequenceNumber = Annotated[int, Field(strict=True, ge=0, le=MAX_SEQUENCE)]
 
 
 def _to_times(value: Any, info: ValidationInfo) -> NDArray[np.float64]:
-    """One number or numbers (N,) as an array (N,), null as NaN; raise InvalidRequestError naming what is wrong."""
+    """Return one number or numbers (N,) as an array (N,), null as NaN; raise InvalidRequestError."""
     return np.array(numbers(info.field_name or "value", value if isinstance(value, list) else [value], nullable=True))
 
 
@@ -96,13 +98,13 @@ Matrix = Annotated[
     NDArray[np.float64],
     PlainValidator(rows_of_numbers(nullable=True), json_schema_input_type=_Numbers | list[_Numbers]),
 ]
-"""JSON array of shape (N, n), or (n,) for one row; null where there is no number."""
+"""JSON array of shape (N, n), or (n,) for one row; null for a missing number."""
 Times = Annotated[NDArray[np.float64], PlainValidator(_to_times, json_schema_input_type=float | _Numbers)]
 """JSON array of shape (N,), or a number for one row."""
 
 
 class ObservationRequest(BaseModel):
-    """A batch of rows from one source, in SI units. A row with null or a number that is not finite is not learnt."""
+    """A batch of rows from one stream, in SI units. A row with null or a number that is not finite is not learnt."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -123,76 +125,73 @@ class ObservationRequest(BaseModel):
         },
     )
 
-    stream_id: StreamId = Field(description="The robot or recording that the rows come from")
+    stream_id: StreamId = Field(description="Stream: the robot or recording that the rows come from")
     sequence: SequenceNumber = Field(
-        description="Number of the batch in its stream, counted up by one. With `stream_id` it is its identity: sent "
-        "again, it is acknowledged again and learnt once"
+        description="Number of the batch in its stream, counted up by one. It identifies the batch: a batch that is "
+        "sent again is acknowledged again and learnt once"
     )
     t: Times | None = Field(
-        None, description="Times of the rows by the stream's own clock, s: (N). Without them rows count as of arrival"
+        None, description="Times of the rows by the stream's own clock, s: (N). By default the time of arrival"
     )
     q: Matrix = Field(description="Positions, rad (prismatic: m): (N, n), or (n) for one row")
     dq: Matrix = Field(description="Velocities, rad/s (m/s)")
     ddq: Matrix | None = Field(
-        None, description="Accelerations, rad/s² (m/s²); left out, they are derived from `t` and `dq`, with a delay"
+        None, description="Accelerations, rad/s² (m/s²); if absent, they are derived from `t` and `dq`, with a delay"
     )
-    tau: Matrix = Field(description="Measured torques, N·m (prismatic: N), of the model's convention")
+    tau: Matrix = Field(description="Measured torques, N·m (prismatic: N), in the model's torque convention")
     joint_names: list[str] | None = Field(
-        None, max_length=1000, description="Joints in the order of the columns; that of the model by default"
+        None, max_length=1000, description="Joints in the order of the columns; by default the model's order"
     )
 
 
 class DerivedAcceleration(BaseModel):
-    """How accelerations were derived: as the slope of a parabola through the velocities around a row."""
+    """Derivation of accelerations: the slope of a parabola through the velocities around each row."""
 
-    delay_s: float = Field(description="How much later than its row an acceleration is known, s")
-    window: int = Field(description="Rows on either side of a row that its acceleration stands on")
-    rate_hz: float = Field(description="Rows a second")
+    delay_s: float = Field(description="Delay from a row to its acceleration, s")
+    window: int = Field(description="Rows used on either side of a row")
+    rate_hz: float = Field(description="Sampling rate of the rows, Hz")
     carried: int = Field(
-        description="Rows of the batches next to this one that had to wait for it, decided and counted with it"
+        description="Rows of neighbouring batches that had to wait for this one and are counted with it"
     )
 
 
 class Derivation(BaseModel):
-    """What was not measured."""
+    """Derived quantities."""
 
     ddq: DerivedAcceleration
 
 
 class ObservationResponse(BaseModel):
-    """The rows are logged for good: `accepted` of them are learnt within a moment."""
+    """Acknowledgement: the rows are logged durably, and `accepted` of them are learnt soon."""
 
     model: str
-    version: int = Field(description="The version that predicted the rows before it learnt them")
-    revision: int = Field(description="Answers of this version with this `revision` or a later one contain the batch")
+    version: int = Field(description="Version that predicted the rows before it learnt them")
+    revision: int = Field(description="Responses of this version with this `revision` or a later one contain the batch")
     stream_id: str
     sequence: int
-    rows: int = Field(description="Rows that came")
-    accepted: int = Field(description="Rows to be learnt")
+    rows: int = Field(description="Rows received")
+    accepted: int = Field(description="Rows that are learnt")
     effective_samples: float | None = Field(
         None,
-        description="Independent samples that these count as now: rows of a fast stream tell nearly the same, and with "
-        "`forgetting_s` late rows count less; null for a batch that an earlier release has logged",
+        description="Effective samples of the accepted rows: neighbouring rows of a fast stream are correlated, and "
+        "with `forgetting_s` late rows count less. Null for a batch logged by an earlier release",
     )
-    duplicate: bool = Field(description="Whether the batch had come before: then this is what was said the first time")
-    state: State = Field(description="What has become of the batch since")
+    duplicate: bool = Field(description="Whether the batch was received before; then this is its first acknowledgement")
+    state: State = Field(description="Present state of the batch")
     rejected: dict[str, int] = Field(
-        description="Rows that are kept but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`, "
-        "`stationary`, `contact`, `change` (a changed robot, or a stream that did not fit, and its owner has not "
-        "decided), `payload` (the arm carries something, of which the row teaches instead), `edge` (acceleration not "
-        "derivable; where the stream goes on, these are learnt with the next batch), `late` (came so late that by "
-        "`forgetting_s` it counts less than a thousandth), `paused` (learning is paused), "
-        "`implausible` (a torque that nobody has measured: zero against gravity, the model's own answer, or the same "
-        "all the time while the arm moves)"
+        description="Rows that are stored but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`, "
+        "`stationary`, `contact`, `change` (the robot changed or the stream does not fit, and the owner has not "
+        "decided yet), `payload` (the arm carries a payload, which the row updates instead), `edge` (acceleration "
+        "cannot be derived yet; if the stream continues, these are learnt with the next batch), `late` (so late that "
+        "with `forgetting_s` it counts less than 0.001), `paused` (learning is paused), `implausible` (not a measured "
+        "torque: zero against gravity, the model's own prediction, or constant while the arm moves)"
     )
-    gaps: list[list[int]] = Field(
-        description="Ranges [first, last] of sequences of the stream that have not come, the latest ones"
-    )
-    derived: Derivation | None = Field(None, description="What was derived because it was not sent")
-    held: bool = Field(description="Whether learning stands still until the model's owner has decided about a change")
+    gaps: list[list[int]] = Field(description="Latest ranges [first, last] of missing sequences of the stream")
+    derived: Derivation | None = Field(None, description="Derived quantities; null if all were sent")
+    held: bool = Field(description="Whether learning is paused until the model's owner decides about a change")
 
 
 class ExpiredError(ServiceError):
-    """The batch is so old that it is not known any more whether it has been learnt."""
+    """The batch is so old that the service cannot tell whether it was learnt."""
 
     status, code = 409, "expired"

@@ -1,4 +1,4 @@
-"""Models at a glance, as the API shows them: what a list of robots needs to know of each."""
+"""Short summaries of models for lists."""
 
 from __future__ import annotations
 
@@ -17,74 +17,78 @@ Three = list[float]
 class SketchedJoint(BaseModel):
     """A joint of a learnt arm, in the frame of the joint before it."""
 
-    joint: int = Field(description="Which of the model's joints it is, from 0")
+    joint: int = Field(description="Index of the joint in the model, from 0")
     type: JointType
-    rotation: list[Three] = Field(description="Of its frame with its position at zero, 3 × 3")
-    translation: Three = Field(description="m")
-    axis: Three = Field(description="In its own frame")
-    mass: float = Field(description="Of what it moves, itself, kg")
-    centre: Three = Field(description="Of that mass, in its own frame, m")
+    rotation: list[Three] = Field(description="Rotation of the joint frame at position zero, 3 × 3")
+    translation: Three = Field(description="Translation of the joint frame, m")
+    axis: Three = Field(description="Joint axis in the joint frame")
+    mass: float = Field(description="Mass of the link that the joint moves, kg")
+    centre: Three = Field(description="Centre of mass of this link in the joint frame, m")
 
 
 class ArmSketch(BaseModel):
-    """Enough of an arm to draw it, joints from base to tip; `parameters` of its version has all, with uncertainty."""
+    """Geometry for a drawing of an arm, joints from base to tip. `parameters` of the version has all of it."""
 
     gravity: Three
     joints: list[SketchedJoint]
 
 
 class CoursePoint(BaseModel):
-    """Rows of a short while, each predicted before it was learnt."""
+    """Rows of a short time span, each predicted before it was learnt."""
 
-    at: float = Field(description="When that while began, Unix seconds")
+    at: float = Field(description="Start of the time span, Unix seconds")
     rows: int = Field(description="Rows that could be predicted")
     innovation: list[float] = Field(
-        description="Per joint, root mean square of (tau - mean) in standard deviations of a measurement, "
-        "sqrt(std² + noise_std²): 1 where errors are as large as the model says"
+        description="Per joint, root mean square of (tau - mean) / sqrt(std² + noise_std²): 1 if errors are as large "
+        "as predicted"
     )
 
 
 class RecentQuality(BaseModel):
-    """How well a model predicted what it observed lately."""
+    """Prediction quality on recent observations."""
 
-    seconds: float = Field(description="How far it looks back")
+    seconds: float = Field(description="Length of the window, s")
     rows: int
     nmse: Nullable = Field(description="Mean squared error / variance of the measured torque")
     coverage: Nullable = Field(description="Share of measurements inside the 95 % interval, noise included")
-    course: list[CoursePoint] = Field(description="Oldest first; a while without rows is left out")
+    course: list[CoursePoint] = Field(description="Time spans, oldest first; time spans without rows are left out")
 
 
 class ModelOverview(BaseModel):
-    """A model at a glance."""
+    """A short summary of a model."""
 
     name: str
-    serving_version: int | None = Field(description="null where all versions wait as candidates")
+    serving_version: int | None = Field(description="Serving version; null if all versions are candidates")
     latest_version: int
-    estimator: str = Field(description="Of the version that serves, else of the newest, as all that follows")
-    created_at: str = Field(description="When that version was made")
+    estimator: str = Field(
+        description="Estimator of the serving version, else of the newest. The following fields are of this version"
+    )
+    created_at: str = Field(description="Creation time of the version")
     joint_names: list[str]
     joint_types: list[JointType]
-    quality: HeldOutQuality | None = Field(description="On what its training held out; null where that was nothing")
-    candidate: int | None = Field(description="A version that waits under the alias `candidate`")
-    arm: ArmSketch | None = Field(description="null: the estimator knows no arm")
-    position: list[float] = Field(
-        description="Where it was at the last row that this service took, rad (m); else a posture it was trained at"
+    quality: HeldOutQuality | None = Field(
+        description="Quality on the held-out part of its training; null if nothing was held out"
     )
-    idle_s: float | None = Field(description="Seconds since observations came last; null: never")
+    candidate: int | None = Field(description="Version under the alias `candidate`")
+    arm: ArmSketch | None = Field(description="Null if the estimator has no arm geometry")
+    position: list[float] = Field(
+        description="Position at the last row that this process received, rad (m); else a posture of its training"
+    )
+    idle_s: float | None = Field(description="Time since the last observation, s; null if there was none")
     recent: RecentQuality | None = Field(
-        description="Of the quality window nearest to an hour; null while nothing that this service knows has come"
+        description="From the quality window nearest to one hour; null if this process has no observations"
     )
     payloads: list[LivePayload] | None = Field(
-        description="What each stream's arm carries; null: no arm is known, or the model is not in memory"
+        description="Payload of each stream; null if the model has no arm geometry or is not in memory"
     )
-    held: bool = Field(description="Whether learning waits for a decision")
-    failure: str | None = Field(description="Why the version does not learn, where it should")
-    alarm: Alarm | None = Field(description="The newest one")
+    held: bool = Field(description="Whether learning is paused until a person decides")
+    failure: str | None = Field(description="Why learning fails; null if it does not")
+    alarm: Alarm | None = Field(description="Newest alarm")
 
 
 class OverviewPage(BaseModel):
-    """One page of models at a glance, newest first."""
+    """One page of model summaries, newest first."""
 
     items: list[ModelOverview]
     next_cursor: str | None
-    live_after_s: Literal[10] = Field(10, description="A model whose `idle_s` is below counts as live")
+    live_after_s: Literal[10] = Field(10, description="A model counts as live if its `idle_s` is below this")

@@ -1,4 +1,4 @@
-"""Payloads: what a query or an owner declares, and what is known of what arms carry."""
+"""Payloads: declared by a query or an owner, and estimated from streams."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from service.contract.observations import StreamId
 
 
 def _three(value: Any) -> Any:
-    """A list of three of whatever; raise PydanticCustomError for anything else."""
+    """Return a list of three items; raise PydanticCustomError for anything else."""
     if not isinstance(value, list) or len(value) != 3:
         raise PydanticCustomError("three", "a list of three")
     return value
 
 
-MOST_NUMBER = 1e6
-"""Largest number of a payload in kg, m or kg·m², far beyond any arm's: what is answered stays a number."""
+MAX_PAYLOAD_NUMBER = 1e6
+"""Max size of a payload's numbers in kg, m or kg·m², far beyond any arm's, so that predictions stay finite."""
 _VECTOR = {
     "type": "array",
-    "items": {"type": "number", "minimum": -MOST_NUMBER, "maximum": MOST_NUMBER},
+    "items": {"type": "number", "minimum": -MAX_PAYLOAD_NUMBER, "maximum": MAX_PAYLOAD_NUMBER},
     "minItems": 3,
     "maxItems": 3,
 }
 _MATRIX = {"type": "array", "items": _VECTOR, "minItems": 3, "maxItems": 3}
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MOST_NUMBER, le=MOST_NUMBER)]
-# tuples, so that payloads can be compared; of JSON they are lists
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_PAYLOAD_NUMBER, le=MAX_PAYLOAD_NUMBER)]
+# tuples, so that payloads can be compared; JSON has lists
 Triple = Annotated[tuple[Number, Number, Number], Field(strict=False), BeforeValidator(_three), WithJsonSchema(_VECTOR)]
 Triples = Annotated[
     tuple[Triple, Triple, Triple], Field(strict=False), BeforeValidator(_three), WithJsonSchema(_MATRIX)
@@ -36,48 +36,52 @@ Triples = Annotated[
 
 
 class Payload(BaseModel):
-    """A body that the arm carries besides what it was learnt with, fixed to its last link: the one that the last joint
-    moves."""
+    """A body on the last link, which the last joint moves, that was not there in training."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
-    mass: Annotated[float, Field(gt=0, le=MOST_NUMBER, allow_inf_nan=False)] = Field(description="kg, above zero")
+    mass: Annotated[float, Field(gt=0, le=MAX_PAYLOAD_NUMBER, allow_inf_nan=False)] = Field(
+        description="Mass, kg, above zero"
+    )
     com: Triple = Field(
-        description="Centre of mass, m, in the frame of the last link. Of a model around a URDF that is the frame of "
-        "the URDF's last movable joint. An arm that was learnt from torque alone has frames of its own, which "
-        "`parameters.geometry` of the version lists. Its last one need not lie at the flange or point as it does, and "
-        "the arm may be mirrored: bring a position measured at the flange into that frame first"
+        description="Centre of mass in the frame of the last link, m. For a model with a URDF, this is the frame of "
+        "the URDF's last movable joint. An arm learnt from torque alone has its own frames, listed in "
+        "`parameters.geometry` of the version. Its last frame may differ from the flange, and the arm may be mirrored: "
+        "transform a position measured at the flange first"
     )
     inertia: Triples | None = Field(
         None,
-        description="3 × 3, kg·m², about the centre of mass, along the axes of the last link; that of a point where it "
-        "is left out",
+        description="Inertia about the centre of mass, along the axes of the last link, 3 × 3, kg·m². By default that "
+        "of a point mass",
     )
 
     @property
     def numbers(self) -> tuple[float, Triple, Triples | None]:
-        """What `DeclaredPayloads` knows it by."""
+        """Key of the payload in `DeclaredPayloads`."""
         return self.mass, self.com, self.inertia
 
 
-MOST_DISTANCE = 10.0
+MAX_DISTANCE_M = 10.0
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Metres = Annotated[float, Field(ge=-MOST_DISTANCE, le=MOST_DISTANCE, allow_inf_nan=False)]
+Metres = Annotated[float, Field(ge=-MAX_DISTANCE_M, le=MAX_DISTANCE_M, allow_inf_nan=False)]
 Row = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 PAYLOAD_EXAMPLE: dict[str, Any] = {"mass": 1.5, "com": [0.0, 0.0, 0.12]}
 
 
 class PayloadRequest(BaseModel):
-    """A payload that the arm carries, as robot controllers take it: in the frame of the last link."""
+    """A payload in the frame of the last link, as in robot controllers."""
 
     model_config = ConfigDict(extra="forbid", strict=True, json_schema_extra={"examples": [PAYLOAD_EXAMPLE]})
 
-    mass: float = Field(gt=0, le=1000.0, allow_inf_nan=False, description="kg")
+    mass: float = Field(gt=0, le=1000.0, allow_inf_nan=False, description="Mass, kg")
     com: Annotated[list[Metres], Field(min_length=3, max_length=3)] = Field(description="Centre of mass, m")
     inertia: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = Field(
-        None, description="3 × 3 about the centre of mass, along the axes of the link, kg·m²; null: that of a point"
+        None,
+        description="Inertia about the centre of mass, along the axes of the link, 3 × 3, kg·m²; null: a point mass",
     )
-    stream_id: StreamId | None = Field(None, description="The robot that carries it; null: all of the model")
+    stream_id: StreamId | None = Field(
+        None, description="Stream of the robot that carries it; null: all robots of the model"
+    )
 
 
 class Scalar(BaseModel):
@@ -95,59 +99,61 @@ class Vector(BaseModel):
 
 
 class Tensor(BaseModel):
-    """A matrix of 3 × 3 and its standard deviations."""
+    """A 3 × 3 matrix and its standard deviations."""
 
     mean: list[list[float]]
     std: list[list[float]]
 
 
 class PayloadBody(BaseModel):
-    """A body on the last link, as far as its stream tells."""
+    """Estimate of a body on the last link."""
 
-    mass: Scalar = Field(description="kg")
+    mass: Scalar = Field(description="Mass, kg")
     com: Vector = Field(description="Centre of mass in the frame of the last link, m")
-    com_tip: Vector | None = Field(description="The same in the frame of the URDF's tip, m; null without a URDF")
-    inertia: Tensor = Field(description="About the centre of mass, along the axes of the last link, kg·m²")
+    com_tip: Vector | None = Field(description="Centre of mass in the frame of the URDF's tip, m; null without a URDF")
+    inertia: Tensor = Field(description="Inertia about the centre of mass, along the axes of the last link, kg·m²")
 
 
 class Carrying(BaseModel):
-    """Whether one robot carries anything."""
+    """Payload state of one robot."""
 
     stream_id: str
     state: PayloadState = Field(
-        description="What its last rows show: `payload`, `contact`, `friction` (it has changed), or `none` of these"
+        description="State by the latest rows: `payload`, `contact`, `friction` (changed friction) or `none`"
     )
-    declared: bool = Field(description="Whether the payload was declared, and not only seen")
-    since: str | None = Field(description="Since when it carries what it carries, or nothing")
-    rows: int = Field(description="Rows that the payload was seen on")
+    declared: bool = Field(description="Whether the payload was declared rather than detected")
+    since: str | None = Field(description="Time since which the robot carries this payload, or none")
+    rows: int = Field(description="Rows used to estimate the payload")
 
 
 class LivePayload(Carrying):
-    """What one robot carries, in short."""
+    """Short summary of one robot's payload."""
 
-    mass: Scalar | None = Field(description="kg; null: nothing that the model was not trained with")
+    mass: Scalar | None = Field(description="Mass, kg; null without a payload")
 
 
 class StreamPayload(Carrying):
-    """What one robot carries."""
+    """Payload of one robot."""
 
-    probabilities: dict[str, float] = Field(description="Of what may have begun within the last 0.3 s")
-    payload: PayloadBody | None = Field(description="null: it carries nothing that the model was not trained with")
+    probabilities: dict[str, float] = Field(
+        description="Probabilities of events that may have begun within the last 0.3 s"
+    )
+    payload: PayloadBody | None = Field(description="Null: nothing beyond what the model was trained with")
 
 
 class Payloads(BaseModel):
-    """What the robots of a model carry."""
+    """Payloads of a model's robots."""
 
     model: str
     version: int
-    link: str | None = Field(description="The joint that moves the last link")
+    link: str | None = Field(description="Joint that moves the last link")
     frame: Literal["learnt", "urdf"] | None = Field(
-        description="Whose frame of that link centres of mass are in. `learnt`: the arm was learnt from torque alone; "
-        "its origin lies on the last joint's axis, and lengths, and with them masses, are as good as the geometry"
+        description="Frame of the centres of mass. `urdf`: of the URDF's link. `learnt`: the arm was learnt from "
+        "torque alone; the origin lies on the last joint's axis, and lengths and masses are as accurate as the geometry"
     )
-    tip: str | None = Field(description="The frame of the URDF that counts as its tip")
-    reason: str | None = Field(description="Why nothing is watched; null where payloads are")
+    tip: str | None = Field(description="Frame of the URDF that is its tip")
+    reason: str | None = Field(description="Why payloads are not detected; null if they are")
     streams: list[StreamPayload]
     default: PayloadBody | None = Field(
-        description="Declared for all of the model: what streams that have sent nothing yet are answered with"
+        description="Payload declared for all robots of the model. It applies to streams without observations"
     )

@@ -1,4 +1,4 @@
-"""Torque queries, and comparisons of models with data sets, as the API takes and answers them."""
+"""Torque queries, and comparisons of models with data sets."""
 
 from __future__ import annotations
 
@@ -30,25 +30,27 @@ Vectors = Annotated[
 
 ComponentNames = Annotated[
     list[ComponentName],
-    Field(max_length=len(COMPONENTS), json_schema_extra={"uniqueItems": True}),  # first: a long list is not looked at
+    # checked first, so that a long list is not read
+    Field(max_length=len(COMPONENTS), json_schema_extra={"uniqueItems": True}),
     AfterValidator(check_unique),
 ]
 Part = Literal["all", "held_out"]
-"""Of a data set that a model is compared with."""
+"""Part of the data set with which a model is compared."""
 Nested = float | list[float] | list[list[float]] | list[list[list[float]]]
 
 
 def one_choice(version: int | None, alias: str | None) -> None:
-    """Raise InvalidRequestError where a version is named by its number and by an alias."""
+    """Raise InvalidRequestError if a version is given both by number and by alias."""
     if version is not None and alias is not None:
-        raise invalid_request("alias", alias, f"no alias beside the version, {version}: name one of the two")
+        message = f"Both `version` ({version}) and `alias` ({alias}) are given. Give only one of them."
+        raise invalid_request("alias", alias, "no alias beside a version", message)
 
 
 class VersionChoice(BaseModel):
-    """Which version is meant: a number, an alias, or the one that serves."""
+    """Choice of a version: a number, an alias, or by default the serving version."""
 
-    version: VersionNumber | None = Field(None, description="A version of the model; the one that serves by default")
-    alias: AliasName | None = Field(None, description="A version by a name that it was given, instead of its number")
+    version: VersionNumber | None = Field(None, description="Version of the model; the serving version by default")
+    alias: AliasName | None = Field(None, description="Alias of a version, instead of its number")
 
     @model_validator(mode="after")
     def _one_of_both(self) -> Self:
@@ -61,16 +63,16 @@ MinRevision = Annotated[
     Field(
         ge=0,
         lt=2**31,
-        description="Answer with this revision of the version or a later one, as the `revision` of an acknowledgement: "
-        "what was taught is in the answer, whichever service took it. Waits up to LIPSERVE_MIN_REVISION_WAIT_S, then "
-        "503 `revision_not_reached`. Revisions count for one version: where another may have been promoted since, "
-        "name the `version` of the acknowledgement too",
+        description="Min revision of the version. With the `revision` of an acknowledgement, the response contains "
+        "that batch, whichever process received it. Waits up to LIPSERVE_MIN_REVISION_WAIT_S, then fails with 503 "
+        "`revision_not_reached`. Revisions belong to one version: if another one may have been promoted since, also "
+        "give the `version` of the acknowledgement",
     ),
 ]
 
 
 class PredictRequest(VersionChoice):
-    """One query, or a batch of them, in SI units."""
+    """One query or a batch of queries, in SI units."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -91,32 +93,34 @@ class PredictRequest(VersionChoice):
     q: Vectors = Field(description="Positions, rad (prismatic: m): (n) or (N, n)")
     dq: Vectors = Field(description="Velocities, rad/s (m/s)")
     ddq: Vectors = Field(description="Accelerations, rad/s² (m/s²)")
-    covariance: bool = Field(False, description="Also answer the covariance of the function between joints")
+    covariance: bool = Field(False, description="Also return the covariance of the function between joints")
     components: ComponentNames = Field(
         default=[],
-        description="Also answer these parts of the dynamics. Energy and rigid-body estimators offer all, others "
-        "`friction`. They cost several times a torque: the most queries of such a request are fewer",
+        description="Also return these parts of the dynamics. Energy and rigid-body estimators offer all of them, "
+        "others `friction`. They cost several times as much as a torque, so the max batch size is smaller",
     )
-    tau: Vectors | None = Field(None, description="Torque that `forward_dynamics` is asked for, N·m (prismatic: N)")
+    tau: Vectors | None = Field(None, description="Torque for `forward_dynamics`, N·m (prismatic: N)")
     min_revision: MinRevision = None
     payload: Payload | None = Field(
         None,
-        description="Answer for the arm with this on its last link, and nothing else that it did not have in training. "
-        "For models with rigid bodies, as of `rigid-body`. It is taken as exact: `tau_std` is what the model does not "
-        "know of the arm with it. A model of gravity-compensated torques leaves out its weight, too",
+        description="Predict for the arm with this payload on its last link, and no other. For models with rigid "
+        "bodies, such as `rigid-body`. The payload counts as exact: `tau_std` is the uncertainty of the arm with it. A "
+        "model of gravity-compensated torques leaves out its weight as well",
     )
 
 
 class ComponentValues(BaseModel):
-    """A component at one query or a batch: numbers, vectors (n) or matrices (n, n) a query."""
+    """A component for one query or a batch: a number, a vector (n) or a matrix (n, n) per query."""
 
     mean: Nested
-    std: Nested = Field(description="Standard deviation of the function; of forward dynamics to first order")
+    std: Nested = Field(description="Standard deviation of the function; for forward dynamics to first order")
 
 
 class PredictResponse(BaseModel):
-    """Torques, shaped as the query. An interval that shall hold measurements needs both standard deviations and the
-    scale: tau ± 1.96 · scale · sqrt(tau_std² + noise_std²) for 95 % of them."""
+    """Torques in the shape of the query.
+
+    The 95 % interval of a measurement is tau ± 1.96 · scale · sqrt(tau_std² + noise_std²).
+    """
 
     model: str
     version: int
@@ -127,36 +131,36 @@ class PredictResponse(BaseModel):
     tau_std: list[float] | list[list[float]] = Field(description="Standard deviation of the function")
     noise_std: list[float] = Field(description="Standard deviation of the measurement, per joint")
     scale: list[float] = Field(
-        description="Factor on the half width, per joint: what the streams that teach the model need now for intervals "
-        "that hold what they promise, the largest of the recent ones; at least what left-out blocks of the training "
-        "have proved, and 1"
+        description="Factor on the half width of intervals, per joint. It is the largest factor that recent streams "
+        "need for the nominal coverage, and at least 1 and the factor that held-out blocks of the training need"
     )
     guaranteed: list[float] | None = Field(
         None,
-        description="Share of measurements that left-out blocks of the training guarantee for the 95 % interval, per "
-        "joint, for motion of that kind: less where there are fewer than 19; null for the shipped model",
+        description="Min coverage of the 95 % interval, per joint, that held-out blocks of the training guarantee for "
+        "similar motion; below 95 % with fewer than 19 blocks. Null for the shipped model",
     )
-    covariance: list[list[float]] | list[list[list[float]]] | None = Field(None, description="(N·m)², where asked for")
+    covariance: list[list[float]] | list[list[list[float]]] | None = Field(
+        None, description="Covariance of the function between joints, (N·m)²; null unless requested"
+    )
     components: dict[ComponentName, ComponentValues] | None = Field(
         None,
-        description="Where asked for. `inertia_matrix` M(q), kg·m²; torques `inertial` M(q) ddq, `coriolis`, `gravity` "
-        "and `friction`, N·m, which sum to `tau` unless it falls back; `kinetic_energy`, J; `potential_energy`, J, "
-        "relative to the posture in the middle of each joint's training range; `forward_dynamics`, rad/s²: the "
-        "acceleration under the torque "
-        "asked for. Friction is in `friction` and `forward_dynamics` alone; a model of gravity-compensated torques "
-        "knows no gravity",
+        description="Requested components. `inertia_matrix` M(q), kg·m²; torques `inertial` M(q) ddq, `coriolis`, "
+        "`gravity` and `friction`, N·m, which sum to `tau` without fallback; `kinetic_energy`, J; `potential_energy`, "
+        "J, relative to the middle of each joint's training range; `forward_dynamics`, rad/s²: the acceleration under "
+        "the given torque. Friction is only in `friction` and `forward_dynamics`. A model of gravity-compensated "
+        "torques has no gravity",
     )
     fallback: list[float] | list[list[float]] | None = Field(
         None,
-        description="Share of the fallback in each torque, 0 to 1, shaped as `tau`; absent if all are zero. At 1 the "
-        "training does not determine the torque of this motion: `tau` is gravity, offset and friction only, or the "
-        "mean torque of the training if these are not determined either. `tau_std` is that of the full model",
+        description="Share of the fallback in each torque, 0 to 1, in the shape of `tau`; absent if all are zero. At "
+        "1, training does not determine the torque of this motion: `tau` is only gravity, offset and friction, or the "
+        "mean training torque if these are not determined either. `tau_std` is that of the full model",
         examples=[[0.0, 0.0, 0.0, 0.0, 0.35, 1.0, 0.0]],
     )
 
 
 class EvaluateRequest(VersionChoice):
-    """Which data set to compare a model with."""
+    """Data set with which a model is compared."""
 
     model_config = ConfigDict(
         extra="forbid", strict=True, json_schema_extra={"examples": [{"dataset": "ds_0123456789abcdef", "version": 1}]}
@@ -165,25 +169,27 @@ class EvaluateRequest(VersionChoice):
     dataset: str = Field(max_length=MAX_NAME_CHARS, description="Id or name of a data set")
     part: Part = Field(
         "all",
-        description="`held_out`: only what the training of the version has held out of the data set, see `holdout` of "
-        "a job. If the version has learnt that since, `evaluate` returns the figures of the judged fit",
+        description="`held_out`: only the held-out part of the version's training, see `holdout` of a job. If the "
+        "version was trained on this part afterwards, `evaluate` returns the figures of the evaluated fit",
     )
     min_revision: MinRevision = None
 
 
 class EvaluateResponse(Evaluation):
-    """Figures per joint. nmse is null for a joint whose measured torque does not vary."""
+    """Figures per joint. `nmse` is null for a joint with constant measured torque."""
 
     model: str
     version: int
-    revision: int = Field(description="Online updates applied to the version; 0 for figures of a judged fit")
+    revision: int = Field(description="Online updates applied to the version; 0 for figures of the evaluated fit")
     dataset: str
     part: Part
     joint_names: list[str]
-    in_training: bool = Field(description="Whether the version has learnt these samples: then the figures flatter")
+    in_training: bool = Field(
+        description="Whether the version was trained on these samples, so that the figures are too good"
+    )
     judged: bool = Field(
-        description="Whether the figures are of the judged fit, which was trained without these samples; the version "
-        "was then trained on all"
+        description="Whether the figures are of the evaluated fit, which was trained without these samples before the "
+        "version was trained on all"
     )
 
 
@@ -193,7 +199,7 @@ Row = Annotated[int, Field(ge=0, lt=2**53)]
 
 
 class TraceRequest(EvaluateRequest):
-    """Which rows of which data set to follow a model along."""
+    """Rows of a data set along which a model is traced."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -202,27 +208,26 @@ class TraceRequest(EvaluateRequest):
     )
 
     start: Row = Field(0, description="First row of the data set, counted from 0")
-    stop: Row | None = Field(None, description="Row to end before; the end of the data set by default and at most")
+    stop: Row | None = Field(None, description="Row after the last one; by default and at most the end of the data set")
     points: int = Field(
-        1000, ge=1, lt=2**31, description="Rows to show; evenly chosen where there are more. At most 2000 by default"
+        1000, ge=1, lt=2**31, description="Max rows to show, evenly chosen. The limit is 2000 by default"
     )
     components: Annotated[
         list[TraceComponent], Field(max_length=4, json_schema_extra={"uniqueItems": True}), AfterValidator(check_unique)
-    ] = Field([], description="Also answer these parts of the torque, where the estimator offers them, as in `predict`")
+    ] = Field([], description="Also return these parts of the torque if the estimator offers them, as in `predict`")
 
 
 class TraceComponentValues(BaseModel):
-    """A part of the torque at the rows shown, N·m, one list of joints a row."""
+    """A part of the torque at the rows shown, N·m, one list of joints per row."""
 
     mean: list[list[float]]
     std: list[list[float]] = Field(description="Standard deviation of the function")
 
 
 class TraceResponse(BaseModel):
-    """Measured and predicted torque at rows of a data set, N·m (prismatic: N), one list of joints a row.
+    """Measured and predicted torque at rows of a data set, N·m (prismatic: N), one list of joints per row.
 
-    An interval that shall hold the measurements needs both standard deviations and the scale:
-    mean ± 1.96 · scale · sqrt(std² + noise_std²) for 95 % of them.
+    The 95 % interval of a measurement is mean ± 1.96 · scale · sqrt(std² + noise_std²).
     """
 
     model: str
@@ -233,29 +238,31 @@ class TraceResponse(BaseModel):
     joint_names: list[str]
     torque_convention: TorqueConvention
     samples: int = Field(description="Samples of the data set, or of the part")
-    in_range: int = Field(description="Samples of these from `start` to `stop`")
-    shown: int = Field(description="Samples shown: evenly chosen where fewer than `in_range`, and peaks may be missing")
-    rows: list[int] = Field(description="Their rows in the data set, counted from 0")
-    t: list[float] = Field(description="Their times, s")
+    in_range: int = Field(description="Number of these samples from `start` to `stop`")
+    shown: int = Field(
+        description="Number of samples shown. If fewer than `in_range`, they are evenly chosen and peaks may be missing"
+    )
+    rows: list[int] = Field(description="Rows of these samples in the data set, counted from 0")
+    t: list[float] = Field(description="Times of these samples, s")
     breaks: list[int] = Field(
-        description="Places in `rows` at which another episode begins, or another piece of the part held out: lines "
-        "are not to be drawn across"
+        description="Indices in `rows` at which another episode or another piece of the held-out part begins. Plots "
+        "should break lines there"
     )
     tau: list[list[float]] = Field(description="Measured torque")
     mean: list[list[float]] = Field(description="Predicted torque")
     std: list[list[float]] = Field(description="Standard deviation of the function")
     noise_std: list[float] = Field(description="Standard deviation of the measurement, per joint")
-    scale: list[float] = Field(description="The version's own factor on the half width of its intervals, per joint")
-    offered: list[TraceComponent] = Field(description="Components that may be asked for")
+    scale: list[float] = Field(description="The version's own factor on the half width of intervals, per joint")
+    offered: list[TraceComponent] = Field(description="Components that can be requested")
     components: dict[TraceComponent, TraceComponentValues]
     in_training: bool = Field(
-        description="Whether the version has learnt these samples, even if they were held out: then it looks better "
-        "than it is"
+        description="Whether the version was trained on these samples, even if they were held out at first, so that it "
+        "looks better than it is"
     )
 
 
 class CompareRequest(BaseModel):
-    """Which two versions to compare, and on which data set."""
+    """Two versions to compare on a data set."""
 
     model_config = ConfigDict(
         extra="forbid",
@@ -279,20 +286,26 @@ class VersionFigures(BaseModel):
     coverage: list[float]
     nlpd: list[float]
     interval_width: list[float]
-    in_training: bool = Field(description="Whether the version was trained on this data set: then its figures flatter")
+    in_training: bool = Field(
+        description="Whether the version was trained on this data set, so that its figures are too good"
+    )
 
 
 class Differences(BaseModel):
-    """The second version's figure less the first's, per joint. Errors are null where the samples make a single block,
-    all is null for a joint whose measured torque does not vary, where it is nMSE."""
+    """The second version's figure less the first's, per joint.
+
+    Errors are null if the samples form a single block. For nMSE, all is null for a joint with constant measured torque.
+    """
 
     difference: list[float | None]
-    standard_error: list[float | None] = Field(description="Of the paired difference; it respects correlation in time")
-    half_width: list[float | None] = Field(description="Half the width of its 95 % interval")
+    standard_error: list[float | None] = Field(
+        description="Standard error of the paired difference, with correlation in time"
+    )
+    half_width: list[float | None] = Field(description="Half the width of the 95 % interval of the difference")
 
 
 class JointDifferences(BaseModel):
-    """Differences per joint, one of each figure."""
+    """Differences per joint, by figure."""
 
     nmse: Differences
     rmse: Differences
@@ -301,7 +314,7 @@ class JointDifferences(BaseModel):
 
 
 class TotalDifference(BaseModel):
-    """The second version's figure less the first's, all joints together; null where it cannot be told."""
+    """The second version's figure less the first's, all joints combined; null if it cannot be determined."""
 
     difference: float | None
     standard_error: float | None
@@ -309,24 +322,26 @@ class TotalDifference(BaseModel):
 
 
 class CompareResponse(BaseModel):
-    """Two versions on one data set, and what the difference between them says."""
+    """Two versions compared on one data set."""
 
     model: str
     dataset: str
     joint_names: list[str]
     samples: int = Field(description="Samples of the data set")
-    samples_used: int = Field(description="Samples compared: evenly thinned where there are more than the limit")
+    samples_used: int = Field(description="Compared samples, evenly thinned above the limit")
     blocks: int = Field(
-        description="Stretches of a second, or episodes where there are enough, that standard errors stand on"
+        description="Blocks for standard errors: stretches of one second, or episodes if there are enough"
     )
     versions: list[VersionFigures] = Field(description="The two versions in the order of the request")
     differences: JointDifferences
-    nlpd: TotalDifference = Field(description="Negative log predictive density, nats a sample, summed over the joints")
-    nmse: TotalDifference = Field(description="nMSE, averaged over the joints whose torque varies")
-    outcome: Outcome = Field(
-        description="By the negative log predictive density, which rewards small errors and true uncertainty alike; "
-        "`cannot_tell` where the samples make too few blocks"
+    nlpd: TotalDifference = Field(
+        description="Negative log predictive density, nats per sample, summed over the joints"
     )
-    better: int | None = Field(description="The version that is better by that; null where none is")
-    verdict: str = Field(description="The same in words")
-    warnings: list[str] = Field(description="What makes the comparison unfair")
+    nmse: TotalDifference = Field(description="nMSE, averaged over the joints with varying torque")
+    outcome: Outcome = Field(
+        description="Outcome by the negative log predictive density, which rewards small errors and right uncertainty. "
+        "`cannot_tell`: too few blocks"
+    )
+    better: int | None = Field(description="The better version by this outcome; null if there is none")
+    verdict: str = Field(description="Outcome in words")
+    warnings: list[str] = Field(description="Reasons why the comparison is unfair")

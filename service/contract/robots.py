@@ -1,4 +1,4 @@
-"""Robots as the API shows them."""
+"""Uploaded robots and known robot profiles."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from service.foundation.fields import upload_body
 
 
 class RobotJoint(BaseModel):
-    """A joint that moves on its own."""
+    """A movable joint."""
 
     name: str
     type: JointType
 
 
 class Robot(BaseModel):
-    """An uploaded URDF, immutable."""
+    """An uploaded, immutable URDF."""
 
     id: str
     name: str
     created_at: str
     sha256: str = Field(description="Hash of the URDF")
-    joints: list[RobotJoint] = Field(description="Joints that move; those that the data do not name are locked")
+    joints: list[RobotJoint] = Field(description="Movable joints. Joints that the data do not name are locked")
 
 
 class RobotPage(BaseModel):
@@ -33,38 +33,38 @@ class RobotPage(BaseModel):
 
 
 class ProfileJoint(RobotJoint):
-    """A joint and its limits; null where it has none, or where none is known."""
+    """A joint and its limits; null if it has none or none is known."""
 
-    aliases: list[str] = Field(description="Other names that recordings have for it")
-    turns_freely: bool = Field(description="Whether it turns without end, so that it has no range")
-    lower: float | None = Field(description="rad, or m where it is prismatic")
-    upper: float | None = Field(description="rad, or m where it is prismatic")
-    max_speed: float | None = Field(description="rad/s or m/s")
-    max_acceleration: float | None = Field(description="rad/s² or m/s²")
-    max_torque: float | None = Field(description="N·m or N")
-    torque_constant: float | None = Field(description="N·m/A, of its motor current")
+    aliases: list[str] = Field(description="Other names of the joint in recordings")
+    turns_freely: bool = Field(description="Whether the joint turns endlessly, so that it has no range")
+    lower: float | None = Field(description="Lower position limit, rad (prismatic: m)")
+    upper: float | None = Field(description="Upper position limit, rad (prismatic: m)")
+    max_speed: float | None = Field(description="Speed limit, rad/s (m/s)")
+    max_acceleration: float | None = Field(description="Acceleration limit, rad/s² (m/s²)")
+    max_torque: float | None = Field(description="Torque limit, N·m (N)")
+    torque_constant: float | None = Field(description="Torque constant of the motor current, N·m/A")
 
 
 class RobotProfile(BaseModel):
-    """What is known of a robot: what data of it are read, checked and reported with."""
+    """A known robot. Its data are read, checked and reported with this profile."""
 
     name: str
     title: str
     joints: list[ProfileJoint] = Field(description="From base to tip")
     effort: EffortMeaning = Field(
-        description="What the effort field of its recordings is, unless the upload says: measured torque, gravity "
-        "included; commanded torque, added to gravity compensation; motor current, A"
+        description="Meaning of the effort in recordings, unless the upload says otherwise: measured torque with "
+        "gravity, commanded torque on top of gravity compensation, or motor current in A"
     )
     effort_note: str
-    source: str = Field(description="Of the numbers")
-    urdf_available: bool = Field(description="Whether its name will do as the robot of a job with rigid bodies")
-    urdf_note: str | None = Field(description="Why not")
+    source: str = Field(description="Source of the numbers")
+    urdf_available: bool = Field(description="Whether jobs with rigid bodies can use this robot by name")
+    urdf_note: str | None = Field(description="Why no URDF is available; null if one is")
 
 
 class ProfileList(BaseModel):
-    """Robots known by name, all on one page."""
+    """All known robots, on one page."""
 
-    items: list[RobotProfile] = Field(description="Some are known only where example-robot-data is installed")
+    items: list[RobotProfile] = Field(description="Known robots. Some need the package example-robot-data")
     next_cursor: str | None = None
 
 

@@ -1,4 +1,4 @@
-"""States and choices as the API names them."""
+"""States and choices of the API."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ CANCELLED: Final = "cancelled"
 ACTIVE = (QUEUED, RUNNING)
 
 PartState = Literal["ok", "warning", "failed"]
-"""Of a part of the service."""
+"""State of a part of the service."""
 
 PromotionOption = Literal["ask", "always"]
-"""When a version answers by itself: if it does well on what was held out, or in any case."""
+"""When a new version starts to serve: if it passes on the held-out part, or always."""
 Outcome = Literal["first_better", "second_better", "no_difference", "cannot_tell"]
-"""Of a comparison of two versions."""
+"""Outcome of a comparison of two versions."""

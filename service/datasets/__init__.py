@@ -1,1 +1,1 @@
-"""Data sets: upload, validation, preparation, report."""
+"""Data sets: upload, validation, preparation and report."""

@@ -1,4 +1,4 @@
-"""Reading an upload where it can do no harm: `service.runtime.cage` calls this in a process of its own."""
+"""Reading of uploads in a confined process, which `service.runtime.cage` starts."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from service.storage.disk import DiskBudget, Usage
 
 
 def warm() -> None:
-    """Import all readers; raise MissingExtraError where they are not installed."""
+    """Import all readers before processes are forked; raise MissingExtraError if they are not installed."""
     sys.meta_path.insert(0, _WithoutPandas)
     for name in ("numpy.ma", "encodings.utf_8_sig", "dateutil.relativedelta"):
         with suppress(ImportError):
@@ -27,7 +27,7 @@ def warm() -> None:
     import_extra("pyarrow", "ingest")
     for name in ("csv", "parquet", "bags.reading", "lerobot", "joined"):
         import_extra(f"service.datasets.formats.{name}", "ingest")
-    # Arrow looks its functions up when they are first called, for 50 ms: once here, not in each process that is forked
+    # the first call of an Arrow function takes 50 ms to find it: once here, not in each forked process
     arrow = import_module("service.datasets.formats.arrow")
     cells = import_module("pyarrow").array(["1", "1.5", "a"])
     arrow.NumberColumn("", decimal_comma=True).share(cells)
@@ -36,11 +36,11 @@ def warm() -> None:
 
 
 class _WithoutPandas(MetaPathFinder):
-    """Arrow would import pandas where it is installed, for half a second, and for nothing."""
+    """Import hook that hides pandas: Arrow would import it without need, which takes 0.5 s."""
 
     @staticmethod
     def find_spec(fullname: str, *_: Any) -> None:
-        """Raise ModuleNotFoundError for pandas; other modules are for others to find."""
+        """Raise ModuleNotFoundError for pandas; leave other modules to other finders."""
         if fullname == "pandas":
             raise ModuleNotFoundError(fullname, name=fullname)
 
@@ -54,7 +54,7 @@ def read_upload(
     folder: Path,
     settings: Settings,
 ) -> Recording:
-    """Read an upload to columns in a folder; raise as `open_table` and `read` do. usage: of the disk, before."""
+    """Read an upload to columns in a folder; raise as `open_table` and `read` do. usage: of the disk before reading."""
     with open_table(upload, kind, options.read, settings) as table:
         made = read(table, folder, options, robot, settings, DiskBudget(usage))
     return Recording(made.staged.joint_names, made.staged.lengths, made.torque_convention, made.facts, made.noted)

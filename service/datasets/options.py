@@ -1,4 +1,4 @@
-"""How an upload is to be read and prepared: the texts of a query, read."""
+"""Options for reading and preparing an upload, parsed from its query."""
 
 from __future__ import annotations
 
@@ -22,49 +22,53 @@ EFFORT_CONVENTIONS: Mapping[Effort, TorqueConvention] = {
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """How a file becomes columns. All may be None: then it is found out, or the robot says.
-
-    columns: for t, episode, q, dq, ddq, tau what its columns are called: a pattern with `{joint}`, or a list; units: of
-    these by name; topic: of a bag; delimiter: of a CSV; joint_names: of joints 1..n; effort: what tau is;
-    torque_constants: N·m/A a joint, of motor currents; torque_factors: by which each joint's torque is multiplied;
-    column_names: of text that has none; dt: s between rows that have no times.
-    """
+    """How a file becomes columns. An option that is None is detected, or comes from the robot's profile."""
 
     columns: Mapping[str, str | tuple[str, ...]] = field(default_factory=dict)
+    """Column names of t, episode, q, dq, ddq and tau: a pattern with `{joint}`, or a list."""
     units: Mapping[str, str] = field(default_factory=dict)
+    """Units by the same keys."""
     topic: str | None = None
+    """Topic of a bag."""
     delimiter: str | None = None
+    """Delimiter of a CSV."""
     joint_names: tuple[str, ...] | None = None
+    """Names of joints 1..n."""
     effort: Effort | None = None
+    """What the torque column holds."""
     torque_constants: tuple[float, ...] | None = None
+    """Torque constant of each joint for motor currents, N·m/A."""
     torque_factors: tuple[float, ...] | None = None
+    """Factor on each joint's torque."""
     column_names: tuple[str, ...] | None = None
+    """Column names of text without a header."""
     dt: float | None = None
+    """Time between rows without times, s."""
 
 
 @dataclass(frozen=True)
 class UploadOptions:
-    """What an upload is taken as.
-
-    robot: a profile's name or the id of an uploaded URDF; torque_convention: None takes that of the effort; joints:
-    those to keep, in this order, None keeps all; drop_joints: those to leave out, which then must not move.
-    """
+    """Options of an upload."""
 
     read: ReadOptions = field(default_factory=ReadOptions)
     recipe: Recipe = field(default_factory=Recipe)
     robot: str | None = None
+    """Profile name, or id of an uploaded URDF."""
     torque_convention: TorqueConvention | None = None
+    """None: the convention that the effort implies."""
     joints: tuple[str, ...] | None = None
+    """Joints to keep, in this order; None keeps all."""
     drop_joints: tuple[str, ...] = ()
+    """Joints to leave out, which must not move."""
 
 
 QUANTITIES = ("t", "episode", "q", "dq", "ddq", "tau")
-MOST_NAMES = 1000
-MOST_NAME = 200
+MAX_LIST_NAMES = 1000
+MAX_COLUMN_CHARS = 200
 
 
 def upload_options(query: UploadQuery) -> UploadOptions:
-    """Read the texts of a query; raise InvalidRequestError for one that has no such meaning."""
+    """Parse the texts of a query; raise InvalidRequestError if one is malformed."""
     read = ReadOptions(
         columns=_columns(query.columns),
         units=_units(query.units),
@@ -95,8 +99,8 @@ def _names(field: str, given: str | None) -> tuple[str, ...] | None:
     if given is None:
         return None
     names = tuple(part.strip() for part in given.split(","))
-    if len(names) > MOST_NAMES:
-        raise invalid_request(field, f"{len(names)} names", f"at most {MOST_NAMES}")
+    if len(names) > MAX_LIST_NAMES:
+        raise invalid_request(field, f"{len(names)} names", f"at most {MAX_LIST_NAMES}")
     return names
 
 
@@ -104,7 +108,7 @@ _RANGE = re.compile(r"(.*?)(\d{1,4})\.\.(.*?)(\d{1,4})")
 
 
 def _ranges(field: str, given: str | None) -> tuple[str, ...] | None:
-    """Names of columns, ranges of them written out: `q1..q3` stands for q1, q2, q3."""
+    """Return names of columns, with ranges expanded: `q1..q3` is q1, q2, q3."""
     names: list[str] = []
     for name in _names(field, given) or ():
         match = _RANGE.fullmatch(name)
@@ -112,7 +116,7 @@ def _ranges(field: str, given: str | None) -> tuple[str, ...] | None:
             names.append(name)
             continue
         first, last = int(match[2]), int(match[4])
-        if match[3] not in ("", match[1]) or not first <= last < first + MOST_NAMES:
+        if match[3] not in ("", match[1]) or not first <= last < first + MAX_LIST_NAMES:
             raise invalid_request(field, name, "a range of names such as q1..q7")
         names += [f"{match[1]}{number}" for number in range(first, last + 1)]
     return tuple(names) if names else None
@@ -126,7 +130,7 @@ def _numbers(field: str, given: str | None, unit: str) -> tuple[float, ...] | No
         except ValueError:
             value = float("nan")
         if not 0 < abs(value) < 1e6:
-            raise invalid_request(field, text, f"numbers of {unit}, none of them 0, separated by commas")
+            raise invalid_request(field, text, f"nonzero numbers ({unit}) below 1e6, separated by commas")
         values.append(value)
     return None if given is None else tuple(values)
 
@@ -136,19 +140,23 @@ def _object(field: str, given: str | None) -> Mapping[str, Any]:
         return {}
     parsed = read_json(given.encode())
     if not isinstance(parsed, dict):
-        raise invalid_request(field, given, f"a JSON object with any of {', '.join(QUANTITIES)}")
+        raise invalid_request(field, given, f"a JSON object with keys of {', '.join(QUANTITIES)}")
     for name in parsed:
         if name not in QUANTITIES:
-            raise invalid_request(f"{field}.{name}", parsed[name], f"any of {', '.join(QUANTITIES)}")
+            raise invalid_request(f"{field}.{name}", parsed[name], f"one of {', '.join(QUANTITIES)}")
     return parsed
 
 
 def _columns(given: str | None) -> dict[str, str | tuple[str, ...]]:
     columns: dict[str, str | tuple[str, ...]] = {}
     for name, value in _object("columns", given).items():
-        several = isinstance(value, list) and 0 < len(value) <= MOST_NAMES
-        if not all(isinstance(each, str) and 0 < len(each) <= MOST_NAME for each in (value if several else [value])):
-            raise invalid_request(f"columns.{name}", value, "the name of a column, a pattern with {joint}, or a list")
+        several = isinstance(value, list) and 0 < len(value) <= MAX_LIST_NAMES
+        if not all(
+            isinstance(each, str) and 0 < len(each) <= MAX_COLUMN_CHARS for each in (value if several else [value])
+        ):
+            raise invalid_request(
+                f"columns.{name}", value, "a column name, a pattern with {joint}, or a list of column names"
+            )
         columns[name] = tuple(value) if several else value
     return columns
 
@@ -156,6 +164,6 @@ def _columns(given: str | None) -> dict[str, str | tuple[str, ...]]:
 def _units(given: str | None) -> dict[str, str]:
     units = _object("units", given)
     for name, value in units.items():
-        if not isinstance(value, str) or not 0 < len(value) <= MOST_NAME:
+        if not isinstance(value, str) or not 0 < len(value) <= MAX_COLUMN_CHARS:
             raise invalid_request(f"units.{name}", value, "the name of a unit, such as deg")
     return dict(units)

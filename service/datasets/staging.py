@@ -1,4 +1,4 @@
-"""Columns of a recording on disk, one file each, as read and as prepared: no more than a few have to be in memory."""
+"""Columns of a recording on disk, one file each, so that only a few are in memory at a time."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from lipcore.data.outliers import CorruptRowsError, find_corrupt_rows
 from lipcore.data.samples import Array
 from lipcore.preparation.plan import plan
 from lipcore.preparation.recipe import PreparationError, Recipe
-from service.foundation.errors import invalid_data
+from service.foundation.errors import invalid_data, readable
 from service.storage.disk import Disk, DiskBudget
 
 TIME, EPISODE = "t", "episode"
@@ -26,14 +26,14 @@ QUANTITIES = ("q", "dq", "ddq", "tau")
 
 
 def column(quantity: str, joint: int) -> str:
-    """Name of the column of a quantity of a joint, counted from 0: `q1` is the position of joint 0."""
+    """Return the column name of a quantity of a joint, counted from 0: `q1` is the position of joint 0."""
     return f"{quantity}{joint + 1}"
 
 
 class Staged:
-    """Columns by canonical name (`t`, `episode`, `q1`…): float64 (rows,), SI units, NaN where a value is missing.
+    """Columns by canonical name (`t`, `episode`, `q1`…): float64 (rows,), SI units, NaN if a value is missing.
 
-    joint_names: of joints 1..n. Whoever makes one removes its folder, see `staging`.
+    joint_names: of joints 1..n. The caller removes the folder, see `staging`.
     """
 
     def __init__(self, folder: Path, joint_names: tuple[str, ...], disk: Disk | DiskBudget) -> None:
@@ -43,15 +43,18 @@ class Staged:
 
     @classmethod
     def of_others(cls, folder: Path, joint_names: tuple[str, ...], lengths: Mapping[str, int], disk: Disk) -> Staged:
-        """Columns that another process has written, which may have come to harm; raise InvalidDataError where one is
-        not there, or no plain file of its own: a link would show what else the service can read."""
+        """Return columns that the confined reader, which is not trusted, has written.
+
+        Raise InvalidDataError if a column is missing or is not a regular file: a link could expose other files.
+        """
         staged = cls(folder, joint_names, disk)
         known = {TIME, EPISODE, *(column(each, joint) for each in QUANTITIES for joint in range(len(joint_names)))}
         for name, rows in lengths.items():
             path = folder / f"{name}.f64"
             status = path.lstat() if name in known and path.exists() else None
             if status is None or not stat.S_ISREG(status.st_mode) or status.st_nlink > 1 or status.st_size != 8 * rows:
-                raise invalid_data("file", f"one whose reader left no column {name}", "an undamaged one")
+                message = f"The file could not be read: column `{readable(name[:200])}` is missing or damaged."
+                raise invalid_data("file", f"without column {name}", "a readable file", message)
         staged._rows = dict(lengths)
         return staged
 
@@ -67,19 +70,19 @@ class Staged:
 
     @property
     def rows(self) -> int:
-        """Rows so far: of the longest column."""
+        """Rows of the longest column."""
         return max(self._rows.values(), default=0)
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Those of q, dq, ddq, tau that there are columns of."""
+        """Those of q, dq, ddq and tau that have columns."""
         return tuple(each for each in QUANTITIES if column(each, 0) in self._rows)
 
     def __contains__(self, name: str) -> bool:
         return name in self._rows
 
     def append(self, columns: Mapping[str, Array]) -> None:
-        """Write more rows (M,) of some columns; raise StorageFullError."""
+        """Append rows (M,) to some columns; raise StorageFullError."""
         self.disk.reserve(sum(values.nbytes for values in columns.values()))
         for name, values in columns.items():
             with (self.folder / f"{name}.f64").open("ab") as file:
@@ -88,7 +91,7 @@ class Staged:
         self._missing = None
 
     def read(self, name: str) -> Array:
-        """One column, (rows,); raise KeyError where there is none."""
+        """Return one column, (rows,); raise KeyError if there is none."""
         count = self._rows[name]
         values: Array = np.fromfile(self.folder / f"{name}.f64", np.float64)
         if len(values) != count:
@@ -96,7 +99,7 @@ class Staged:
         return values
 
     def missing(self) -> NDArray[np.bool_]:
-        """Rows in which any value is missing, (rows,); looked up once, as that reads all columns."""
+        """Return whether each row lacks a value, (rows,). The result is cached, because all columns are read."""
         if self._missing is None:
             self._missing = np.zeros(self.rows, dtype=np.bool_)
             for name in self._rows:
@@ -104,17 +107,17 @@ class Staged:
         return self._missing
 
     def joint(self, index: int) -> dict[str, Array]:
-        """Columns of one joint by quantity."""
+        """Return the columns of one joint by quantity."""
         return {each: self.read(column(each, index)) for each in self.quantities}
 
     def table(self, quantity: str, rows: slice | np.ndarray = slice(None)) -> Array:
-        """A quantity of all joints at some rows, (M, n): for figures on a few rows, as the whole may be large."""
+        """Return a quantity of all joints at some rows, (M, n); all rows may not fit in memory."""
         return np.column_stack([self.read(column(quantity, joint))[rows] for joint in range(self.n_joints)])
 
 
 @contextmanager
 def staging(folder: Path) -> Iterator[Path]:
-    """A folder for columns, removed at the end; what a killed service leaves below `folder` is swept at its start."""
+    """Create a folder for columns and remove it at the end; at its start, the service removes leftovers."""
     path = Path(tempfile.mkdtemp(dir=folder))
     try:
         yield path
@@ -124,33 +127,35 @@ def staging(folder: Path) -> Iterator[Path]:
 
 @dataclass(frozen=True)
 class Prepared:
-    """Samples ready to learn from, and how they came about.
-
-    staged: `t`, `episode` and all of q, dq, ddq, tau, finite, (M,) each; steps: what was done, in order, each a JSON
-    object with `step`, its parameters and `text`, a sentence; episodes: contiguous parts; rate_hz: of the samples, None
-    without times; cutoff_hz: of the low-pass, None where none was used; derived: of "dq" and "ddq", those derived;
-    gaps: places in time where the recording was split; missing, repeated: rows left out for missing values, and as
-    their time stamp was there before.
-    """
+    """Prepared samples, ready for training."""
 
     staged: Staged
+    """`t`, `episode`, and q, dq, ddq, tau of all joints, finite, (M,) each."""
     steps: list[dict[str, Any]]
+    """Steps in order, each a JSON object with `step`, its parameters and `text`, a sentence."""
     episodes: int
+    """Number of contiguous parts."""
     rate_hz: float | None
+    """Sampling rate, None without times."""
     cutoff_hz: float | None
+    """Cut-off of the low-pass, None without one."""
     derived: tuple[str, ...]
+    """Those of "dq" and "ddq" that were derived."""
     gaps: int
+    """Number of gaps in time at which the recording was split."""
     missing: int
+    """Rows dropped because a value is missing."""
     repeated: int
+    """Rows dropped because their time stamp repeats an earlier one."""
 
 
 def prepare(
     raw: Staged, folder: Path, recipe: Recipe, min_samples: int, disk: Disk | DiskBudget | None = None
 ) -> Prepared:
-    """Prepare staged columns, NaN where a value is missing, in a folder of their own below `folder`.
+    """Prepare staged columns, NaN if a value is missing, in a new folder below `folder`.
 
-    A few columns are in memory at a time. Raise InvalidDataError where the recording does not allow what the recipe
-    asks for, or where fewer than min_samples come out; StorageFullError.
+    Only a few columns are in memory at a time. Raise InvalidDataError if the recipe cannot be applied or fewer than
+    `min_samples` remain; StorageFullError.
     """
     t, episode, missing = _or_none(raw, TIME), _or_none(raw, EPISODE), raw.missing()
     numbers = np.zeros(raw.rows) if episode is None else episode
@@ -158,11 +163,11 @@ def prepare(
         damaged = find_corrupt_rows(t, numbers, raw.n_joints, lambda *which: raw.read(column(*which)), raw.quantities)
         made = plan(t, episode, missing, raw.quantities, recipe, damaged.rows)
     except (CorruptRowsError, PreparationError) as error:
-        raise invalid_data(error.field, error.value, error.expected) from None
+        raise invalid_data(error.field, error.value, error.expected, str(error)) from None
     if len(made) < min_samples:
-        why = "trimming the filter's edges" if made.cutoff is not None else "leaving out what cannot be used"
+        why = "trimming the filter's edges" if made.cutoff is not None else "dropping unusable rows"
         raise invalid_data("rows", len(made), f"at least {min_samples} samples after {why}")
-    own = folder / "prepared"  # columns that were read have the same names
+    own = folder / "prepared"  # the columns of the recording have the same names
     own.mkdir()
     staged = Staged(own, raw.joint_names, raw.disk if disk is None else disk)
     staged.append({TIME: made.t, EPISODE: made.episode.astype(np.float64)})

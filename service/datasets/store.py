@@ -1,4 +1,4 @@
-"""Storing and finding data sets."""
+"""Storage of data sets: add, find, list, preview and delete them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sqlalchemy.orm import Session
 from lipcore.data.samples import Array, Samples
 from lipcore.profiles import Profile
 from lipcore.vocabulary import JointType
-from service.contract.datasets import MOST_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
+from service.contract.datasets import MAX_PREVIEW_STARTS, Dataset, DatasetPage, Preview, PreviewColumn
 from service.contract.states import ACTIVE
 from service.datasets.mapping.checks import MIN_SAMPLES
 from service.datasets.mapping.reading import Recording
@@ -37,17 +37,18 @@ from service.storage.sample_file import PartOf
 from service.storage.storage import Storage
 
 READER = "service.datasets.caged:read_upload"
-MOST_NAMED = 5
-"""Ids that are listed where several data sets have one name."""
+MAX_LISTED_IDS = 5
+"""Max ids that an error lists if several data sets have the same name."""
 
 
 def add(
     storage: Storage, upload: Path, kind: str, name: str, options: UploadOptions, named: RequestIdentity | None = None
 ) -> Dataset:
-    """Read an upload, which goes with that, check and prepare it, then store it: samples first, the row that makes them
-    visible last.
+    """Read, check, prepare and store an upload, and delete its file.
 
-    Columns lie on disk meanwhile, below the uploads. named: the request, which is not done again where it was before.
+    Samples are stored first. The database row, which makes them visible, comes last. Columns are staged on disk below
+    the uploads. named: the request; if it was done before, its data set is returned.
+
     Raise InvalidDataError, InvalidRequestError, TooLargeError, StorageFullError or ConflictError.
     """
     with storage.database.session() as session:
@@ -89,7 +90,7 @@ def add(
         if not is_undecided(error):
             storage.files.delete_samples(dataset)
         raise
-    if before is not None:  # the same request was faster on another connection
+    if before is not None:  # the same request finished first on another connection
         storage.files.delete_samples(dataset)
         return _show(before)
     return _show(row)
@@ -101,29 +102,34 @@ def show(database: Database, dataset: str) -> Dataset:
 
 
 def find(database: Database, dataset: str) -> DatasetRow:
-    """Return the row of a data set by its id or its name; raise NotFoundError, or InvalidRequestError where several
-    have the name."""
+    """Return the row of a data set by its id or its name.
+
+    Raise NotFoundError, or InvalidRequestError if several data sets have the name.
+    """
     with database.session() as session:
         return existing(session, dataset)
 
 
 def existing(session: Session, dataset: str) -> DatasetRow:
-    """As `find`, in a session."""
+    """Return the row as `find` does, in a session."""
     row = session.scalar(select(DatasetRow).where(DatasetRow.id == dataset))
     if row is not None:
         return row
-    called = select(DatasetRow).where(DatasetRow.name == dataset).order_by(DatasetRow.seq.desc()).limit(MOST_NAMED + 1)
+    called = (
+        select(DatasetRow).where(DatasetRow.name == dataset).order_by(DatasetRow.seq.desc()).limit(MAX_LISTED_IDS + 1)
+    )
     rows = list(session.scalars(called))
     if not rows:
         raise not_found("dataset", dataset)
     if len(rows) > 1:
-        ids = ", ".join(each.id for each in rows[:MOST_NAMED]) + (" …" if len(rows) > MOST_NAMED else "")
-        raise invalid_request("dataset", dataset, f"the id of one of those that are called so: {ids}")
+        ids = ", ".join(each.id for each in rows[:MAX_LISTED_IDS]) + (" …" if len(rows) > MAX_LISTED_IDS else "")
+        message = f"Several data sets are named {dataset!r}. Use one of their ids: {ids}."
+        raise invalid_request("dataset", dataset, f"one of the ids {ids}", message)
     return rows[0]
 
 
 def samples(files: Files, row: DatasetRow, most: int | None = None, part: PartOf | None = None) -> Samples:
-    """Read the samples of a data set, or part of them, evenly thinned to `most`; raise DamagedDataError."""
+    """Read samples of a data set, evenly thinned to at most `most`; raise DamagedDataError."""
     return files.read_samples(row.id, row.joint_names, row.sha256, most, part)
 
 
@@ -134,7 +140,7 @@ def preview(storage: Storage, dataset: str, quantities: Sequence[str], points: i
 
 
 def page(database: Database, part: Page, upload_sha256: str | None = None) -> DatasetPage:
-    """List data sets, newest first; upload_sha256: only those of files with this hash."""
+    """List data sets, newest first. upload_sha256: only those whose uploaded file has this hash."""
     of_file = () if upload_sha256 is None else (DatasetRow.report["upload_sha256"].as_string() == upload_sha256,)
     with database.session() as session:
         rows, following = read_page(session, DatasetRow, part, *of_file)
@@ -142,25 +148,27 @@ def page(database: Database, part: Page, upload_sha256: str | None = None) -> Da
 
 
 def delete(storage: Storage, dataset: str) -> None:
-    """Delete a data set; raise ConflictError while a job waits for it or reads it."""
+    """Delete a data set; raise ConflictError if a queued or running job needs it."""
     with storage.database.transaction() as session:
         row = existing(session, dataset)
         for job in session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE))):
             if row.id in job.request["datasets"]:
-                raise ConflictError(f"data set {dataset!r} is in use by {job.id}: cancel it or wait for its end")
+                raise ConflictError(
+                    f"data set {dataset!r} is in use by {job.id}: cancel this job or wait until it has finished"
+                )
         session.delete(row)
     storage.files.delete_samples(row.id)
 
 
 def _joint_types(profile: Profile, joint_names: Sequence[str]) -> list[JointType] | None:
-    """Types of the joints by the robot; None where it does not have them all."""
+    """Return the joint types of the robot, None if it lacks a joint."""
     places = profile.match(joint_names)
     types = [profile.joint_types[place] for place in places if place is not None]
     return types if len(types) == len(joint_names) else None
 
 
 def _array(staged: Staged, name: str) -> NDArray[np.float64] | NDArray[np.int64]:
-    """One array of the samples, filled column by column."""
+    """Return one array of the samples, filled column by column."""
     if name in ("t", "episode"):
         return staged.read(name)
     values = np.empty((staged.rows, staged.n_joints))
@@ -173,8 +181,8 @@ def _show(row: DatasetRow) -> Dataset:
     return Dataset.model_validate(row, from_attributes=True)
 
 
-MOST_POINTS = 2000
-"""Most points of a column."""
+MAX_PREVIEW_POINTS = 2000
+"""Max points of a column in a preview."""
 
 ReadRows = Callable[[str, int, int], Array]
 """(quantity, first row, row after the last) → these rows of all joints, (rows, n)."""
@@ -186,12 +194,12 @@ def make_preview(
     joint_names: Sequence[str],
     quantities: Sequence[str],
     read: ReadRows,
-    points: int = MOST_POINTS,
+    points: int = MAX_PREVIEW_POINTS,
 ) -> Preview:
-    """Thin the quantities of all joints to at most `points` points a column, at least 2; t, episode: (N,)."""
+    """Thin the quantities of all joints to at most `points` points per column; t, episode: (N,)."""
     starts = np.concatenate([[0], np.flatnonzero(np.diff(episode)) + 1])
-    if len(starts) > MOST_STARTS:
-        starts = starts[np.linspace(0, len(starts) - 1, MOST_STARTS).astype(np.int64)]
+    if len(starts) > MAX_PREVIEW_STARTS:
+        starts = starts[np.linspace(0, len(starts) - 1, MAX_PREVIEW_STARTS).astype(np.int64)]
     columns = []
     for quantity in quantities:
         for name, (rows, values) in zip(joint_names, extremes(len(t), quantity, read, points), strict=True):
@@ -209,7 +217,7 @@ def make_preview(
 
 
 def extremes(count: int, quantity: str, read: ReadRows, points: int) -> list[tuple[NDArray[np.int64], Array]]:
-    """For each joint ascending rows, at most `points`, and their values: all, or the extremes of stretches."""
+    """Return for each joint at most `points` ascending rows and their values: all, or the extremes of stretches."""
     if points < 2:
         raise ValueError(f"points is {points}, expected at least 2")
     if count <= points:
@@ -222,13 +230,13 @@ def extremes(count: int, quantity: str, read: ReadRows, points: int) -> list[tup
         rows.append(first + both)
         values.append(np.take_along_axis(stretch, both, axis=0))
     at, what = np.concatenate(rows).T, np.concatenate(values).T
-    # a stretch whose smallest value is its largest gives one point
+    # a constant stretch gives one point
     new = [np.concatenate([[True], np.diff(each) > 0]) for each in at]
     return [(a[keep].astype(np.int64), b[keep]) for a, b, keep in zip(at, what, new, strict=True)]
 
 
 def preview_file(path: Path, joint_names: Sequence[str], quantities: Sequence[str], points: int) -> Preview:
-    """Preview of stored samples, see sample_file.py; no more than the times and a stretch of rows are held."""
+    """Preview stored samples, see sample_file.py. Only the times and one stretch of rows are in memory."""
     with safe_open(path, framework="numpy") as file:
         slices = {quantity: file.get_slice(quantity) for quantity in quantities}
         return make_preview(

@@ -25,7 +25,7 @@ class Problem(BaseModel):
 
 
 class ErrorBody(BaseModel):
-    """code: stable, for programs; message: for people."""
+    """The error: a stable code for programs, a message for people."""
 
     code: str = Field(examples=["invalid_request"])
     message: str = Field(examples=["q[0][3] is nan, expected a finite number"])
@@ -33,7 +33,7 @@ class ErrorBody(BaseModel):
 
 
 class ErrorResponse(BaseModel):
-    """The body of every answer with a status of 400 and above."""
+    """The body of every response with a status of 400 and above."""
 
     error: ErrorBody
 
@@ -50,31 +50,31 @@ class ServiceError(Exception):
 
 
 class InvalidRequestError(ServiceError):
-    """The request is understood, but a value in it is wrong."""
+    """A value in the request is wrong: `detail` names the field and what was expected."""
 
     status, code = 422, "invalid_request"
 
 
 class InvalidDataError(ServiceError):
-    """An uploaded data set is wrong."""
+    """The uploaded file cannot be used: `detail` names the place and what was expected."""
 
     status, code = 422, "invalid_data"
 
 
 class NotFoundError(ServiceError):
-    """No data set, job, model or version of that name."""
+    """The data set, job, model or version does not exist."""
 
     status, code = 404, "not_found"
 
 
 class ConflictError(ServiceError):
-    """The request contradicts the state of things."""
+    """The request conflicts with the present state of what it names: the message says how."""
 
     status, code = 409, "conflict"
 
 
 class NoServingVersionError(ServiceError):
-    """All versions of the model wait as candidates: none answers by itself."""
+    """The model has no serving version: all its versions are candidates."""
 
     status, code = 409, "no_serving_version"
 
@@ -86,81 +86,79 @@ class TooLargeError(ServiceError):
 
 
 class UnsupportedMediaTypeError(ServiceError):
-    """The body's media type is not one of those accepted."""
+    """The media type of the body is not accepted here."""
 
     status, code = 415, "unsupported_media_type"
 
 
 class UnauthorizedError(ServiceError):
-    """No API key was given where one is needed, or one that is not known, has expired or was revoked."""
+    """The API key is missing, unknown, expired or revoked."""
 
     status, code = 401, "unauthorized"
 
 
 class ForbiddenError(ServiceError):
-    """The API key may not do this, or a web page of another site asks."""
+    """The API key lacks the scope for this, or the request comes from a web page of another site."""
 
     status, code = 403, "forbidden"
 
 
 class RequestTimeoutError(ServiceError):
-    """The body came too slowly."""
+    """The body arrived too slowly."""
 
     status, code = 408, "request_timeout"
 
 
 class BusyError(ServiceError):
-    """A queue is full: try again later."""
+    """A queue is full: retry later."""
 
     status, code = 429, "busy"
 
 
 class RateLimitedError(ServiceError):
-    """More requests than allowed in so short a time; the header `Retry-After` says when to go on."""
+    """Too many requests in a short time: retry after the time in the header `Retry-After`."""
 
     status, code = 429, "rate_limited"
 
 
 class NotReadyError(ServiceError):
-    """The service cannot answer now."""
+    """The service cannot answer at present: retry later."""
 
     status, code = 503, "not_ready"
 
 
 class RevisionNotReachedError(ServiceError):
-    """The version that answers has not learnt as much yet as the query asks for: the header `Retry-After` says when to
-    ask again. Revisions count for one version: `version` names the one that an acknowledgement spoke of."""
+    """The version has not reached the required revision: retry after the time in the header `Retry-After`."""
 
     status, code = 503, "revision_not_reached"
 
 
 class StorageUnavailableError(ServiceError):
-    """The database or the disk cannot be written now: nothing was stored, try again."""
+    """The database or the disk cannot be written at present. Nothing was stored: retry."""
 
     status, code = 503, "storage_unavailable"
 
 
 class StorageFullError(ServiceError):
-    """The disk or the quota of the service is full: nothing was stored. Delete data sets or versions."""
+    """The disk or the quota is full. Nothing was stored: delete data sets or versions."""
 
     status, code = 507, "storage_full"
 
 
 class NotInstalledError(ServiceError):
-    """The service runs without the packages that this needs: `detail` names the extra and the line that installs it,
-    where the service runs. `GET /health` says what it can do."""
+    """The service lacks packages for this: `detail` names the extra and the command that installs it."""
 
     status, code = 501, "not_installed"
 
 
 class DamagedDataError(ServiceError):
-    """A stored data set does not have the checksum that it was stored with."""
+    """The stored data set is damaged: its checksum has changed."""
 
     status, code = 500, "damaged_data"
 
 
 class UnreadableVersionError(ServiceError):
-    """The version's files are damaged, or of a format that this release does not read."""
+    """The files of the version are damaged, or have a format that this release does not read."""
 
     status, code = 500, "unreadable_version"
 
@@ -173,7 +171,7 @@ def problem(field: str, value: object, expected: str, message: str | None = None
     text = value if isinstance(value, str) else _REPR.repr(value)
     text = text if len(text) <= 200 else text[:200] + "…"
     found = Problem(field=readable(field[:200]), value=readable(text), expected=expected)
-    found._message = message
+    found._message = None if message is None else readable(message)
     return found
 
 

@@ -99,7 +99,7 @@ class Settings(BaseSettings):
         "Needs LIPSERVE_DATABASE_URL.",
     )
     replica_lost_s: Seconds = Field(
-        10.0, description="Time without a sign of life after which other services take over the jobs of a service."
+        10.0, description="Time without a heartbeat after which other services take over the jobs of a service."
     )
 
     keys: Literal["auto", "on"] = Field(
@@ -241,15 +241,15 @@ class Settings(BaseSettings):
     @model_validator(mode="after")
     def _shared_together(self) -> Self:
         if (self.database_url is None) != (self.files_url is None):
-            raise ValueError("database_url and files_url: expected both, for services that share them, or none of them")
+            raise ValueError("database_url and files_url must be set together, for services that share them")
         if self.cluster is not None and self.database_url is None:
-            raise ValueError("cluster: expected database_url and files_url too, which its workers share")
+            raise ValueError("cluster needs database_url and files_url, which its workers share")
         return self
 
     @model_validator(mode="after")
     def _ports_apart(self) -> Self:
         if self.grpc_port and self.grpc_port == self.port:
-            raise ValueError(f"grpc_port is {self.grpc_port}, expected another port than that of HTTP")
+            raise ValueError(f"grpc_port is {self.grpc_port}, expected a port other than that of HTTP")
         return self
 
     @property

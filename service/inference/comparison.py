@@ -12,6 +12,7 @@ from service.contract import predictions as schema
 from service.contract.states import Outcome
 from service.foundation.errors import invalid_request
 from service.foundation.fields import finite
+from service.inference import texts
 from service.inference.evaluating import read_dataset
 from service.models.evaluation import joint_figures
 from service.models.loaded import LoadedModels, ServedModel
@@ -65,7 +66,9 @@ def _versions(loaded: LoadedModels, model: str, request: schema.CompareRequest) 
         for named in request.versions
     )
     if first.version == second.version:
-        raise invalid_request("versions[1]", request.versions[1], f"another version than versions[0], {first.version}")
+        raise invalid_request(
+            "versions[1]", request.versions[1], f"another version than that of versions[0], {first.version}"
+        )
     return first, second
 
 
@@ -77,33 +80,24 @@ def _answer(served: ServedModel, samples: Samples) -> TorqueDistribution:
 def _verdict(first: int, second: int, compared: Comparison) -> tuple[Outcome, str]:
     """Return the outcome of a comparison, as a code and in words."""
     if compared.blocks < metrics.MIN_BLOCKS:
-        return "cannot_tell", (
-            f"These data cannot tell: they make {compared.blocks} stretches of {metrics.BLOCK_S:g} s, or episodes, and "
-            f"a verdict needs {metrics.MIN_BLOCKS}. Record longer, or more episodes."
-        )
+        return "cannot_tell", texts.describe_too_little(compared.blocks, metrics.BLOCK_S, metrics.MIN_BLOCKS)
     total = compared.total
     (density, nmse), (clear, larger_or_smaller) = total.mean.tolist(), total.significant.tolist()
     better, worse = (first, second) if density > 0 else (second, first)
     if clear:
         outcome: Outcome = "first_better" if better == first else "second_better"
-        text = (
-            f"Version {better} predicts better than version {worse}: its negative log predictive density is lower by "
-        )
+        said = [texts.describe_better(better, worse, _amount(total, 0))]
     else:
         outcome, better = "no_difference", second
-        text = f"These data show no difference between versions {first} and {second}: their negative log predictive "
-        text += "densities differ by "
-    text += f"{_amount(total, 0)} nats a sample (95 % interval)."
-    if not isfinite(nmse):
-        return outcome, text
-    if not larger_or_smaller:
-        return outcome, f"{text} Their mean nMSE differs by {_amount(total, 1)}, which shows no difference."
+        said = [texts.describe_no_difference(first, second, _amount(total, 0))]
     smaller = (nmse < 0) == (better == second)
-    text += f" The errors of version {better} are {'smaller' if smaller else 'larger'}: its mean nMSE is "
-    text += f"{'lower' if smaller else 'higher'} by {_amount(total, 1)}."
-    if clear and not smaller:
-        text += " What is better is how true its stated uncertainty is."
-    return outcome, text
+    if isfinite(nmse) and not larger_or_smaller:
+        said.append(texts.describe_equal_errors(_amount(total, 1)))
+    elif isfinite(nmse):
+        said.append(texts.describe_errors(better, smaller, _amount(total, 1)))
+        if clear and not smaller:
+            said.append(texts.BETTER_UNCERTAINTY)
+    return outcome, " ".join(said)
 
 
 def _amount(difference: Difference, place: int) -> str:
@@ -115,12 +109,9 @@ def _warnings(versions: Collection[ServedModel], in_training: Collection[bool]) 
     warnings = []
     for served, trained in zip(versions, in_training, strict=True):
         if trained:
-            warnings.append(f"version {served.version} was trained on this data set: its figures flatter it")
+            warnings.append(texts.describe_trained_on(served.version))
         if served.revision:
-            warnings.append(
-                f"version {served.version} has learnt online since, up to revision {served.revision}: where that was "
-                "from the motion of this data set, its figures flatter it"
-            )
+            warnings.append(texts.describe_learnt_online(served.version, served.revision))
     return warnings
 
 

@@ -18,6 +18,7 @@ from service.contract import predictions as schema
 from service.contract.models import Evaluation, HoldoutLineage
 from service.datasets import store
 from service.foundation.errors import DamagedDataError, invalid_request
+from service.inference import texts
 from service.inference.predicting import MAX_COMPONENT_BATCH, check_offered
 from service.models import registry
 from service.models.evaluation import MAX_EVALUATION_SAMPLES, evaluation
@@ -70,7 +71,7 @@ def _split_of(loaded: LoadedModels, row: DatasetRow, served: ServedModel) -> Set
     version = registry.find(loaded.database, served.name, served.version)
     split = holding_out.find_earlier_split(row, version.manifest["lineage"])
     if split is None:
-        raise CannotHoldOutError(f"version {served.version} has held nothing out of data set {row.id}")
+        raise CannotHoldOutError(f"version {served.version} has no held-out rows of data set {row.id}")
     return split
 
 
@@ -80,7 +81,7 @@ def _splitting() -> Iterator[None]:
     try:
         yield
     except CannotHoldOutError as error:
-        raise invalid_request("part", "held_out", f"all, as {error}") from None
+        raise invalid_request("part", "held_out", f"all: {error}") from None
 
 
 def find_dataset(loaded: LoadedModels, dataset: str, *versions: ServedModel) -> DatasetRow:
@@ -92,11 +93,14 @@ def find_dataset(loaded: LoadedModels, dataset: str, *versions: ServedModel) -> 
     for served in versions:
         known = served.model
         if tuple(row.joint_names) != known.joint_names:
-            expected = f"those of the model, {', '.join(known.joint_names)}{_how_to_upload(row, known.joint_names)}"
-            raise invalid_request("dataset", f"a data set with the joints {', '.join(row.joint_names)}", expected)
+            own, others = ", ".join(row.joint_names), ", ".join(known.joint_names)
+            message = f"The joints of data set {row.id} are {own}; those of the model are {others}."
+            message += _how_to_upload(row, known.joint_names)
+            raise invalid_request("dataset", f"a data set with the joints {own}", f"the joints {others}", message)
         if row.torque_convention != known.torque_convention:
-            expected = f"that of the model, {known.torque_convention}"
-            raise invalid_request("dataset", f"a data set whose torque is {row.torque_convention}", expected)
+            own, others = row.torque_convention, known.torque_convention
+            message = f"The torque of data set {row.id} is {own}; that of the model is {others}."
+            raise invalid_request("dataset", f"a data set with torque {own}", f"torque {others}", message)
     return row
 
 
@@ -106,7 +110,7 @@ def _how_to_upload(row: DatasetRow, joint_names: Sequence[str]) -> str:
         return ""
     named = next((name for name in recognise(joint_names) if profile(name).joint_names == tuple(joint_names)), None)
     option = f"joint_names={','.join(joint_names)}" if named is None else f"robot={named}"
-    return f"; if they are the same joints, upload the recording with {option}"
+    return f" If they are the same joints, upload the recording with {option}."
 
 
 def evaluate(
@@ -178,7 +182,7 @@ def _repeats(loaded: LoadedModels, served: ServedModel, used: Samples, in_traini
         training = repeating.read_training_parts(loaded.database, loaded.files, version.manifest["lineage"])
         return repeating.look(training, used, served.model.joint_types)
     except (CannotHoldOutError, DamagedDataError) as error:  # the figures are valid without the training data
-        return {**repeating.look([], used, ()), "warnings": [f"whether they repeat the training is not known: {error}"]}
+        return {**repeating.look([], used, ()), "warnings": [texts.describe_unknown_repetition(error)]}
 
 
 Rows = NDArray[np.int64]
@@ -239,8 +243,8 @@ def _within(part: Rows, request: schema.TraceRequest, count: int) -> Rows:
     stop = count if request.stop is None else request.stop
     chosen = part[(part >= request.start) & (part < stop)]
     if not len(chosen):
-        expected = f"rows of which some were held out; these lie between {part[0]} and {part[-1]}"
-        raise invalid_request("start", f"{request.start}, up to {stop}", expected)
+        message = f"Rows {request.start} to {stop} contain no held-out rows; these lie in {part[0]} to {part[-1]}."
+        raise invalid_request("start", f"{request.start}, up to {stop}", "a range with held-out rows", message)
     return chosen
 
 

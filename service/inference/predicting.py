@@ -68,7 +68,7 @@ class Query(NamedTuple):
             raise invalid_request(
                 "q" if self.single else f"q[{error.index}]",
                 "a posture whose learnt inertia matrix is not positive definite",
-                f"for {FORWARD} a posture whose inertia the training data tell",
+                f"for {FORWARD} a posture near the training data",
             ) from error
 
     def _name(self, name: str, row: np.intp, joint: np.intp) -> str:
@@ -83,10 +83,12 @@ def check_shapes(request: Any, model: TorqueModel) -> list[Array]:
     parts = {name: values for name in QUANTITIES if (values := getattr(request, name)) is not None}
     for name, values in parts.items():
         if values.shape[-1] != model.n_joints:
-            expected = f"{model.n_joints} numbers: {', '.join(model.joint_names)}"
-            raise invalid_request(name, f"{values.shape[-1]} numbers long", expected)
+            given, names = values.shape[-1], ", ".join(model.joint_names)
+            message = f"`{name}` has {given} values; this model has {model.n_joints} joints: {names}."
+            raise invalid_request(name, f"{given} values", f"{model.n_joints} values: {names}", message)
         if values.shape != request.q.shape:
-            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}")
+            message = f"`{name}` has shape {values.shape}; `q` has shape {request.q.shape}."
+            raise invalid_request(name, f"of shape {values.shape}", f"the shape of q, {request.q.shape}", message)
     return list(parts.values())
 
 
@@ -107,7 +109,7 @@ def check_offered(model: TorqueModel, components: Sequence[ComponentName]) -> No
     offered = dynamics.available_components(model.estimator)
     for index, name in enumerate(components):
         if name not in offered:
-            expected = f"what a model with the estimator {model.estimator.name} offers: {', '.join(offered)}"
+            expected = f"a component of estimator {model.estimator.name}: {', '.join(offered)}"
             raise invalid_request(f"components[{index}]", name, expected)
 
 
@@ -124,9 +126,10 @@ def check_torque(given: bool, needed: bool, users: str, place: str) -> None:
     `users` are the components that need it, `place` the field that requests them.
     """
     if needed and not given:
-        raise invalid_request("tau", "missing", f"the torque that {users} is asked for, shaped as q")
+        raise invalid_request("tau", "missing", "torque with the shape of q", f"`tau` is required for {users}.")
     if given and not needed:
-        raise invalid_request("tau", "given", f"no tau, or {users} among the {place}")
+        message = f"`tau` is used only for {users}, which is not among the {place}."
+        raise invalid_request("tau", "given", f"no tau, or {users} among the {place}", message)
 
 
 def model_with_payload(served: ServedModel, payload: Payload | None) -> TorqueModel:
@@ -139,9 +142,9 @@ def model_with_payload(served: ServedModel, payload: Payload | None) -> TorqueMo
     try:
         return served.declared_payloads.model(payload.numbers)
     except NoArmError:
-        rigid = f"knows no rigid bodies to add it to, one of {', '.join(ROBOT_ESTIMATORS)} does"
-        expected = f"no payload: a model with the estimator {served.model.estimator.name} {rigid}"
-        raise invalid_request("payload", "given", expected) from None
+        expected = f"no payload, or a model of estimator {' or '.join(ROBOT_ESTIMATORS)}"
+        message = f"`payload` needs a model with rigid bodies; estimator {served.model.estimator.name} has none."
+        raise invalid_request("payload", "given", expected, message) from None
     except ValueError as error:  # the message starts with a payload field and ends with what was expected
         name, text = str(error).partition(" ")[0], str(error).rpartition("expected ")[2]
         raise invalid_request(f"payload.{name}", payload.model_dump(mode="json")[name], text) from error

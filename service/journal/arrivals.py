@@ -110,8 +110,8 @@ def _check_new(session: Session, model: str, batch: NewBatch) -> None:
     last = session.scalar(select(func.max(EventRow.last_sequence)).where(*of_stream))
     if last is not None and batch.sequence <= last:
         raise ConflictError(
-            f"stream {batch.stream_id!r} was silent for so long that nobody knows any more which of its batches up to "
-            f"{last} have come: go on with higher sequences, or with a stream_id of its own"
+            f"stream {batch.stream_id!r} was silent so long that its record, up to batch {last}, was deleted: continue "
+            "with higher sequences, or with another stream_id"
         )
 
 
@@ -125,10 +125,7 @@ def _make_room(session: Session, model: str, most: int, received: float) -> None
     silent = case((used > received + MIN_SILENT_S, 0.0), else_=used)  # stamped before the clock was set back
     oldest = session.scalars(select(StreamRow).where(of_model).order_by(silent).limit(1)).one()
     if abs((oldest.received or 0.0) - received) < MIN_SILENT_S:
-        raise BusyError(
-            f"model {model!r} has {known} sources of observations in use, the most it may have: go on with one of "
-            "their stream_ids"
-        )
+        raise BusyError(f"model {model!r} already has {known} active streams, the max: use one of their stream_ids")
     session.delete(oldest)
     session.flush()
 
@@ -137,13 +134,15 @@ def check_kind(source: StreamRow | None, kind: StreamKind) -> None:
     """Raise ConflictError if a stream carries the other kind: one sequence cannot count both."""
     if source is not None and source.kind != kind:
         name = f"stream {source.stream_id!r} of model {source.model!r}"
-        raise ConflictError(f"{name} carries {source.kind}, not {kind}: use another stream_id")
+        raise ConflictError(f"{name} consists of {source.kind}, not {kind}: use another stream_id")
 
 
 def _check_stream(source: StreamRow, batch: NewBatch) -> None:
     name = f"stream {source.stream_id!r} of model {source.model!r}"
     check_kind(source, batch.kind)
     if batch.kind == "frames" and batch.sequence <= source.last:
-        raise ConflictError(f"{name} has come to frame {source.last}, frame {batch.sequence} does not go on from there")
+        raise ConflictError(f"{name} has reached frame {source.last}: frame {batch.sequence} is not newer")
     if is_forgotten(source, batch.sequence):
-        raise ConflictError(f"batch {batch.sequence} of {name} may have come before: that far back none is kept")
+        raise ConflictError(
+            f"batch {batch.sequence} of {name} may be a repetition: batches that old are no longer kept"
+        )

@@ -31,7 +31,7 @@ def unlearn(session: Session, model: str, event: EventRow, received: float) -> E
             _delete_snapshots(session, model, event.number, SnapshotRow.version == version)
         else:
             name = f"batch {event.sequence} of stream {event.stream_id!r}"
-            logger.error("%s stays in what model %r has learnt: the log lacks what is before it", name, model)
+            logger.error("could not unlearn %s of model %r: the log lacks earlier batches", name, model)
     numbers = [event.number, *(each.number for each in log.find_related(session, event, "replay"))]
     session.execute(update(EventRow).where(EventRow.model == model, EventRow.number.in_(numbers)).values(void=True))
     return log.append(session, model, "unlearn", {"event": event.number}, received)

@@ -20,6 +20,7 @@ from service.contract.observations import ObservationRequest, ObservationRespons
 from service.contract.states import PartState
 from service.foundation.errors import BusyError
 from service.journal import log
+from service.learning import texts
 from service.learning.ingest.append import ObservationLog
 from service.learning.ingest.frames import Frames, FramesResult, observe_frames
 from service.learning.ingest.monitor import Monitor
@@ -69,7 +70,7 @@ class IngestThreads:
         """
         waiting = sum(map(len, self._arrived.values())) - MAX_THREADS
         if waiting >= MAX_WAITING_BATCHES:
-            raise BusyError(f"{waiting} batches are waiting to be logged, the most that may: try again later")
+            raise BusyError(f"too many observation batches wait to be logged ({waiting}): retry later")
         arrived = perf_counter() if arrived is None else arrived
         self._arrived[model] = [*self._arrived.get(model, ()), arrived]
         try:
@@ -215,15 +216,15 @@ class Learners:
             return "ok", "not needed yet"
         gone = lasting(self.process.pid is None)
         if gone is not None and gone <= RESTART_S:
-            return "warning", "is being started"
+            return "warning", "is starting"
         if gone is not None:
-            return "failed", f"has not run for {gone:.0f} s: observations are stored, but not learnt"
+            return "failed", texts.describe_process_gone(gone)
         if (silent_s := self.process.silent_s) > RESTART_S:
-            return "failed", f"has not got on for {silent_s:.0f} s: observations are stored, but not learnt"
+            return "failed", texts.describe_process_silent(silent_s)
         behind, stands = self._behind()
         waited = lasting(stands, "lag")
         if waited is not None and waited > MAX_LAG_S:
-            return "warning", f"runs, but {behind} events wait, of which it has learnt none for {waited:.0f} s"
+            return "warning", texts.describe_lag(behind, waited)
         return "ok", "runs"
 
     def _behind(self) -> tuple[int, bool]:
@@ -286,5 +287,5 @@ class Learners:
             for call in self.on_published:
                 call(message)
         elif isinstance(message, LearningFailure):
-            logger.error("version %s of model %s does not learn: %s", message.version, message.model, message.error)
+            logger.error("version %s of model %s cannot learn: %s", message.version, message.model, message.error)
             self._update_status(message, failed=message)

@@ -28,31 +28,29 @@ class LearningCollector(Collector):
     )
     coverage = _quality("coverage", "Share of measurements inside the 95 % interval, noise included")
     nlpd = _quality("nlpd", "Mean negative log predictive density, nats")
-    revision = MetricKind("gauge", "lipserve_revision", "Revision that answers contain", ("model", "version"))
-    novel = MetricKind(
-        "gauge", "lipserve_novel_share", "Share of the latest samples that lie beyond the basis", ("model",)
-    )
+    revision = MetricKind("gauge", "lipserve_revision", "Revision that predictions contain", ("model", "version"))
+    novel = MetricKind("gauge", "lipserve_novel_share", "Share of the latest samples outside the basis", ("model",))
     scale = MetricKind(
         "gauge",
         "lipserve_interval_scale",
-        "Factor on the half width of intervals that questions are answered with, 1 as the model itself believes",
+        "Factor on the half width of returned intervals; 1: as the model states",
         ("model", "joint"),
     )
-    streams = MetricKind("gauge", "lipserve_streams", "Streams that are known", ("model",))
-    carrying = MetricKind("gauge", "lipserve_streams_with_payload", "Streams of them that carry a payload", ("model",))
+    streams = MetricKind("gauge", "lipserve_streams", "Streams of the model", ("model",))
+    carrying = MetricKind("gauge", "lipserve_streams_with_payload", "Streams that carry a payload", ("model",))
     lag_rows = MetricKind(
-        "gauge", "lipserve_learning_lag_rows", "Rows to be learnt that answers do not contain yet", ("model",)
+        "gauge", "lipserve_learning_lag_rows", "Rows to be learnt that predictions do not contain yet", ("model",)
     )
     lag_s = MetricKind(
         "gauge",
         "lipserve_learning_lag_seconds",
-        "Seconds since the first row arrived that answers do not contain yet",
+        "Time since the arrival of the first row that predictions do not contain yet, s",
         ("model",),
     )
     rows = MetricKind(
         "counter",
         "lipserve_observations_total",
-        "Rows of observations since the service has started, by what became of them",
+        "Observation rows since the start of the service, by outcome",
         ("model", "outcome"),
     )
     loaded = MetricKind("gauge", "lipserve_models_loaded", "Model versions in memory")

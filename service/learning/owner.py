@@ -31,9 +31,9 @@ def set_options(database: Database, model: str, chosen: LearningOptions, n_joint
     """
     limits = chosen.torque_limits
     if limits is not None and len(limits) != n_joints:
-        raise invalid_request(
-            "torque_limits", f"a list of {len(limits)}", f"{n_joints} positive numbers, one for each joint in order"
-        )
+        expected = f"{n_joints} positive numbers, one for each joint in order"
+        message = f"`torque_limits` has {len(limits)} values; this model has {n_joints} joints."
+        raise invalid_request("torque_limits", f"{len(limits)} values", expected, message)
     with database.turn(model), database.transaction(model) as session:
         row = _row(session, model)
         audit.note(session, model, "learning set", before=row.options, after=chosen.model_dump())

@@ -17,10 +17,9 @@ from service.contract.jobs import Job
 from service.contract.learning import AlarmKind
 from service.contract.states import ACTIVE
 from service.foundation.errors import BusyError, ConflictError
-from service.foundation.text import percent
 from service.journal import log
 from service.journal.alarms import raise_alarm
-from service.learning import owner
+from service.learning import owner, texts
 from service.learning.learner.follower import NOVELTY_ROWS
 from service.learning.learner.publication import Publication
 from service.learning.learners import Learners
@@ -91,19 +90,19 @@ def queue_refresh(database: Database, queue: JobQueue, published: Publication) -
             return None
         if not owner.read_options(session, model).auto_refresh:
             for each in reasons:
-                _raise_once(session, model, each.trigger, f"{each.text}: a refresh would help", each.evidence)
+                _raise_once(session, model, each.trigger, texts.describe_refresh_advice(each.text), each.evidence)
             return None
         why = reasons[0]
         try:
             job = jobs.add_refresh(session, version, why.trigger)
         except ConflictError as error:
-            text = f"{why.text}, but it cannot be refreshed: {error.message}"
+            text = texts.describe_refresh_failure(why.text, error.message)
             _raise_once(session, model, "refresh", text, why.evidence)
             return None
         except BusyError as error:
-            logger.warning("model %s is to be refreshed, but %s", model, error.message)
+            logger.warning("model %s should be refreshed, but %s", model, error.message)
             return None
-        raise_alarm(session, model, why.trigger, f"{why.text}: it is refreshed", {**why.evidence, "job": job.id})
+        raise_alarm(session, model, why.trigger, texts.describe_refresh(why.text), {**why.evidence, "job": job.id})
     queue.submit(job.id)
     return jobs.represent(job)
 
@@ -155,7 +154,7 @@ def _find_reasons(published: Publication) -> Iterator[RefreshReason]:
     revision = {"version": published.version, "revision": published.revision}
     share = published.novel_share
     if share > RULE.novelty_share:
-        text = f"{percent(share)} of the last {NOVELTY_ROWS} samples lie beyond what {named} can learn"
+        text = texts.describe_novelty(named, share, NOVELTY_ROWS)
         figures: dict[str, Any] = {
             "novel_share": share,
             "threshold": RULE.novelty_share,
@@ -165,9 +164,7 @@ def _find_reasons(published: Publication) -> Iterator[RefreshReason]:
         yield RefreshReason("novelty", text, {**revision, **figures})
     errors = published.linearisation or (0.0,)
     if max(errors) > RULE.linearisation_error:
-        text = (
-            f"the arm of {named} has moved from where its torque is linear: {percent(max(errors))} of the stated error"
-        )
+        text = texts.describe_linearisation(named, max(errors))
         by_joint = {"linearisation_error": list(errors), "threshold": RULE.linearisation_error}
         yield RefreshReason("linearisation", text, {**revision, **by_joint})
 

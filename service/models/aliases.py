@@ -33,7 +33,8 @@ def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> 
     """
     if (request.version is None) == (request.alias is None):
         given = "neither" if request.version is None else "both"
-        raise invalid_request("version or alias", given, "exactly one of the two")
+        message = f"Expected either `version` or `alias`, got {given}."
+        raise invalid_request("version or alias", given, "exactly one of the two", message)
     return _move(loaded, model, alias, loaded.get(model, request.version, request.alias).version)
 
 
@@ -56,7 +57,7 @@ def remove(loaded: LoadedModels, model: str, alias: str) -> None:
         with loaded.database.transaction() as session:
             _check_model(session, model)
             if alias == SERVING:
-                raise ConflictError("the alias 'serving' is built in: it can be moved, and not be removed")
+                raise ConflictError("the alias 'serving' is built in: it can be moved, but not removed")
             if session.get(AliasRow, (model, alias)) is None:
                 raise not_found("alias", alias)
             point(session, model, alias, None)
@@ -75,7 +76,7 @@ def _move(loaded: LoadedModels, model: str, alias: str, version: int, taken_back
                 manifest = session.get_one(VersionRow, (model, version)).manifest
                 registry.check_robot(session, model, RobotKind.of_manifest(manifest))
             elif _last(session, model, alias).seq != number:
-                raise ConflictError(f"the alias {alias!r} of model {model!r} was moved meanwhile: look, and try again")
+                raise ConflictError(f"the alias {alias!r} of model {model!r} was moved meanwhile: check it, and retry")
             if alias == SERVING:
                 registry.serve(session, model, version, number)
             else:
@@ -126,7 +127,7 @@ def _last(session: Session, model: str, alias: str) -> AliasMoveRow:
     _check_model(session, model)
     move = standing(session, model, alias)
     if move is None and (alias == SERVING or _history(session, model, alias, 1)):
-        raise ConflictError(f"the alias {alias!r} of model {model!r} has no move left that could be taken back")
+        raise ConflictError(f"the alias {alias!r} of model {model!r} has no move left to roll back")
     if move is None:
         raise not_found("alias", alias)
     return move
@@ -136,9 +137,9 @@ def _before(session: Session, move: AliasMoveRow) -> int:
     """Return the version that an alias pointed to before a move."""
     name = f"the alias {move.alias!r} of model {move.model!r}"
     if move.before is None:
-        raise ConflictError(f"{name} has pointed to nothing before version {move.version}: it can be moved or removed")
+        raise ConflictError(f"{name} pointed to no version before version {move.version}: move or remove it instead")
     if not registry.exists(session, move.model, move.before):
-        raise ConflictError(f"{name} pointed to version {move.before} before, which has been deleted: name another one")
+        raise ConflictError(f"version {move.before}, to which {name} pointed, has been deleted: choose another version")
     return move.before
 
 
@@ -155,9 +156,7 @@ def names(session: Session, model: str) -> list[str]:
 def _check_room(loaded: LoadedModels, session: Session, model: str, alias: str) -> None:
     known = names(session, model)
     if alias not in known and len(known) >= registry.MAX_ALIASES:
-        raise ConflictError(
-            f"model {model!r} has {registry.MAX_ALIASES} aliases, the most it may have: remove one first"
-        )
+        raise ConflictError(f"model {model!r} already has {registry.MAX_ALIASES} aliases, the max: remove one first")
 
 
 def _show(loaded: LoadedModels, session: Session, model: str, alias: str) -> Alias:

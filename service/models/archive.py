@@ -92,7 +92,8 @@ def _find(loaded: LoadedModels, model: str, version: int | None, alias: str | No
     Raise NotFoundError, or InvalidRequestError if both are given.
     """
     if version is not None and alias is not None:
-        raise invalid_request("version or alias", "both", "one of the two at most")
+        message = "Expected `version` or `alias`, got both."
+        raise invalid_request("version or alias", "both", "at most one of the two", message)
     return registry.find(loaded.database, model, loaded.resolve_version(model, version, alias)[0])
 
 
@@ -181,7 +182,7 @@ def write_urdf(loaded: LoadedModels, model: str, version: int | None, alias: str
     try:
         text = urdf_of_parameters(manifest["parameters"], manifest["joint_names"], manifest["training_range"], name)
     except ValueError as error:
-        item = problem("version", row.version, "a version with rigid bodies that holds where its joints lie")
+        item = problem("version", row.version, "a version with rigid bodies and a learnt geometry")
         message = f"version {row.version} of model {row.model!r} cannot be written as a URDF: {error}"
         raise InvalidRequestError(message, [item]) from error
     return f"{name}.urdf", text

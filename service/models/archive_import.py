@@ -78,7 +78,7 @@ def _publish(
     with loaded.database.transaction() as session:
         registry.check_robot(session, model, RobotKind.of_manifest(manifest))
         first = not registry.has_model(session, model)
-        other = Acceptance(unknown=("it was imported beside other versions",))
+        other = Acceptance(unknown=("not judged, because it was imported into a model with other versions",))
         judged = Promotion.of(_accepted(manifest) if first else other, registry.serving_version(session, model), option)
         version = registry.publish(
             session, model, folder, manifest, None, candidate=not judged.answers, promotion=judged
@@ -91,7 +91,7 @@ def _accepted(manifest: Mapping[str, Any]) -> Acceptance:
     try:
         return accept(held_out_figures(tuple(manifest["joint_names"]), manifest["lineage"]["holdout"]))
     except (KeyError, TypeError, ValueError):
-        return Acceptance(unknown=("its archive does not say how it does on what its training held out",))
+        return Acceptance(unknown=("not judged, because its archive has no figures of held-out rows",))
 
 
 def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
@@ -100,7 +100,7 @@ def _checked(files: Mapping[str, bytes], settings: Settings) -> dict[str, Any]:
     try:
         manifest = read_manifest_bytes(files[MANIFEST], limits)
         if ROBOT in files and "robot" not in manifest:
-            raise ModelFormatError(f"{ROBOT} is there, but the manifest names no robot", ROBOT)
+            raise ModelFormatError(f"the archive has {ROBOT}, but the manifest names no robot", ROBOT)
         check_texts("", manifest)
         _check_options(manifest["options"])
         Lineage.model_validate(manifest["lineage"])

@@ -90,9 +90,9 @@ def members(path: Path, limits: Mapping[str, int]) -> dict[str, bytes]:
                 raise ArchiveError("archive", f"cut off at byte {length}", "a complete tar file")
             name, count = _header(header)
             if name not in limits:
-                raise ArchiveError(name, "a file that no model has", f"one of {', '.join(limits)}")
+                raise ArchiveError(name, "an unknown file", f"one of {', '.join(limits)}")
             if name in files:
-                raise ArchiveError(name, "there twice", "each file once")
+                raise ArchiveError(name, "given twice", "each file once")
             if count > limits[name]:
                 raise ArchiveError(name, f"a file of {count} bytes", f"at most {limits[name]}")
             if file.tell() + count + padding(count) > length:
@@ -103,7 +103,7 @@ def members(path: Path, limits: Mapping[str, int]) -> dict[str, bytes]:
     if any(rest):
         raise ArchiveError("archive", "followed by more data", "nothing after its end")
     if len(rest) < BLOCK:
-        raise ArchiveError("archive", "without its end", "a complete tar file")
+        raise ArchiveError("archive", "cut off before its end", "a complete tar file")
     return files
 
 
@@ -150,11 +150,11 @@ def read(upload: Path, settings: Settings) -> tuple[ArchiveOrigin, dict[str, byt
     files.pop(SIGNATURE, None)
     sums = _json(CHECKSUMS, files.pop(CHECKSUMS))
     if not isinstance(sums, dict) or sums.keys() != files.keys():
-        given = f"of {', '.join(map(strict_json.quote, sums))}" if isinstance(sums, dict) else strict_json.quote(sums)
+        given = f"for {', '.join(map(strict_json.quote, sums))}" if isinstance(sums, dict) else strict_json.quote(sums)
         raise invalid_data(CHECKSUMS, given, f"the sha256 of each of {', '.join(files)}")
     for name, content in files.items():
         if persistence.sha256(content) != sums[name]:
-            raise invalid_data(name, "not what its sha256 in checksums.json says", "an undamaged file")
+            raise invalid_data(name, "different from its sha256 in checksums.json", "an undamaged file")
     try:
         return ArchiveOrigin.model_validate(_json(EXPORT, files.pop(EXPORT))), files
     except ValidationError as error:

@@ -118,12 +118,12 @@ def _check_unused(session: Session, model: str, version: int) -> None:
     if pointing := list(session.scalars(aliases.order_by(AliasRow.alias))):
         raise ConflictError(f"{name} has the alias {', '.join(map(repr, pointing))}: move or remove it first")
     if registry.serving_version(session, model) == version:
-        raise ConflictError(f"{name} serves: let another version serve first, or delete the model")
+        raise ConflictError(f"{name} is the serving version: let another version serve first, or delete the model")
     if session.scalar(select(func.count()).select_from(VersionRow).where(VersionRow.model == model)) == 1:
-        raise ConflictError(f"{name} is its only one: delete the model")
+        raise ConflictError(f"{name} is its only version: delete the model instead")
     for job in _active_jobs(session):
         if job.model == model and (job.request.get("refresh") or {}).get("version") == version:
-            raise ConflictError(f"{job.id} trains {name} anew: cancel it or wait for its end")
+            raise ConflictError(f"{job.id} refreshes {name}: cancel it or wait for its end")
         if job.request.get("base") == f"{model}:{version}":
             raise ConflictError(f"{job.id} starts from {name}: cancel it or wait for its end")
 
@@ -148,4 +148,4 @@ def _remove_files(files: Files, folders: Collection[str], snapshots: Collection[
             try:
                 delete_file(name)
             except OSError as error:
-                logger.warning("a file of a deleted version is left until the next start: %s", error)
+                logger.warning("could not delete a file of a deleted version; the next start will: %s", error)

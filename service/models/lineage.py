@@ -96,7 +96,7 @@ def held_out_figures(joint_names: tuple[str, ...], holdout: Mapping[str, Any]) -
         if each.name != "joint_names"
     }
     if any(each.shape != (len(joint_names),) for each in found.values()):
-        raise ValueError("figures are not those of the joints")
+        raise ValueError("the figures do not match the joints")
     return HeldOutFigures(joint_names, **found)
 
 

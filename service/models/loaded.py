@@ -222,7 +222,7 @@ class LoadedModels:
         except (UnreadableVersionError, OSError) as error:  # the earlier version keeps answering
             logger.error("%s", error)
         except NotFoundError:  # deleted after another version started to serve, which that change loads
-            logger.info("version %d of model %s was deleted before it answered", serving.version, model)
+            logger.info("version %d of model %s was deleted before it served", serving.version, model)
         return False
 
     def held(self) -> dict[Key, int | None]:
@@ -342,7 +342,11 @@ class LoadedModels:
         try:
             known = self.learnt.find(row.model, row.version, base)
         except Exception:  # queries are answered by the version as trained; the reply states its revision
-            logger.exception("what version %d of model %r has learnt is not known", row.version, row.model)
+            logger.exception(
+                "could not read what version %d of model %r has learnt; serving it as trained",
+                row.version,
+                row.model,
+            )
             return served
         if known is None:
             return served

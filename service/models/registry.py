@@ -130,8 +130,8 @@ def check_robot(session: Session, model: str, kind: RobotKind) -> None:
     if first is not None and found is not None:
         field, own, others = found
         raise ConflictError(
-            f"model {model!r} is of another robot: the {field} of its version {first.version}: {own}; of this one: "
-            f"{others}. Choose another name"
+            f"model {model!r} is of another robot: {field} of its version {first.version} is {own}, that of this one "
+            f"is {others}. Choose another name"
         )
 
 
@@ -157,8 +157,8 @@ def missing(session: Session, model: str, version: int | None) -> NotFoundError 
         return not_found("version", version)
     newest = session.scalar(select(func.max(VersionRow.version)).where(VersionRow.model == model))
     return NoServingVersionError(
-        f"no version of model {model!r} serves, all wait as candidates: `lipserve models show {model}` says why, and "
-        f"`lipserve models promote {model} {newest}` lets the newest answer"
+        f"no version of model {model!r} serves, all are candidates: `lipserve models show {model}` says why, and "
+        f"`lipserve models promote {model} {newest}` lets the newest serve"
     )
 
 

@@ -195,6 +195,6 @@ async def wait_for_revision(
 
 def _not_reached(served: ServedModel, revision: int) -> RevisionNotReachedError:
     name = f"version {served.version} of model {served.name!r}"
-    text = f"{name} answers with revision {served.revision} and has not learnt up to revision {revision} yet: ask again"
-    expected = f"{served.revision} or less now, of version {served.version}"
+    text = f"{name} is at revision {served.revision} and has not reached revision {revision} yet: retry"
+    expected = f"at most {served.revision} at present, of version {served.version}"
     return RevisionNotReachedError(text, [problem("min_revision", revision, expected)], {"Retry-After": "1"})

@@ -124,7 +124,7 @@ def profile_of(database: Database, robot: str) -> Profile:
     try:
         return profiles.from_urdf(row.urdf, row.name)
     except UrdfError as error:  # an earlier release accepted it
-        raise invalid_urdf(f"robot {robot} cannot be used any more: {error}") from None
+        raise invalid_urdf(f"robot {robot} can no longer be used: {error}") from None
 
 
 def _of_profile(robot: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:

@@ -88,7 +88,7 @@ def run(
     outcome = _ask(Call(function, encoded, paths, write, *limits))
     if outcome.output:
         shown = readable(outcome.output.decode(errors="backslashreplace"))[:MAX_OUTPUT_BYTES]
-        logger.warning("a reader of an upload wrote", extra={"fields": {"reader": function, "output": shown}})
+        logger.warning("output of a reader of an upload", extra={"fields": {"reader": function, "output": shown}})
     if outcome.late:
         raise _beyond("time", field, settings)
     if outcome.status == -signal.SIGXCPU:
@@ -100,8 +100,9 @@ def run(
         if outcome.status == 0:
             return _decoder(returns).decode(answer.value)
     except msgspec.MsgspecError as error:
-        logger.warning("a reader of an upload sent what is no answer: %s", error)
-    raise invalid_data(field, f"one that cannot be read: its reader {_ending(outcome.status)}", "an undamaged one")
+        logger.warning("a reader of an upload sent an invalid answer: %s", error)
+    message = f"The upload could not be read: its reader {_ending(outcome.status)}."
+    raise invalid_data(field, "unreadable", "an undamaged file", message)
 
 
 def _decoder(kind: type[T]) -> msgspec.msgpack.Decoder[T]:
@@ -126,7 +127,7 @@ def _ask(call: Call) -> Outcome:
         # the waiting process had just ended, hangs, or cannot start
         except (EOFError, OSError) as error:
             failed = error
-    raise NotReadyError(f"uploads cannot be read now: no process can be started for it ({failed!r})")
+    raise NotReadyError(f"uploads cannot be read at present: no reader process could be started ({failed!r})")
 
 
 def _hand_over(call: Call, connection: socket.socket, process: Any) -> None:
@@ -144,7 +145,7 @@ def _hand_over(call: Call, connection: socket.socket, process: Any) -> None:
             raise EOFError
         except TimeoutError:
             if (reason := progress.look()) is not None:
-                logger.error("the process that waits for uploads hangs and is killed: %s", reason)
+                logger.error("the process that reads uploads hangs and is killed: %s", reason)
                 _spawner.end(process)
                 raise
 
@@ -165,7 +166,8 @@ def _beyond(limit: str, field: str, settings: Settings) -> ServiceError:
     }
     what, most, setting = of[limit]
     expected = f"at most {most}" + ("" if setting is None else f" ({setting} sets it)")
-    error = invalid_data(field, f"one that takes more than {most} of {what} to read", expected)
+    message = f"Reading the upload takes more than {most} of {what}" + (f" ({setting})." if setting else ".")
+    error = invalid_data(field, f"an upload that takes more than {most} of {what} to read", expected, message)
     return TooLargeError(error.message, error.detail) if limit == "size" else error
 
 

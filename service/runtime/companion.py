@@ -123,7 +123,7 @@ class Companion:
         supervisor, sender = self._threads
         supervisor.join(5.0)
         if supervisor.is_alive() and self._process is not None:
-            logger.warning("the %s process does not end: killed", self.name)
+            logger.warning("the %s process does not end; it is killed", self.name)
             self._process.kill()
         supervisor.join()
         sender.join()
@@ -135,7 +135,7 @@ class Companion:
             try:
                 connection, self._process = self._start()
             except Exception:  # no memory or too many processes: a retry may succeed
-                logger.exception("the %s process cannot be started: tried again", self.name)
+                logger.exception("the %s process could not be started; retrying", self.name)
                 pause = self._rest(pause)
                 continue
             with self._changed:
@@ -192,7 +192,7 @@ class Companion:
             try:
                 self.on_message(message)
             except Exception:  # the next one may be valid
-                logger.exception("a message of the %s process was not taken: %s", self.name, message)
+                logger.exception("could not handle a message of the %s process: %s", self.name, message)
 
     def _send(self) -> None:
         """Send work, in a thread: the process may be busy and the pipe full."""

@@ -1,6 +1,6 @@
-"""Confinement of a process that reads an untrusted file: limited memory, time and disk, only the given files, no
-network, no other processes. The kernel enforces all of it, whatever code the file may run.
+"""Confinement of a process that reads an untrusted file, enforced by the kernel whatever code the file may run.
 
+Memory, time and disk are limited; the process reads only the given files, and has no network or other processes.
 The resource limits are POSIX. On Linux the process also drops its capabilities. Landlock restricts its files
 (https://docs.kernel.org/userspace-api/landlock.html), and a seccomp filter the system calls. All are irrevocable.
 """

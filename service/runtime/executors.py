@@ -117,7 +117,7 @@ class Processes(Executor):
             return
         self._looked = time.monotonic()
         if (reason := self._progress.look()) is not None:
-            logger.error("processes that sum up statistics hang and are killed: %s", reason)
+            logger.error("processes that compute statistics hang and are killed: %s", reason)
             self._progress.step()
             for process in self._processes():
                 process.kill()
@@ -187,7 +187,7 @@ def choose_settings(sent: Settings | None) -> Settings:
     if _placed is not None:
         return _placed
     if sent is None:
-        raise RuntimeError("a shard without settings, in a process that is no worker of a cluster")
+        raise RuntimeError("a shard has no settings, and this process is no cluster worker")
     return sent
 
 
@@ -263,7 +263,7 @@ def sum_shards(
     try:
         while added < len(shards):
             if cancelled():
-                raise FitCancelledError("cancelled while the samples were summed up")
+                raise FitCancelledError("cancelled while statistics were computed")
             more = again or (begun < len(shards) and begun < added + MAX_SHARDS_AHEAD)
             if more:  # one at a time: an executor may run it at once
                 number = again.pop(0) if again else begun

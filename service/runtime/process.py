@@ -86,7 +86,7 @@ def start_process(place: ProcessOptions) -> None:
         if place.cpus is not None:
             os.sched_setaffinity(0, place.cpus)
     except OSError as error:  # a sandbox forbids it: that costs latency, not training
-        logger.warning("process %d keeps its place among the others: %s", os.getpid(), error)
+        logger.warning("could not set the scheduling of process %d: %s", os.getpid(), error)
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
@@ -150,7 +150,7 @@ class Slot:
         if code is None:
             return "ended"
         if code == -signal.SIGKILL:
-            return "was killed (SIGKILL, as by a system without memory)"
+            return "was killed (SIGKILL: the system may be out of memory)"
         with suppress(ValueError):  # not the number of a signal
             return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         return f"ended with exit code {code}"

@@ -67,7 +67,7 @@ class Progress:
         else:
             self.silent_s += passed
         if self.silent_s >= self._quiet_s:
-            return f"it has not got on for {self._quiet_s:g} s"
+            return f"it has made no progress for {self._quiet_s:g} s"
         if self._stepless_s >= self._step_s:
-            return f"one step of it has taken {self._step_s:g} s"
+            return f"one of its steps has taken {self._step_s:g} s"
         return None

@@ -115,4 +115,4 @@ async def _clean(database: Database, settings: Settings) -> None:
         try:
             await to_thread.run_sync(clean, database, settings)
         except Exception as error:
-            logger.warning("old lines of the audit log cannot be deleted now: %s", error)
+            logger.warning("could not delete old lines of the audit log: %s", error)

@@ -75,7 +75,7 @@ def backup(home: Path, file: Path) -> Backup:
     if not (home / FILE).is_file():
         raise FileNotFoundError(f"home is {str(home)!r}, expected a folder with the database of a service")
     if file.exists():
-        raise FileExistsError(f"file is {str(file)!r}, expected a new one: there is one of that name")
+        raise FileExistsError(f"file is {str(file)!r}, expected a new file: this one exists already")
     draft = file.with_name(f"{file.name}.draft")
     draft.unlink(missing_ok=True)
     draft.touch(0o600)  # the database contains hashes of keys
@@ -155,7 +155,7 @@ def _files(home: Path, keys: Iterable[str], missing_ok: bool = False) -> Iterato
                 files |= {name: opened.enter_context((home / name).open("rb")) for name in names}
             except FileNotFoundError:
                 if not missing_ok:
-                    message = f"{key} is missing below {home}: `lipserve verify` tells all that is damaged"
+                    message = f"{key} is missing below {home}: `lipserve verify` lists all damage"
                     raise BackupError(message) from None
         yield files
 
@@ -193,7 +193,7 @@ def restore(home: Path, file: Path) -> Backup:
     """
     with file.open("rb") as opened, lock_home(home):
         if any(path.name != LOCK for path in home.iterdir()):
-            raise HomeError(f"home is {str(home)!r}, expected an empty folder: nothing is restored over what is there")
+            raise HomeError(f"home is {str(home)!r}, expected an empty folder, as nothing is overwritten")
         try:
             return _restored(home, opened)
         except BaseException:
@@ -210,7 +210,7 @@ def _restored(home: Path, opened: IO[bytes]) -> Backup:
             for info in tar:
                 name, content = info.name, tar.extractfile(info) if info.isreg() else None
                 if content is None or info.issparse() or not _NAMES.fullmatch(name) or name in sums:
-                    raise BackupError(f"the file holds {name[:200]!r}, which no backup does, or twice")
+                    raise BackupError(f"the file is no backup: it has the unexpected or repeated entry {name[:200]!r}")
                 if name == MANIFEST:
                     about = json.loads(content.read())
                     continue
@@ -254,10 +254,10 @@ def _check(about: Any, sums: dict[str, dict[str, Any]]) -> None:
         raise BackupError(f"the file is no backup, or is cut off: it has no {MANIFEST} at its end")
     if about.get("format_version") != FORMAT_VERSION:
         message = f"the backup has format_version {about.get('format_version')!r}, expected {FORMAT_VERSION}"
-        raise BackupError(f"{message}: a later release of LIPServe has made it")
+        raise BackupError(f"{message}: it was made by a later release of LIPServe")
     files = about.get("files")
     if not isinstance(files, dict):
-        raise BackupError(f"the backup is damaged: {MANIFEST} names no files")
+        raise BackupError(f"the backup is damaged: {MANIFEST} lists no files")
     for name, known in {FILE: None, **files}.items():
         if sums.get(name) != known or known is None:
-            raise BackupError(f"the backup is damaged: {name} is not what {MANIFEST} says")
+            raise BackupError(f"the backup is damaged: {name} does not match {MANIFEST}")

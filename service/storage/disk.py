@@ -36,11 +36,11 @@ class Usage:
         """Return why there is no space for `size` more bytes, None if there is."""
         if self.free - size < self.floor:
             return (
-                f"the disk of the service has {_amount(self.free)} free, of which {_amount(self.floor)} stay so "
+                f"the disk is full: {_amount(self.free)} are free, and {_amount(self.floor)} must stay free "
                 "(LIPSERVE_MIN_FREE_BYTES)"
             )
         if self.quota is not None and self.used + size > self.quota:
-            return f"the service has stored {_amount(self.used)} of {_amount(self.quota)} (LIPSERVE_MAX_HOME_BYTES)"
+            return f"the quota is full: {_amount(self.used)} of {_amount(self.quota)} in use (LIPSERVE_MAX_HOME_BYTES)"
         return None
 
 
@@ -95,7 +95,7 @@ class Disk:
 
 
 def _full(reason: str) -> StorageFullError:
-    return StorageFullError(f"{reason}, which leaves no room for more: delete data sets or versions of models")
+    return StorageFullError(f"{reason}. Delete data sets or versions")
 
 
 def measure(folder: Path) -> int:

@@ -63,7 +63,7 @@ def _of_database(error: DBAPIError) -> ServiceError | None:
     if primary == sqlite3.SQLITE_FULL:
         return StorageFullError(_NO_SPACE)
     if primary in (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB):
-        return StorageUnavailableError(f"the database is damaged: {error.orig}; the service's log says more")
+        return StorageUnavailableError(f"the database is damaged: {error.orig}; see the service's log")
     if primary in (sqlite3.SQLITE_READONLY, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_PERM):
         return StorageUnavailableError(f"the database cannot be used now: {error.orig}", headers=RETRY_AFTER)
     return None
@@ -90,6 +90,6 @@ def _of_postgresql(error: DBAPIError, state: str | None) -> ServiceError | None:
         return StorageUnavailableError(_LOST, headers=RETRY_AFTER)
     # read-only, no access, no such database, out of memory and the like, its disk, its own faults
     if state.startswith(("25006", "28", "3D", "42501", "53", "58", "XX")):
-        message = f"the database cannot be used now: SQLSTATE {state}; the service's log says more"
+        message = f"the database cannot be used now: SQLSTATE {state}; see the service's log"
         return StorageUnavailableError(message, headers=RETRY_AFTER)
     return None

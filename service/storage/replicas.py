@@ -64,7 +64,7 @@ class Replicas:
                 session.execute(delete(ReplicaRow).where(ReplicaRow.id == self.id))
                 session.commit()
         except Exception:  # as after a kill: the others wait until it counts as lost
-            logger.warning("the service could not take its leave of the others", exc_info=True)
+            logger.warning("could not tell the other services that this one stops", exc_info=True)
 
     def others(self, session: Session) -> list[str]:
         """Return the ids of the other live services."""
@@ -112,7 +112,7 @@ class Replicas:
             try:
                 self._beat()
             except Exception as error:
-                logger.warning("no sign of life could be given to other services: %s", error)
+                logger.warning("could not send a heartbeat to the other services: %s", error)
 
     def _beat(self) -> None:
         row = {"id": self.id, "host": socket.gethostname(), "started_at": self._started, "seen_at": _SECONDS}

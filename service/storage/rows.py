@@ -85,8 +85,8 @@ def find_done_row(session: Session, table: type[Made], named: RequestIdentity | 
     row = session.scalar(select(table).where(table.idempotency_key == named.stored))
     if row is not None and row.request_digest != named.digest:
         raise ConflictError(
-            f"{HEADER} is {named.key}, the key of another request, which made {row.id}: give every request its own",
-            [problem(HEADER, named.key, "a key that no other request was sent with")],
+            f"{HEADER} {named.key} was used by another request, which made {row.id}: use a new key for each request",
+            [problem(HEADER, named.key, "a key that no other request has used")],
         )
     return row
 

@@ -165,7 +165,7 @@ def _unusable(home: Path, error: OSError) -> str:
 def _unusable_files(settings: Settings, error: OSError) -> str:
     expected = "a folder that is mounted and that the service may write to"
     if (settings.files_url or "").startswith("s3:"):
-        expected = "a bucket that this service may list, read, write and delete in, by the AWS_ variables or a role"
+        expected = "a bucket in which the AWS_ variables or a role allow to list, read, write and delete"
     return f"files_url is {settings.files_url!r}, expected {expected}: {error.strerror or error}"
 
 
@@ -175,6 +175,6 @@ def _unusable_database(settings: Settings, damage: str) -> str:
         return f"the database of LIPSERVE_DATABASE_URL cannot be used: {damage}"
     path = settings.home / FILE
     return (
-        f"the database {path} cannot be used: {damage}. Where it is damaged, restore a copy of the home, or what "
-        f'can be read of it with `sqlite3 {path} ".recover"`; or set LIPSERVE_HOME to another folder'
+        f"the database {path} cannot be used: {damage}. If it is damaged, restore a backup of the home, or recover "
+        f'what is readable with `sqlite3 {path} ".recover"`; or set LIPSERVE_HOME to another folder'
     )

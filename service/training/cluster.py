@@ -18,7 +18,7 @@ from service.runtime.cluster import Cluster, needs_gpu
 from service.runtime.executors import ClusterUnavailableError, is_worker_lost
 from service.runtime.process import Slot
 from service.storage.database import JobRow
-from service.training import lifecycle
+from service.training import lifecycle, texts
 from service.training.lifecycle import JobEnd, WatchedJob
 from service.training.queue import JobQueue
 
@@ -89,7 +89,7 @@ class ClusterQueue(JobQueue):
             if row is None or row.state != QUEUED or row.owner not in (None, self.replicas.id):
                 return None
             gpu = needs_gpu(row.request)
-            message = f"waits for a worker of the cluster{' with a GPU' if gpu else ''}"
+            message = texts.describe_cluster_wait(gpu)
             if not row.history or row.history[-1]["message"] != message:
                 lifecycle.enter(row, QUEUED, message)
             row.owner = self.replicas.id
@@ -108,7 +108,7 @@ class ClusterQueue(JobQueue):
             if error is None or is_worker_lost(error):
                 self._wait(watched.job, time.monotonic() + RETRY_S)
             else:
-                self._pass_on(JobEnd(watched.job, "refused", f"a worker could not begin with it: {error}"))
+                self._pass_on(JobEnd(watched.job, "refused", f"a worker could not start the job: {error}"))
 
     def _end(self, watched: WatchedJob) -> None:
         if watched.future is not None and watched.ran is None:  # a worker that has begun reads its row

@@ -26,7 +26,7 @@ MAX_FOLLOWERS = 100
 class JobEventStream(OpenCounter):
     """Followers of jobs; belongs to the event loop."""
 
-    too_many = "events of jobs are followed {} times, the most there may be: close one, or try again later"
+    too_many = "{} event streams of jobs are open, the max: close one, or retry later"
     headers: ClassVar = {"Retry-After": "5"}
 
     def __init__(self, database: Database) -> None:
@@ -63,7 +63,7 @@ class JobEventStream(OpenCounter):
             try:
                 rows = await to_thread.run_sync(self._look, list(self._followers))
             except Exception:  # a database error: the next read may succeed
-                logger.exception("jobs that are followed could not be read")
+                logger.exception("could not read the followed jobs")
                 rows = []
             for row in rows:
                 known = self._rows.get(row.id)

@@ -70,7 +70,7 @@ class SetSplit:
                 raise CannotHoldOutError(f"data set {self.dataset!r}: {error}") from error
         counts = (int(np.count_nonzero(parts.held_out)), parts.guarded)
         if self.known is not None and counts != self.known:
-            raise CannotHoldOutError(f"data set {self.dataset!r} does not split as it did before")
+            raise CannotHoldOutError(f"data set {self.dataset!r} cannot be split as before")
         return parts
 
     def held_out(self, episode: Numbers, t: Array) -> Mask:
@@ -101,13 +101,14 @@ def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
     """Raise InvalidRequestError if the reports already show that the data sets cannot be split as requested."""
     _check_stretches(rows, asked)
     if (index := first_repeat(row.sha256 for row in rows)) is not None:
-        expected = "other samples than those of the data sets before it"
-        raise invalid_request(f"datasets[{index}]", rows[index].id, expected)
+        message = f"Data set {rows[index].id} has the same samples as an earlier one of `datasets`."
+        raise invalid_request(f"datasets[{index}]", rows[index].id, "samples of no earlier data set", message)
     for row in rows:
         if asked.guard_s is not None and not _is_timed(row):
-            raise invalid_request("holdout.guard_s", asked.guard_s, f"none, as data set {row.id} has no times")
+            message = f"`holdout.guard_s` needs times, which data set {row.id} does not have."
+            raise invalid_request("holdout.guard_s", asked.guard_s, "no guard without times", message)
     if asked.kind == "episodes" and len(rows) == 1 and rows[0].report["episodes"] < 2:
-        raise invalid_request("holdout.kind", asked.kind, "last or blocks, as the data set is one episode")
+        raise invalid_request("holdout.kind", asked.kind, "last or blocks, as the data set has only one episode")
     total = sum(row.rows for row in rows)
     if asked.stretches is None:
         field, value, left = "holdout.share", asked.share, round((1 - asked.share) * total)
@@ -122,7 +123,8 @@ def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
 def _check_stretches(rows: Sequence[DatasetRow], asked: Holdout) -> None:
     """Raise InvalidRequestError unless stretches are rows of the data sets, in order and disjoint."""
     if (asked.stretches is None) != (asked.kind != "stretches"):
-        raise invalid_request("holdout.stretches", asked.stretches, "rows, where `kind` is stretches, and only there")
+        message = "`holdout.stretches` is required if `holdout.kind` is stretches, and not allowed otherwise."
+        raise invalid_request("holdout.stretches", asked.stretches, "rows, only for kind stretches", message)
     known = {row.id: row.rows for row in rows}
     for name, stretches in (asked.stretches or {}).items():
         field = f"holdout.stretches.{name}"
@@ -130,7 +132,7 @@ def _check_stretches(rows: Sequence[DatasetRow], asked: Holdout) -> None:
             raise invalid_request(field, name, f"one of the data sets to train on: {', '.join(known)}")
         borders = [border for stretch in stretches for border in stretch]
         if any(a >= b for a, b in stretches) or borders != sorted(borders) or borders[-1] > known[name]:
-            expected = f"stretches in order, each of a first and a larger last row, at most {known[name]}"
+            expected = f"stretches in order, each a first row and a larger last row, at most {known[name]}"
             raise invalid_request(field, stretches, expected)
 
 

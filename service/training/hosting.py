@@ -35,7 +35,7 @@ from service.runtime.executors import GPU_SHARD, SHARD, choose_settings
 from service.runtime.process import Slot, training_process_options
 from service.storage.database import Database, JobRow
 from service.storage.files import Files
-from service.training import lifecycle, worker
+from service.training import lifecycle, texts, worker
 from service.training.lifecycle import JobEnd, JobStatus, Settler, WatchedJob
 
 T = TypeVar("T")
@@ -58,7 +58,7 @@ def host(version: str, job: str) -> None:
     they are free.
     """
     if version != __version__:
-        raise VersionsDifferError(f"the worker has version {__version__}, the service {version}: start them alike")
+        raise VersionsDifferError(f"the worker has version {__version__}, the service {version}: install the same one")
     with _one:  # a worker that lost its scheduler and rejoined may still run a job
         following: str | None = job
         while following is not None and not _stopping.is_set():
@@ -116,15 +116,14 @@ class Host:
         if row is not None and row.state == RUNNING:
             if self._lives(row):
                 return True
-            message = "the worker that ran it is gone"
-            self._settle(JobEnd(job, "ended", message, row.attempts))
+            self._settle(JobEnd(job, "ended", texts.WORKER_GONE, row.attempts))
             row = self._patiently(lambda: self._row(job))
         if row is None or row.state != QUEUED:
             return True
         try:
             future = self.slot.start(self.function, self.settings, job)
         except OSError as error:
-            self._settle(JobEnd(job, "ended", f"a training process could not be started: {error}"))
+            self._settle(JobEnd(job, "ended", texts.describe_start_failure(error)))
             return False
         return self._watch(WatchedJob(job, self.slot, future, time.monotonic()), future, row.attempts + 1)
 
@@ -137,7 +136,7 @@ class Host:
             try:
                 row = self._row(watched.job)
             except Exception:  # the process needs the database too, but it may become available again
-                logger.warning("the row of %s could not be read", watched.job, exc_info=True)
+                logger.warning("could not read the row of %s", watched.job, exc_info=True)
                 continue
             clock = time.monotonic()
             if row is None or row.attempts > attempt or (watched.ran is not None and row.state == QUEUED):
@@ -180,7 +179,7 @@ class Host:
             row = lifecycle.row_of(session, job)
             if row is None or row.state != RUNNING or row.attempts != attempt:
                 return
-            lifecycle.hand_back(row, "its worker was stopped while it ran")
+            lifecycle.hand_back(row, texts.WORKER_STOPPED)
         lifecycle.remove_leftovers(self.database, self.files, job)
 
     def _settle(self, end: JobEnd) -> None:
@@ -192,7 +191,7 @@ class Host:
             try:
                 return ask()
             except Exception:
-                logger.warning("the database could not be used: tried again", exc_info=True)
+                logger.warning("the database is unavailable; retrying", exc_info=True)
                 if _stopping.wait(1.0):
                     return None
 
@@ -251,8 +250,8 @@ async def _work(settings: Settings, scheduler: str, resources: dict[str, float],
                 await joined
             return
         if (error := joined.exception()) is not None:
-            logger.warning("the cluster could not be joined: %s", error)
-        logger.warning("the scheduler %s is gone: joined again once it is there", scheduler)
+            logger.warning("could not join the cluster: %s", error)
+        logger.warning("lost the scheduler %s; joining again when it is back", scheduler)
         with suppress(TimeoutError):
             await asyncio.wait_for(stopped.wait(), 2.0)
 

@@ -40,7 +40,7 @@ from service.storage.database import Database, DatasetRow, JobRow, RobotRow, Ver
 from service.storage.files import new_id
 from service.storage.rows import Page, RequestIdentity, find_done_row, mark_row, read_page
 from service.telemetry.logs import KEY_ID, request_id, request_scope
-from service.training import holding_out, lifecycle, refresh_data
+from service.training import holding_out, lifecycle, refresh_data, texts
 from service.training.queue import JobQueue
 
 MAX_DATASETS = 100
@@ -96,7 +96,7 @@ def check(queue: JobQueue, draft: JobDraft) -> None:
     if queue.settings.cluster is None:
         _check_extra(draft)
     if draft.robot is not None and draft.estimator not in (AUTO, *ROBOT_ESTIMATORS):
-        raise invalid_request("robot", draft.robot, f"none, as {draft.estimator} takes none")
+        raise invalid_request("robot", draft.robot, "no robot", f"`robot` is not used by estimator {draft.estimator}.")
     if draft.robot is not None and draft.robot not in ROBOTS:
         robots.profile_of(queue.database, draft.robot)
 
@@ -141,7 +141,7 @@ def add(
     waiting = session.scalar(select(func.count()).select_from(JobRow).where(JobRow.state == QUEUED)) or 0
     if waiting >= MAX_QUEUED:
         raise BusyError(
-            f"{waiting} jobs are waiting already, the most that may: try again later",
+            f"the queue is full, with {waiting} waiting jobs: retry later",
             headers={"Retry-After": str(_seconds_to_wait(session))},
         )
     job = JobRow(
@@ -158,7 +158,7 @@ def add(
         key=(request_scope.get() or {}).get(KEY_ID),
     )
     mark_row(job, named)
-    lifecycle.enter(job, QUEUED, "queued" if retry_of is None else f"queued to repeat {retry_of}")
+    lifecycle.enter(job, QUEUED, texts.describe_queued(retry_of))
     session.add(job)
     return job
 
@@ -207,11 +207,11 @@ def cancel(queue: JobQueue, job: str) -> Job:
     with queue.database.transaction() as session:
         row = _existing(lifecycle.row_of(session, job), job)
         if row.state not in ACTIVE:
-            raise ConflictError(f"{job} has {row.state} already")
+            raise ConflictError(f"{job} has already ended ({row.state})")
         if row.state == QUEUED:
-            lifecycle.enter(row, CANCELLED, "cancelled while it waited")
+            lifecycle.enter(row, CANCELLED, texts.CANCELLED_WAITING)
         elif not row.cancel_requested:
-            lifecycle.enter(row, RUNNING, "asked to end")
+            lifecycle.enter(row, RUNNING, texts.CANCEL_REQUESTED)
         row.cancel_requested = True
     return represent(row)
 
@@ -219,17 +219,21 @@ def cancel(queue: JobQueue, job: str) -> Job:
 def _check_joints(request: JobRequest, rows: list[DatasetRow]) -> list[str]:
     first = rows[0]
     if (twice := first_repeat(row.id for row in rows)) is not None:
-        raise invalid_request(f"datasets[{twice}]", request.datasets[twice], "every data set once")
+        field, value = f"datasets[{twice}]", request.datasets[twice]
+        raise invalid_request(field, value, "no data set twice", f"`{field}` repeats data set {value}.")
     for index, row in enumerate(rows):
         for what in ("joint_names", "torque_convention"):
             if getattr(row, what) != getattr(first, what):
-                expected = f"the {what} of datasets[0], {getattr(first, what)}"
-                raise invalid_request(f"datasets[{index}]", f"a data set with {getattr(row, what)}", expected)
+                field, own, others = f"datasets[{index}]", getattr(row, what), getattr(first, what)
+                message = f"`{what}` of data set {row.id} is {own}, that of {first.id} is {others}."
+                raise invalid_request(field, f"a data set with {what} {own}", f"{what} {others}", message)
     n = len(first.joint_names)
     known = next((each for row in rows if (each := row.report.get("joint_types")) is not None), ["revolute"] * n)
     types: list[str] = list(known if request.joint_types is None else request.joint_types)
     if len(types) != n:
-        raise invalid_request("joint_types", f"{len(types)} types", f"{n}, one a joint: {', '.join(first.joint_names)}")
+        names = ", ".join(first.joint_names)
+        message = f"`joint_types` has {len(types)} entries; the data have {n} joints: {names}."
+        raise invalid_request("joint_types", f"{len(types)} types", f"{n} types, one for each joint: {names}", message)
     return types
 
 
@@ -334,7 +338,7 @@ def add_refresh(
     if not registry.exists(session, model, version.version):  # deleted since it was found
         raise not_found("version", version.version)
     for job in session.scalars(refreshes_of(model).where(JobRow.state.in_(ACTIVE))):
-        raise ConflictError(f"{job.id} refreshes model {model!r} already: wait for its end or cancel it")
+        raise ConflictError(f"{job.id} already refreshes model {model!r}: wait until it ends, or cancel it")
     through = log.newest(session, model)
     scope = refresh_data.scope_of(session, model, through)
     kept, left_out = refresh_data.split_datasets(session, scope, manifest["lineage"])
@@ -358,10 +362,10 @@ def add_refresh(
 
 
 def _nothing(version: VersionRow, rows: int, left_out: list[dict[str, str]], least: int) -> str:
-    data = "; ".join(f"data set {each['id']!r} is left out: {each['reason']}" for each in left_out)
+    data = "; ".join(f"data set {each['id']!r}: {each['reason']}" for each in left_out)
     return (
-        f"version {version.version} of model {version.model!r} cannot be refreshed: its log has {rows} rows to train "
-        f"on, expected at least {least} where none of its data sets is left ({data or 'it names none'})"
+        f"version {version.version} of model {version.model!r} cannot be refreshed: none of its data sets can be used "
+        f"({data or 'it names none'}), and its log has {rows} rows to train on, expected at least {least}"
     )
 
 
@@ -381,7 +385,7 @@ def retry(queue: JobQueue, job: str, named: RequestIdentity | None = None) -> Jo
     if (before := done_before(queue.database, named)) is not None:
         return before
     if row.state not in (FAILED, CANCELLED):
-        raise ConflictError(f"{job} is {row.state}: only one that has failed or was cancelled can be repeated")
+        raise ConflictError(f"{job} is {row.state}: only failed or cancelled jobs can be repeated")
     try:
         again = row.request.get("refresh")
         if again is not None:

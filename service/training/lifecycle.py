@@ -19,6 +19,7 @@ from service.foundation.settings import Settings
 from service.runtime.progress import HEARTBEAT_S
 from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.files import Files, new_id
+from service.training import texts
 
 MAX_ENTRIES = 100
 """Maximum entries of a job. A waiting job may see any number of service restarts."""
@@ -149,25 +150,23 @@ class WatchedJob:
         """Return why the process must be killed now, None if it need not be."""
         if self.away:
             if self.done is not None:
-                return JobEnd(self.job, "returned", "it has ended, or is another service's")
+                return JobEnd(self.job, "returned", texts.ENDED_ELSEWHERE)
             clock -= 0.5  # leave time for the worker's host, which applies the same rules
         if self.done is not None:
             late = clock - self.done >= LIMITS.linger_s
-            return JobEnd(self.job, "lingering", "the process did not go on after its end") if late else None
+            return JobEnd(self.job, "lingering", texts.LINGERS) if late else None
         if self.stopped is not None:
             if clock - self.stopped < LIMITS.cancel_s:
                 return None
-            message = f"the training process did not stop within {LIMITS.cancel_s:g} s and was ended"
-            return JobEnd(self.job, "cancelled", message)
+            return JobEnd(self.job, "cancelled", texts.describe_unstoppable(LIMITS.cancel_s))
         if self.ran is None:
             if self.away or clock - self.since < LIMITS.start_s:
                 return None
-            return JobEnd(self.job, "not_started", f"no training process was ready within {LIMITS.start_s:g} s")
+            return JobEnd(self.job, "not_started", texts.describe_not_ready(LIMITS.start_s))
         if clock - self.beat_at >= LIMITS.heartbeat_s:
-            message = f"the training process gave no sign of life for {LIMITS.heartbeat_s:g} s and was ended"
-            return JobEnd(self.job, "silent", message)
+            return JobEnd(self.job, "silent", texts.describe_no_progress(LIMITS.heartbeat_s))
         if clock - self.ran >= settings.max_job_s:
-            return JobEnd(self.job, "too_long", f"it ran for {settings.max_job_s:g} s, the longest that a job may")
+            return JobEnd(self.job, "too_long", texts.describe_too_long(settings.max_job_s))
         return None
 
 
@@ -191,7 +190,7 @@ def remove_leftovers(database: Database, files: Files, job: str) -> int:
         for name in left:
             files.delete_version(name)
     except OSError as error:
-        logger.warning("files that %s did not publish are left until they are swept: %s", job, error)
+        logger.warning("unpublished files of %s could not be deleted; the next sweep will: %s", job, error)
         return 0
     return len(left)
 
@@ -257,11 +256,11 @@ class Settler:
             return JobOutcome(again=True)
         starts = self._starts.get(end.job, 0)
         if starts + 1 >= LIMITS.attempts:
-            message = f"{end.message}: no training process could be started for it, {starts + 1} times"
+            message = f"{end.message}: {starts + 1} starts have failed"
             fail(row, "interrupted", message)
             return JobOutcome()
         pause = min(LIMITS.pause_s * 2**starts, 30.0)
-        enter(row, QUEUED, f"{end.message}: it waits for another one")
+        enter(row, QUEUED, f"{end.message}: queued again")
         return JobOutcome(again=True, pause_s=pause, problem=end.message)
 
 
@@ -273,7 +272,7 @@ def queue_again(row: JobRow, message: str, most_attempts: int) -> bool:
     if row.cancel_requested:
         enter(row, CANCELLED, f"cancelled: {message}")
     elif row.attempts >= most_attempts:
-        fail(row, "interrupted", f"{message}: the training process ended before its job, {row.attempts} times")
+        fail(row, "interrupted", f"{message}: interrupted {row.attempts} times")
     else:
         enter(row, QUEUED, f"{message}: queued again")
         return True

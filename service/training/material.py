@@ -169,7 +169,7 @@ def load_refresh_data(database: Database, files: Files, model: str, request: dic
     parts = [replace(part, factor=_aged(part.row, within)) for part in parts]
     table, held_out, every = _tables(parts, splits, corrupt)
     if not table.parts and logged.rows < MIN_SAMPLES:
-        raise NothingToLearnError(f"the log has {logged.rows} rows to train on, expected {MIN_SAMPLES}")
+        raise NothingToLearnError(f"the log has {logged.rows} rows to train on, expected at least {MIN_SAMPLES}")
     newest, before = read(within, MAX_EVALUATION_SAMPLES, after), LoggedSamples(None, 0)
     unlearnt = None
     if newest.samples is not None:

@@ -27,14 +27,12 @@ OUTCOMES = (SUCCEEDED, FAILED, CANCELLED)
 class JobMetrics(Collector):
     """Metrics of the training jobs in the database. Not for the event loop."""
 
-    jobs = MetricKind("gauge", "lipserve_jobs", "Training jobs that wait or run now", ("state",))
-    finished = MetricKind(
-        "counter", "lipserve_jobs_finished_total", "Training jobs that have ended, ever", ("outcome",)
-    )
+    jobs = MetricKind("gauge", "lipserve_jobs", "Training jobs that wait or run", ("state",))
+    finished = MetricKind("counter", "lipserve_jobs_finished_total", "Training jobs that have ended", ("outcome",))
     duration = MetricKind(
         "histogram",
         "lipserve_job_duration_seconds",
-        "Time from the last start of a training job to its end, s; of all jobs ever",
+        "Time from the last start of a training job to its end, s",
         ("outcome",),
     )
 
@@ -71,14 +69,14 @@ def look(queue: JobQueue, lasting: FaultAge) -> tuple[PartState, str]:
         if cluster.problem is not None:
             return "warning", f"{cluster.problem}; {words}"
         none = waiting > 0 and cluster.jobs == 0
-        return ("warning" if none else "ok"), f"{words}, the cluster takes {cluster.jobs} at a time"
+        return ("warning" if none else "ok"), f"{words}, the cluster runs up to {cluster.jobs} at a time"
     stuck = lasting(waiting > 0 and running < queue.settings.training_workers)
     if stuck is None or stuck <= START_S:
         silent_s = queue.silent_s
         if silent_s > SILENT_S:
-            return "warning", f"{words}; a training process has given no sign of life for {silent_s:.0f} s"
+            return "warning", f"{words}; a training process has made no progress for {silent_s:.0f} s"
         return "ok", words
-    return "failed", f"{counted(waiting, 'job')} waiting, though no more than {running} have run for {stuck:.0f} s"
+    return "failed", f"{counted(waiting, 'job')} waiting and {running} running for {stuck:.0f} s: no job is started"
 
 
 def _counts(session: Session) -> dict[str, int]:

@@ -72,7 +72,7 @@ class PlannedFit:
             again = refit(widen_intervals(judged, held_out), self._task(heartbeat.last_fit, heartbeat))
             return self._on_all_rows(settings, again, heartbeat)
         except (ArithmeticError, ValueError) as error:
-            logger.exception("the fit on all rows failed: the version is the model that was judged")
+            logger.exception("the final fit, on all rows, failed; the version keeps the judged fit")
             why = shortened(f"{type(error).__name__}: {error}")[:MAX_NAME]
             return replace(judged, fit={**judged.fit, REFIT_ERROR: why})
 

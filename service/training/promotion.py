@@ -25,6 +25,7 @@ from service.models import aliases, registry
 from service.models.lineage import answer_of, held_out_figures, learnt_from
 from service.storage.database import Database, VersionRow
 from service.storage.files import Files
+from service.training import texts
 
 CANDIDATE = "candidate"
 """Alias of the version that waits for approval."""
@@ -48,7 +49,7 @@ def judge(
         number = registry.serving_version(session, model)
         serving = None if number is None else session.get_one(VersionRow, (model, number))
     if held_out is None:
-        found = Acceptance(unknown=("not judged, as nothing was held out",))
+        found = Acceptance(unknown=(texts.NOT_JUDGED,))
     else:
         found = accept(held_out_figures(trained.joint_names, lineage["holdout"]))
         if serving is not None:
@@ -64,7 +65,7 @@ def settle(session: Session, model: str, judged: Promotion, option: PromotionOpt
     serving = registry.serving_version(session, model)
     if serving in (None, judged.serving) or not judged.answers or option == "always":
         return judged
-    reason = f"version {serving} answers since it was judged, and was not compared with it"
+    reason = texts.describe_changed_serving(serving)
     return Promotion(answers=False, passed=False, serving=serving, reason=reason)
 
 
@@ -82,16 +83,16 @@ def _against(
     name, manifest = f"version {serving.version}", serving.manifest
     kind = RobotKind(trained.joint_names, trained.joint_types, trained.torque_convention)
     if RobotKind.of_manifest(manifest).difference(kind) is not None:
-        return Acceptance(against=(f"{name} is of another robot",))
+        return Acceptance(against=(texts.describe_other_robot(name),))
     scores = BlockScores.of(held_out, answer_of(trained, held_out))
     try:
         before = _scores(files, serving, held_out, lineage["holdout"])
     except ModelFormatError:
-        return Acceptance(speaks_for=(f"not compared with {name}, which cannot be read",))
+        return Acceptance(speaks_for=(texts.describe_unreadable(name),))
     if before is None or not np.array_equal(before.rows, scores.rows):
-        return Acceptance(speaks_for=(f"not compared with {name}, which was trained on what was held out",))
+        return Acceptance(speaks_for=(texts.describe_learnt_held_out(name),))
     if len(scores.rows) < 2:
-        return Acceptance(speaks_for=(f"what was held out is too short to compare it with {name}",))
+        return Acceptance(speaks_for=(texts.describe_too_short(name),))
     return _verdict(scores.difference_from(before), name)
 
 
@@ -122,15 +123,12 @@ def _verdict(total: Difference, name: str) -> Acceptance:
     """
     (density, nmse), (clear, larger) = total.mean.tolist(), total.significant.tolist()
     half, half_nmse = total.half_width.tolist()
-    amount = f"{density:+.3g} ± {half:.2g} nats a sample"
     if clear and density > 0:
-        worse = f"it predicts what was held out worse than {name}: negative log density {amount}"
-        return Acceptance(against=(worse,))
+        return Acceptance(against=(texts.describe_density("worse", name, density, half),))
     if larger and nmse > 0 and not clear:
-        larger_than = f"its errors are larger than those of {name}: mean nMSE {nmse:+.2g} ± {half_nmse:.1g}"
-        return Acceptance(against=(larger_than,))
+        return Acceptance(against=(texts.describe_larger_errors(name, nmse, half_nmse),))
     how = "better" if clear else "no worse"
-    return Acceptance(speaks_for=(f"it predicts what was held out {how} than {name}: negative log density {amount}",))
+    return Acceptance(speaks_for=(texts.describe_density(how, name, density, half),))
 
 
 def _is_new_to(earlier: dict[str, Any], holdout: dict[str, Any]) -> bool:

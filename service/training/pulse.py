@@ -219,7 +219,7 @@ class Heartbeat:
             except SupersededError:
                 self._superseded = True
             except Exception:  # the database may be locked or the disk full for a while: training continues
-                logger.exception("the progress could not be written")
+                logger.exception("could not store the progress")
             self._wake.wait(BEAT_S)
             self._wake.clear()
 
@@ -233,6 +233,6 @@ class Heartbeat:
     def _gets_on(self) -> bool:
         reason = self._progress.look()
         if reason is not None and not self._hangs:
-            logger.error("no signs of life are given any more: %s", reason)
+            logger.error("no more heartbeats are sent: %s", reason)
         self._hangs = reason is not None
         return not self._hangs

@@ -25,7 +25,7 @@ from service.runtime.process import Slot, training_process_options
 from service.storage.database import JobRow
 from service.storage.replicas import Replicas
 from service.storage.storage import Storage
-from service.training import lifecycle, worker
+from service.training import lifecycle, texts, worker
 from service.training.feed import JobEventStream
 from service.training.lifecycle import JobEnd, JobOutcome, JobStatus, Settler, WatchedJob, queue_again
 
@@ -105,19 +105,19 @@ class JobQueue:
         try:
             self._hand_back()
         except Exception:  # the next start finds them, as after a kill
-            logger.exception("running jobs could not be handed back")
+            logger.exception("could not queue the running jobs again")
         self.replicas.close()
 
     def _hand_back(self) -> None:
         with self.database.transaction() as session:
             for row in session.scalars(select(JobRow).where(JobRow.state == RUNNING)):
                 if self.replicas.is_mine(row.owner):
-                    lifecycle.hand_back(row, "the service was stopped while it ran")
+                    lifecycle.hand_back(row, texts.SERVICE_STOPPED)
 
     def _is_ready(self, row: JobRow) -> bool:
         if row.state == QUEUED and not row.cancel_requested:
             return True
-        return queue_again(row, "the service was killed while it ran", lifecycle.LIMITS.attempts)
+        return queue_again(row, texts.SERVICE_KILLED, lifecycle.LIMITS.attempts)
 
     # everything down to the clerk runs only in the watcher's thread
 
@@ -128,12 +128,12 @@ class JobQueue:
             except queue.Empty:
                 pass
             except Exception:
-                logger.exception("the queue of jobs goes on after an error")
+                logger.exception("error in the job queue, which continues")
             for step in (self._look, self._reconcile, self._hand_out):
                 try:
                     step()
                 except Exception:  # a database error: the next check may succeed
-                    logger.exception("the queue of jobs goes on after an error")
+                    logger.exception("error in the job queue, which continues")
 
     def _wait(self, job: str, ready: float = 0.0) -> None:
         self._waiting.setdefault(job, ready)
@@ -159,7 +159,7 @@ class JobQueue:
             try:
                 future = slot.start(worker.run, self.settings, job)
             except Exception as error:  # no memory, too many processes
-                self._pass_on(JobEnd(job, "ended", f"a training process could not be started: {error}"))
+                self._pass_on(JobEnd(job, "ended", texts.describe_start_failure(error)))
                 continue
             watched = WatchedJob(job, slot, future, clock)
             self._watched_jobs.append(watched)
@@ -205,11 +205,11 @@ class JobQueue:
         self._watched_jobs.remove(watched)
         error = watched.future.exception()
         if error is None:
-            self._pass_on(JobEnd(watched.job, "returned", "the training process gave it back"))
+            self._pass_on(JobEnd(watched.job, "returned", texts.RETURNED))
         elif isinstance(error, BrokenProcessPool):
             self._pass_on(JobEnd(watched.job, "ended", f"the training process {watched.slot.ending()}"))
         else:
-            self._pass_on(JobEnd(watched.job, "ended", f"the training process could not go on: {error}"))
+            self._pass_on(JobEnd(watched.job, "ended", texts.describe_process_failure(error)))
 
     def _pass_on(self, end: JobEnd) -> None:
         self._settling.add(end.job)
@@ -243,9 +243,9 @@ class JobQueue:
         `ours` is False if it was just taken over.
         """
         if not ours:
-            self._pass_on(JobEnd(row.id, "ended", "the service that had it run is gone"))
+            self._pass_on(JobEnd(row.id, "ended", texts.SERVICE_GONE))
         elif _age(row.heartbeat_at) > lifecycle.LIMITS.heartbeat_s:
-            self._pass_on(JobEnd(row.id, "ended", "no process runs it"))
+            self._pass_on(JobEnd(row.id, "ended", texts.NO_PROCESS))
 
     def _settled(self, job: str, outcome: JobOutcome) -> None:
         self._settling.discard(job)
@@ -267,7 +267,7 @@ class JobQueue:
                 try:
                     outcome = self._settler.settle(end)
                 except Exception:
-                    logger.exception("what becomes of %s could not be written: tried again", end.job)
+                    logger.exception("the outcome of %s could not be stored; retrying", end.job)
                     self._closing.wait(RETRY_S)
             if outcome is None:
                 return

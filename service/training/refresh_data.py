@@ -43,7 +43,7 @@ class Scope:
         if self.changed is not None:
             return "the robot has changed since"
         if datetime.fromisoformat(recorded.created_at).timestamp() < self.since:
-            return f"it is older than {MAX_AGE_FORGETTING_TIMES:g} forgetting times"
+            return f"it is older than {MAX_AGE_FORGETTING_TIMES:g} times the forgetting time"
         return None
 
 

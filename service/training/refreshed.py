@@ -29,6 +29,7 @@ from service.models.lineage import answer_of
 from service.storage import audit
 from service.storage.database import Database, LearningRow, VersionRow
 from service.storage.files import Files
+from service.training import texts
 from service.training.refresh_data import ComparisonRows
 
 
@@ -46,7 +47,7 @@ def compare(
     """Compare the judged fit of a refresh with the version that it refreshes, on rows that neither has learnt."""
     name = f"version {serving.version}"
     if rows is None or len(metrics.blocks(rows.samples)) < MIN_BLOCKS:
-        return RefreshComparison(Acceptance(unknown=(f"too few rows are logged to compare it with {name}",)), {})
+        return RefreshComparison(Acceptance(unknown=(texts.describe_too_few_logged(name),)), {})
     samples, key = rows.samples, (serving.model, serving.version)
     base = files.load_version(serving.folder, serving.checksums)
     known = restore(database, files, *key, base, rows.after)
@@ -61,10 +62,9 @@ def compare(
         "standard_error": float(found.standard_error[0]),
         "figures": {which: _figures(samples, answer) for which, answer in answers.items()},
     }
-    amount = f"negative log density {found.mean[0]:+.3g} ± {found.half_width[0]:.2g} nats a row"
     better = bool(found.significant[0] and found.mean[0] < 0)
-    said = (f"it predicts the newest logged rows {'' if better else 'no '}better than {name}: {amount}",)
-    return RefreshComparison(Acceptance(speaks_for=said) if better else Acceptance(against=said), evidence)
+    reason = (texts.describe_newest_rows(better, name, found.mean[0], found.half_width[0]),)
+    return RefreshComparison(Acceptance(speaks_for=reason) if better else Acceptance(against=reason), evidence)
 
 
 def promote(session: Session, model: str, version: int, judged: Promotion, evidence: dict[str, Any]) -> str:
@@ -78,17 +78,13 @@ def promote(session: Session, model: str, version: int, judged: Promotion, evide
     promoted = judged.answers and promotes and serving == judged.serving
     if promoted:
         registry.serve(session, model, version)
-        outcome = f"answers from now on: {judged.reason}"
-    elif judged.answers:
-        outcome = f"waits: {judged.reason}; a rollback to version {version} lets it answer"
-    else:
-        outcome = f"is dismissed: {judged.reason}"
+    outcome = texts.describe_refresh(version, judged.reason, judged.answers, promoted)
     verdict = "promote" if judged.answers else "dismiss"
     if not promoted:
         after = {"verdict": verdict, "serving": serving}
         audit.note(session, model, "candidate dismissed", version, after=after)
     named = {"serving": judged.serving, "candidate": version, "verdict": verdict, "promoted": promoted}
-    raise_alarm(session, model, "promotion", f"version {version} {outcome}", {**named, **evidence})
+    raise_alarm(session, model, "promotion", f"Version {version} {outcome}.", {**named, **evidence})
     return outcome
 
 

@@ -74,6 +74,6 @@ def _warnings(found: Repetition) -> list[str]:
         return []
     again = "" if found.period is None else f", which repeats every {found.period:.3g} s"
     return [
-        f"{floor(100 * found.share)} % of these samples repeat motion that was trained on{again}: the figures flatter. "
-        "Judge by a recording of other motion"
+        f"{floor(100 * found.share)} % of these samples repeat motion of the training{again}, so the figures are too "
+        "optimistic. Evaluate a recording of other motion."
     ]

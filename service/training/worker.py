@@ -30,7 +30,7 @@ from service.storage.database import Database, JobRow, VersionRow, now
 from service.storage.disk import Disk
 from service.storage.files import PATIENCE_S, Files
 from service.telemetry.logs import job_id
-from service.training import judging, lifecycle, promotion, refresh_data, refreshed
+from service.training import judging, lifecycle, promotion, refresh_data, refreshed, texts
 from service.training.holding_out import CannotHoldOutError
 from service.training.material import TrainingData, load_datasets, load_refresh_data
 from service.training.planned_fit import PlannedFit
@@ -88,7 +88,7 @@ def _claim(database: Database, job: str) -> Claim | None:
         if row is None or row.state != QUEUED:
             return None
         row.attempts += 1
-        lifecycle.enter(row, RUNNING, f"started: attempt {row.attempts} of at most {lifecycle.LIMITS.attempts}")
+        lifecycle.enter(row, RUNNING, texts.describe_started(row.attempts, lifecycle.LIMITS.attempts))
         row.started_at = row.heartbeat_at = now()
         row.progress = {"stage": "loading"}
         return Claim(job, row.attempts, row.model, row.request)
@@ -112,12 +112,12 @@ def _train(settings: Settings, database: Database, files: Files, claim: Claim) -
         with database.transaction() as session:
             row = _own(session, claim)
             if row.cancel_requested:
-                raise lipcore.FitCancelledError("cancelled after the last look at the flag")
+                raise lipcore.FitCancelledError("cancelled before the version was added")
             row.version, outcome = _publish(session, settings, claim, data, folder, manifest, judged)
             row.progress = {**heartbeat.as_json(), "stage": "done", "fraction": 1.0, "remaining_s": 0.0}
-            lifecycle.enter(row, SUCCEEDED, f"version {row.version} is trained{outcome}")
+            lifecycle.enter(row, SUCCEEDED, texts.describe_outcome(row.version, outcome))
     except lipcore.FitCancelledError:
-        _finish(database, files, claim, CANCELLED, "cancelled while it ran")
+        _finish(database, files, claim, CANCELLED, texts.CANCELLED_RUNNING)
     except SupersededError:
         logger.warning("%s was taken over by another attempt", claim.job)
     except Exception as error:
@@ -208,12 +208,12 @@ def _publish(
         version = registry.publish(session, claim.model, folder, manifest, claim.job, candidate=waits, promotion=judged)
         if waits:
             promotion.wait(session, claim.model, version)
-        return version, f" and {'waits as candidate' if waits else 'answers'}: {judged.reason}"
+        return version, texts.describe_promotion(judged.answers, judged.reason)
     if refresh_data.is_taken_back(session, claim.model, refresh["through"], data.seen):
-        raise TakenBackError("part of what was observed has been taken back while it was trained on: refresh again")
+        raise TakenBackError(texts.TAKEN_BACK)
     start, evidence = refresh["through"], manifest["lineage"]["refresh"]["evidence"]
     version = registry.publish(session, claim.model, folder, manifest, claim.job, True, start, judged)
-    return version, f" and {refreshed.promote(session, claim.model, version, judged, evidence)}"
+    return version, refreshed.promote(session, claim.model, version, judged, evidence)
 
 
 def _code(error: Exception) -> str:

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A torque loop of 1 kHz that uses a learnt model where that can be trusted, and its own torque where it cannot. With
-// `teach` it also teaches the model what was measured.
+// A torque loop at 1 kHz. It uses the torque of a learnt model if the model is certain, and its own torque otherwise.
+// With `teach`, the model also learns from measured torques.
 //     controller MODEL [CYCLES] [teach]
 //
-// Put your robot in the place of `Rehearsal`, and teach nothing but what its sensors measure. Nothing here stands between a wrong torque and your hardware: keep the
-// limits and the emergency stop of your controller. Run it with a real-time priority: chrt -f 80 controller …
+// Replace `Rehearsal` by your robot, and send only torques that its sensors measure. This example does not limit
+// torques: keep the limits and the emergency stop of your controller. Run it with real-time priority: chrt -f 80 …
 
 #include <sys/mman.h>
 
@@ -21,11 +21,11 @@ using lipserve::Status;
 
 constexpr unsigned joints = 7;
 constexpr std::int64_t period_ns = 1'000'000;
-constexpr double budget_s = 0.0005;  // of a cycle for the answer: what comes later is no use to this cycle
-constexpr double most_std = 1.0;     // N·m: a torque that the model knows less well is not used; choose it for your robot
+constexpr double budget_s = 0.0005;  // max time per cycle to wait for the answer
+constexpr double max_std = 1.0;      // N·m, max standard deviation of torques to use; choose it for your robot
 
-/// Stands in for a robot: it moves on sinusoids, its own torque is zero. It has no sensors: what it was told to exert
-/// stands in for their torque, and a model is not to learn that (the service keeps it out as `implausible`).
+/// Replacement of a robot: it moves on sinusoids and its own torque is zero. It has no sensors: `measured` is the
+/// commanded torque, which a model must not learn (the service rejects it as `implausible`).
 struct Rehearsal {
   double q[joints] = {}, dq[joints] = {}, ddq[joints] = {}, own[joints] = {}, measured[joints] = {};
 
@@ -42,9 +42,9 @@ struct Rehearsal {
   }
 };
 
-bool sure(const lipserve::Answer& answer) {
+bool is_certain(const lipserve::Answer& answer) {
   for (unsigned k = 0; k < joints; ++k)
-    if (answer.tau_std[k] > most_std) return false;
+    if (answer.tau_std[k] > max_std) return false;
   return !answer.late;
 }
 
@@ -53,7 +53,7 @@ bool sure(const lipserve::Answer& answer) {
 int main(int count, char** arguments) {
   if (count < 2) return std::fputs("usage: controller MODEL [CYCLES] [teach]\n", stderr), 2;
   const long cycles = count > 2 ? std::atol(arguments[2]) : 5000;
-  // a stream_id knows its sequences for good: one a run, unless the last sequence is kept over runs
+  // the service remembers the sequences of a stream_id: use a new one for each run, or store the last sequence
   const std::string run = "controller-" + std::to_string(std::time(nullptr));
   lipserve::Options options;
   options.model = arguments[1];
@@ -61,7 +61,8 @@ int main(int count, char** arguments) {
   const bool teaches = count > 3 && std::string(arguments[3]) == "teach";
   if (teaches) options.stream_id = run.c_str();
   lipserve::Client client(options);
-  if (mlockall(MCL_CURRENT | MCL_FUTURE) != 0) std::fputs("memory is not locked: it may be paged out\n", stderr);
+  if (mlockall(MCL_CURRENT | MCL_FUTURE) != 0)
+    std::fputs("warning: memory could not be locked and may be paged out\n", stderr);
   if (client.connect(Deadline::in(10.0)) != Status::ok) return std::fprintf(stderr, "%s\n", client.error().message), 1;
 
   Rehearsal robot;
@@ -71,27 +72,28 @@ int main(int count, char** arguments) {
   for (long cycle = 0; cycle < cycles; ++cycle) {
     robot.move(static_cast<double>(cycle) * 1e-3);
     const lipserve::Query query{robot.q, robot.dq, robot.ddq, teaches ? robot.measured : nullptr};
-    // first the torque that this cycle needs, then what it measured; neither waits for longer than the budget
+    // first request the torque of this cycle, then send the measured one; neither call waits longer than the budget
     const Status status = client.ask(query, answer, Deadline::in(budget_s));
-    const bool use = status == Status::ok && sure(answer);
+    const bool use = status == Status::ok && is_certain(answer);
     ++(use ? used : status == Status::ok ? unsure : missed);
     robot.command(use ? answer.tau : robot.own);
     if (teaches) kept += client.teach(query) == Status::ok;
 
     due += period_ns;
-    if (due < Deadline::now().ns) due = Deadline::now().ns;  // a cycle that took too long is not made up for
+    if (due < Deadline::now().ns) due = Deadline::now().ns;  // skip missed cycles
     const timespec moment{static_cast<time_t>(due / 1'000'000'000), static_cast<long>(due % 1'000'000'000)};
     clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &moment, nullptr);
   }
 
-  std::printf("%ld cycles: %ld answers used, %ld late or unsure, %ld missed\n", cycles, used, unsure, missed);
+  std::printf("%ld cycles: %ld answers used, %ld late or uncertain, %ld missed\n", cycles, used, unsure, missed);
   if (!teaches) return 0;
   client.flush(Deadline::in(10.0));
   const lipserve::Learnt& learnt = client.learnt();
-  std::printf("%ld torques taught: %llu learnt, %llu kept out, %llu refused, %zu torques not acknowledged\n", kept,
+  std::printf("%ld torques sent: %llu learnt, %llu rejected, %llu refused, %zu torques not acknowledged\n", kept,
               static_cast<unsigned long long>(learnt.accepted), static_cast<unsigned long long>(learnt.rejected),
               static_cast<unsigned long long>(learnt.refused), client.unsettled());
   if (learnt.rejected)
-    std::printf("why: lipserve alarms %s; lipserve learning batches %s --rejected\n", arguments[1], arguments[1]);
+    std::printf("for the reasons, run: lipserve alarms %s; lipserve learning batches %s --rejected\n", arguments[1],
+                arguments[1]);
   if (*client.error().code) std::printf("last error: %s\n", client.error().message);
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Counts what is allocated between two points, by whatever: operator new, malloc, and the C library. To be included by
-// one file of a program. Under AddressSanitizer by its hooks, else by standing in for glibc's malloc.
+// Counts allocations by operator new, malloc and the C library between two points. Include it in one file of a program.
+// It uses the hooks of AddressSanitizer, or else replaces glibc's malloc.
 
 #ifndef LIPSERVE_TESTS_ALLOCATIONS_HPP
 #define LIPSERVE_TESTS_ALLOCATIONS_HPP
@@ -14,7 +14,7 @@ namespace allocations {
 inline bool counting = false;
 inline unsigned long count = 0;
 
-/// Counts while it lives.
+/// Counts allocations during its lifetime.
 struct Watch {
   Watch() { counting = true; }
   ~Watch() { counting = false; }
@@ -50,13 +50,13 @@ void* realloc(void* old, std::size_t size) noexcept { return allocations::note()
 
 namespace allocations {
 
-/// Begin to count; false where that cannot be done here. To be called first.
+/// Start to count; return false if that is not possible on this system. Call it first.
 inline bool able() {
 #ifdef LIPSERVE_HOOKS
   __sanitizer_install_malloc_and_free_hooks([](const volatile void*, std::size_t) { note(); },
                                             [](const volatile void*) {});
 #endif
-  void* (*volatile allocate)(std::size_t) = std::malloc;  // no compiler knows that this is to no purpose
+  void* (*volatile allocate)(std::size_t) = std::malloc;  // volatile: the compiler must not remove the call
   {
     const Watch watch;
     std::free(allocate(100));

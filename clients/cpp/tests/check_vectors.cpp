@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Checks the header's parts against clients/stream-vectors.txt, and WebSocket messages however they are cut.
+// Checks the parts of the header against clients/stream-vectors.txt, and WebSocket messages in pieces of any size.
 //     check_vectors stream-vectors.txt
 
 #include <cstdio>
@@ -46,7 +46,7 @@ std::vector<double> numbers_of(const std::string& text) {
   return numbers;
 }
 
-/// Whether these are the same bits.
+/// Return whether two values have the same bits.
 bool same(const double* seen, const std::string& text) {
   const std::vector<double> expected = numbers_of(text);
   return seen && std::memcmp(seen, expected.data(), 8 * expected.size()) == 0;
@@ -150,7 +150,7 @@ void check_text(const std::string& name, const Fields& fields, const Bytes& byte
   }
 }
 
-/// A message of a server, which does not mask.
+/// Return an unmasked message of a server.
 Bytes plain(unsigned first, const Bytes& payload) {
   Bytes frame{static_cast<std::uint8_t>(first)};
   const std::size_t size = payload.size();
@@ -215,7 +215,7 @@ int check_vectors(const char* path) {
   return count;
 }
 
-/// Messages in one piece and in parts, with control frames between, read in steps of every size.
+/// Check whole and fragmented messages with control frames between them, read in pieces of any size.
 void check_inbox() {
   const Bytes small(5, 's'), middle(300, 'm'), large(70000, 'l');
   Bytes stream;

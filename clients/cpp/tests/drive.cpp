@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A client that does what it reads from its input, a line at a time, and answers each with a line of JSON:
+// Client for tests. It reads commands from standard input, one per line, and answers each with a line of JSON:
 //     connect SECONDS | ask ROW SECONDS [std|learn|external …] | teach FROM TO | flush SECONDS | tick | close | end
-//     loop CYCLES PERIOD_US BUDGET_US FIRST_ROW    asks and teaches in every cycle; says "cycle" in the middle
-//     loop-ask CYCLES PERIOD_US BUDGET_US FIRST_ROW    only asks
-// Its options are arguments, name=value; rows=FILE has rows of 4 · joints doubles: q, dq, ddq, tau; alarms=1: a signal
-// interrupts the client's system calls every 50 µs.
+//     loop CYCLES PERIOD_US BUDGET_US FIRST_ROW    calls `ask` and `teach` in every cycle; prints "cycle" in the middle
+//     loop-ask CYCLES PERIOD_US BUDGET_US FIRST_ROW    only calls `ask`
+// Options are arguments of the form name=value. rows=FILE: rows of 4 · joints doubles: q, dq, ddq, tau. alarms=1: a
+// signal interrupts the client's system calls every 50 µs.
 
 #include "allocations.hpp"
 
@@ -59,7 +59,7 @@ std::string list(const double* values, std::size_t count) {
   return out + "]";
 }
 
-/// Interrupts system calls while it lives, every 50 µs where there are alarms.
+/// Interrupts system calls during its lifetime, every 50 µs if alarms are enabled.
 class Alarms {
  public:
   static void allow() {

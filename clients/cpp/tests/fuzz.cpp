@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What a service sends, at random: to be compiled by Clang with -fsanitize=fuzzer,address,undefined.
+// Fuzzer of the messages of a service. Compile it with Clang and -fsanitize=fuzzer,address,undefined.
 
 #include <lipserve/client.hpp>
 #include <vector>
@@ -8,7 +8,7 @@
 namespace {
 
 namespace detail = lipserve::detail;
-using Bytes = std::vector<std::uint8_t>;  // of exactly the size that it has, so that a byte too many is noticed
+using Bytes = std::vector<std::uint8_t>;  // exact size, so that reads beyond the end are detected
 
 void read_messages(const std::uint8_t* data, std::size_t size) {
   Bytes buffer(64);

@@ -1,6 +1,13 @@
-"""Python client of LIPServe: asks a service for torques, teaches it, trains and manages its models.
+"""Python client of LIPServe: predicts torques, sends observations, trains and manages models.
 
-`LIPSERVE_URL` and `LIPSERVE_API_KEY` say which service is asked, with which key, where a client is told neither.
+The environment variables `LIPSERVE_URL` and `LIPSERVE_API_KEY` set the default address and API key.
+
+Example:
+    >>> from lipserve import Client
+    >>> with Client("http://127.0.0.1:8000") as client:
+    ...     answer = client.predict("panda-sim", [0.0] * 7, [0.0] * 7, [0.0] * 7)
+    >>> answer.tau.shape
+    (7,)
 """
 
 from __future__ import annotations
@@ -18,7 +25,7 @@ if TYPE_CHECKING:
     from lipserve.sync import Client
 
 __version__ = "0.2.0"
-"""Of the client and of the service: both distributions read it here."""
+"""Version of the client and of the service: both distributions read it here."""
 
 _HOMES = {
     "ApiError": "sending",
@@ -36,7 +43,7 @@ _HOMES = {
     "StreamError": "exchange",
     "Trace": "results.series",
 }
-"""Where each name is made: imported when it is asked for, as the service shares modules here and starts no client."""
+"""Module of each exported name. Names are imported on first use: the service imports modules of this package."""
 
 __all__ = [
     "ApiError",

@@ -1,4 +1,4 @@
-"""Where a service is, and the key that it is asked with: as a program says, else as its environment does."""
+"""Address and API key of a service, from arguments or from the environment."""
 
 from __future__ import annotations
 
@@ -7,45 +7,45 @@ from dataclasses import dataclass
 from pathlib import Path
 
 DEFAULT_URL = "http://127.0.0.1:8000"
-"""Where a service listens by default."""
+"""Default address of a service."""
 URL_VARIABLE = "LIPSERVE_URL"
-"""Environment variable that clients take the address from."""
+"""Environment variable with the address."""
 KEY_VARIABLE = "LIPSERVE_API_KEY"
-"""Environment variable that clients take the key from."""
+"""Environment variable with the API key."""
 UNIX = "unix://"
 NO_HOST = "http://localhost"
-"""What HTTP says the host is where a socket leads to the service."""
+"""Host in HTTP requests over a Unix-domain socket."""
 
 
 def url_of(url: str | None) -> str:
-    """The address of a service, where None or empty that of the environment, else of one on this machine."""
+    """Return the given address, else that of the environment, else the default."""
     return url or os.environ.get(URL_VARIABLE, "").strip() or DEFAULT_URL
 
 
 def headers_of(key: str | None) -> dict[str, str]:
-    """Headers of a client's requests with its key, where None the one of the environment, or none at all.
+    """Return the authorization header for the given key, else for that of the environment, else no header.
 
-    Raise ValueError, which does not repeat it, where it cannot be a key.
+    Raise ValueError for an invalid key; the message does not contain the key.
     """
     given = (os.environ.get(KEY_VARIABLE, "") if key is None else key).strip()
     if not given.isascii() or not given.isprintable() or " " in given:
-        raise ValueError(f"key (or {KEY_VARIABLE}) holds other characters than keys do, expected lip_…")
+        raise ValueError(f"key (or {KEY_VARIABLE}) has characters that are not allowed in an API key, expected lip_…")
     return {"Authorization": f"Bearer {given}"} if given else {}
 
 
 @dataclass(frozen=True)
 class Address:
-    """Where a service is. base: of its routes; unix: path of its Unix-domain socket, None where a host is named."""
+    """Address of a service. base: URL of its routes; unix: path of its Unix-domain socket, None for host and port."""
 
     base: str
     unix: Path | None
 
     @classmethod
     def of(cls, url: str) -> Address:
-        """Read http://host:port or unix:///path; raise ValueError."""
+        """Parse http://host:port or unix:///path; raise ValueError for a relative path."""
         if not url.startswith(UNIX):
             return cls(url, None)
         path = url.removeprefix(UNIX)
         if not path.startswith("/"):
-            raise ValueError(f"url is {url!r}, expected unix:// and an absolute path, as unix:///run/lipserve.sock")
+            raise ValueError(f"url is {url!r}, expected unix:// and an absolute path, e.g. unix:///run/lipserve.sock")
         return cls(NO_HOST, Path(path))

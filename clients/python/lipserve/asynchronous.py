@@ -1,4 +1,4 @@
-"""The client of programs that do something else meanwhile: the same calls, awaited."""
+"""Asynchronous client."""
 
 from __future__ import annotations
 
@@ -51,10 +51,15 @@ def _followed(make: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClient, P
 
 
 class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _followed}):
-    """Asynchronous client, for asyncio; use it as an asynchronous context manager or close it.
+    """Asynchronous client for asyncio. Use it as an asynchronous context manager, or close it.
 
-    Arguments and errors are those of `Client`, and so are the methods: they are awaited, lists and events are
-    asynchronous iterators.
+    Arguments, methods and errors are those of `Client`. Methods are awaited; lists and events are asynchronous
+    iterators.
+
+    Example:
+        >>> async def torque():
+        ...     async with AsyncClient() as client:
+        ...         return await client.predict("panda-sim", [0.0] * 7, [0.0] * 7, [0.0] * 7)
     """
 
     _http: httpx.AsyncClient
@@ -69,11 +74,11 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
         await self.close()
 
     async def close(self) -> None:
-        """Close the connections."""
+        """Close all connections."""
         await self._http.aclose()
 
     async def ready(self) -> bool:
-        """Whether the service can answer queries now."""
+        """Return whether the service can answer queries now."""
         try:
             await self.health()
         except (sending.ApiError, sending.ServiceUnreachableError):
@@ -83,7 +88,7 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
     async def wait(
         self, job: str | Job, on_progress: Callable[[Job], None] | None = None, *, progress: bool = False
     ) -> Job:
-        """Wait for a job's end, however it ends; on_progress is called with every look at it, progress: show a bar."""
+        """Wait until a job has ended, and return it; see `Client.wait`."""
         name = job if isinstance(job, str) else job.id
         with looking(on_progress, progress) as ended:
             while not ended(seen := await self.job(name)):
@@ -91,17 +96,19 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
         return seen
 
     async def set_learning(self, model: str, **options: Any) -> Learning:
-        """Set how a model learns; options of `LearningOptions` by name, those left out keep their values."""
+        """Set learning options of a model by name; others keep their values. Names: see `LearningOptions`."""
         known = await self.learning(model)
         return await self.put_learning(model, {**known.options.as_dict(), **options})
 
     def stream(self, model: str, **options: Any) -> AsyncStreamClient:
-        """A torque stream, to be opened with `async with`; options: those of `AsyncStreamClient` but for the address
-        and the key."""
+        """Return a torque stream; open it with `async with`.
+
+        Options: those of `AsyncStreamClient`, except address and key.
+        """
         return AsyncStreamClient(model, self._address.base, self._address.unix, key=self._key, **options)
 
     async def send(self, call: Call[T]) -> T:
-        """Make a call and return its result; repeat it where that is safe and helps."""
+        """Send a call and return its result; repeat it if that is safe and useful."""
         attempts = sending.Attempts(call, self._reach)
         while True:
             try:
@@ -115,7 +122,7 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
             await asyncio.sleep(pause)
 
     async def follow(self, call: Call[T]) -> AsyncIterator[T]:
-        """Make a call and yield what its server-sent events say, until the service ends them; as `Client.follow`."""
+        """Send a call and yield its server-sent events until the service ends them; see `Client.follow`."""
         attempts, begun = sending.Attempts(call, self._reach), False
         while not begun:
             try:
@@ -133,7 +140,7 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
                 await asyncio.sleep(pause)
 
     async def _exchange(self, call: Call[Any]) -> Answer:
-        """Make one attempt at a call."""
+        """Send a call once."""
         if call.save_to is not None:
             return await self._save(call, call.save_to)
         with sending.content_of(call) as content:
@@ -152,6 +159,6 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
 
 
 async def _awaited(content: Iterator[bytes]) -> AsyncIterator[bytes]:
-    """Pieces of a file, read in a thread: a disk may be slow."""
+    """Yield pieces of a file, read in a thread because a disk may be slow."""
     while (piece := await asyncio.to_thread(next, content, None)) is not None:
         yield piece

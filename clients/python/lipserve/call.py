@@ -1,6 +1,7 @@
-"""What a client asks and how it reads the answer, without any transport: each route of the API is one function.
+"""Requests of the API and how to read their answers, without transport.
 
-`route` makes such a function of one that says what goes into a request; `Client` and `AsyncClient` are made of them.
+The decorator `route` turns a function that fills in a request into a function that returns a `Call`. `Client` and
+`AsyncClient` turn these functions into methods.
 """
 
 from __future__ import annotations
@@ -26,13 +27,12 @@ T = TypeVar("T")
 R = TypeVar("R", bound=Record)
 
 ROUTES: dict[tuple[str, str], str] = {}
-"""(method, path as in the OpenAPI document) of every route that there is a call of, and the call's name."""
+"""Name of the call for each (method, path as in the OpenAPI document)."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What came back. body: of the whole answer, or the data of one server-sent event, whose kind is `event`; empty
-    where it was written to a file."""
+    """Answer of the service, or one server-sent event of kind `event`; body is empty if it was saved to a file."""
 
     status: int
     body: bytes
@@ -42,35 +42,37 @@ class Answer:
 
 @dataclass(frozen=True, kw_only=True)
 class Call(Generic[T]):
-    """One request, and `read`, which makes its result of the answer.
-
-    path: filled in and quoted; json: body as JSON; file: body as the bytes of a file; repeatable: whether it
-    may be sent again when its answer is lost; removes: repeated, it has succeeded where nothing is found any more;
-    timeout: longest wait for the answer in s, that of the client where None; save_to: file that the answer is written
-    to, whole or not at all; shown: what a progress bar says, none where None.
-    """
+    """One request, and `read`, which converts its answer to the result."""
 
     method: str
     path: str
+    """Path with quoted names."""
     read: Callable[[Answer], T]
     params: Mapping[str, Any] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     json: Any = None
+    """Body as JSON."""
     file: Path | None = None
+    """File that is the body."""
     repeatable: bool = False
+    """Whether the request may be sent again if its answer is lost."""
     removes: bool = False
+    """Whether 404 in a repeated request means success."""
     timeout: float | None = None
+    """Max time to wait for the answer, s; the client's if None."""
     save_to: Path | None = None
+    """File for the answer; it is written completely or not at all."""
     shown: str | None = None
+    """Text of a progress bar; None for no bar."""
 
     def after(self, cursor: str) -> Call[T]:
-        """The same call for the page after another one."""
+        """Return the same call for the page at a cursor."""
         return replace(self, params={**self.params, "cursor": cursor})
 
 
 @dataclass(frozen=True)
 class Page(Generic[T]):
-    """Part of a list. following: cursor of the next part, None on the last."""
+    """Page of a list. following: cursor of the next page, None on the last."""
 
     items: list[T]
     following: str | None
@@ -78,15 +80,20 @@ class Page(Generic[T]):
 
 @dataclass(frozen=True)
 class Route:
-    """A method and the paths it goes to: of several the one whose names in braces are given."""
+    """HTTP method and path of a route; of several paths, the one whose names in braces are all given is used."""
 
     method: str
     paths: tuple[str, ...]
     repeatable: bool
 
     def __call__(self, read: Callable[[Answer], T], *, names: Mapping[str, Any], **asked: Any) -> Call[T]:
-        """Make the call. names: what stands for the names in braces, None where a name is not given; asked: see `Call`,
-        `params` that are None are left out."""
+        """Return the call.
+
+        Args:
+            read: Converts the answer to the result.
+            names: Values of the names in braces; None if a name is not given.
+            **asked: Other fields of `Call`. `params` that are None are omitted.
+        """
         given = {name: str(value) for name, value in names.items() if value is not None}
         path = next(path for path in self.paths if set(_NAMES.findall(path)) == set(given))
         filled = path.format_map({name: quote(value, safe="") for name, value in given.items()})
@@ -102,9 +109,12 @@ _NAMES = re.compile(r"{(\w+)}")
 def route(
     method: str, *paths: str, repeatable: bool | None = None
 ) -> Callable[[Callable[Concatenate[Route, P], Call[T]]], Callable[P, Call[T]]]:
-    """Make a call of a function that is given its route first.
+    """Decorate a function of a `Route` and arguments, so that it returns the call for these arguments.
 
-    repeatable: whether it may be sent again when its answer is lost; where None, what is no POST may.
+    Args:
+        method: HTTP method.
+        *paths: Paths with names in braces.
+        repeatable: Whether the request may be sent again if its answer is lost. Default: all but POST.
     """
     at = Route(method, paths, method != "POST" if repeatable is None else repeatable)
 
@@ -115,7 +125,7 @@ def route(
 
         signature = inspect.signature(make)
         _, *rest = signature.parameters.values()
-        made.__signature__ = signature.replace(parameters=rest)  # type: ignore[attr-defined]  # what `help` shows
+        made.__signature__ = signature.replace(parameters=rest)  # type: ignore[attr-defined]  # shown by `help`
         for path in paths:
             ROUTES[method, path] = make.__name__
         return made
@@ -132,22 +142,22 @@ class _Listed(msgspec.Struct, Generic[T]):
 
 
 def decoder(kind: type[T], hook: Callable[[Any, Any], Any] | None = None) -> msgspec.json.Decoder[T]:
-    """What decodes JSON as a type. hook: as `dec_hook` of msgspec, for what msgspec does not know.
+    """Return a decoder of JSON as a type. hook: `dec_hook` of msgspec, for types that msgspec does not know.
 
-    Made by one thread at a time: two that are the first to use a type of msgspec at once can end the process (SIGSEGV).
+    A lock serialises this: if two threads are the first to use a type of msgspec, the process can crash (SIGSEGV).
     """
     with _making:
         return msgspec.json.Decoder(kind, dec_hook=hook)
 
 
 def record(kind: type[R]) -> Callable[[Answer], R]:
-    """Read a record of the API."""
+    """Return a function that reads a record of the API."""
     decode = decoder(kind).decode
     return lambda answer: decode(answer.body)
 
 
 def page(kind: type[R]) -> Callable[[Answer], Page[R]]:
-    """Read one page of a list of records."""
+    """Return a function that reads one page of a list of records."""
     decode = decoder(_Listed[kind]).decode  # type: ignore[valid-type]
 
     def read(answer: Answer) -> Page[R]:
@@ -158,16 +168,16 @@ def page(kind: type[R]) -> Callable[[Answer], Page[R]]:
 
 
 def document(answer: Answer) -> Any:
-    """Read JSON as it is."""
+    """Read an answer as plain JSON."""
     return json.loads(answer.body)
 
 
 def nothing(answer: Answer) -> None:
-    """Read an answer that says nothing."""
+    """Read an empty answer."""
 
 
 def given(**values: Any) -> dict[str, Any]:
-    """Those of the values that are not None."""
+    """Return the values that are not None."""
     return {name: value for name, value in values.items() if value is not None}
 
 
@@ -175,9 +185,9 @@ _RESULT = re.compile(r"Call\[(?:Page\[(?P<item>.+)\]|(?P<one>.+))\]")
 
 
 def bound(method: Callable[P, T], result: str = "{}") -> Callable[P, T]:
-    """Give a function that wraps a call's the signature of a method, and return it.
+    """Give a wrapper of a call function the signature of a method, for `help`, and return it.
 
-    result: what it returns, with {} for what the call makes or its page lists.
+    result: its return annotation, with {} for the call's result or the item of its page.
     """
     own = inspect.signature(method)
     itself = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
@@ -194,5 +204,5 @@ KEY_HEADER = "Idempotency-Key"
 
 
 def new_key() -> str:
-    """A key that no other request has."""
+    """Return a new unique idempotency key."""
     return token_hex(16)

@@ -1,4 +1,4 @@
-"""What a client of torque streams sends and reads, without any transport."""
+"""Frames and messages of torque streams, without transport."""
 
 from __future__ import annotations
 
@@ -34,10 +34,20 @@ from lipserve.frames import (
 
 
 class StreamError(RuntimeError):
-    """The service refused a connection or a frame, or is gone.
+    """The service rejected a stream or a frame, or is not reachable.
 
-    code: as the service says, else `unreachable`, `closed`, `timeout` or `layout`; detail: its problems; sequence: of
-    the frame that was refused, None where it could not be read.
+    Attributes:
+        message: Text for people.
+        code: Error code of the service, or `unreachable`, `closed`, `timeout` or `layout`.
+        detail: Problems, with field, value and expected.
+        sequence: Sequence of the rejected frame; None if it is unknown or the whole stream failed.
+
+    Example:
+        >>> try:
+        ...     answer = stream.predict(q, dq, ddq, deadline=0.001)
+        ... except StreamError as error:
+        ...     print(error.code)
+        timeout
     """
 
     def __init__(
@@ -49,7 +59,10 @@ class StreamError(RuntimeError):
 
 @dataclass(frozen=True)
 class StreamHello:
-    """What holds for all answers of a version. noise_std: (n,) N·m, of the measurement around the function."""
+    """Description of the version that answers.
+
+    noise_std: (n,) standard deviation of a measurement around the predicted torque, N·m.
+    """
 
     model: str
     version: int
@@ -62,22 +75,25 @@ class StreamHello:
 
 @dataclass(frozen=True, slots=True)
 class StreamExternal:
-    """What of a measured torque the model does not explain: a touch, a payload, or an error of model or sensor. Not a
-    safety function.
+    """External torque: measured torque that the model does not explain.
 
-    tau: (n,) measured − mean, N·m; std: (n,) standard deviation of that where nothing touches the arm; z: (n,) tau /
-    std; statistic: T of the arm as one, χ² with n degrees of freedom then; p: its probability to be larger than T.
+    Its cause may be contact, a payload, or an error of model or sensor. This is not a safety function.
     """
 
     tau: NDArray[np.float64]
+    """(n,) measured − predicted torque, N·m."""
     std: NDArray[np.float64]
+    """(n,) standard deviation of `tau` without external torque, N·m."""
     z: NDArray[np.float64]
+    """(n,) tau / std."""
     statistic: float
+    """T of the whole arm; without external torque it has a χ² distribution with n degrees of freedom."""
     p: float
+    """P(χ² > T)."""
 
 
 class StreamPayload(NamedTuple):
-    """Mass that a stream's robot carries, kg; both NaN where it carries nothing as far as is known."""
+    """Estimated mass of a stream's payload and its standard deviation, kg; both NaN without a payload."""
 
     mass: float
     std: float
@@ -85,48 +101,54 @@ class StreamPayload(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class StreamAnswer:
-    """Torque at one motion, N·m.
-
-    tau: (n,) mean; tau_std: (n,) standard deviation of the function, where asked for; late: whether more than the
-    deadline has passed from sending the query to having its answer, by this client's clock; late_answers: how many of
-    this connection have been late, this one included; seconds: from the arrival of the frame in the service to the
-    departure of the answer; scale: (n,) factor on the half width of intervals that hold measurements, external: torque
-    that is not explained, payload: what the arm carries, where asked for; fallback: whether some joint's torque went
-    back to gravity, offset and friction, or to the training's mean, because the training does not determine it at this
-    motion.
-    """
+    """Predicted torque at one motion. Fields that were not requested are None."""
 
     sequence: int
+    """Sequence of the query."""
     tau: NDArray[np.float64]
+    """(n,) mean, N·m (prismatic: N)."""
     tau_std: NDArray[np.float64] | None
+    """(n,) standard deviation of the predicted torque, without measurement noise."""
     version: int
+    """Version that answered."""
     revision: int
+    """Revision that answered."""
     late: bool
+    """Whether the answer came after the deadline, by this client's clock."""
     late_answers: int
+    """Number of late answers of this connection, including this one."""
     seconds: float
+    """Time from the arrival of the frame in the service to the departure of the answer, s."""
     scale: NDArray[np.float64] | None = None
+    """(n,) factor on the half width of intervals."""
     external: StreamExternal | None = None
+    """External torque."""
     payload: StreamPayload | None = None
+    """Estimated payload."""
     fallback: bool = False
+    """Whether the training data do not determine some joint's torque at this motion.
+
+    That torque is then gravity, offset and friction only, or the mean of the training data.
+    """
 
 
 @dataclass(frozen=True)
 class StreamLearnt:
-    """What has become of the torques that a client sent; all of it is durable.
-
-    through: the last sequence that is settled, one less than the client's first where none is; accepted: how many are
-    new and learnt from; duplicates: were known before; rejected: kept out of learning, by code; revision: answers of it
-    and above contain them.
-    """
+    """Acknowledged torques of a stream; all of them are durable."""
 
     through: int
+    """Last sequence that is acknowledged or refused; before the first, the client's first sequence − 1."""
     accepted: int = 0
+    """Number of torques that are new and learnt from."""
     duplicates: int = 0
+    """Number of torques that were logged before."""
     rejected: dict[str, int] = field(default_factory=dict)
+    """Number of torques that are not learnt from, by code."""
     revision: int = 0
+    """Answers of this revision and later ones include these torques."""
 
     def and_more(self, message: dict[str, Any]) -> StreamLearnt:
-        """Return the totals after one more message of the service."""
+        """Return the totals after another message of the service."""
         rejected = dict(Counter(self.rejected) + Counter(message["rejected"]))
         return StreamLearnt(
             through=message["through"],
@@ -139,7 +161,7 @@ class StreamLearnt:
 
 @dataclass(frozen=True)
 class StreamRefusal:
-    """Torques that the service could not log: those with sequences first to through. code, message, detail: why."""
+    """Torques with sequences `first` to `through` that the service could not log, and the reason."""
 
     first: int
     through: int
@@ -149,16 +171,20 @@ class StreamRefusal:
 
 
 def read_hello(message: dict[str, Any]) -> StreamHello:
-    """Read what holds for all answers; raise StreamError where frames have another layout than this client's."""
+    """Read the first message of a stream; raise StreamError if this client does not support its frame layout."""
     if message["layout"] != LAYOUT:
-        raise StreamError(f"the service's frames have layout {message['layout']}, this client knows {LAYOUT}", "layout")
+        raise StreamError(
+            f"the service uses frame layout {message['layout']}; this client supports {LAYOUT}: install the client of "
+            "the service's release",
+            "layout",
+        )
     known = {each.name: message[each.name] for each in fields(StreamHello)}
     known |= {"joint_names": tuple(message["joint_names"]), "noise_std": np.array(message["noise_std"])}
     return StreamHello(**known)
 
 
 def read_answer(data: bytes) -> StreamAnswer | StreamError:
-    """Read an answer frame, or the error that is in its place."""
+    """Read an answer frame, or the error in its place."""
     sequence, flags, n, version, late, revision, seconds = ANSWER.unpack_from(data)
     if flags & ERROR:
         error = json.loads(data[ANSWER.size :])["error"]
@@ -183,11 +209,11 @@ def read_answer(data: bytes) -> StreamAnswer | StreamError:
 SEQUENCES = 1 << 32
 WHY = ("code", "message", "detail")
 _REFUSALS = 1000
-"""Refusals kept: a robot that goes on where nothing is learnt must not fill the memory."""
+"""Max number of refusals kept, to limit memory if the service refuses for a long time."""
 
 
 class Destination(NamedTuple):
-    """Where a stream goes: its address as a WebSocket's, and host and port of it."""
+    """WebSocket address of a stream, with its host and port."""
 
     address: str
     host: str
@@ -195,7 +221,7 @@ class Destination(NamedTuple):
 
 
 def destination(url: str, model: str, **query: int | str | None) -> Destination:
-    """Where the stream of a model is, of a service at http://host:port; query: what of it is not None."""
+    """Return the destination of a model's stream at http://host:port. query: None values are omitted."""
     parts = urlsplit(url)
     secure = parts.scheme in ("https", "wss")
     asked = urlencode({name: value for name, value in query.items() if value is not None})
@@ -205,10 +231,19 @@ def destination(url: str, model: str, **query: int | str | None) -> Destination:
 
 
 class Exchange:
-    """One stream's state. stream_id: whether torques may be sent; first_sequence: of the first frame.
+    """State of one stream.
 
-    hello: what the service said of the version that answers, None before it has; answers: those that nobody has taken;
-    unsettled: sequences of torques that are neither acknowledged nor refused; learnt, refusals: see `StreamClient`.
+    Args:
+        stream_id: Stream that sent torques belong to, None if none are learnt.
+        first_sequence: Sequence of the first frame.
+
+    Attributes:
+        hello: Description of the version that answers, None until it has been received.
+        answers: Received answers that were not returned yet.
+        unsettled: Sequences of torques that are neither acknowledged nor refused.
+        learnt: Acknowledged torques.
+        refusals: Torques that could not be logged.
+        late_answers: Number of late answers.
     """
 
     def __init__(self, stream_id: str | None, first_sequence: int) -> None:
@@ -221,7 +256,7 @@ class Exchange:
         self.learnt = StreamLearnt(first_sequence - 1)
         self.refusals: deque[StreamRefusal] = deque(maxlen=_REFUSALS)
         self.late_answers = 0
-        self._due: dict[int, float] = {}  # by this client's clock, of queries with a deadline that have no answer
+        self._due: dict[int, float] = {}  # deadlines of open queries, by `monotonic`
 
     def frame(
         self,
@@ -242,11 +277,10 @@ class Exchange:
             shapes = ", ".join(str(part.shape) for part in parts)
             raise ValueError(f"{names} have the shapes {shapes}, expected (n,) each")
         if external and tau is None:
-            raise ValueError("tau is missing, expected the torque measured at this motion, to tell what is external")
+            raise ValueError("`external` requires `tau`, the torque measured at this motion")
         learn = learn and tau is not None and self._stream_id is not None
         if tau is not None and not learn and not external:
-            source = "a client with stream_id, the name of what it was measured on, and learn"
-            raise ValueError(f"tau is given, expected {source}, or external")
+            raise ValueError("`tau` has no effect: to learn from it, set `stream_id` of the client, or set `external`")
         flags = (ASK_STD if std else 0) | (ASK_LEARN if learn else 0) | (ASK_EXTERNAL if external else 0)
         self._sequence = (self._sequence + 1) % SEQUENCES
         if learn:
@@ -257,12 +291,12 @@ class Exchange:
         return self._sequence, b"".join((header, *(part.tobytes() for part in parts)))
 
     def take(self, data: str | bytes) -> None:
-        """Keep what the service said; raise StreamError where it speaks another layout."""
+        """Process a message of the service; raise StreamError if its frame layout is not supported."""
         if isinstance(data, bytes):
             answer = self._timed(read_answer(data))
             self.answers.append(answer)
             if isinstance(answer, StreamError) and answer.sequence is not None:
-                with suppress(ValueError):  # a frame without torque
+                with suppress(ValueError):  # the frame had no torque
                     self.unsettled.remove(answer.sequence)
             return
         message = json.loads(data)
@@ -279,7 +313,7 @@ class Exchange:
             self.hello = read_hello(message)
 
     def _timed(self, answer: StreamAnswer | StreamError) -> StreamAnswer | StreamError:
-        """The answer, late or not by this client's clock."""
+        """Return the answer, marked as late or not by this client's clock."""
         due = None if answer.sequence is None else self._due.pop(answer.sequence, None)
         if due is None or isinstance(answer, StreamError):
             return answer
@@ -288,12 +322,12 @@ class Exchange:
         return replace(answer, late=late, late_answers=self.late_answers)
 
     def given_up(self, sequence: int) -> None:
-        """Count an answer as late that has not come; it is not counted again where it comes after all."""
+        """Count a missing answer as late; if it arrives later, it is not counted again."""
         if self._due.pop(sequence, None) is not None:
             self.late_answers += 1
 
     def answer(self) -> StreamAnswer:
-        """Take the oldest answer; raise what is in its place where the query was refused."""
+        """Remove and return the oldest answer; raise StreamError if its query was rejected."""
         answer = self.answers.popleft()
         if isinstance(answer, StreamError):
             raise answer
@@ -305,49 +339,49 @@ class Exchange:
 
 
 class StreamSide:
-    """What every client of a stream tells of it. _exchange: its state."""
+    """State of a stream that both stream clients expose."""
 
     _exchange: Exchange
 
     @property
     def hello(self) -> StreamHello:
-        """What the service said of the version that answers, so far as it has been read."""
+        """Description of the version that answers, as last received."""
         assert self._exchange.hello is not None, "the stream is not open: use `async with`"
         return self._exchange.hello
 
     @property
     def learnt(self) -> StreamLearnt:
-        """What the service has acknowledged of the torques sent over this connection, so far as it has been read."""
+        """Acknowledged torques of this connection, as last received."""
         return self._exchange.learnt
 
     @property
     def refusals(self) -> tuple[StreamRefusal, ...]:
-        """The last 1000 times that the service could not log torques, so far as it has been read."""
+        """Last 1000 refusals to log torques, as received so far."""
         return tuple(self._exchange.refusals)
 
 
 def refused(status: int, body: bytes | bytearray | None) -> StreamError:
-    """The error of a connection that could not be had."""
+    """Return the error for a stream that the service refused to open."""
     try:
         error: dict[str, Any] = json.loads(body or b"")["error"]
         return StreamError(error["message"], error["code"], error["detail"])
     except (ValueError, KeyError, TypeError):
-        return StreamError(f"the service refused the stream with status {status}", "refused")
+        return StreamError(f"the service refused the stream with HTTP status {status}", "refused")
 
 
 def closed(error: ConnectionClosed) -> StreamError:
-    """The error of a connection that has ended."""
+    """Return the error for a closed connection."""
     if error.rcvd is None:
-        return StreamError("the connection is lost", "closed")
+        return StreamError("the connection was lost", "closed")
     return StreamError(f"the service closed the stream: {error.rcvd.reason or error.rcvd.code}", "closed")
 
 
 def unanswered(timeout: float) -> StreamError:
-    """The error of an answer that has not come in time."""
+    """Return the error for a missing answer."""
     return StreamError(f"no answer within {timeout:g} s", "timeout")
 
 
 def unsettled(count: int, timeout: float) -> StreamError:
-    """The error of torques of which nothing was heard in time."""
-    message = f"{count} torques are neither acknowledged nor refused within {timeout:g} s"
+    """Return the error for torques that were not acknowledged in time."""
+    message = f"{count} torques were neither acknowledged nor refused within {timeout:g} s"
     return StreamError(message, "timeout")

@@ -1,4 +1,4 @@
-"""Kinds of files that can be uploaded."""
+"""File types that can be uploaded."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ MEDIA_TYPES = {
     "application/x-mcap": "mcap",
     "application/zip": "zip",
 }
-"""Kind of a file by its media type. A zip is a directory of LeRobot or of a rosbag2, or tables of text to be joined."""
+"""File type by media type. A zip holds a LeRobot or rosbag2 directory, or text tables to be joined."""
 SUFFIXES = {
     ".csv": "csv",
     ".tsv": "csv",
@@ -29,7 +29,7 @@ SUFFIXES = {
     ".mcap": "mcap",
     ".zip": "zip",
 }
-"""Kind of a file by the ending of its name."""
+"""File type by suffix."""
 _FIRST = {kind: media_type for media_type, kind in reversed(MEDIA_TYPES.items())}
 MEDIA_TYPE_OF = {suffix: _FIRST[kind] for suffix, kind in SUFFIXES.items()}
-"""Media type by the ending of a file's name, for clients."""
+"""Media type by suffix, for clients."""

@@ -1,4 +1,4 @@
-"""What both clients have: a method for every call, what is known of the service, looks at a job."""
+"""Base of both clients: a method for every call, connection settings, waiting for jobs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ POLL_SECONDS = 0.3
 
 
 class One(Generic[P, T]):
-    """A call as a method that returns its result; of `AsyncClient` it is awaited."""
+    """Method that returns the result of a call; in `AsyncClient` it is awaited."""
 
     def __init__(self, make: Callable[P, Call[T]]) -> None:
         self.make = make
@@ -34,7 +34,7 @@ class One(Generic[P, T]):
     @overload
     def __get__(self, client: AsyncClient, owner: Any = None) -> Callable[P, Coroutine[Any, Any, T]]: ...
     def __get__(self, client: Any, owner: Any = None) -> Any:
-        """For types: `Calls` puts functions in the place of these."""
+        """Declare the type only: `Calls` replaces these objects by functions."""
         raise NotImplementedError
 
 
@@ -44,28 +44,28 @@ class _Many(Generic[P, T]):
     @overload
     def __get__(self, client: AsyncClient, owner: Any = None) -> Callable[P, AsyncIterator[T]]: ...
     def __get__(self, client: Any, owner: Any = None) -> Any:
-        """For types, as that of `One`."""
+        """Declare the type only, as in `One`."""
         raise NotImplementedError
 
 
 class Listed(_Many[P, T]):
-    """A call as a method that yields the items of all pages, each page when it is needed."""
+    """Method that yields the items of all pages; pages are requested when they are needed."""
 
     def __init__(self, make: Callable[P, Call[Page[T]]]) -> None:
         self.make = make
 
 
 class Followed(_Many[P, T]):
-    """A call as a method that yields its server-sent events."""
+    """Method that yields the server-sent events of a call."""
 
     def __init__(self, make: Callable[P, Call[T]]) -> None:
         self.make = make
 
 
 class Calls:
-    """The methods that clients have of calls.
+    """Base class of clients; its members become methods of a subclass, made by the subclass's `makers`.
 
-    url, timeout, key, retries: see `Client`. makers: of a client, what makes its methods, by kind.
+    Arguments: see `Client`.
     """
 
     def __init_subclass__(cls, makers: dict[type, Callable[[Any], Any]]) -> None:
@@ -83,7 +83,7 @@ class Calls:
         self._http = self._connected(uds, base_url=self._address.base, timeout=timeout, headers=headers_of(key))
 
     def _connected(self, uds: str | None, **options: Any) -> Any:
-        """A client of httpx; uds: path of a Unix-domain socket, None where a host is named."""
+        """Return a client of httpx. uds: path of a Unix-domain socket, None for host and port."""
         raise NotImplementedError
 
     upload = One(calls.datasets.upload)
@@ -159,11 +159,11 @@ class Calls:
 
 @contextmanager
 def looking(on_progress: Callable[[Job], None] | None, progress: bool) -> Iterator[Callable[[Job], bool]]:
-    """What takes every look at a job, shows it to whoever asks for that, and tells whether the job has ended."""
+    """Yield a function that reports a job's state to callback and progress bar, and returns whether it has ended."""
     with ExitStack() as stack:
         looks = [] if on_progress is None else [on_progress]
         if progress:
-            from lipserve.progress import job_bar  # noqa: PLC0415 - rich, for those who look
+            from lipserve.progress import job_bar  # noqa: PLC0415 - Rich is optional
 
             looks.append(stack.enter_context(job_bar()))
 

@@ -1,4 +1,4 @@
-"""Progress of uploads and training jobs in a terminal."""
+"""Progress bars of uploads and training jobs."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ try:
     from rich.console import Console
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeElapsedColumn, TransferSpeedColumn
 except ModuleNotFoundError as error:
-    raise ModuleNotFoundError("bars need Rich: pip install 'lipserve-client[progress]'", name=error.name) from error
+    raise ModuleNotFoundError(
+        "Progress bars need Rich: pip install 'lipserve-client[progress]'", name=error.name
+    ) from error
 
 from lipserve.records.jobs import Job
 from lipserve.states import ACTIVE
 from lipserve.wording import percent
 
-if TYPE_CHECKING:  # which shows its progress with this
+if TYPE_CHECKING:  # avoids a circular import
     from lipserve.sync import Client
 
 PLAIN_EVERY = 5.0
-"""Seconds between two lines where the console is no terminal."""
+"""Time between two lines if the console is not a terminal, s."""
 
 
 @contextmanager
 def job_bar(console: Console | None = None) -> Iterator[Callable[[Job], None]]:
-    """A bar, to be called with every look at a job; lines every five seconds where the console is no terminal.
+    """Yield a function that shows the progress of a job: as a bar, or without a terminal as lines every five seconds.
 
-    console: that of standard error where None.
+    console: default is standard error.
     """
     console = console or Console(stderr=True)
     columns = (
@@ -47,7 +49,7 @@ def job_bar(console: Console | None = None) -> Iterator[Callable[[Job], None]]:
             text = f"{at.stage} {at.iteration}/{at.max_iterations}{objective}" if at.iteration else at.stage
             text = text if at.estimator is None else f"{at.estimator}: {text}"
             if at.remaining_s:
-                text += f", at most about {at.remaining_s:.0f} s left"
+                text += f", about {at.remaining_s:.0f} s left at most"
             bar.update(task, description=text, completed=at.fraction)
             if not console.is_terminal and (at.elapsed_s - printed >= PLAIN_EVERY or seen.state not in ACTIVE):
                 printed = at.elapsed_s
@@ -60,9 +62,9 @@ def job_bar(console: Console | None = None) -> Iterator[Callable[[Job], None]]:
 def upload_bar(
     text: str, size: int, console: Console | None = None
 ) -> Iterator[Callable[[Iterator[bytes]], Iterator[bytes]]]:
-    """A bar that shows how much of `size` bytes has passed the iterator that it is wrapped around.
+    """Yield a wrapper of an iterator of bytes that shows how much of `size` bytes has passed.
 
-    When all has been sent, the service still has to read and prepare it: the bar says so.
+    After the last piece, the bar says that the service is reading the file.
     """
     console = console or Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn())
@@ -73,7 +75,7 @@ def upload_bar(
             for piece in content:
                 yield piece
                 bar.update(task, advance=len(piece))
-            bar.update(task, description=f"{text}: sent, being read")
+            bar.update(task, description=f"{text}: sent, service is reading it")
 
         yield passed
 
@@ -84,6 +86,6 @@ def follow(client: Client, job: Job, console: Console) -> Job:
         with job_bar(console) as show:
             return client.wait(job.id, show)
     except KeyboardInterrupt:
-        console.print("cancelling…")
+        console.print("cancelling …")
         client.cancel(job.id)
         return client.wait(job.id)

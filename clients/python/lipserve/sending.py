@@ -1,8 +1,7 @@
-"""What both clients share of sending a call: errors, requests, files, server-sent events, attempts.
+"""Sending of calls, shared by both clients: errors, requests, files, server-sent events, retries.
 
-A lost connection, and answers 429 and 503 that say when to come back, are no reason to give up at once; but only for
-calls that do the same however often they arrive. A service that has answered this client before is waited for while it
-starts again; one that never has is told to be missing at once.
+A call is repeated after a lost connection, and after 429 or 503 with Retry-After, but only if repetition is safe. If
+the service has answered this client before, the client waits for its restart; otherwise it fails at once.
 """
 
 from __future__ import annotations
@@ -24,14 +23,32 @@ from lipserve.call import Answer, Call, T
 
 
 class ServiceUnreachableError(ConnectionError):
-    """No service answers at the address, or the connection to it was lost."""
+    """No service answers at the address, or the connection was lost.
+
+    Example:
+        >>> try:
+        ...     Client("http://127.0.0.1:9", retries=0).health()
+        ... except ServiceUnreachableError as error:
+        ...     print(error)
+    """
 
 
 class ApiError(RuntimeError):
-    """The service refused a request, or answered it as another release does: code `unreadable_answer`.
+    """The service rejected a request, or its answer cannot be read by this release (code `unreadable_answer`).
 
-    status: of HTTP; code, message, detail: as the service says; retry_after: seconds after which it may be tried again,
-    where the service says so.
+    Attributes:
+        status: HTTP status.
+        code: Error code of the service.
+        message: Text for people.
+        detail: Problems, with field, value and expected.
+        retry_after: Time to wait before a retry, s; None if the service does not say.
+
+    Example:
+        >>> try:
+        ...     client.model("nobody")
+        ... except ApiError as error:
+        ...     print(error.status, error.code)
+        404 not_found
     """
 
     def __init__(
@@ -42,7 +59,7 @@ class ApiError(RuntimeError):
 
 
 def refused(status: int, body: bytes, retry_after: float | None = None) -> ApiError:
-    """The error that an answer tells."""
+    """Return the error that an answer describes."""
     try:
         error = json.loads(body)["error"]
         if isinstance(error, str):  # below /v2
@@ -53,23 +70,23 @@ def refused(status: int, body: bytes, retry_after: float | None = None) -> ApiEr
 
 
 def result_of(call: Call[T], answer: Answer) -> T:
-    """Return what an answer or a server-sent event says; raise ApiError if this release cannot read it."""
+    """Return the result of an answer or a server-sent event; raise ApiError if this release cannot read it."""
     try:
         return call.read(answer)
     except msgspec.DecodeError as error:
         message = (
-            f"The answer to {call.method} {call.path} cannot be read: {error}. "
-            f"Use the client of the service's release; this is {__version__}."
+            f"The answer to {call.method} {call.path} could not be read: {error}. "
+            f"Install the client of the service's release; this is {__version__}."
         )
         raise ApiError(answer.status, "unreadable_answer", message, []) from error
 
 
 CHUNK = 1 << 18
-"""Bytes of a file that are sent together."""
+"""Bytes of a file sent at once."""
 
 
 def request_of(call: Call[Any]) -> dict[str, Any]:
-    """How httpx is to be asked, but for the content of a file."""
+    """Return the arguments of httpx for a call, without the content of a file."""
     asked: dict[str, Any] = {"method": call.method, "url": call.path, "params": call.params, "headers": call.headers}
     if call.json is not None:
         asked["json"] = call.json
@@ -79,13 +96,13 @@ def request_of(call: Call[Any]) -> dict[str, Any]:
 
 
 def answer_of(response: httpx.Response, body: bytes = b"") -> Answer:
-    """What came back; body: empty where it was written to a file."""
+    """Return the answer in a response. body: empty if it was saved to a file."""
     return Answer(response.status_code, body, response.headers)
 
 
 @contextmanager
 def content_of(call: Call[Any]) -> Iterator[Iterator[bytes] | None]:
-    """The file that a call sends, in pieces, with a bar where that is to be shown; None where it sends none."""
+    """Yield the pieces of the file that a call sends, with a progress bar if requested; None without a file."""
     if call.file is None:
         yield None
         return
@@ -93,7 +110,7 @@ def content_of(call: Call[Any]) -> Iterator[Iterator[bytes] | None]:
         file = stack.enter_context(call.file.open("rb"))
         content: Iterator[bytes] = iter(partial(file.read, CHUNK), b"")
         if call.shown is not None:
-            from lipserve.progress import upload_bar  # noqa: PLC0415 - rich, for those who look
+            from lipserve.progress import upload_bar  # noqa: PLC0415 - Rich is optional
 
             content = stack.enter_context(upload_bar(call.shown, call.file.stat().st_size))(content)
         yield content
@@ -101,7 +118,7 @@ def content_of(call: Call[Any]) -> Iterator[Iterator[bytes] | None]:
 
 @contextmanager
 def drafted(path: Path) -> Iterator[BinaryIO]:
-    """A file to be written in the block, which is there once it is whole, or not at all."""
+    """Yield a temporary file that replaces `path` if the block succeeds."""
     draft = path.with_name(f"{path.name}.part")
     try:
         with draft.open("wb") as file:
@@ -112,13 +129,13 @@ def drafted(path: Path) -> Iterator[BinaryIO]:
 
 
 class Events:
-    """Server-sent events of the lines of an answer."""
+    """Parser of server-sent events."""
 
     def __init__(self) -> None:
         self._event, self._data = "", list[str]()
 
     def take(self, line: str) -> Answer | None:
-        """Take a line, without its end; return the event that it completes, None where it completes none."""
+        """Add a line without its end; return the event if the line completes one."""
         if line.startswith("event:"):
             self._event = line.removeprefix("event:").strip()
         elif line.startswith("data:"):
@@ -127,21 +144,20 @@ class Events:
             event = Answer(200, "\n".join(self._data).encode(), event=self._event) if self._data else None
             self._event, self._data = "", []
             return event
-        return None  # comments keep the connection alive
+        return None  # comment lines only keep the connection alive
 
 
 RETRIES = 6
-"""Most times that a call is repeated: with these pauses a service may take three to six seconds to start again."""
-FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.1, 10.0
-"""Pauses double from the first on; a service that asks for more than the longest is not waited for."""
+"""Max number of repetitions: with these pauses a service has three to six seconds to restart."""
+FIRST_PAUSE_S, MAX_PAUSE_S = 0.1, 10.0
+"""Pauses double, starting with the first. If the service asks for more than the max, the call fails."""
 LATER = (429, 503)
 NOT_FOUND = 404
 
 
 @dataclass
 class Reach:
-    """What is known of a service. url: as people name it; retries: most repetitions of a call; reached: whether it has
-    answered since the client was made."""
+    """State of the connection to a service. reached: whether it has answered this client."""
 
     url: str
     retries: int = RETRIES
@@ -149,7 +165,7 @@ class Reach:
 
 
 class Attempts:
-    """The attempts at one call."""
+    """Attempts to send one call."""
 
     def __init__(self, call: Call[Any], reach: Reach) -> None:
         self._call, self._reach = call, reach
@@ -157,26 +173,28 @@ class Attempts:
         self._lost = False
 
     def lost(self, error: httpx.TransportError, begun: bool = False) -> float:
-        """Return after how many seconds to try again; raise ServiceUnreachableError where that is no use.
+        """Return the pause before the next attempt, s; raise ServiceUnreachableError if there is none.
 
-        What takes too long is not asked again: that would only add to the load. begun: events had come already.
+        Calls that time out are not repeated, because this would add load. begun: whether events had arrived.
         """
         if begun:
-            raise ServiceUnreachableError(f"the service at {self._reach.url} is lost ({error})") from error
+            raise ServiceUnreachableError(
+                f"the connection to the service at {self._reach.url} was lost ({error})"
+            ) from error
         timed_out = isinstance(error, httpx.TimeoutException)
         unknown = isinstance(error, httpx.ConnectError) and not self._reach.reached
         if not self._call.repeatable or timed_out or unknown or self._made >= self._reach.retries:
-            what = "takes longer than it may" if timed_out else f"({error})"
+            cause = "timeout" if timed_out else error
             raise ServiceUnreachableError(
-                f"no service answers at {self._reach.url} {what}: start one with `lipserve serve`"
+                f"no service answers at {self._reach.url} ({cause}): start one with `lipserve serve`"
                 if not self._reach.reached
-                else f"the service at {self._reach.url} does not answer any more {what}"
+                else f"the service at {self._reach.url} does not answer any more ({cause})"
             ) from error
         self._lost = True
         return self._pause()
 
     def answered(self, answer: Answer) -> float | None:
-        """Return after how many seconds to try again, None where this is the answer; raise ApiError."""
+        """Return the pause before the next attempt, s, or None if the answer is final; raise ApiError."""
         self._reach.reached = True
         if answer.status < 400:
             return None
@@ -184,14 +202,14 @@ class Attempts:
             return None  # removed by the attempt whose answer was lost
         after = _retry_after(answer.headers)
         patient = self._call.repeatable and self._made < self._reach.retries
-        if answer.status in LATER and patient and after is not None and after <= LONGEST_PAUSE_S:
+        if answer.status in LATER and patient and after is not None and after <= MAX_PAUSE_S:
             return max(after, self._pause())
         raise refused(answer.status, answer.body, after)
 
     def _pause(self) -> float:
-        """Twice as long each time, and never the same: many clients lose a service at once."""
+        """Return a pause that doubles each time, with a random part so that clients do not retry together."""
         self._made += 1
-        longest = min(FIRST_PAUSE_S * 2.0 ** (self._made - 1), LONGEST_PAUSE_S)
+        longest = min(FIRST_PAUSE_S * 2.0 ** (self._made - 1), MAX_PAUSE_S)
         return longest * random.uniform(0.5, 1.0)  # noqa: S311 - no secret
 
 

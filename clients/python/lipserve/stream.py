@@ -1,4 +1,4 @@
-"""Clients of torque streams, for controllers on the same host or network: one that waits, and one that is awaited."""
+"""Synchronous and asynchronous clients of torque streams, for controllers on the same host or network."""
 
 from __future__ import annotations
 
@@ -47,12 +47,12 @@ __all__ = [
 
 
 PATIENCE_S = 10.0
-"""Shortest that this wait may be, s: a control loop's `timeout` may be shorter."""
-ASK_WARNING = "{0}.ask is called predict since 0.3. Use {0}.predict: 0.4 removes ask."
+"""Min timeout for opening and flushing a stream, s; a control loop's `timeout` may be shorter."""
+ASK_WARNING = "{0}.ask is deprecated since 0.3 and will be removed in 0.4. Use {0}.predict."
 
 
 class _Stream(StreamSide):
-    """What both clients do alike; arguments: see `StreamClient`."""
+    """Common part of both stream clients. Arguments: see `StreamClient`."""
 
     def __init__(
         self,
@@ -86,15 +86,15 @@ class _Stream(StreamSide):
 
     @property
     def _patience(self) -> float:
-        """Longest wait for a connection and for acknowledgements, in s."""
+        """Max time to wait for a connection and for acknowledgements, s."""
         return max(PATIENCE_S, self.timeout)
 
     def _begin(self) -> None:
-        """Open the stream where making a client does so."""
+        """Open the stream, if the constructor of the client does so."""
 
     @contextmanager
     def _opening(self) -> Iterator[None]:
-        """Raise StreamError for what keeps the block from connecting."""
+        """Convert connection errors in the block to StreamError."""
         try:
             yield
         except InvalidStatus as error:
@@ -102,21 +102,21 @@ class _Stream(StreamSide):
         except (OSError, InvalidHandshake) as error:
             raise StreamError(f"no service answers at {self._unix or self._url}: {error}", "unreachable") from error
 
-    _last: StreamAnswer | None = None  # that came in time
+    _last: StreamAnswer | None = None  # last answer in time
 
     def _until(self, deadline: float) -> float:
-        """Until when an answer is waited for, by `monotonic`."""
+        """Return when to stop waiting for an answer, by `monotonic`."""
         return monotonic() + (deadline or self.timeout)
 
     def _in_time(self, answer: StreamAnswer) -> StreamAnswer:
-        """The answer, or the last one that came in time."""
+        """Return the answer, or the last one in time if it is late."""
         if not answer.late:
             self._last = answer
             return answer
         return answer if self._last is None else self._held()
 
     def _late(self, sequence: int, deadline: float, error: StreamError) -> StreamAnswer:
-        """What is answered in the place of an answer that has not come by its deadline."""
+        """Return the last answer in time, instead of one that missed its deadline; raise StreamError without one."""
         if error.code != "timeout":
             raise error
         self._exchange.given_up(sequence)
@@ -129,7 +129,7 @@ class _Stream(StreamSide):
         return replace(self._last, late=True, late_answers=self._exchange.late_answers)
 
     def _answer_to(self, sequence: int) -> StreamAnswer | None:
-        """The answer to a query if it has come, those before it dropped; raise StreamError where it was refused."""
+        """Return the answer to a query if it has arrived, dropping earlier ones; raise StreamError if rejected."""
         while self._exchange.answers:
             try:
                 answer = self._exchange.answer()
@@ -143,15 +143,30 @@ class _Stream(StreamSide):
 
 
 class StreamClient(_Stream):
-    """One stream; use it as a context manager or close it. Not to be shared between threads.
+    """Synchronous torque stream. Use it as a context manager, or close it. Do not share it between threads.
 
-    model: its name; url, key: as of `Client`; unix: path of the service's Unix-domain socket, instead of host and port
-    of the address; version: pins one, alias: follows what that points to, else the version that serves answers;
-    timeout: longest wait for an answer without a deadline, in s; stream_id: name of the source of the torques
-    that are sent to learn from, None where only answers are wanted; first_sequence: of the first frame: to send frames
-    again after a lost connection, take the first of them above `learnt.through`; scale, payload: whether answers carry
-    the factor on the half width of their intervals, and what the arm carries.
-    Raise StreamError where the service cannot be reached or refuses.
+    Args:
+        model: Name of the model.
+        url: As in `Client`.
+        unix: Path of the service's Unix-domain socket, instead of host and port.
+        version: Version number. Default: the serving version, also if it changes.
+        timeout: Max time to wait for an answer without a deadline, s.
+        stream_id: Name of the robot or recording, to let the model learn from sent torques. Default: do not learn.
+        first_sequence: Sequence of the first frame. To send torques again after a lost connection, start with the
+            first sequence above that of `learnt`.
+        alias: Alias of the version, instead of its number; followed if it moves.
+        key: As in `Client`.
+        scale: Request the factor on the half width of intervals with every answer.
+        payload: Request the estimated payload with every answer.
+
+    Raises:
+        StreamError: The service cannot be reached or refuses the stream.
+
+    Example:
+        >>> with StreamClient("panda-sim") as stream:
+        ...     answer = stream.predict([0.0] * 7, [0.0] * 7, [0.0] * 7)
+        >>> answer.tau.shape
+        (7,)
     """
 
     def _begin(self) -> None:
@@ -183,14 +198,29 @@ class StreamClient(_Stream):
         external: bool = False,
         learn: bool = True,
     ) -> StreamAnswer:
-        """Return the torque at one motion: q, dq, ddq of shape (n,) in SI units.
+        """Predict the torque at one motion.
 
-        deadline: seconds from this call on after which it returns the last answer that came in time, with its own
-        sequence, as `late`; 0 for none, then it waits for `timeout`. tau: (n,) N·m, the torque measured there, to be
-        learnt from after the answer where the client has a stream_id, unless learn is false; external: whether to
-        answer how much of tau the model does not explain.
-        Raise StreamError where the service refuses the motion (the stream goes on), is gone, or does not answer in time
-        (code `timeout`) and no answer has come in time before. One that comes after all is dropped by the next call.
+        If the deadline passes, the call returns the last answer that came in time, marked as `late` and with its own
+        sequence. The next call drops the answer that arrives too late.
+
+        Args:
+            q: (n,) positions, rad (prismatic: m).
+            dq: (n,) velocities, rad/s.
+            ddq: (n,) accelerations, rad/s².
+            std: Request the standard deviation.
+            deadline: Max time for this call, s; 0: wait for `timeout`.
+            tau: (n,) torque measured at this motion, N·m. The model learns from it after the answer, if the client
+                has a stream_id and learn is True.
+            external: Request the external torque, i.e. the part of tau that the model does not explain.
+            learn: Whether the model may learn from tau.
+
+        Returns:
+            The answer.
+
+        Raises:
+            ValueError: The arguments have wrong shapes or do not fit together.
+            StreamError: The service rejects the motion (the stream stays open), is not reachable, or does not answer
+                in time (code `timeout`) and no earlier answer came in time.
         """
         end = self._until(deadline)
         sequence = self.send(q, dq, ddq, std, deadline, tau, external, learn)
@@ -217,7 +247,7 @@ class StreamClient(_Stream):
         external: bool = False,
         learn: bool = True,
     ) -> int:
-        """Send one query, with torque or without, and return its sequence; `receive` has its answer."""
+        """Send a query and return its sequence. Arguments: see `predict`; `receive` returns the answer."""
         sequence, frame = self._exchange.frame(q, dq, ddq, std, deadline, tau, external, learn)
         try:
             self._socket.send(frame)
@@ -226,16 +256,21 @@ class StreamClient(_Stream):
         return sequence
 
     def receive(self) -> StreamAnswer:
-        """Return the answer to the oldest query without one; raise StreamError where it was refused."""
+        """Return the answer to the oldest open query; raise StreamError if the query was rejected."""
         while not self._exchange.answers:
             self._take(self.timeout)
         return self._exchange.answer()
 
     def flush(self, timeout: float | None = None) -> StreamLearnt:
-        """Wait until every torque sent is acknowledged or refused, and return what has become of them.
+        """Wait until all sent torques are acknowledged or refused, and return the totals.
 
-        timeout: longest wait in s, 10 where None. Answers that come meanwhile wait for `receive`.
-        Raise StreamError where it takes longer, or the service is gone.
+        Answers that arrive meanwhile are kept for `receive`.
+
+        Args:
+            timeout: Max time to wait, s. Default: 10 s, or the client's timeout if that is longer.
+
+        Raises:
+            StreamError: It takes longer, or the service is not reachable.
         """
         timeout = self._patience if timeout is None else timeout
         end = monotonic() + timeout
@@ -249,7 +284,7 @@ class StreamClient(_Stream):
         return self._exchange.learnt
 
     def _take(self, timeout: float) -> None:
-        """Read one message."""
+        """Receive and process one message."""
         try:
             message = self._socket.recv(timeout)
         except TimeoutError as error:
@@ -258,15 +293,20 @@ class StreamClient(_Stream):
             raise closed(error) from error
         try:
             self._exchange.take(message)
-        except StreamError:  # of a layout that this client cannot read
+        except StreamError:  # unsupported frame layout
             self.close()
             raise
 
 
 class AsyncStreamClient(_Stream):
-    """One stream, open while `async with` lasts. Not to be shared between tasks.
+    """Asynchronous torque stream; open it with `async with`. Do not share it between tasks.
 
     Arguments, methods and errors are those of `StreamClient`; methods that wait are awaited.
+
+    Example:
+        >>> async def torque():
+        ...     async with AsyncStreamClient("panda-sim") as stream:
+        ...         return await stream.predict([0.0] * 7, [0.0] * 7, [0.0] * 7)
     """
 
     _connection: awaited.ClientConnection | None = None
@@ -275,7 +315,7 @@ class AsyncStreamClient(_Stream):
         address = self._destination.address
         with self._opening():
             if self._unix is None:
-                # the proxy that an environment may name is not for controllers
+                # ignore proxy settings of the environment: they are not meant for controllers
                 self._connection = await awaited.connect(address, proxy=None, **self._options)
             else:
                 self._connection = await awaited.unix_connect(str(self._unix), address, **self._options)
@@ -305,8 +345,10 @@ class AsyncStreamClient(_Stream):
         external: bool = False,
         learn: bool = True,
     ) -> StreamAnswer:
-        """Return the torque at one motion; see `StreamClient.predict`. Where the task is cancelled meanwhile, the
-        answer is dropped by the next call."""
+        """Predict the torque at one motion; see `StreamClient.predict`.
+
+        If the task is cancelled, the next call drops the answer.
+        """
         end = self._until(deadline)
         sequence = await self.send(q, dq, ddq, std, deadline, tau, external, learn)
         while (answer := self._answer_to(sequence)) is None:
@@ -332,7 +374,7 @@ class AsyncStreamClient(_Stream):
         external: bool = False,
         learn: bool = True,
     ) -> int:
-        """Send one query, with torque or without, and return its sequence; `receive` has its answer."""
+        """Send a query and return its sequence. Arguments: see `predict`; `receive` returns the answer."""
         sequence, frame = self._exchange.frame(q, dq, ddq, std, deadline, tau, external, learn)
         try:
             await self._open().send(frame)
@@ -341,13 +383,13 @@ class AsyncStreamClient(_Stream):
         return sequence
 
     async def receive(self) -> StreamAnswer:
-        """Return the answer to the oldest query without one; raise StreamError where it was refused."""
+        """Return the answer to the oldest open query; raise StreamError if the query was rejected."""
         while not self._exchange.answers:
             await self._take(self.timeout)
         return self._exchange.answer()
 
     async def flush(self, timeout: float | None = None) -> StreamLearnt:
-        """Wait until every torque sent is acknowledged or refused; see `StreamClient.flush`."""
+        """Wait until all sent torques are acknowledged or refused; see `StreamClient.flush`."""
         timeout = self._patience if timeout is None else timeout
         try:
             async with asyncio.timeout(timeout):
@@ -358,7 +400,7 @@ class AsyncStreamClient(_Stream):
         return self._exchange.learnt
 
     async def _take(self, timeout: float | None) -> None:
-        """Read one message."""
+        """Receive and process one message."""
         try:
             async with asyncio.timeout(timeout):
                 message = await self._open().recv()
@@ -376,7 +418,7 @@ class AsyncStreamClient(_Stream):
 
 
 def _connect(host: str, port: int, unix: Path | None, timeout: float) -> socket.socket:
-    """Open a connection without Nagle's delay, and without the proxy that a controller's environment may name."""
+    """Open a connection without Nagle's delay; ignore proxy settings of the environment."""
     if unix is not None:
         made = socket.socket(socket.AF_UNIX)
         try:

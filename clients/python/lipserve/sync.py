@@ -1,4 +1,4 @@
-"""The client of programs that wait for what they ask."""
+"""Synchronous client."""
 
 from __future__ import annotations
 
@@ -50,14 +50,27 @@ def _followed(make: Callable[P, Call[T]]) -> Callable[Concatenate[Client, P], It
 
 
 class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
-    """Synchronous client; use it as a context manager or close it. Threads may share it.
+    """Synchronous client. Use it as a context manager, or close it. Threads may share it.
 
-    url: http://host:port, or unix:///path of the service's Unix-domain socket, where None that of the environment
-    variable LIPSERVE_URL, else http://127.0.0.1:8000; timeout: longest wait for an answer, s; key: API key, that of the
-    environment variable LIPSERVE_API_KEY where None; retries: most repetitions of a call that may be repeated, where
-    the connection is lost or the service asks to come back; uploads and jobs carry an identity, so that a repetition
-    does not do them twice.
-    Methods raise ServiceUnreachableError where no service answers, ApiError where it refuses.
+    Calls are repeated automatically if the connection is lost or the service asks to retry, but only if this is safe.
+    Uploads and jobs carry an idempotency key, so a repetition does not run them twice.
+
+    Args:
+        url: http://host:port, or unix:///path of a Unix-domain socket. Default: the environment variable
+            LIPSERVE_URL, else http://127.0.0.1:8000.
+        timeout: Max time to wait for an answer, s.
+        key: API key. Default: the environment variable LIPSERVE_API_KEY.
+        retries: Max number of repetitions of a call.
+
+    Raises:
+        ServiceUnreachableError: By all methods, if the service does not answer.
+        ApiError: By all methods, if the service rejects the request.
+
+    Example:
+        >>> with Client("http://127.0.0.1:8000") as client:
+        ...     answer = client.predict("panda-sim", [0.0] * 7, [0.0] * 7, [0.0] * 7)
+        >>> answer.tau.shape, answer.tau_std.shape
+        ((7,), (7,))
     """
 
     _http: httpx.Client
@@ -72,11 +85,11 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
         self.close()
 
     def close(self) -> None:
-        """Close the connections."""
+        """Close all connections."""
         self._http.close()
 
     def ready(self) -> bool:
-        """Whether the service can answer queries now."""
+        """Return whether the service can answer queries now."""
         try:
             self.health()
         except (sending.ApiError, sending.ServiceUnreachableError):
@@ -84,7 +97,15 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
         return True
 
     def wait(self, job: str | Job, on_progress: Callable[[Job], None] | None = None, *, progress: bool = False) -> Job:
-        """Wait for a job's end, however it ends; on_progress is called with every look at it, progress: show a bar."""
+        """Wait until a job has ended, and return it.
+
+        The job may have succeeded, failed or been cancelled: check its `state`.
+
+        Args:
+            job: The job or its id.
+            on_progress: Called with the job each time it is requested.
+            progress: Show a progress bar (needs the extra `progress`).
+        """
         name = job if isinstance(job, str) else job.id
         with looking(on_progress, progress) as ended:
             while not ended(seen := self.job(name)):
@@ -92,15 +113,15 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
         return seen
 
     def set_learning(self, model: str, **options: Any) -> Learning:
-        """Set how a model learns; options of `LearningOptions` by name, those left out keep their values."""
+        """Set learning options of a model by name; others keep their values. Names: see `LearningOptions`."""
         return self.put_learning(model, {**self.learning(model).options.as_dict(), **options})
 
     def stream(self, model: str, **options: Any) -> StreamClient:
-        """Open a torque stream; options: those of `StreamClient` but for the address and the key."""
+        """Open a torque stream. Options: those of `StreamClient`, except address and key."""
         return StreamClient(model, self._address.base, self._address.unix, key=self._key, **options)
 
     def send(self, call: Call[T]) -> T:
-        """Make a call and return its result; repeat it where that is safe and helps."""
+        """Send a call and return its result; repeat it if that is safe and useful."""
         attempts = sending.Attempts(call, self._reach)
         while True:
             try:
@@ -114,10 +135,10 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
             time.sleep(pause)
 
     def follow(self, call: Call[T]) -> Iterator[T]:
-        """Make a call and yield what its server-sent events say, until the service ends them.
+        """Send a call and yield its server-sent events until the service ends them.
 
-        The start is repeated as that of any other call; where the connection is lost later, ServiceUnreachableError
-        is raised: ask again then.
+        The start is repeated like other calls. If the connection is lost later, ServiceUnreachableError is raised:
+        call again then.
         """
         attempts, begun = sending.Attempts(call, self._reach), False
         while not begun:
@@ -137,7 +158,7 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
                 time.sleep(pause)
 
     def _exchange(self, call: Call[Any]) -> Answer:
-        """Make one attempt at a call."""
+        """Send a call once."""
         if call.save_to is not None:
             return self._save(call, call.save_to)
         with sending.content_of(call) as content:

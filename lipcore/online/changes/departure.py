@@ -76,8 +76,10 @@ class Departure:
         return Departure(version, False, *(np.zeros(n) for _ in ARRAY_FIELDS))
 
     def step(self, time: Array, weight: Array, error: Array, std: Array, noise_std: Array) -> Departure:
-        """Add rows. time: (N,) s; weight: (N,) effective rows; error: tau − mean, (N, n); std: (N, n); noise_std: (n,),
-        all N·m."""
+        """Add rows.
+
+        time: (N,) s; weight: (N,) effective rows; error: tau − mean, (N, n); std: (N, n); noise_std: (n,), all N·m.
+        """
         if self.retired or not len(time):
             return self
         spread = np.sqrt(std**2 + noise_std**2)
@@ -125,8 +127,7 @@ class Departure:
         return float(self.since[list(self.joints)].min())
 
     def evidence(self, joint_names: Sequence[str]) -> dict[str, Any]:
-        """Return the evidence for JSON: the trained version, and per alarmed joint the mean error in its stated
-        standard deviations."""
+        """Return the evidence for JSON: the version, and each alarmed joint's mean error in stated deviations."""
         drift = {joint_names[joint]: float(self.drift[joint]) for joint in self.joints}
         return {"cause": "drift against the trained version", "trained": {"version": self.version, "drift": drift}}
 

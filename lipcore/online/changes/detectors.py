@@ -83,8 +83,9 @@ class Change:
     errors have not grown, but the model has left the trained version (`lipcore.online.changes.departure`)."""
 
     def evidence(self, joint_names: Sequence[str], friction: Array | None = None) -> dict[str, Any]:
-        """Return the evidence of the change for JSON. friction: `friction_share` of the innovations after it, which is
-        added.
+        """Return the evidence of the change for JSON.
+
+        friction: `friction_share` of the innovations after it, which is added.
 
         Per joint: nmse, rmse (N·m), standardised (mean of e²/s², 1 if intervals are right) and innovation (mean of e,
         N·m), each before and after; None if unknown.
@@ -273,8 +274,7 @@ def friction_share(dq: Array, error: Array) -> Array:
 
 
 def suspect(friction: Array, joints: tuple[int, ...]) -> str:
-    """Return what a change looks like: `friction` if that explains the median alarmed joint, or `payload or
-    contact`."""
+    """Return the likely cause: `friction` if that explains the median alarmed joint, else `payload or contact`."""
     return "friction" if np.median(friction[list(joints)]) > FRICTION_SHARE else "payload or contact"
 
 
@@ -293,8 +293,7 @@ def _variation(buckets: Sequence[Bucket]) -> Array:
 
 
 def _mean(buckets: Sequence[Bucket]) -> Array:
-    """Return the standardised errors of all rows of the buckets. It skips the rest of their sum, as it runs twice a
-    second."""
+    """Return the standardised errors of all rows of the buckets, and no other sum, as it runs twice a second."""
     rows = [bucket.record.rows for bucket in buckets]
     return np.asarray(np.average([bucket.record.standardised for bucket in buckets], axis=0, weights=rows))
 

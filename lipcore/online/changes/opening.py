@@ -92,7 +92,7 @@ class Opening:
         per_joint = dict(zip(joint_names, self.coverage.tolist(), strict=True))
         return {
             "kind": "opening",
-            "cause": "the stream's first second lies outside the band",
+            "cause": "coverage of the stream's first second is too low",
             "coverage": float(self.coverage.mean()),
             "joint_coverage": per_joint,
         }

@@ -74,8 +74,10 @@ def eta_of(carried: Body) -> Array:
 def most_likely(
     information: Array, pull: Array, prior: PayloadPrior, start: Array
 ) -> tuple[Array, Array, Array, float]:
-    """Return η that minimises ½ πᵀ Λ π − ξᵀ π + prior; its covariance, the derivative of π there, and the evidence
-    gained, nats. information: Λ; pull: ξ."""
+    """Return η that minimises ½ πᵀ Λ π − ξᵀ π + prior; its covariance, dπ/dη and the evidence gained, nats.
+
+    information: Λ; pull: ξ.
+    """
 
     def cost(eta: Array) -> float:
         payload, off = body(eta)[0], eta - prior.centre
@@ -111,8 +113,7 @@ def inverse(matrix: Array) -> Array:
 
 
 def typical_torque(features: Array) -> float:
-    """Return the torque of a payload of 1.5 kg on the joint that it loads most, N·m. features: of its parameters, (10,
-    n)."""
+    """Return the torque of a payload of 1.5 kg on its most loaded joint, N·m. features: of its parameters, (10, n)."""
     return float(np.sqrt(((features * (1.5 * UNIT_BODY)[:, None]) ** 2).sum(axis=0).max()))
 
 

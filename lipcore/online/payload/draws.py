@@ -94,13 +94,15 @@ class Draw:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """An arm with its energy. residual: of the energy; misfit: mean square of the rows' part; differentiate: returns
-    the derivative of the residual by whitened steps, which most points do not need."""
+    """An arm with its energy."""
 
     place: ArmWithPayload
     residual: Array
+    """Of the energy."""
     misfit: float
+    """Mean square of the rows' part."""
     differentiate: Callable[[], Array]
+    """Return the derivative of the residual by whitened steps, which most points do not need."""
 
     @cached_property
     def derivative(self) -> Array:

@@ -107,16 +107,20 @@ class TrackedPayload:
 
     @staticmethod
     def from_other_version(values: Mapping[str, Any], since: float, carrier: Carrier) -> TrackedPayload:
-        """Return the payload that another version wrote with `to_json`. The last link of each version has its own
-        frame: the payload has this mass and lies nearby. Rows determine where."""
+        """Return the payload that another version wrote with `to_json`.
+
+        The last link of each version has its own frame: the payload has this mass and lies nearby. Rows tell where.
+        """
         covariance = np.array(values["covariance"]) + np.diag(FRAME_STD**2)
         prior, nothing = PayloadPrior(np.array(values["eta"]), inverse(covariance)), no_rows(carrier.model.n_joints)
         return TrackedPayload(since, False, nothing, nothing, 1, 0, 1.0, prior, estimate_from_prior(carrier, prior))
 
     @staticmethod
     def from_json(values: Mapping[str, Any], since: float, carrier: Carrier, rows: Rows | None) -> TrackedPayload:
-        """Read what `to_json` returned. rows: with the payload, in order of event time. Without them its correlation
-        with the arm is lost, and later rows determine it."""
+        """Read what `to_json` returned. rows: with the payload, in order of event time.
+
+        Without rows its correlation with the arm is lost, and later rows determine it.
+        """
         count, nothing = int(values["rows"]), no_rows(carrier.model.n_joints)
         eta, covariance = np.array(values["eta"]), np.array(values["covariance"])
         if rows is None:
@@ -157,8 +161,7 @@ class TrackedPayload:
         return replace(held, due=OPTIONS.growth * count, estimate=moved)
 
     def refinement(self, carrier: Carrier) -> Generator[None, None, TrackedPayload] | None:
-        """Return a generator of the payload with a refined estimate, step by step; None if that would change
-        nothing."""
+        """Return a generator that refines the payload's estimate step by step; None if that would change nothing."""
         if not carrier.is_nonlinear or self.declared or not len(self.rows):
             return None
         # a posterior that was nearly linear remains so with more rows

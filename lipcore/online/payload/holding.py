@@ -1,5 +1,4 @@
-"""Track the payload of one stream row by row: notice it, estimate it, notice that it was put down, accept a
-declaration."""
+"""Track the payload of one stream row by row: pick-up, estimate, put-down, and declaration by a user."""
 
 from __future__ import annotations
 
@@ -203,8 +202,7 @@ class PayloadTracker:
         return self if self.unsettled is not None else replace(self, unsettled=at)
 
     def _pick_up(self, carrier: Carrier, after: int, every: int = 1) -> PayloadTracker:
-        """Return the tracker with the payload that the last `after` cells show. every: one of so many cells was
-        compared."""
+        """Return the tracker with the payload that the last `after` cells show; one of `every` cells was compared."""
         rows, before = Rows.concatenate(self.recent[-after:]), no_rows(self.n)
         if self.held is None and len(self.recent) > after:  # rows before must be free of any payload
             before = Rows.concatenate(self.recent[:-after][-every * WINDOW.before :])
@@ -248,8 +246,7 @@ class PayloadTracker:
         return replace(self, off=off)._with_state("payload" if state == "none" else state)
 
     def _gain_unloaded(self, carrier: Carrier, window: CellWindow, gains: Gains) -> tuple[float, int]:
-        """Return the nats by which the arm without its payload explains the last cells better, and the number of these
-        cells."""
+        """Return the nats by which the arm without payload explains the last cells better, and their number."""
         assert self.held is not None
         assert self.around is not None
         load = self.held.estimate.load
@@ -270,8 +267,7 @@ class PayloadTracker:
         return None if self.held is None or self.around is None else self.held.refinement(self.around.carrier)
 
     def refined(self, refined: TrackedPayload) -> PayloadTracker:
-        """Return the tracker with a payload that was refined while rows arrived; unchanged if the payload is another
-        one now."""
+        """Return the tracker with a payload that was refined meanwhile; unchanged if the payload is another one now."""
         assert self.around is not None
         if self.held is None or self.held.since != refined.since or self.held.declared != refined.declared:
             return self
@@ -299,8 +295,7 @@ class PayloadTracker:
 
     @staticmethod
     def from_other_version(values: Mapping[str, Any], n: int, carrier: Carrier) -> PayloadTracker:
-        """Return the tracker that another version wrote with `to_json`, for a version whose last link has another
-        frame."""
+        """Return the tracker that another version, whose last link has another frame, wrote with `to_json`."""
         since, held = values["since"], values["held"]
         if held is None:
             return PayloadTracker(n, since=since)

@@ -115,8 +115,10 @@ def _joined(parts: Sequence[Rows]) -> Rows:
 def _means(
     around: LinearisedCarrier, parts: Sequence[Rows], rows: Rows, features: Array, expected: Array
 ) -> tuple[Cell, ...]:
-    """Return the cells of parts, which together are `rows`. features, expected: of each row, see
-    `LinearisedCarrier.all_rows`."""
+    """Return the cells of parts, which together are `rows`.
+
+    features, expected: of each row, see `LinearisedCarrier.all_rows`.
+    """
     counts = np.array([len(each) for each in parts])
     first = np.cumsum(counts) - counts
 

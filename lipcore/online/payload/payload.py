@@ -148,16 +148,18 @@ class _DrawResult:
     noise: Array | None
 
     def excess(self, least: Point) -> float:
-        """Return the energy above the usual one of a draw, nats. The usual one exceeds the min by half the number of
-        unknowns."""
+        """Return the energy above a draw's usual one, nats, which is the min plus half the number of unknowns."""
         usual = 0.0 if self.noise is None else 0.5 * least.derivative.shape[1]
         return self.point.energy - least.energy - usual
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """The energy of rows with a payload. loaded, free: motions with it and without; tau: of both, the free ones first,
-    (N, n) N·m; roots: see `correlation_roots`, of both."""
+    """The energy of rows with a payload.
+
+    loaded, free: motions with it and without; tau: of both, the free ones first, (N, n) N·m; roots: of both, see
+    `correlation_roots`.
+    """
 
     carrier: Carrier
     training: Training
@@ -264,8 +266,10 @@ class _Problem:
         return Estimate(eta, of_eta, load, *self.gains(at), draws, 1.0 if sure else OPTIONS.doubt)
 
     def gains(self, at: Point) -> tuple[float, float]:
-        """Return the nats by which a payload, and a contact of constant torque, explain the rows better than the arm
-        alone, which is then linear."""
+        """Return the nats by which a payload, and a constant torque, explain the rows better than the arm alone.
+
+        The arm is linear then.
+        """
         least, volume, contact = explain_unloaded(self.carrier, self.free, self.loaded, self.tau, self.roots)
         curved = np.linalg.slogdet(at.derivative.T @ at.derivative)[1] - np.linalg.slogdet(self.prior.precision)[1]
         return self.training.learnt_energy + least - at.energy + 0.5 * (volume - float(curved)), contact

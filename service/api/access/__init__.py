@@ -1,1 +1,1 @@
-"""Who may do what: API keys with scopes, and what protects a service that needs none."""
+"""Access control: API keys with scopes, and the protection of a service without keys."""

@@ -1,6 +1,6 @@
-"""API keys: what a key may do and until when, with the sha256 of it, never the key itself.
+"""API keys with scopes and expiry. Only the sha256 of a key is stored, never the key itself.
 
-They are checked in memory, without the database, and read again every second for what another process changed.
+Keys are checked in memory and read from the database every second, since other processes can change them.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from service.storage.database import ApiKeyRow, Database, now
 from service.storage.files import new_id
 
 PREFIX = "lip_"
-SLOWEST, FASTEST = 1e-3, 1e6
-"""Requests per s that a key may be limited to."""
-GIVEN = re.compile(rf"{PREFIX}[A-Za-z0-9_-]{{43,200}}")
-"""A key that was made elsewhere: 43 letters of base64 are the 32 bytes of ours."""
+MIN_REQUESTS_PER_S, MAX_REQUESTS_PER_S = 1e-3, 1e6
+"""Range of the rate limit of a key."""
+IMPORTED_KEY = re.compile(rf"{PREFIX}[A-Za-z0-9_-]{{43,200}}")
+"""Pattern of an imported key: at least 43 base64 characters, which hold 32 bytes like our own keys."""
 REFRESH_S = 1.0
-"""Seconds after which a running service knows of keys that another process made or revoked."""
+"""Interval at which a running service reads keys that other processes created or revoked."""
 
 
 class KeyRate:
-    """How often one key may ask, per s, as it was made; burst: most at once, of any client of the service."""
+    """Rate limit of one key, in requests per s; `burst`: max requests at once of any client of the service."""
 
     __slots__ = ("_rate", "per_s")
 
@@ -47,18 +47,18 @@ class KeyRate:
         self._rate = Rate(per_s, max(1, min(burst, ceil(10.0 * per_s))))  # at most 10 s of its own rate at once
 
     def count(self, key: str) -> None:
-        """Count a request of the key; raise RateLimitedError where it comes too early."""
+        """Count a request of the key; raise RateLimitedError if it exceeds the rate."""
         if wait := self._rate.wait(key, monotonic()):
-            message = f"the API key {key} asks more than {self.per_s:g} times per s, the most that it may"
+            message = f"Too many requests with API key {key}: at most {self.per_s:g} per s."
             raise RateLimitedError(message, headers={"Retry-After": str(ceil(wait))})
 
 
 @dataclass(slots=True, eq=False)
 class Key:
-    """A stored key, as it is checked. Times are Unix times in s.
+    """A stored key in memory. Times are Unix times in s.
 
-    digest: sha256 of the key; expires: inf where it never does; rate: of its own, None where it has none; seen: when it
-    last let a request through, 0 where it has not since the start.
+    `digest` is the key's sha256, `expires` is inf for a key without expiry, `rate` is its own limit, if any, and `seen`
+    is the last request that it authorised, 0 if there was none since the start.
     """
 
     id: str
@@ -70,16 +70,16 @@ class Key:
     seen: float = field(default=0.0)
 
     def allows(self, scope: str) -> bool:
-        """Whether the key may do what needs this scope."""
+        """Return whether the key has a scope, directly or through `admin`."""
         return scope in self.scopes or ADMIN in self.scopes
 
     def valid(self, at: float) -> bool:
-        """Whether the key is neither revoked nor expired at a Unix time."""
+        """Return whether the key is neither revoked nor expired at a Unix time."""
         return not self.revoked and at < self.expires
 
 
 def digest_of(secret: bytes) -> bytes:
-    """What of a key is stored and compared. A plain hash is enough: a key is 256 random bits, no password."""
+    """Return the sha256 of a key. A plain hash is enough, as a key has 256 random bits, unlike a password."""
     return sha256(secret).digest()
 
 
@@ -91,10 +91,10 @@ def create(
     given: str | None = None,
     max_requests_per_s: float | None = None,
 ) -> tuple[ApiKeyRow, str]:
-    """Store a new key; return its row and the key, which nobody can tell again. Raise ValueError for wrong values.
+    """Store a new key; return its row and the key, which cannot be read again. Raise ValueError for wrong values.
 
-    given: a key that was made elsewhere. One that is stored already, revoked or not, stays as it is.
-    max_requests_per_s: how often it may ask, instead of what the setting of this name says.
+    `given` is an imported key; if it is stored already, revoked or not, it stays unchanged. `max_requests_per_s`
+    replaces the setting of this name.
     """
     try:
         check_name("name", name)
@@ -102,14 +102,16 @@ def create(
         raise ValueError(error.message) from error
     allowed = list(dict.fromkeys(scopes))
     if not allowed:
-        raise ValueError(f"scopes are missing, expected some of {', '.join(SCOPES)}")
+        raise ValueError(f"give at least one scope of {', '.join(SCOPES)}")
     for scope in allowed:
         if scope not in SCOPES:
             raise ValueError(f"scope is {scope!r}, expected one of {', '.join(SCOPES)}")
-    if given is not None and not GIVEN.fullmatch(given):
-        raise ValueError(f"the key is not one, expected {PREFIX} and 43 to 200 random letters, digits, - or _")
-    if max_requests_per_s is not None and not SLOWEST <= max_requests_per_s <= FASTEST:
-        raise ValueError(f"rate is {max_requests_per_s:g}, expected {SLOWEST:g} to {FASTEST:g} requests per s")
+    if given is not None and not IMPORTED_KEY.fullmatch(given):
+        raise ValueError(f"a key must be {PREFIX} and 43 to 200 random letters, digits, - or _")
+    if max_requests_per_s is not None and not MIN_REQUESTS_PER_S <= max_requests_per_s <= MAX_REQUESTS_PER_S:
+        raise ValueError(
+            f"rate is {max_requests_per_s:g}, expected {MIN_REQUESTS_PER_S:g} to {MAX_REQUESTS_PER_S:g} requests per s"
+        )
     secret = given or PREFIX + secrets.token_urlsafe(32)
     row = ApiKeyRow(
         id=new_id("key"),
@@ -129,24 +131,24 @@ def create(
     return row, secret
 
 
-def stored(database: Database) -> list[ApiKeyRow]:
-    """Return all keys, the oldest first, also those that are no longer valid."""
+def list_keys(database: Database) -> list[ApiKeyRow]:
+    """Return all keys, oldest first, including invalid ones."""
     with database.session() as session:
         return list(session.scalars(select(ApiKeyRow).order_by(ApiKeyRow.seq)))
 
 
 def revoke(database: Database, key: str) -> ApiKeyRow:
-    """End a key for good, by its id; one that has been revoked stays as it is. Raise ValueError for an unknown id."""
+    """Revoke a key by its id, permanently. A revoked key stays unchanged. Raise ValueError for an unknown id."""
     with database.transaction() as session:
         row = session.scalar(select(ApiKeyRow).where(ApiKeyRow.id == key))
         if row is None:
-            raise ValueError(f"key is {key!r}, expected the id of a key: `lipserve keys list` shows them")
+            raise ValueError(f"there is no key {key!r}: `lipserve keys list` shows the ids of all keys")
         row.revoked_at = row.revoked_at or now()
     return row
 
 
 def note_used(database: Database, seen: Mapping[str, float]) -> None:
-    """Store when keys, by id, were seen last: Unix times in s."""
+    """Store the last use of keys: Unix times in s by key id."""
     with database.transaction() as session:
         for key, at in seen.items():
             text = datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds")
@@ -154,13 +156,13 @@ def note_used(database: Database, seen: Mapping[str, float]) -> None:
 
 
 def key_of(row: ApiKeyRow) -> Key:
-    """Return a stored key as it is checked."""
+    """Return the key of a database row."""
     expires = inf if row.expires_at is None else datetime.fromisoformat(row.expires_at).timestamp()
     return Key(row.id, bytes.fromhex(row.hash), frozenset(row.scopes), expires, row.revoked_at is not None)
 
 
 def state_of(row: ApiKeyRow, at: float) -> str:
-    """Say in a word whether a key is `valid`, `expired` or `revoked` at a Unix time."""
+    """Return `valid`, `expired` or `revoked`, the state of a key at a Unix time."""
     if row.revoked_at is not None:
         return "revoked"
     return "valid" if key_of(row).valid(at) else "expired"
@@ -168,16 +170,16 @@ def state_of(row: ApiKeyRow, at: float) -> str:
 
 logger = logging.getLogger(__name__)
 
-INDEXED = 16
-"""Bytes of a digest that keys are looked up by; the others are compared in constant time."""
+PREFIX_BYTES = 16
+"""Leading bytes of a digest that keys are looked up by. The whole digest is then compared in constant time."""
 CHALLENGE = 'Bearer realm="lipserve"'
 
 
 class Keyring:
     """The keys of one service, for its event loop. Empty until `watching`.
 
-    refresh_s: seconds after which a key that was made or revoked elsewhere is known here; burst: most requests at once
-    of a key that has a rate of its own.
+    `refresh_s` is the interval between reads of the database. `burst` limits the requests at once of a key with its own
+    rate.
     """
 
     def __init__(self, refresh_s: float, burst: int) -> None:
@@ -186,31 +188,31 @@ class Keyring:
         self._lasting: dict[Key, list[Callable[[], None]]] = {}
         self._noted: dict[str, float] = {}
         self._failing = False
-        self._thread = CapacityLimiter(1)  # of its own: a revocation does not wait for requests that hold all others
+        self._thread = CapacityLimiter(1)  # its own: a revocation must not wait for requests that use all other threads
 
     def find(self, secret: bytes | None) -> Key:
-        """Return the key that a request carries, valid or not; raise UnauthorizedError where it carries none."""
+        """Return the key of a request, valid or not; raise UnauthorizedError for a missing or unknown key."""
         if secret is None:
             message = (
-                "no API key was given, expected the header `Authorization: Bearer lip_…` (clients: LIPSERVE_API_KEY)"
+                "An API key is required. Send the header `Authorization: Bearer lip_…` (clients: set LIPSERVE_API_KEY)."
             )
             raise UnauthorizedError(message, headers={"WWW-Authenticate": CHALLENGE})
         digest = digest_of(secret)
-        key = self._keys.get(digest[:INDEXED])
+        key = self._keys.get(digest[:PREFIX_BYTES])
         if key is None or not compare_digest(key.digest, digest):
-            raise refusal("the API key is not one of this service")
+            raise invalid_key("Unknown API key.")
         return key
 
     def use(self, key: Key) -> None:
-        """Let a key be used now; raise UnauthorizedError where it is no longer valid."""
+        """Record a use of a key; raise UnauthorizedError if it is no longer valid."""
         at = time()
         if not key.valid(at):
-            raise refusal(f"the API key {key.id} {'was revoked' if key.revoked else 'has expired'}")
+            raise invalid_key(f"API key {key.id} {'was revoked' if key.revoked else 'has expired'}.")
         key.seen = at
 
     @contextmanager
     def lasting(self, key: Key, end: Callable[[], None]) -> Iterator[None]:
-        """Call `end`, which may be more than once, when the key is no longer valid while the context lasts."""
+        """Call `end`, possibly more than once, if the key becomes invalid while the context is open."""
         ends = self._lasting.setdefault(key, [])
         ends.append(end)
         try:
@@ -222,13 +224,13 @@ class Keyring:
 
     @asynccontextmanager
     async def watching(self, database: Database) -> AsyncIterator[None]:
-        """Read the keys, and again and again while the context lasts."""
-        self._take(await to_thread.run_sync(stored, database, limiter=self._thread))
+        """Read the keys now and then regularly while the context is open."""
+        self._take(await to_thread.run_sync(list_keys, database, limiter=self._thread))
         valid = sum(key.valid(time()) for key in self._keys.values())
         if valid:
-            logger.info("keys are needed, %d are valid", valid)
+            logger.info("API keys are required; %d valid", valid)
         else:
-            logger.warning("keys are needed and none is valid: make one with `lipserve keys create`")
+            logger.warning("API keys are required, but none is valid: create one with `lipserve keys create`")
         task = asyncio.create_task(self._watch(database))
         try:
             yield
@@ -244,12 +246,12 @@ class Keyring:
             await self._note_used(database, 60.0)
 
     async def _refresh(self, database: Database) -> None:
-        """Read the keys; while the database cannot be read, the known ones stay: controllers are not to stop for it."""
+        """Read the keys. If the database fails, keep the known keys, so that controllers continue."""
         try:
-            rows = await to_thread.run_sync(stored, database, limiter=self._thread)
+            rows = await to_thread.run_sync(list_keys, database, limiter=self._thread)
         except Exception as error:
             if not self._failing:
-                logger.warning("the keys cannot be read, those known stay as they are: %s", error)
+                logger.warning("API keys cannot be read, keeping the known ones: %s", error)
             self._failing = True
         else:
             self._failing = False
@@ -261,11 +263,11 @@ class Keyring:
         fresh: dict[bytes, Key] = {}
         for row in rows:
             read = key_of(row)
-            key = known.pop(read.id, read)  # the same object: streams and counts hold on to it
+            key = known.pop(read.id, read)  # the same object, which streams and rates refer to
             key.scopes, key.expires, key.revoked = read.scopes, read.expires, read.revoked
             if row.max_requests_per_s is not None and key.rate is None:
                 key.rate = KeyRate(row.max_requests_per_s, self._burst)
-            fresh[key.digest[:INDEXED]] = key
+            fresh[key.digest[:PREFIX_BYTES]] = key
         for gone in known.values():
             gone.revoked = True
         self._keys = fresh
@@ -274,25 +276,25 @@ class Keyring:
         at = time()
         for key in [key for key in self._lasting if not key.valid(at)]:
             ends = list(self._lasting[key])
-            logger.info("%d streams end with the key %s", len(ends), key.id)
+            logger.info("API key %s is no longer valid: closing its streams (%d)", key.id, len(ends))
             for end in ends:
                 try:
                     end()
-                except Exception:  # the others are to end all the same
-                    logger.exception("a stream of the key %s cannot be ended", key.id)
+                except Exception:  # close the others all the same
+                    logger.exception("a stream of API key %s could not be closed", key.id)
 
     async def _note_used(self, database: Database, seconds: float) -> None:
-        """Store when keys were seen last, of those that were seen so long after what is stored."""
+        """Store the last use of keys that were used more than `seconds` after the stored use."""
         seen = {key.id: key.seen for key in self._keys.values() if key.seen > self._noted.get(key.id, 0.0) + seconds}
         if not seen:
             return
         try:
             await to_thread.run_sync(note_used, database, seen, limiter=self._thread)
         except Exception as error:
-            logger.warning("when keys were used cannot be stored: %s", error)
+            logger.warning("the last use of API keys could not be stored: %s", error)
         self._noted |= seen
 
 
-def refusal(message: str) -> UnauthorizedError:
-    """Return the answer to a key that cannot be used."""
+def invalid_key(message: str) -> UnauthorizedError:
+    """Return the error for a key that cannot be used."""
     return UnauthorizedError(message, headers={"WWW-Authenticate": f'{CHALLENGE}, error="invalid_token"'})

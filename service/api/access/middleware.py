@@ -1,6 +1,6 @@
-"""Who is let through: who has a key for what is asked; without keys, all but the web pages of other sites.
+"""Access middleware: checks API keys and scopes or, without keys, refuses web pages of other sites.
 
-A key is in the header `Authorization`, from browsers in a WebSocket's subprotocol.
+A key is sent in the header `Authorization`, or by browsers in a WebSocket's subprotocol.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from functools import partial
 from anyio import CancelScope
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.api.access.keys import CHALLENGE, Key, Keyring, refusal
+from service.api.access.keys import CHALLENGE, Key, Keyring, invalid_key
 from service.api.access.scopes import ADMIN, WEBSOCKET, Rules, scopes_of_stream
 from service.api.errors import refuse
 from service.api.limits.requests import COUNTED
@@ -23,11 +23,11 @@ from service.telemetry.logs import KEY_ID
 
 SUBPROTOCOL = "lipserve"
 KEY_SUBPROTOCOL = "lipserve.key."
-"""Browsers can give a WebSocket no header: `new WebSocket(url, ["lipserve", "lipserve.key." + key])`."""
+"""Browsers cannot set headers of a WebSocket: `new WebSocket(url, ["lipserve", "lipserve.key." + key])`."""
 
 
 def secret_of(scope: Scope) -> bytes | None:
-    """Return the key that a request carries, None where it carries none."""
+    """Return the key of a request, None if it has none."""
     for name, value in scope["headers"]:
         if name == b"authorization":
             given: bytes = value
@@ -41,25 +41,25 @@ def secret_of(scope: Scope) -> bytes | None:
 
 
 def subprotocol_of(offered: Iterable[str]) -> str | None:
-    """Return the subprotocol to agree on, None where only the key is offered: answers repeat no keys."""
+    """Return the subprotocol to accept, None if only the key is offered: a key must not be sent back."""
     return SUBPROTOCOL if SUBPROTOCOL in offered else None
 
 
-FOREIGN = frozenset({b"cross-site", b"same-site"})
-"""What a browser says of a request that a page of another origin makes: another port is one, of the same site."""
-MOST_KNOWN = 100
+OTHER_SITES = frozenset({b"cross-site", b"same-site"})
+"""Values of Sec-Fetch-Site for pages of other origins. Another port of the same host is `same-site`."""
+MAX_KNOWN_HOSTS = 100
 _HOST = re.compile(r"(?:\[([^\[\]]*)\]|([^:\[\]]*))(?::[0-9]*)?")
-"""An address of IPv6 in brackets, or another name, and a port or none."""
+"""An IPv6 address in brackets or another name, with an optional port."""
 
 
 class LocalAccess:
-    """Middleware that refuses requests of other sites' web pages.
+    """Middleware that refuses requests from web pages of other sites, for a service without keys.
 
-    Host: a site can let its own name lead to 127.0.0.1 (DNS rebinding), and its pages then pass for this service's own;
-    but the name stays theirs. Origin, and Sec-Fetch-Site where a browser leaves that out: a page may ask any address,
-    but has to say from where. It could not read the answer, but hold streams of events open, or have archives made. A
-    link that somebody follows is no such request. None of these headers can be changed by a page; a program that asks
-    does without.
+    - Host must be a local name. With DNS rebinding, a site points its own name to 127.0.0.1, but Host keeps that name.
+    - Origin must be this service, and so must Sec-Fetch-Site, as some requests have no Origin. A foreign page cannot
+      read the answers, but it could keep event streams open or start exports. Links to this service are allowed.
+
+    Pages cannot change these headers. Programs usually do not send Origin or Sec-Fetch-Site.
     """
 
     def __init__(self, app: ASGIApp) -> None:
@@ -67,7 +67,7 @@ class LocalAccess:
         self._known: set[bytes] = set()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or answer it with 403."""
+        """Pass the request on or answer 403."""
         if scope["type"] != "lifespan":
             host = origin = site = mode = target = None
             for name, value in scope["headers"]:
@@ -87,14 +87,14 @@ class LocalAccess:
             if origin is not None and origin.partition(b"://")[2] != host:
                 await refuse(_wrong_origin(origin), scope, receive, send)
                 return
-            if site in FOREIGN and not self._is_link(scope, mode, target):
-                await refuse(_wrong_origin(b"of a page that is " + (site or b"")), scope, receive, send)
+            if site in OTHER_SITES and not self._is_link(scope, mode, target):
+                await refuse(_wrong_origin(site or b""), scope, receive, send)
                 return
         await self.app(scope, receive, send)
 
     @staticmethod
     def _is_link(scope: Scope, mode: bytes | None, target: bytes | None) -> bool:
-        """Whether a browser asks for a page to be shown by itself, not within one of another site."""
+        """Return whether a browser follows a link, rather than embedding the page in one of another site."""
         safe = scope["type"] == "http" and scope["method"] in ("GET", "HEAD", "OPTIONS")  # these change nothing
         return safe and mode == b"navigate" and target == b"document"
 
@@ -103,7 +103,7 @@ class LocalAccess:
         match = _HOST.fullmatch(name)
         if match is None or not is_loopback((match[1] or match[2]).lower().removesuffix(".")):
             return False
-        if len(self._known) < MOST_KNOWN:
+        if len(self._known) < MAX_KNOWN_HOSTS:
             self._known.add(host)
         return True
 
@@ -111,26 +111,26 @@ class LocalAccess:
 def _wrong_host(host: bytes) -> ServiceError:
     name = readable(host.decode("latin-1")[:200])
     message = (
-        f"the host is {name!r}: a service without keys answers to localhost and addresses of loopback only. "
-        "Behind a proxy or a forwarded port let it ask for keys: LIPSERVE_KEYS=on"
+        f"Host {name!r} is not allowed: without API keys, the service only answers at localhost and loopback "
+        "addresses. Behind a proxy or a forwarded port, require keys: LIPSERVE_KEYS=on"
     )
-    return ForbiddenError(message, [problem("host", name, "localhost or an address of loopback")])
+    return ForbiddenError(message, [problem("host", name, "localhost or a loopback address")])
 
 
 def _wrong_origin(origin: bytes) -> ServiceError:
     name = readable(origin.decode("latin-1")[:200])
-    message = f"the origin {name!r} is not this service: web pages of other sites may not ask"
-    return ForbiddenError(message, [problem("origin", name, "this service, or none")])
+    message = f"Requests from web pages of other sites are not allowed (origin {name!r})."
+    return ForbiddenError(message, [problem("origin", name, "this service or none")])
 
 
 class KeyAccess:
-    """Middleware that asks for a key, and for the scope that the route needs; streams end with their key."""
+    """Middleware that checks the API key and the scope that the route needs. Streams end with their key."""
 
     def __init__(self, app: ASGIApp, keyring: Keyring) -> None:
         self.app, self.keyring = app, keyring
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or answer it with 401, 403, 429, or 404 where there is no such route."""
+        """Pass the request on or answer 401, 403, 429, or 404 for an unknown route."""
         kind = scope["type"]
         if kind == "lifespan":
             await self.app(scope, receive, send)
@@ -142,7 +142,7 @@ class KeyAccess:
             return
         try:
             key = self.keyring.find(secret_of(scope))
-            scope[KEY_ID] = key.id  # also of what is refused: the log is to say whose it was
+            scope[KEY_ID] = key.id  # before the checks: the log also names the key of a refused request
             self.keyring.use(key)
             if key.rate is not None:
                 key.rate.count(key.id)
@@ -163,17 +163,17 @@ class KeyAccess:
             await self._events(key, scope, receive, send)
 
     async def _stream(self, key: Key, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let a WebSocket talk until its key ends."""
+        """Serve a WebSocket until its key becomes invalid."""
         connection = scope.get("state", {}).get(CONNECTION)
-        if not isinstance(connection, StreamProtocol):  # the route says that it cannot talk
+        if not isinstance(connection, StreamProtocol):  # the route answers with an error
             await self.app(scope, receive, send)
             return
-        end = partial(connection.end, 1008, f"the API key {key.id} is no longer valid")  # policy violation
+        end = partial(connection.end, 1008, _invalid(key))  # policy violation
         with self.keyring.lasting(key, end):
             await self.app(scope, receive, send)
 
     async def _events(self, key: Key, scope: Scope, receive: Receive, send: Send) -> None:
-        """Let events be sent until their key ends."""
+        """Send events until their key becomes invalid."""
         started = False
 
         async def watched(message: Message) -> None:
@@ -187,21 +187,25 @@ class KeyAccess:
         if started:
             await send({"type": "http.response.body", "body": b"", "more_body": False})
         else:
-            await refuse(refusal(f"the API key {key.id} is no longer valid"), scope, receive, send)
+            await refuse(invalid_key(_invalid(key)), scope, receive, send)
+
+
+def _invalid(key: Key) -> str:
+    return f"API key {key.id} is no longer valid."
 
 
 def _check(key: Key, scopes: tuple[str, ...]) -> None:
-    """Raise ForbiddenError where the key lacks one of the scopes."""
+    """Raise ForbiddenError if the key lacks one of the scopes."""
     for scope in scopes:
         if not key.allows(scope):
             may = ", ".join(sorted(key.scopes))
-            message = f"the API key {key.id} has the scopes {may}: this needs {scope}"
+            message = f"API key {key.id} lacks the scope {scope}. Its scopes: {may}."
             challenge = f'{CHALLENGE}, error="insufficient_scope", scope="{scope}"'
             raise ForbiddenError(message, headers={"WWW-Authenticate": challenge})
 
 
 def _check_unknown(key: Key, scope: Scope) -> None:
-    """Raise NotFoundError for a route that is not in the table, unless the key may do everything."""
+    """Raise NotFoundError for an unknown route, unless the key has the scope `admin`."""
     if not key.allows(ADMIN):
         method = scope.get("method", WEBSOCKET)
-        raise NotFoundError(f"no route {method} {readable(scope['path'][:200])}: /docs lists all")
+        raise NotFoundError(f"There is no route {method} {readable(scope['path'][:200])}. /docs lists all routes.")

@@ -1,4 +1,4 @@
-"""What an API key has to be allowed for each route, which says so where it is declared."""
+"""Scopes of API keys, and the scope that each route needs."""
 
 from __future__ import annotations
 
@@ -13,23 +13,22 @@ from starlette.routing import BaseRoute
 
 READ, PREDICT, UPDATE, TRAIN, ADMIN = "read", "predict", "update", "train", "admin"
 SCOPES = {
-    READ: "list and look: data sets, robots, jobs, models, quality, metrics; export a model",
-    PREDICT: "ask for torques, over HTTP and streams; evaluate, trace and compare models on data sets",
-    UPDATE: "teach: send observations and torque in streams, unlearn and replay them",
-    TRAIN: "upload and delete data sets and robots; start, cancel and repeat training jobs",
-    ADMIN: "everything, also what no other scope allows: move aliases, delete models, set how they learn",
+    READ: "list and read data sets, robots, jobs, models, quality and metrics; export models",
+    PREDICT: "predict torque over HTTP and streams; evaluate, trace and compare models on data sets",
+    UPDATE: "send observations and torque in streams to learn from; unlearn and replay observation batches",
+    TRAIN: "upload and delete data sets and robots; start, cancel and retry training jobs",
+    ADMIN: "everything, including what no other scope allows: move aliases, delete models, set learning options",
 }
-"""Each scope and what it allows. Only `admin` implies others."""
+"""The scopes and what they allow. Only `admin` includes other scopes."""
 
 WEBSOCKET = "WEBSOCKET"
-"""Stands for the method of a WebSocket, which has none."""
-LONGEST_PATH = 1000
-"""Far beyond that of any route: what is longer is not kept for the next request."""
+"""Stands in for the method of a WebSocket."""
+MAX_PATH_CHARS = 1000
+"""Far longer than the path of any route. Longer paths are not looked up or cached."""
 
 
 class Rule(NamedTuple):
-    """What a route needs. scope: None where it needs no key; lasting: its answer goes on for long, and ends with the
-    key."""
+    """What a route needs: a scope, or None if no key. A `lasting` answer is a stream that ends with the key."""
 
     scope: str | None
     lasting: bool = False
@@ -39,7 +38,7 @@ Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 
 
 def needs(scope: str | None, lasting: bool = False) -> Callable[[Endpoint], Endpoint]:
-    """Declare what the route of an endpoint needs; see `Rule`."""
+    """Declare the rule of an endpoint's route; see `Rule`."""
 
     def declare(endpoint: Endpoint) -> Endpoint:
         endpoint.rule = Rule(scope, lasting)  # type: ignore[attr-defined]
@@ -49,9 +48,9 @@ def needs(scope: str | None, lasting: bool = False) -> Callable[[Endpoint], Endp
 
 
 class Rules:
-    """What the routes of an application need. table: by method and path as in the OpenAPI document.
+    """The rules of an application's routes; `table`: by method and path as in the OpenAPI document.
 
-    Raise RuntimeError for a route that does not say it.
+    Raise RuntimeError for a route without a rule.
     """
 
     def __init__(self, routes: Sequence[BaseRoute]) -> None:
@@ -64,8 +63,8 @@ class Rules:
         self._find = lru_cache(1024)(self._search)
 
     def of(self, method: str, path: str) -> Rule | None:
-        """Return the rule of a request, None where there is no such route."""
-        return self._find(method, path) if len(path) <= LONGEST_PATH else None
+        """Return the rule of a request, None if there is no such route."""
+        return self._find(method, path) if len(path) <= MAX_PATH_CHARS else None
 
     def _search(self, method: str, path: str) -> Rule | None:
         method = "GET" if method == "HEAD" else method
@@ -73,7 +72,7 @@ class Rules:
 
 
 def _declared(routes: Sequence[BaseRoute]) -> Iterator[tuple[Sequence[str], str, re.Pattern[str], Rule]]:
-    """Methods, path, the pattern by which it is routed, and the rule of every route."""
+    """Yield the methods, path, path pattern and rule of every route."""
     for route in iter_route_contexts(routes):
         calls: dict[str, Rule] | None = getattr(route.original_route, "calls", None)
         if calls is not None:
@@ -81,17 +80,17 @@ def _declared(routes: Sequence[BaseRoute]) -> Iterator[tuple[Sequence[str], str,
                 yield ("POST",), call, re.compile(re.escape(call) + r"\Z"), needed
             continue
         path, pattern = str(route.path), route.path_regex
-        # pages and their files, which are no part of the API, are shown without a key
+        # pages and their files are not part of the API and need no key
         if path in ("/", "/openapi.json") or path.startswith(("/docs", "/static-offline-docs", "/dashboard", "/guide")):
             yield ("GET",), path, pattern, Rule(None)
             continue
         rule = getattr(route.endpoint, "rule", None)
         if not isinstance(rule, Rule):
-            raise RuntimeError(f"the route {path} does not say which scope it needs: declare it with @needs(…)")
+            raise RuntimeError(f"route {path} has no scope: declare it with @needs(…)")
         yield sorted(getattr(route, "methods", None) or {WEBSOCKET}), path, pattern, rule
 
 
 def scopes_of_stream(query: bytes) -> tuple[str, ...]:
-    """Return the scopes that a stream needs: one that names a source of torque to learn from teaches as well."""
+    """Return the scopes that a stream needs. With `stream_id` it also sends torque to learn from."""
     given = parse_qsl(query.decode("ascii", "replace"), keep_blank_values=True)
     return (PREDICT, UPDATE) if any(name == "stream_id" for name, _ in given) else (PREDICT,)

@@ -1,1 +1,1 @@
-"""The dashboard: pages in plain JavaScript that ask the same API as every other client."""
+"""The dashboard: pages in plain JavaScript that use the same API as every other client."""

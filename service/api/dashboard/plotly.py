@@ -1,5 +1,7 @@
-"""Plotly's JavaScript, as it is sent: compressed, and at an address that changes when it does, so that browsers ask for
-it once. What the pages need of it comes with the wheel (hatch_build.py), or all of it from the Python package."""
+"""Serves Plotly's JavaScript compressed, at an address with its hash, so that browsers can cache it forever.
+
+The wheel contains bundles of the parts that the pages need (hatch_build.py); else the Python package's file is used.
+"""
 
 from __future__ import annotations
 
@@ -16,24 +18,24 @@ from starlette.responses import RedirectResponse, Response
 
 BUNDLES = Path(__file__).with_name("bundles")
 NAMES = ("cartesian", "gl3d")
-"""Bundles by what they draw: plots with two axes, and scenes in 3-D."""
+"""Names of the bundles: plots with two axes, and 3-D scenes."""
 PREFIX = "/dashboard/plotly"
 
 
 class Script:
-    """A file of JavaScript. Its text is read, and compressed, when it is first asked for."""
+    """A JavaScript file, read and compressed on first use."""
 
     def __init__(self, path: Path) -> None:
         self.path, self._lock = path, threading.Lock()
 
     @cached_property
     def digest(self) -> str:
-        """What its address goes by: of its content."""
+        """Hash of the content, for its address."""
         return hashlib.sha256(self.path.read_bytes()).hexdigest()[:16]
 
     @property
     def packed(self) -> bytes:
-        """The file, compressed by gzip: once, whoever asks at the same time."""
+        """The gzip-compressed file. Concurrent requests compress it only once."""
         with self._lock:
             return self._packed
 
@@ -43,20 +45,20 @@ class Script:
 
 
 def scripts(bundles: Path = BUNDLES) -> dict[str, Script]:
-    """The script of each bundle: of the folder, or else of the Python package; none where there is neither."""
+    """Return the script of each bundle, from the folder or else the Python package; empty if there is neither."""
     bundled = {name: next(iter(sorted(bundles.glob(f"plotly-{name}-*.min.js"))), None) for name in NAMES}
     if None not in bundled.values():
         return {name: Script(path) for name, path in bundled.items() if path is not None}
-    spec = find_spec("plotly")  # not imported, which takes a second
+    spec = find_spec("plotly")  # importing it takes a second
     if spec is None or spec.origin is None:
         return {}
     return dict.fromkeys(NAMES, Script(Path(spec.origin).with_name("package_data") / "plotly.min.js"))
 
 
 def install(app: FastAPI, headers: dict[str, str], found: dict[str, Script] | None = None) -> None:
-    """Add the scripts to an application: `cartesian.js` and `gl3d.js` lead to where they are now.
+    """Add the scripts to an application. `cartesian.js` and `gl3d.js` redirect to the current addresses.
 
-    headers: of all answers but for caching; found: the scripts, those that are installed where None.
+    `headers` are sent with every answer, besides those for caching; `found` defaults to the installed scripts.
     """
     known = scripts() if found is None else found
 

@@ -1,1 +1,1 @@
-"""The guide: the documentation as a site, so that a robot's network without a way out has it too."""
+"""The guide: the documentation as a site, also available in robot networks without internet access."""

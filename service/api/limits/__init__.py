@@ -1,1 +1,1 @@
-"""What clients may take of the machine: sizes, times, connections, rates, disk."""
+"""Limits of requests: number, rate, size and time, and uploads within the limits of the disk."""

@@ -1,5 +1,4 @@
-"""What requests may take: how many are answered at a time and how many of a kind compute at once, how often one client
-may ask, how large a body may be and how long it may take."""
+"""Limits of requests: their number, concurrent computations, rate per client, and size and time of bodies."""
 
 from __future__ import annotations
 
@@ -23,31 +22,31 @@ from service.models.archive_reading import MAX_ARCHIVE_BYTES, MAX_URDF_BYTES
 from service.telemetry.logs import KEY_ID
 
 MAX_REQUESTS = 256
-"""Max requests at a time; a quarter as many may wait for the bodies of one client. More are answered 429."""
+"""Max requests at a time. A quarter as many may receive bodies from one client. Further ones are answered 429."""
 
 
 @dataclass(frozen=True)
 class ClientPatience:
-    """How long the service waits for a slow client, before it closes the connection.
-
-    header_s: for a request's line and headers, of at most `header_bytes`. body_s: for a body, and one second more for
-    each `body_bytes_per_s` that came. answer_s: until the client reads any of its answer. frame_s: until it reads an
-    answer of a stream.
-    """
+    """How long the service waits for a slow client before it closes the connection."""
 
     header_s: float = 10.0
+    """For the request line and headers."""
     header_bytes: int = 64 * 1024
+    """Max size of the request line and headers."""
     body_s: float = 20.0
+    """For a body, plus one second for every `body_bytes_per_s` received."""
     body_bytes_per_s: int = 1000
     answer_s: float = 30.0
+    """Until the client reads a part of its answer."""
     frame_s: float = 10.0
+    """Until the client reads an answer of a stream."""
 
 
 PATIENCE = ClientPatience()
 
 
 def body_limits(settings: Settings) -> dict[str, int]:
-    """Largest body in bytes, by path or by a path's last part; `*`: of every other path."""
+    """Return the max body size in bytes, by path or last part of a path; `*`: for every other path."""
     return {
         "/v1/datasets": settings.max_upload_bytes,
         "/v1/robots": MAX_URDF_BYTES,
@@ -58,19 +57,23 @@ def body_limits(settings: Settings) -> dict[str, int]:
 
 
 def body_limit(limits: Mapping[str, int], path: str) -> int:
-    """The limit that a path has."""
+    """Return the max body size of a path."""
     return limits.get(path) or limits.get(path.rpartition("/")[2]) or limits["*"]
 
 
 class BodyLimit:
-    """Refuse to read more of a body than the limit, and to wait for one that comes too slowly.
+    """Middleware that rejects too large, too slow and too many request bodies.
 
-    limits: see `body_limits`; seconds: longest wait for a body, and one second more for
-    every `bytes_per_s` that came. Only waiting counts, not what the application does between two pieces. at_once:
-    bodies of one client that are waited for at a time; more are answered 429.
+    Args:
+        app: The application.
+        limits: Max sizes, see `body_limits`.
+        seconds: Max wait for a body, plus one second for every `bytes_per_s` received. Only the wait for the client
+            counts, not the application's work between two pieces.
+        bytes_per_s: See `seconds`.
+        at_once: Max bodies of one client that are received at a time; further ones are answered 429.
 
-    Not FastAPI's `max_body_size`: to a body whose length is announced, that answers in plain text. Not a timer for
-    each request either: 2 µs, where looking at all that wait now and then costs a fifth.
+    FastAPI's `max_body_size` is not used, as it answers in plain text if the body's length is announced. A periodic
+    check of all waits is used instead of one timer per request: a timer takes 2 µs, five times as long.
     """
 
     def __init__(
@@ -79,11 +82,11 @@ class BodyLimit:
         self.app, self.limits = app, dict(limits)
         self.seconds, self.bytes_per_s, self.at_once = seconds, bytes_per_s, at_once
         self._waited_for: Counter[str] = Counter()  # bodies, by client
-        self._due: dict[asyncio.Task[Any], float | None] = {}  # when each ends that waits; None: it is ended
+        self._due: dict[asyncio.Task[Any], float | None] = {}  # deadline of each wait; None: it was cancelled
         self._looking: asyncio.AbstractEventLoop | None = None
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on; reading its body raises an answer of 413 or 408."""
+        """Pass the request on. Reading its body raises HTTPException with 413, 408 or 429."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -96,7 +99,7 @@ class BodyLimit:
 
         async def limited() -> Message:
             nonlocal seen, waited, complete
-            if complete:  # who asks on waits for the client to go away, as long as it takes
+            if complete:  # a further call waits for the client to disconnect, without a limit
                 return await receive()
             if refused:
                 raise _too_large(limit)
@@ -125,7 +128,7 @@ class BodyLimit:
                 waited += monotonic() - began
             seen += len(message.get("body", b""))
             if seen > limit:
-                # FastAPI takes any other exception for a body that cannot be parsed
+                # HTTPException: FastAPI would report any other exception as a parse error
                 raise _too_large(limit)
             return message
 
@@ -136,7 +139,7 @@ class BodyLimit:
         self._looking.call_later(min(0.5, self.seconds / 4), self._look)
 
     def _look(self) -> None:
-        """End the waits that have lasted too long."""
+        """Cancel the waits that are past their deadline."""
         now = monotonic()
         for task, due in self._due.items():
             if due is not None and due <= now:
@@ -148,39 +151,39 @@ class BodyLimit:
 
 
 def _too_large(limit: int) -> HTTPException:
-    return HTTPException(413, f"the body has more than {limit} bytes, the most that is taken here")
+    return HTTPException(413, f"The body is too large: at most {limit} bytes are allowed.")
 
 
-def _too_many(client: str, most: int) -> HTTPException:
-    message = f"{most} bodies of {client} are being waited for, the most there may be: send fewer at a time"
+def _too_many(client: str, at_once: int) -> HTTPException:
+    message = f"Too many request bodies from {client} at the same time: at most {at_once}."
     return HTTPException(429, message, {"Retry-After": "1", "Connection": "close"})
 
 
 def _too_slow(seen: int) -> HTTPException:
-    # what else comes of the body must not be taken for the next request
-    return HTTPException(408, f"the body came too slowly: {seen} bytes of it so far", {"Connection": "close"})
+    # close: the rest of the body must not be read as the next request
+    return HTTPException(408, f"The body arrived too slowly: {seen} bytes so far.", {"Connection": "close"})
 
 
 HEALTH = "/health"
-"""Requests there and below are always answered: a service that is busy is not one that is dead."""
+"""Requests to this path and below are always answered, so that a busy service does not look dead."""
 
 
 class Gate:
-    """Middleware that refuses requests while `most` others are answered. Streams have a limit of their own.
+    """Middleware that limits the number of requests at a time. Streams have their own limit.
 
-    open: requests that are answered now.
+    `open` is the number of requests that are being answered.
     """
 
-    def __init__(self, app: ASGIApp, most: int) -> None:
-        self.app, self.most, self.open = app, most, 0
+    def __init__(self, app: ASGIApp, max_requests: int) -> None:
+        self.app, self.max_requests, self.open = app, max_requests, 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or answer it with 429."""
-        if scope["type"] != "http" or (self.open >= self.most and scope["path"].startswith(HEALTH)):
+        """Pass the request on or answer 429."""
+        if scope["type"] != "http" or (self.open >= self.max_requests and scope["path"].startswith(HEALTH)):
             await self.app(scope, receive, send)
             return
-        if self.open >= self.most:
-            message = f"{self.open} requests are being answered, the most there may be: try again"
+        if self.open >= self.max_requests:
+            message = f"The service is busy with {self.open} requests, the max. Try again later."
             await refuse(BusyError(message, headers={"Retry-After": "1"}), scope, receive, send)
             return
         self.open += 1
@@ -192,7 +195,7 @@ class Gate:
 
 @dataclass(frozen=True)
 class Turns:
-    """One limiter a kind; to be made where an event loop runs."""
+    """Limits of concurrent computations, by kind. Create it inside the event loop."""
 
     predictions: CapacityLimiter
     uploads: CapacityLimiter = field(default_factory=lambda: CapacityLimiter(2))
@@ -203,10 +206,10 @@ Made = TypeVar("Made")
 
 
 async def in_turn(turns: CapacityLimiter, make: Callable[..., Made], *args: Any) -> Made:
-    """Compute in a thread when it is this one's turn, which lasts until the thread is through.
+    """Compute in a thread, waiting for one of the turns first and holding it until the thread ends.
 
-    Who asks may go away, as a call of gRPC does at its deadline: then what waits is not computed, and what computes
-    keeps its turn, so that no more is computed at a time than there are turns.
+    If the caller is cancelled, as a gRPC call at its deadline, a waiting computation is dropped. A running one keeps
+    its turn, so that the limit holds.
     """
     turn = object()
     await turns.acquire_on_behalf_of(turn)
@@ -214,7 +217,7 @@ async def in_turn(turns: CapacityLimiter, make: Callable[..., Made], *args: Any)
     def over(done: asyncio.Future[Made]) -> None:
         turns.release_on_behalf_of(turn)
         if not done.cancelled():
-            done.exception()  # else asyncio logs one that nobody waits for any more
+            done.exception()  # else asyncio logs it as never retrieved
 
     computing = asyncio.ensure_future(to_thread.run_sync(make, *args, limiter=CapacityLimiter(1)))
     computing.add_done_callback(over)
@@ -222,32 +225,32 @@ async def in_turn(turns: CapacityLimiter, make: Callable[..., Made], *args: Any)
 
 
 COUNTED = "lipserve.counted"
-"""In the ASGI scope of a request that was counted already: of a key with a rate of its own."""
-FORGET_S = 1.0
-"""Shortest time in s between two searches for clients that need not be remembered any more."""
+"""Marks the ASGI scope of a request that was already counted: its key has its own rate."""
+MIN_CLEANUP_INTERVAL_S = 1.0
+"""Min time in s between two clean-ups of clients with full buckets."""
 NETWORK_BITS = 64
-"""Leading bits of an IPv6 address that tell clients apart: who has one address has all that begin with them."""
+"""Leading bits of an IPv6 address that identify a client: a client can use all addresses with this prefix."""
 OTHERS, LOCAL = "others", "a local socket"
 
 
 class Rate:
-    """A token bucket for each client: `burst` tokens at most, of which `per_s` are put in every second.
+    """A token bucket per client: at most `burst` tokens, refilled at `per_s` tokens per second.
 
-    Kept as one time per client, when its bucket will be full again. most: clients that have one of their
-    own; the others share one.
+    A bucket is stored as the time when it is full again. At most `max_clients` have their own bucket; the others share
+    one.
     """
 
-    def __init__(self, per_s: float, burst: int, most: int = 10_000) -> None:
-        self.step, self.depth, self.most = 1 / per_s, burst / per_s, most
+    def __init__(self, per_s: float, burst: int, max_clients: int = 10_000) -> None:
+        self.step, self.depth, self.max_clients = 1 / per_s, burst / per_s, max_clients
         self._full: dict[str, float] = {}
-        self._forgotten = -FORGET_S
+        self._forgotten = -MIN_CLEANUP_INTERVAL_S
 
     def wait(self, client: str, at: float) -> float:
-        """Take a token at a time in s; 0 where there was one, else the s until there will be."""
+        """Use a token at a time in s. Return 0 if there was one, else the time in s until there is one."""
         full = self._full.get(client)
-        if full is None and len(self._full) >= self.most:
+        if full is None and len(self._full) >= self.max_clients:
             self._forget(at)
-            if len(self._full) >= self.most:
+            if len(self._full) >= self.max_clients:
                 client = OTHERS
                 full = self._full.get(client)
         then = (at if full is None or full < at else full) + self.step
@@ -257,28 +260,29 @@ class Rate:
         return 0.0
 
     def _forget(self, at: float) -> None:
-        """Forget those whose buckets are full: they are as good as new."""
-        if at - self._forgotten >= FORGET_S:
+        """Remove full buckets, which are the same as new ones."""
+        if at - self._forgotten >= MIN_CLEANUP_INTERVAL_S:
             self._forgotten = at
             self._full = {client: full for client, full in self._full.items() if full > at}
 
 
 class RateLimit:
-    """Middleware that refuses the requests of a client beyond its rate. Inside the one that knows keys.
+    """Middleware that limits the request rate of each client. It runs inside the middleware that checks keys.
 
-    A stream counts when it is opened, not its frames.
+    A stream counts once, when it is opened.
     """
 
     def __init__(self, app: ASGIApp, per_s: float, burst: int) -> None:
         self.app, self.per_s, self.rate = app, per_s, Rate(per_s, burst)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on, or answer it with 429."""
+        """Pass the request on or answer 429."""
         if scope["type"] != "lifespan" and COUNTED not in scope and not scope["path"].startswith(HEALTH):
             client = client_of(scope)
             wait = self.rate.wait(client, monotonic())
             if wait:
-                message = f"{client} asks more than {self.per_s:g} times per s (LIPSERVE_MAX_REQUESTS_PER_S)"
+                limit = f"at most {self.per_s:g} per s (LIPSERVE_MAX_REQUESTS_PER_S)"
+                message = f"Too many requests from {client}: {limit}."
                 error = RateLimitedError(message, headers={"Retry-After": str(ceil(wait))})
                 await refuse(error, scope, receive, send)
                 return
@@ -286,20 +290,20 @@ class RateLimit:
 
 
 def client_of(scope: Scope) -> str:
-    """Who asks, in words: an API key, else an address or the network it is in, else a local socket."""
+    """Return a name for the client: its API key, else its address or network, else a local socket."""
     key: str | None = scope.get(KEY_ID)
     if key is not None:
-        return f"the API key {key}"
+        return f"API key {key}"
     client = scope.get("client")
     return network_of(client[0]) if client else LOCAL
 
 
 def network_of(host: str) -> str:
-    """An address, or of IPv6 the network that it is in, in words."""
+    """Return an IPv4 address, or the network of an IPv6 address."""
     if ":" in host:
         try:
             address = ip_address(host.partition("%")[0])
-        except ValueError:  # what a proxy says
+        except ValueError:  # any text from a proxy
             return host[:100]
         if isinstance(address, IPv6Address) and address.ipv4_mapped is None:
             host_bits = address.max_prefixlen - NETWORK_BITS

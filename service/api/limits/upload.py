@@ -1,7 +1,7 @@
-"""Uploads: a file as the body of a request, or in a form, received within the limits of body and disk.
+"""Uploads: receives a file, as the body of a request or in a form, within the limits of body and disk.
 
-A form's file is taken out piece by piece as it comes. Not Starlette's form: that keeps whole files in memory or in the
-system's temporary folder, whose size nobody limits.
+A form is parsed piece by piece. Starlette's form is not used: it keeps whole files in memory or in the system's
+temporary folder, which has no limit.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ MAX_PARTS = 9
 
 
 class FormFile:
-    """Reads a form with one file, in the field `file`; other fields are passed over.
+    """Parser of a form with one file in the field `file`. Other fields are ignored.
 
-    file_name: as the client gave it, None until the file begins.
+    `file_name` is the name given by the client, None until the file begins.
     """
 
     def __init__(self, content_type: str) -> None:
-        """Raise InvalidRequestError where the content-type names no boundary between parts."""
+        """Raise InvalidRequestError if the content-type has no boundary."""
         boundary = parse_options_header(content_type)[1].get(b"boundary")
         if not boundary:
             raise invalid_request("content-type", content_type, "multipart/form-data; boundary=…")
@@ -57,7 +57,7 @@ class FormFile:
             raise _broken(error) from None
 
     def feed(self, data: bytes) -> bytes:
-        """Take a piece of the body; return what of it belongs to the file. Raise InvalidRequestError."""
+        """Parse a piece of the body and return its part of the file; raise InvalidRequestError."""
         try:
             self._parser.write(data)
         except FormParserError as error:
@@ -67,17 +67,19 @@ class FormFile:
         return content
 
     def end(self) -> str:
-        """Finish and return the file's name; raise InvalidRequestError where the form ends early or had no file."""
-        if not self._ended:  # the parser itself does not mind, and half a file would be taken for the whole
+        """Finish and return the file's name; raise InvalidRequestError if the form is incomplete or has no file."""
+        if not self._ended:  # the parser does not check it: half a file would be accepted
             raise _broken("its last boundary is missing")
         if self.file_name is None:
-            raise invalid_request(FIELD, "missing", f"a file in the form field `{FIELD}`")
+            expected = f"a file in the form field `{FIELD}`"
+            raise invalid_request(FIELD, "missing", expected, f"The form has no file. Send {expected}.")
         return self.file_name
 
     def _begin(self) -> None:
         self._parts += 1
         if self._parts > MAX_PARTS:
-            raise invalid_request("form", f"more than {MAX_PARTS} parts", f"one file, in the field `{FIELD}`")
+            given, expected = f"more than {MAX_PARTS} parts", f"one file in the field `{FIELD}`"
+            raise invalid_request("form", given, expected, f"The form has {given}, expected {expected}.")
         self._disposition = b""
 
     def _header_name(self, data: bytes, start: int, end: int) -> None:
@@ -98,7 +100,8 @@ class FormFile:
         if given is None or not self._taking:
             return
         if self.file_name is not None:
-            raise invalid_request(FIELD, "more than one file", "one file: upload them one by one")
+            message = "The form has more than one file. Upload the files one by one."
+            raise invalid_request(FIELD, "more than one file", "one file", message)
         self.file_name = given.decode("utf-8", "replace")
 
     def _end(self) -> None:
@@ -110,32 +113,31 @@ class FormFile:
 
 
 def _broken(error: FormParserError | str) -> InvalidRequestError:
-    """Error for a form that cannot be read."""
-    item = problem("body", f"no form: {error}", "multipart/form-data")
-    return InvalidRequestError(f"the form cannot be read: {error}", [item])
+    """Return the error for a form that cannot be read."""
+    return invalid_request("body", str(error), "multipart/form-data", f"The form could not be read: {error}")
 
 
 FORM = "multipart/form-data"
 WRITE_BYTES = 1 << 20
-"""Bytes that are written together: going to a thread for each piece that the network brings costs more."""
+"""Bytes that are written together. Writing every received piece in a thread would take longer."""
 
 
 @dataclass(frozen=True)
 class Kinds:
-    """What a route takes. media_types: kind of a body by its content-type; suffixes: of a form's file by its ending."""
+    """The kinds of files that a route accepts: of a body by media type, of a form's file by suffix."""
 
     media_types: Mapping[str, str]
     suffixes: Mapping[str, str]
 
     def of_body(self, media_type: str) -> str:
-        """Kind of a body; raise UnsupportedMediaTypeError."""
+        """Return the kind of a body; raise UnsupportedMediaTypeError."""
         kind = self.media_types.get(media_type)
         if kind is None:
             raise _unsupported("content-type", media_type, f"{', '.join(self.media_types)} or {FORM}")
         return kind
 
     def of_file(self, name: str) -> str:
-        """Kind of a file by the ending of its name; raise UnsupportedMediaTypeError."""
+        """Return the kind of a file by the suffix of its name; raise UnsupportedMediaTypeError."""
         kind = self.suffixes.get(Path(name).suffix.lower())
         if kind is None:
             raise _unsupported("file name", name, f"the ending {' or '.join(self.suffixes)}")
@@ -143,17 +145,17 @@ class Kinds:
 
 
 class Received(NamedTuple):
-    """What an upload is. file_name: without folders, None where the body was the file."""
+    """Kind and name of an upload. The name has no folders; it is None if the body was the file."""
 
     kind: str
     file_name: str | None
 
 
 async def receive_to(request: Request, path: Path, kinds: Kinds, disk: Disk) -> Received:
-    """Write an upload to `path`, which the caller deletes; raise before the body is read where that is wrong already.
+    """Write an upload to `path`, which the caller deletes. Check what is possible before reading the body.
 
-    Raise UnsupportedMediaTypeError, InvalidRequestError (a form), StorageFullError; middleware raises HTTPException 413
-    beyond the limit of the path and 408 where the body comes too slowly.
+    Raise UnsupportedMediaTypeError, StorageFullError, or InvalidRequestError for a wrong form. Middleware raises
+    HTTPException 413 for a too large body and 408 for a too slow one.
     """
     upload = _Upload(request, kinds)
     announced = request.headers.get("content-length", "")
@@ -178,14 +180,14 @@ async def receive_to(request: Request, path: Path, kinds: Kinds, disk: Disk) -> 
 
 
 async def receive(request: Request, kinds: Kinds) -> tuple[Received, bytes]:
-    """Read a small upload into memory; raise as `receive_to`, but for the disk."""
+    """Read a small upload into memory; raise as `receive_to`, except StorageFullError."""
     upload = _Upload(request, kinds)
     content = b"".join([piece async for piece in upload.pieces()])
     return upload.received, content
 
 
 class _Upload:
-    """The file of a request. received: what it is, known at the latest when all pieces are read."""
+    """The file of a request. `received` is complete when all pieces have been read."""
 
     def __init__(self, request: Request, kinds: Kinds) -> None:
         self.request, self.kinds = request, kinds
@@ -194,7 +196,7 @@ class _Upload:
         self.received = Received("", None) if self.form else Received(kinds.of_body(_bare(media_type)), None)
 
     async def pieces(self) -> AsyncIterator[bytes]:
-        """The file, piece by piece."""
+        """Yield the file piece by piece."""
         if self.form is None:
             async for piece in self.request.stream():
                 yield piece

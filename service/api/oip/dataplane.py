@@ -1,4 +1,4 @@
-"""What HTTP and gRPC answer alike: models and versions as the protocol names and describes them, and inference."""
+"""The parts of the Open Inference Protocol that HTTP and gRPC share: model lookup, metadata and inference."""
 
 from __future__ import annotations
 
@@ -18,15 +18,17 @@ from service.foundation.errors import NotFoundError, NotReadyError, UnreadableVe
 from service.models import registry
 from service.models.loaded import LoadedModels, ServedModel
 
-SMALL = 16 * 1024
-"""Bytes of a body that is decoded on the event loop: one query of the largest robot fits many times."""
-_LISTED = 20
+MAX_INLINE_BYTES = 16 * 1024
+"""Max size of a body that is decoded on the event loop: many times one query of the largest robot."""
+MAX_LISTED = 20
 
 
 async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> ServedModel:
-    """Return a version by its number or an alias, the one that serves where None, loaded if need be. turns: of what
-    loads. Raise NotFoundError naming those there are."""
-    number, alias = (None, None) if version is None else _meant(version)
+    """Return a version by number or alias, the serving version if None, and load it if necessary.
+
+    `turns` limits how many versions load at a time. Raise NotFoundError, which lists the existing versions.
+    """
+    number, alias = (None, None) if version is None else _parse_version(version)
     served = loaded.hot(name, number, alias)
     if served is not None:
         return served
@@ -34,7 +36,7 @@ async def find(loaded: LoadedModels, turns: CapacityLimiter, name: str, version:
 
 
 async def ready(loaded: LoadedModels, turns: CapacityLimiter, name: str, version: str | None) -> ServedModel:
-    """Return a version once it is in memory; raise NotFoundError, or NotReadyError where it cannot be read."""
+    """Return a version once it is in memory; raise NotFoundError, or NotReadyError if it cannot be read."""
     try:
         return await find(loaded, turns, name, version)
     except UnreadableVersionError as error:
@@ -49,29 +51,29 @@ async def infer(
     size: int,
     decode: Callable[[], Message],
 ) -> Reply:
-    """Answer any request, a wrong one with the error that it raises: one query here, all else in a thread.
+    """Answer an inference request, a single query on the event loop and any other in a thread.
 
-    size: bytes of the body, which `decode` makes a message of.
+    `decode` decodes the body, which has `size` bytes. Raise ServiceError for a wrong request.
     """
     settings = loaded.storage.settings
     served = await find(loaded, turns, name, version)
-    if size > SMALL:
+    if size > MAX_INLINE_BYTES:
         return await in_turn(turns, query.infer, served, decode, settings)
     message = decode()
-    question = query.read_question(served, message, settings)
-    if question.quick:
-        return query.respond(served, message, question)
-    return await in_turn(turns, query.respond, served, message, question)
+    task = query.read_task(served, message, settings)
+    if task.is_inline:
+        return query.respond(served, message, task)
+    return await in_turn(turns, query.respond, served, message, task)
 
 
 def metadata(loaded: LoadedModels, served: ServedModel) -> schema.ModelMetadata:
-    """Describe a version and name all of its model; raise NotFoundError. Not for the event loop."""
+    """Return the tensors of a version and the versions of its model; raise NotFoundError. Not for the event loop."""
     model = served.model
     inputs = [schema.TensorMetadata(name=each, shape=[-1, model.n_joints]) for each in schema.INPUTS]
     inputs.append(schema.TensorMetadata(name=schema.TORQUE, shape=[-1, model.n_joints], parameters={"optional": True}))
     return schema.ModelMetadata(
         name=served.name,
-        versions=_known(loaded, served.name),
+        versions=_version_numbers(loaded, served.name),
         platform=f"lipserve_{model.estimator.name}",
         inputs=inputs,
         outputs=[schema.TensorMetadata(name=each, shape=list(shape)) for each, shape in shapes(model).items()],
@@ -88,8 +90,8 @@ def _parameters(served: ServedModel, model: TorqueModel) -> dict[str, str | int]
     }
 
 
-def _meant(version: str) -> tuple[int | None, str | None]:
-    """A version's number or an alias; the number 0, which no version has, for what is neither."""
+def _parse_version(version: str) -> tuple[int | None, str | None]:
+    """Return a version's number or an alias; number 0, which no version has, if the text is neither."""
     if re.fullmatch(ALIAS, version):
         return None, version
     number = int(version) if version.isascii() and version.isdigit() and len(version) < 10 else 0
@@ -101,11 +103,12 @@ def _load(loaded: LoadedModels, name: str, version: str | None, number: int | No
         return loaded.get(name, number, alias)
     except NotFoundError as error:
         if error.detail[0].field == "model":
-            raise NotFoundError(f"no model {name[:200]!r}: GET /v1/models lists all", error.detail) from error
-        known = [*registry.show(loaded.database, name).aliases, *_known(loaded, name)]
-        item = problem("version", version, f"one of {', '.join(known[-_LISTED:])}")
-        raise NotFoundError(f"{sentence(item)}, of model {name!r}", [item]) from error
+            message = f"No model is named {name[:200]!r}. GET /v1/models lists all models."
+            raise NotFoundError(message, error.detail) from error
+        known = [*registry.show(loaded.database, name).aliases, *_version_numbers(loaded, name)]
+        item = problem("version", version, f"one of {', '.join(known[-MAX_LISTED:])}")
+        raise NotFoundError(f"{sentence(item)} of model {name!r}", [item]) from error
 
 
-def _known(loaded: LoadedModels, name: str) -> list[str]:
+def _version_numbers(loaded: LoadedModels, name: str) -> list[str]:
     return [str(each.version) for each in registry.show(loaded.database, name).versions]

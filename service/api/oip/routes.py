@@ -22,48 +22,48 @@ _TAGS: list[str | Enum] = ["open inference protocol"]
 
 router = APIRouter(prefix="/v2", tags=_TAGS, route_class=Route)
 hot = APIRouter(prefix="/v2", tags=_TAGS)
-"""The routes of inference, to be tried before all others: FastAPI tries one route after the other, 2 µs each."""
+"""Inference routes, matched before all others: FastAPI tries routes one by one, 2 µs each."""
 
 
-@router.get("", summary="What serves")
+@router.get("", summary="Retrieve server metadata")
 @needs(READ)
 async def server_metadata() -> schema.ServerMetadata:
-    """Name, version, and the extensions of the protocol that are supported."""
+    """Return name and version of the server, and the supported extensions of the protocol."""
     return schema.ServerMetadata(name="lipserve", version=__version__, extensions=[schema.BINARY])
 
 
-@router.get("/health/live", summary="Is the server alive?")
+@router.get("/health/live", summary="Check that the server is alive")
 @needs(None)
 async def live() -> schema.ServerLive:
-    """Answer while the event loop turns."""
+    """Answer 200 while the event loop runs."""
     return schema.ServerLive()
 
 
-@router.get("/health/ready", summary="Can the server answer?", responses=schema.failures(503))
+@router.get("/health/ready", summary="Check that the server is ready", responses=schema.failures(503))
 @needs(None)
 def ready(readiness: ReadinessDep) -> schema.ServerReady:
-    """Answer once the models are loaded and while the database answers."""
+    """Answer 200 if the models are loaded and every part of the service works, else 503."""
     health.ready(readiness)
     return schema.ServerReady()
 
 
 @router.get(
     "/models/{model}/versions/{version}",
-    summary="The tensors of a version",
+    summary="Retrieve the tensors of a version",
     responses=schema.failures(404),
     response_model_exclude_none=True,
     openapi_extra=_VERSIONED,
 )
 @router.get(
     "/models/{model}",
-    summary="The tensors of a model",
+    summary="Retrieve the tensors of a model",
     responses=schema.failures(404),
     response_model_exclude_none=True,
     openapi_extra=_ONE,
 )
 @needs(READ)
 async def model_metadata(request: Request) -> schema.ModelMetadata:
-    """Inputs that a request brings, outputs that it may ask for, and the versions there are."""
+    """Return the inputs that a request needs, the outputs that it may request, and the versions of the model."""
     loaded: LoadedModels = request.app.state.loaded
     turns = request.app.state.turns.predictions
     where = request.path_params
@@ -73,19 +73,19 @@ async def model_metadata(request: Request) -> schema.ModelMetadata:
 
 @router.get(
     "/models/{model}/versions/{version}/ready",
-    summary="Can a version answer?",
+    summary="Check that a version is ready",
     responses=schema.failures(404, 503),
     openapi_extra=_VERSIONED,
 )
 @router.get(
     "/models/{model}/ready",
-    summary="Can a model answer?",
+    summary="Check that a model is ready",
     responses=schema.failures(404, 503),
     openapi_extra=_ONE,
 )
 @needs(READ)
 async def model_ready(request: Request) -> schema.ModelReady:
-    """Answer once the version is in memory; it is loaded if it is not."""
+    """Answer 200 when the version is in memory. If it is not, it is loaded first."""
     loaded: LoadedModels = request.app.state.loaded
     turns = request.app.state.turns.predictions
     where = request.path_params
@@ -94,7 +94,7 @@ async def model_ready(request: Request) -> schema.ModelReady:
 
 
 async def _answer(scope: Scope, body: bytes) -> Reply:
-    """Answer any request, a wrong one with the error that it raises."""
+    """Answer any inference request; raise ServiceError for a wrong one."""
     state, where = scope["app"].state, scope["path_params"]
     decode = partial(wire.decode, body, scope["headers"])
     return await dataplane.infer(
@@ -104,22 +104,27 @@ async def _answer(scope: Scope, body: bytes) -> Reply:
 
 @needs(PREDICT)
 async def infer(request: Request) -> Response:
-    """Answer one query, [n], or a batch, [N, n], in JSON or binary. Only what `outputs` names is computed: `tau` and
-    `tau_std` where it names nothing. Nothing is clipped. `noise_std` [n] is the measurement's own deviation; an
-    interval that shall hold measurements needs both, and `scale` [n], see `PredictResponse`.
+    """Predict torque and other outputs for one query, [n], or a batch, [N, n], in JSON or binary.
 
-    With the input `tau`, as measured: `tau_external` [n], how much of it the model does not explain, `tau_external_std`
-    = `scale` · √(`tau_std`² + `noise_std`²), `tau_external_z`, the one over the other; `tau_external_statistic` of the
-    arm as one, eᵀ C⁻¹ e, χ² with n degrees of freedom where nothing touches it, and `tau_external_p`. Not a safety
-    function.
+    Only the outputs in `outputs` are computed; by default `tau` and `tau_std`. Inputs and outputs are not clipped.
+    The 95 % interval of measurements is `tau` ± 1.96 · `scale` · √(`tau_std`² + `noise_std`²), see `PredictResponse`.
+
+    External torque needs the measured torque as input `tau`. It is not a safety function. Its outputs are:
+
+    - `tau_external` [n]: measured minus predicted torque e.
+    - `tau_external_std` [n]: `scale` · √(`tau_std`² + `noise_std`²), the standard deviation of e without contact.
+    - `tau_external_z` [n]: `tau_external` / `tau_external_std`.
+    - `tau_external_statistic`: eᵀ C⁻¹ e of all joints together; χ² with n degrees of freedom without contact.
+    - `tau_external_p`: the probability of a larger statistic without contact.
     """
-    reply = await _answer(request.scope, await request.body())  # for the documentation: all has been answered before
+    # only for the documentation: `_answer` answers every request
+    reply = await _answer(request.scope, await request.body())
     return reply.response()
 
 
 for _path, _summary, _documented in (
-    ("/models/{model}/infer", "Torque at a motion", _ONE),
-    ("/models/{model}/versions/{version}/infer", "Torque at a motion, by a version", _VERSIONED),
+    ("/models/{model}/infer", "Run inference with a model", _ONE),
+    ("/models/{model}/versions/{version}/infer", "Run inference with a version", _VERSIONED),
 ):
     hot.add_api_route(
         _path,

@@ -1,4 +1,4 @@
-"""Messages of the Open Inference Protocol, which msgspec decodes and encodes, and what the documentation says of it."""
+"""Messages of the Open Inference Protocol, decoded and encoded by msgspec, and their OpenAPI documentation."""
 
 from __future__ import annotations
 
@@ -9,44 +9,44 @@ from msgspec import UNSET, Meta, Struct, UnsetType
 from pydantic import BaseModel, Field
 
 INPUTS = ("q", "dq", "ddq")
-"""Tensors that every request brings; `forward_dynamics` and `tau_external` also need TORQUE."""
+"""Inputs that every request needs; `forward_dynamics` and `tau_external` also need TORQUE."""
 TORQUE = "tau"
 DATATYPES = ("FP64", "FP32")
 HEADER = "Inference-Header-Content-Length"
 BINARY = "binary_tensor_data"
-"""The extension that is supported, by its name in the server's metadata."""
+"""Name of the supported extension in the server's metadata."""
 
 Size = Annotated[int, Meta(ge=0)]
 Numbers = list[float | list[float]]
 
 
 class InputParameters(Struct):
-    """Parameters of an input that are understood; others are ignored, as the protocol has it."""
+    """Supported parameters of an input. Others are ignored, as the protocol requires."""
 
-    binary_data_size: Annotated[Size | None, Meta(description="Bytes of this tensor after the JSON")] = None
+    binary_data_size: Annotated[Size | None, Meta(description="Size of this tensor after the JSON, bytes")] = None
     shared_memory_region: Annotated[str | None, Meta(description="Not supported")] = None
 
 
 class OutputParameters(Struct):
-    """Parameters of an output that are understood; others are ignored."""
+    """Supported parameters of an output. Others are ignored."""
 
-    binary_data: Annotated[bool | None, Meta(description="Whether to answer this tensor after the JSON")] = None
+    binary_data: Annotated[bool | None, Meta(description="Return this tensor in binary, after the JSON")] = None
     shared_memory_region: Annotated[str | None, Meta(description="Not supported")] = None
     classification: Annotated[int | None, Meta(description="Not supported")] = None
 
 
 class RequestParameters(Struct):
-    """Parameters of a request that are understood; others are ignored."""
+    """Supported parameters of a request. Others are ignored."""
 
     binary_data_output: Annotated[
-        bool | None, Meta(description="Whether to answer all tensors after the JSON that do not say otherwise")
+        bool | None, Meta(description="Return all tensors in binary, unless their own `binary_data` is given")
     ] = None
 
 
 class InferInput(Struct, forbid_unknown_fields=True):
-    """One tensor: its numbers in `data`, or after the JSON with `binary_data_size`."""
+    """An input tensor. Its numbers are in `data`, or in binary after the JSON if `binary_data_size` is given."""
 
-    name: Annotated[str, Meta(description="q, dq, ddq or, for `forward_dynamics` and `tau_external`, tau")]
+    name: Annotated[str, Meta(description="q, dq or ddq; also tau for `forward_dynamics` and `tau_external`")]
     shape: Annotated[list[Size], Meta(description="[n] for one query, [N, n] for a batch")]
     datatype: Annotated[str, Meta(description="FP64 or FP32")]
     data: Annotated[Numbers | None, Meta(description="Numbers in row-major order, flat or in rows")] = None
@@ -54,33 +54,33 @@ class InferInput(Struct, forbid_unknown_fields=True):
 
 
 class InferOutput(Struct, forbid_unknown_fields=True):
-    """A tensor to answer."""
+    """A requested output tensor."""
 
     name: str
     parameters: OutputParameters | None = None
 
 
 class InferRequest(Struct, forbid_unknown_fields=True):
-    """A query, or a batch of them, in SI units."""
+    """A query or a batch of queries, in SI units."""
 
     inputs: list[InferInput]
     outputs: Annotated[
-        list[InferOutput] | None, Meta(description="What to compute; tau and tau_std where left out or empty")
+        list[InferOutput] | None, Meta(description="Outputs to compute. Default, also if empty: tau and tau_std")
     ] = None
-    id: Annotated[str | None, Meta(description="Returned as it is")] = None
+    id: Annotated[str | None, Meta(description="Returned unchanged")] = None
     parameters: RequestParameters | None = None
-    model_name: Annotated[str | None, Meta(description="May repeat the name in the path")] = None
-    model_version: Annotated[str | None, Meta(description="May repeat the version in the path")] = None
+    model_name: Annotated[str | None, Meta(description="If given, the name in the path")] = None
+    model_version: Annotated[str | None, Meta(description="If given, the number of the version that answers")] = None
 
 
 class TensorParameters(Struct):
-    """Parameters of an answered tensor."""
+    """Parameters of an output tensor."""
 
-    binary_data_size: Annotated[int, Meta(description="Bytes of this tensor after the JSON")]
+    binary_data_size: Annotated[int, Meta(description="Size of this tensor after the JSON, bytes")]
 
 
 class InferTensor(Struct):
-    """An answered tensor: its numbers in `data`, flat and in row-major order, or after the JSON."""
+    """An output tensor. Its numbers are in `data`, flat in row-major order, or in binary after the JSON."""
 
     name: str
     datatype: Literal["FP64"]
@@ -90,14 +90,14 @@ class InferTensor(Struct):
 
 
 class AnswerParameters(Struct):
-    """What an answer is to be taken for."""
+    """Revision and torque convention of an answer."""
 
-    revision: Annotated[int, Meta(description="Online updates applied to the version")]
+    revision: Annotated[int, Meta(description="Number of online updates applied to the version")]
     torque_convention: Annotated[str, Meta(description="gravity_included or gravity_compensated")]
 
 
 class InferResponse(Struct):
-    """The tensors asked for, in that order, and the version that answered."""
+    """The requested outputs, in the requested order, and the version that answered."""
 
     model_name: str
     model_version: str
@@ -107,13 +107,13 @@ class InferResponse(Struct):
 
 
 class Failure(BaseModel):
-    """The body of every /v2 answer with a status of 400 and above."""
+    """The body of every /v2 answer with a status of 400 or above."""
 
     error: str = Field(examples=["q[3] is nan, expected a finite number"])
 
 
 class ServerMetadata(BaseModel):
-    """What serves, and which extensions of the protocol it speaks."""
+    """Name and version of the server, and the supported extensions of the protocol."""
 
     name: str = Field(examples=["lipserve"])
     version: str
@@ -121,7 +121,7 @@ class ServerMetadata(BaseModel):
 
 
 class ServerLive(BaseModel):
-    """The process answers."""
+    """The process is alive."""
 
     live: Literal[True] = True
 
@@ -133,31 +133,31 @@ class ServerReady(BaseModel):
 
 
 class ModelReady(BaseModel):
-    """The version is in memory and answers."""
+    """The version is in memory and can answer."""
 
     name: str
     ready: Literal[True] = True
 
 
 class TensorMetadata(BaseModel):
-    """A tensor of a model. -1 stands for the number of queries N; an input of one query may leave this axis out."""
+    """A tensor of a model. -1 stands for the number of queries N; the inputs of a single query may omit this axis."""
 
     name: str
     datatype: Literal["FP64"] = Field("FP64", description="Inputs may also be FP32")
     shape: list[int]
-    parameters: dict[str, Any] | None = Field(None, description="`optional`: an input that only some outputs need")
+    parameters: dict[str, Any] | None = Field(None, description="`optional`: only some outputs need this input")
 
 
 class ModelMetadata(BaseModel):
-    """The tensors of a model and its versions."""
+    """Tensors and versions of a model."""
 
     name: str
-    versions: list[str] = Field(description="Versions that a path may name; without one the latest answers")
-    platform: str = Field(description="`lipserve_` and the estimator", examples=["lipserve_lip-chain"])
+    versions: list[str] = Field(description="Versions that a path may name; without one, the serving version answers")
+    platform: str = Field(description="`lipserve_` and the name of the estimator", examples=["lipserve_lip-chain"])
     inputs: list[TensorMetadata]
     outputs: list[TensorMetadata]
     parameters: dict[str, Any] = Field(
-        description="`version` and `revision` described here, `torque_convention`, and `joint_names`, joined by commas",
+        description="`version` and `revision` described here, `torque_convention`, and `joint_names`, comma-separated",
     )
 
 
@@ -167,7 +167,7 @@ VERSION = {
     "in": "path",
     "required": True,
     "schema": {"type": "string"},
-    "description": "A version's number, or an alias",
+    "description": "A version's number or an alias",
 }
 _POSTURE = [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7]
 REQUEST: dict[str, Any] = {
@@ -190,29 +190,29 @@ RESPONSE: dict[str, Any] = {
     ],
 }
 _FAILURES = {
-    400: "The request is wrong: `error` names the field, its value and what was expected",
-    404: "No model or version of that name",
-    413: "The body has more bytes than are taken",
+    400: "The request is wrong. `error` names the field, its value and what was expected",
+    404: "The model or version does not exist",
+    413: "The body is too large",
     415: "The body is compressed",
-    503: "The service, or the version, cannot answer now",
+    503: "The service or the version is not ready",
 }
-_LENGTH = "Bytes of the JSON, where binary tensors follow it in the order of the tensors"
+_LENGTH = "Length of the JSON in bytes, if binary tensors follow it. They are in the order of the tensors"
 _BINARY = {
     "schema": {
         "type": "string",
         "format": "binary",
-        "description": "The JSON, then the binary tensors: little-endian, row-major, without padding",
+        "description": "The JSON followed by the binary tensors: little-endian, row-major, without padding",
     }
 }
 
 
 def failures(*statuses: int) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI responses of a route for the errors that it can answer with."""
+    """Return the OpenAPI responses for error statuses."""
     return {status: {"model": Failure, "description": _FAILURES[status]} for status in statuses}
 
 
 def infer_body(path: dict[str, Any]) -> dict[str, Any]:
-    """Body and parameters of an inference request, those of its path among them."""
+    """Return the OpenAPI body and parameters of an inference request, including those of its path."""
     content = {"application/json": {"schema": _schema(InferRequest), "example": REQUEST}}
     header = {"name": HEADER, "in": "header", "required": False, "schema": {"type": "integer"}, "description": _LENGTH}
     return {
@@ -222,9 +222,9 @@ def infer_body(path: dict[str, Any]) -> dict[str, Any]:
 
 
 def infer_answer() -> dict[str, Any]:
-    """The answer to an inference request."""
+    """Return the OpenAPI response of an inference request."""
     return {
-        "description": "The tensors asked for, shaped as the query",
+        "description": "The requested outputs, with the shape of the query",
         "headers": {HEADER: {"schema": {"type": "integer"}, "description": _LENGTH}},
         "content": {
             "application/json": {"schema": _schema(InferResponse), "example": RESPONSE},
@@ -234,7 +234,7 @@ def infer_answer() -> dict[str, Any]:
 
 
 def _schema(message: type[msgspec.Struct]) -> dict[str, Any]:
-    """JSON schema of a message with all that it refers to in place."""
+    """Return the JSON schema of a message with all references inlined."""
     document = msgspec.json.schema(message)
     inlined: dict[str, Any] = _inline(document["$defs"][message.__name__], document["$defs"])
     return inlined

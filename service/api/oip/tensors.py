@@ -1,4 +1,4 @@
-"""What the protocol's transports have in common: a request they have read, and an answer that they are to write."""
+"""Interface of the transports: a request that a transport has decoded, and an answer that it encodes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from service.api.route import Reply
 
 
 class Header(NamedTuple):
-    """Who answered."""
+    """Model and version that answered."""
 
     model: str
     version: str
@@ -20,7 +20,7 @@ class Header(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """An answered tensor; binary: whether its request asks for bytes rather than a list."""
+    """An output tensor; `binary`: whether the request asks for bytes instead of a list."""
 
     name: str
     values: NDArray[np.float64]
@@ -28,18 +28,20 @@ class Answer(NamedTuple):
 
 
 class Message(Protocol):
-    """A request of one transport. The numbers of its tensors are still as they came."""
+    """A request of one transport. The numbers of its tensors are not decoded yet."""
 
     @property
     def request(self) -> InferRequest:
-        """All but the numbers."""
+        """The request without the numbers."""
 
     def check(self) -> None:
-        """Look whether the numbers lie where the request says; raise InvalidRequestError."""
+        """Check that the numbers are where the request says; raise InvalidRequestError."""
 
     def numbers(self, place: int, dtype: np.dtype[np.floating]) -> NDArray[np.floating]:
-        """Numbers of the input at this place, flat or in rows: as many as its shape has, whose elements are `dtype`;
-        raise InvalidRequestError. To be asked in the order of the inputs."""
+        """Return the numbers of the input at this index, flat or in rows; raise InvalidRequestError.
+
+        There are as many as the input's shape needs, with elements of type `dtype`. Call it in the order of the inputs.
+        """
 
     def encode(self, header: Header, answers: list[Answer]) -> Reply:
-        """The answer as this transport has it."""
+        """Encode the answer for this transport."""

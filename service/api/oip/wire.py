@@ -1,4 +1,4 @@
-"""An inference request over HTTP: JSON, and binary tensors after it; and the bytes of its answer."""
+"""Decodes inference requests over HTTP, JSON followed by binary tensors, and encodes their answers."""
 
 from __future__ import annotations
 
@@ -40,39 +40,40 @@ Headers = Iterable[tuple[bytes, bytes]]
 
 
 class Message:
-    """A request, with what its body holds after the JSON."""
+    """A request, with the binary data that follow its JSON."""
 
     def __init__(self, request: InferRequest, body: bytes, offset: int) -> None:
         self.request, self._body, self._offset = request, body, offset
 
     def check(self) -> None:
-        """Compare the bytes after the JSON with those that the inputs announce; raise InvalidRequestError."""
+        """Check that the number of bytes after the JSON is what the inputs announce; raise InvalidRequestError."""
         sizes = (each.parameters.binary_data_size or 0 for each in self.request.inputs if each.parameters)
         announced, present = sum(sizes), len(self._body) - self._offset
         if announced != present:
-            expected = (
-                f"{announced} bytes, the sum of every binary_data_size, after the JSON whose length {HEADER} gives"
-            )
-            raise invalid_request("the binary data", f"{present} bytes", expected)
+            expected = f"{announced} bytes, the sum of every binary_data_size"
+            message = f"{present} bytes follow the JSON, expected {expected}. {HEADER} gives the length of the JSON."
+            raise invalid_request("the binary data", f"{present} bytes", expected, message)
 
     def numbers(self, place: int, dtype: np.dtype[np.floating]) -> NDArray[np.floating]:
-        """Numbers of an input, flat or in rows; to be asked in the order of the inputs, as binary data lie."""
+        """Return the numbers of an input, flat or in rows. Call it in the order of the inputs."""
         tensor = self.request.inputs[place]
         name, count = tensor.name, prod(tensor.shape)
         size = None if tensor.parameters is None else tensor.parameters.binary_data_size
         if (size is None) == (tensor.data is None):
             given_data = "missing" if size is None else "given, and binary_data_size too"
-            raise invalid_request(f"{name}.data", given_data, "numbers in data, or binary_data_size and binary data")
+            fault = "neither `data` nor" if size is None else "both `data` and"
+            message = f"Input `{name}` has {fault} `binary_data_size`. Give exactly one of them."
+            raise invalid_request(f"{name}.data", given_data, "either data or binary_data_size", message)
         if size is None:
-            return _listed(tensor, count)
+            return _read_list(tensor, count)
         if size != count * dtype.itemsize:
-            expected = f"{count * dtype.itemsize} bytes: the shape {tensor.shape} of {tensor.datatype}"
+            expected = f"{count * dtype.itemsize} bytes for shape {tensor.shape} of {tensor.datatype}"
             raise invalid_request(f"{name}.parameters.binary_data_size", size, expected)
         begin, self._offset = self._offset, self._offset + size
         return np.frombuffer(self._body, dtype, count, begin)
 
     def encode(self, header: Header, answers: list[Answer]) -> Reply:
-        """Encode an answer, each tensor as it was asked for."""
+        """Encode an answer, each tensor in the requested form."""
         tensors: list[InferTensor] = []
         payload: list[bytes] = []
         for name, values, binary in answers:
@@ -87,14 +88,16 @@ class Message:
 
 
 def decode(body: bytes, headers: Headers) -> Message:
-    """Decode the JSON of a body; raise InvalidRequestError, or UnsupportedMediaTypeError where it is compressed.
-    headers: of the request, their names in lower case."""
+    """Decode the JSON of a body; raise InvalidRequestError, or UnsupportedMediaTypeError if it is compressed.
+
+    `headers` are those of the request, with names in lower case.
+    """
     length: bytes | None = None
     for name, value in headers:
         if name == _HEADER:
             length = value
         elif name == _ENCODING and value.lower() != b"identity":
-            item = problem("Content-Encoding", value.decode("latin-1"), "none: bodies are taken uncompressed")
+            item = problem("Content-Encoding", value.decode("latin-1"), "an uncompressed body")
             raise UnsupportedMediaTypeError(sentence(item), [item])
     offset = len(body) if length is None else _length(length, len(body))
     text = body if offset == len(body) else memoryview(body)[:offset]
@@ -104,20 +107,21 @@ def decode(body: bytes, headers: Headers) -> Message:
         raise _explain(error, bytes(text), length is None) from error
 
 
-def _listed(tensor: InferInput, count: int) -> NDArray[np.float64]:
-    field, expected = f"{tensor.name}.data", f"{count} numbers or rows of them, as the shape {tensor.shape} has"
+def _read_list(tensor: InferInput, count: int) -> NDArray[np.float64]:
+    field, expected = f"{tensor.name}.data", f"{count} numbers, flat or in rows, for shape {tensor.shape}"
     try:
         values = np.array(tensor.data, np.float64)
     except ValueError:
-        raise invalid_request(field, "numbers and lists, or lists of different lengths", expected) from None
+        given = "numbers and lists, or lists of different lengths"
+        raise invalid_request(field, given, expected, f"`{field}` has {given}, expected {expected}.") from None
     if values.size != count or (values.ndim == 2 and list(values.shape) != tensor.shape):
         given = f"{values.size} numbers" if values.ndim == 1 else f"rows of shape {list(values.shape)}"
-        raise invalid_request(field, given, expected)
+        raise invalid_request(field, given, expected, f"`{field}` has {given}, expected {expected}.")
     return values
 
 
 def _tensor(name: str, values: NDArray[np.float64], payload: list[bytes] | None) -> InferTensor:
-    """Describe a tensor that lies in the JSON, or at the end of the payload."""
+    """Return an output tensor with its numbers in the JSON, or append them to the payload."""
     shape = list(values.shape)
     if payload is None:
         return InferTensor(name, "FP64", shape, data=values.ravel().tolist())
@@ -129,54 +133,53 @@ def _tensor(name: str, values: NDArray[np.float64], payload: list[bytes] | None)
 def _length(value: bytes, total: int) -> int:
     number = int(value) if value.isdigit() and len(value) < 20 else 0
     if not 1 <= number <= total:
-        expected = f"the length of the JSON in bytes, from 1 to the {total} of the body"
+        expected = f"the length of the JSON in bytes, 1 to {total}, the length of the body"
         raise invalid_request(HEADER, value.decode("latin-1"), expected)
     return number
 
 
 def _explain(error: Exception, text: bytes, alone: bool) -> InvalidRequestError:
-    """Say what is wrong with a request's JSON. alone: nothing was said to follow it."""
-    loose = _loosely(text)
+    """Return the error for wrong JSON; `alone`: no header announces binary data after it."""
+    loose = _read_loosely(text)
     if isinstance(error, msgspec.ValidationError):
         match = _MESSAGE.fullmatch(str(error))
-        assert match is not None  # the pattern takes any text
+        assert match is not None  # the pattern matches any text
         return _explain_value(match["what"], match["path"] or "", loose)
     for path, value in _leaves(loose):
-        if isinstance(value, float) and not isfinite(value):  # Python and others write NaN, which JSON does not know
+        if isinstance(value, float) and not isfinite(value):  # Python and others write NaN, which is not JSON
             return invalid_request(path or "the body", value, "a finite number" if path else "an object")
     reason = f"not JSON: {str(error).removeprefix('JSON is malformed: ')}"
-    where, expected = "the body", "an inference request as JSON"
     if alone:
-        expected += f"; the length of JSON that binary tensors follow is to be given in {HEADER}"
+        message = f"The body is {reason}. If binary tensors follow the JSON, give its length in {HEADER}."
     else:
-        where = f"the body, up to byte {len(text)} as {HEADER} says,"
-    return invalid_request(where, reason, expected)
+        message = f"The first {len(text)} bytes of the body, the length in {HEADER}, are {reason}"
+    return invalid_request("the body", reason, "an inference request as JSON", message)
 
 
 def _explain_value(what: str, path: str, loose: Any) -> InvalidRequestError:
     if field := _FIELD.fullmatch(what):
         name = f"{path}.{field['name']}".lstrip(".")
         if field["kind"] == "missing required":
-            return invalid_request(name, "missing", "a value")
-        return invalid_request(name, "given", "no field of that name")
+            return invalid_request(name, "missing", "a value", f"`{name}` is required.")
+        return invalid_request(name, "given", "a known field", f"Unknown field `{name}`.")
     if what == "Number out of range":
-        return invalid_request(path, _at(loose, path, "out of range"), "a finite number")
+        return invalid_request(path, _value_at(loose, path, "out of range"), "a finite number")
     kind, _, got = what.removeprefix("Expected `").partition("`, got ")
     return invalid_request(
-        path or "the body", _at(loose, path, got.strip("`")), _KINDS.get(kind.removesuffix(" | null"), what)
+        path or "the body", _value_at(loose, path, got.strip("`")), _KINDS.get(kind.removesuffix(" | null"), what)
     )
 
 
-def _loosely(text: bytes) -> Any:
-    """JSON with what only Python takes for JSON; None where it is not even that."""
+def _read_loosely(text: bytes) -> Any:
+    """Parse JSON and Python's extensions of it, such as NaN; return None if it is neither."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
         return None
 
 
-def _at(value: Any, path: str, otherwise: str) -> Any:
-    """What lies at a path such as `inputs[0].shape`; `otherwise` where equal keys hide it."""
+def _value_at(value: Any, path: str, otherwise: str) -> Any:
+    """Return the value at a path such as `inputs[0].shape`, or `otherwise` if duplicate keys hide it."""
     try:
         for key, index in _PART.findall(path):
             value = value[key] if key else value[int(index)]
@@ -186,7 +189,7 @@ def _at(value: Any, path: str, otherwise: str) -> Any:
 
 
 def _leaves(value: Any) -> Iterator[tuple[str, Any]]:
-    """Every value that is no list and no object, with its path, in order."""
+    """Yield every value that is not a list or object, with its path, in order."""
     waiting = [("", value)]
     while waiting:
         path, value = waiting.pop()

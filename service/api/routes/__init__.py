@@ -1,1 +1,1 @@
-"""Routes, one file a room."""
+"""Routes, one file per resource."""

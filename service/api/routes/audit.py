@@ -1,4 +1,4 @@
-"""`GET /v1/audit`: who changed what of which model."""
+"""Route of the audit log."""
 
 from __future__ import annotations
 
@@ -19,19 +19,28 @@ from service.storage.database import AuditRow
 router = APIRouter(prefix="/v1", tags=["audit"], responses=responses(InvalidRequestError), route_class=Route)
 
 
-@router.get("/audit", summary="List what changed models, newest first")
+@router.get("/audit", summary="List changes of models, newest first")
 @needs(ADMIN)
 def list_audit(
     storage: StorageDep,
     page: PageQuery,
-    model: Annotated[str | None, Query(max_length=64, description="Only changes of this model")] = None,
-    key: Annotated[str | None, Query(max_length=40, description="Only by the API key of this id")] = None,
+    model: Annotated[str | None, Query(max_length=64, description="Only changes to this model")] = None,
+    key: Annotated[
+        str | None, Query(max_length=40, description="Only changes made with the API key of this id")
+    ] = None,
     change: Annotated[Change | None, Query(description="Only changes of this kind")] = None,
-    since: Annotated[AwareDatetime | None, Query(description="Only from this moment on, ISO 8601 with a zone")] = None,
-    until: Annotated[AwareDatetime | None, Query(description="Only before this moment")] = None,
+    since: Annotated[
+        AwareDatetime | None, Query(description="Only changes at or after this time: ISO 8601 with a time zone")
+    ] = None,
+    until: Annotated[
+        AwareDatetime | None, Query(description="Only changes before this time: ISO 8601 with a time zone")
+    ] = None,
 ) -> AuditPage:
-    """Who changed what of which model, when and by what. A line is written with the change and never altered; it is
-    kept for `LIPSERVE_AUDIT_RETENTION_S`. What is learnt from observations is in their own log."""
+    """Return one page of the audit log: who changed which model, what changed, and when.
+
+    An entry is stored together with its change and never altered. It is kept for `LIPSERVE_AUDIT_RETENTION_S`.
+    Learning from observations is not listed here: see `GET /v1/models/{model}/observations`.
+    """
     rows, following = audit.page(storage.database, page, model, key, change, since, until)
     return AuditPage(items=[_show(row) for row in rows], next_cursor=following)
 

@@ -60,7 +60,10 @@ async def upload(
     query: Annotated[UploadQuery, Query()],
     idempotency_key: KeyHeader = None,
 ) -> Dataset:
-    """Validate a recording, prepare it and store it as an immutable data set, or say what is wrong and where."""
+    """Check a recording, prepare it and store it as a data set, which never changes.
+
+    A wrong recording is rejected: `detail` names the column or row and what was expected.
+    """
     options = upload_options(query)
     path = storage.files.upload()
     try:
@@ -81,23 +84,23 @@ def list_datasets(
     storage: StorageDep,
     page: PageQuery,
     upload_sha256: Annotated[
-        str | None, Query(pattern="^[0-9a-f]{64}$", description="Only those of files with this sha256, however read")
+        str | None, Query(pattern="^[0-9a-f]{64}$", description="Only data sets made from a file with this sha256")
     ] = None,
 ) -> DatasetPage:
-    """One page of data sets with their reports."""
+    """Return one page of data sets with their reports."""
     return store.page(storage.database, page, upload_sha256)
 
 
-@router.get("/{dataset}", summary="One data set and its report", responses=responses(NotFoundError))
+@router.get("/{dataset}", summary="Retrieve a data set and its report", responses=responses(NotFoundError))
 @needs(READ)
 def show(storage: StorageDep, dataset: str) -> Dataset:
-    """What was found in the recording and what was derived."""
+    """Return a data set with its report: what the recording contained and what was derived from it."""
     return store.show(storage.database, dataset)
 
 
 @router.get(
     "/{dataset}/preview",
-    summary="Points of a data set for a plot",
+    summary="Retrieve points of a data set for a plot",
     responses=responses(NotFoundError, DamagedDataError),
 )
 @needs(READ)
@@ -105,13 +108,13 @@ def preview(
     storage: StorageDep,
     dataset: str,
     quantities: Annotated[
-        str, Query(max_length=100, description="Any of q, dq, ddq, tau, separated by commas")
+        str, Query(max_length=100, description="Any of q, dq, ddq, tau; separated by commas")
     ] = ",".join(QUANTITIES),
     points: Annotated[
-        int, Query(ge=2, le=store.MOST_POINTS, description="Most points of one column")
-    ] = store.MOST_POINTS,
+        int, Query(ge=2, le=store.MAX_PREVIEW_POINTS, description="Max points per column")
+    ] = store.MAX_PREVIEW_POINTS,
 ) -> Preview:
-    """Columns thinned so that the largest and smallest values stay."""
+    """Return columns of a data set, reduced to at most `points` rows. Minima and maxima stay visible."""
     names = [name.strip() for name in quantities.split(",")]
     for name in names:
         if name not in QUANTITIES or names.count(name) > 1:
@@ -127,5 +130,5 @@ def preview(
 )
 @needs(TRAIN)
 def delete(storage: StorageDep, dataset: str) -> None:
-    """Delete the samples. Models trained on them stay."""
+    """Delete a data set with its samples. Models trained on it stay."""
     store.delete(storage, dataset)

@@ -1,4 +1,4 @@
-"""Routes of health: for what watches over the service, without a key."""
+"""Health routes for monitoring, which need no API key."""
 
 from __future__ import annotations
 
@@ -20,16 +20,19 @@ from service.foundation.errors import NotReadyError, problem
 router = APIRouter(prefix="/health", tags=["health"], route_class=Route)
 
 
-@router.get("", summary="What can the service do?")
+@router.get("", summary="Retrieve version and installed extras")
 @needs(None)
 async def health(confined: Annotated[dict[str, bool], Depends(of_app("confined"))]) -> Health:
-    """Answer which extras are installed. Who asks for what needs another one is answered 501 `not_installed`."""
+    """Return the version and which optional extras are installed.
+
+    A request that needs a missing extra is answered with 501 `not_installed`.
+    """
     return Health(version=__version__, can=dict(_can()), missing=list(_missing()), confined=confined)
 
 
 @cache
 def _can() -> tuple[tuple[str, bool], ...]:
-    """Of every extra whether it is installed: looked up once, as a running service does not see what is new."""
+    """Return for every extra whether it is installed. Cached: a running service cannot import a new package."""
     return tuple((name, is_installed(name)) for name in EXTRAS)
 
 
@@ -39,20 +42,25 @@ def _missing() -> Iterator[Missing]:
             yield Missing(extra=name, gives=EXTRAS[name].gives, install=install_line(name))
 
 
-@router.get("/live", summary="Is the process alive?")
+@router.get("/live", summary="Check that the process is alive")
 @needs(None)
 async def live() -> Live:
-    """Answer while the event loop turns."""
+    """Answer 200 while the event loop runs."""
     return Live()
 
 
-@router.get("/ready", summary="Can the service answer?", responses=responses(NotReadyError))
+@router.get("/ready", summary="Check that the service is ready", responses=responses(NotReadyError))
 @needs(None)
 def ready(readiness: ReadinessDep) -> Ready:
-    """Answer once the models are loaded, and while each part works: the database and the home can be written and are
-    not full, the versions that serve can be read, the learner gets on where something learns, training jobs are
-    started, and the service is not stopping. Otherwise `detail` names the parts that do not. Looked at once a second
-    at most.
+    """Answer 200 if the models are loaded and every part of the service works, else 503.
+
+    - The database and the home folder can be written and are not full.
+    - The serving versions can be read.
+    - The learner makes progress, if a model learns.
+    - Training jobs are started.
+    - The service is not stopping.
+
+    With 503, `detail` names the parts that failed. The parts are checked at most once a second.
     """
     report = readiness.report()
     if failed := [each for each in report if each.state == "failed"]:

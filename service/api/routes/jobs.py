@@ -1,4 +1,4 @@
-"""A job's changes as server-sent events."""
+"""Routes of training jobs, and their progress as server-sent events."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _row(queue: JobQueueDep, job: str) -> JobRow:
 
 
 async def _followed(queue: JobQueueDep, row: Annotated[JobRow, Depends(_row)]) -> AsyncIterator[JobRow]:
-    """The job at the start; one more is counted while the answer lasts."""
+    """Yield the job as it is at the start, and count one follower until the answer ends."""
     with queue.feed.count_one(MAX_FOLLOWERS):
         yield row
 
@@ -48,14 +48,14 @@ FollowedDep = Annotated[JobRow, Depends(_followed)]
 async def _events(
     queue: JobQueue, loaded: LoadedModels, closing: asyncio.Event, row: JobRow
 ) -> AsyncIterator[ServerSentEvent]:
-    """`state` with the job as it is; then `state` or `progress`, each with the whole job; ends with the job."""
+    """Yield a `state` event, then a `state` or `progress` event at every change, until the job ends."""
     last: JobRow | None = None
     async for now in queue.feed.follow(row, closing):
         kind = None if last is None else _kind(last, now)
         if last is not None and kind is None:
             continue
         job = jobs.represent(now)
-        if now.version is not None:  # who sees it succeed is answered by its version from then on
+        if now.version is not None:  # a client that sees the job succeed must get answers from its version
             await to_thread.run_sync(loaded.announce, [now.model])
             [job] = await to_thread.run_sync(jobs.represent_all, queue.database, [now])
         yield ServerSentEvent(event=kind or "state", data=job)
@@ -65,7 +65,7 @@ async def _events(
 
 
 def _kind(before: JobRow, now: JobRow) -> str | None:
-    """What has changed, None where nothing has that a reader would care for."""
+    """Return the kind of event for a change, None if no visible field changed."""
     if (before.state, before.history) != (now.state, now.history):
         return "state"
     return "progress" if before.progress != now.progress else None
@@ -84,7 +84,10 @@ router = APIRouter(
 )
 @needs(TRAIN)
 def create(queue: JobQueueDep, request: JobRequest, response: Response, idempotency_key: KeyHeader = None) -> Job:
-    """Queue a training job. It runs in another process and ends in a new version of the model."""
+    """Queue a training job. It runs in a separate process and creates a new version of the model.
+
+    Poll `GET /v1/jobs/{job}` or follow `GET /v1/jobs/{job}/events` to see its progress.
+    """
     named = identify_request(idempotency_key, "train", request.model_dump(mode="json", exclude_unset=True))
     job = jobs.create(queue, request, named=named)
     response.headers["Location"] = f"/v1/jobs/{job.id}"
@@ -94,27 +97,29 @@ def create(queue: JobQueueDep, request: JobRequest, response: Response, idempote
 @router.post(
     "/check",
     status_code=status.HTTP_204_NO_CONTENT,
-    summary="Check a job before its data are uploaded",
+    summary="Check a training request before uploading data",
     responses=responses(NotFoundError, ConflictError),
 )
 @needs(TRAIN)
 def check(queue: JobQueueDep, draft: JobDraft) -> None:
-    """Refuse what a request to train would be refused for, as far as the data sets that are there tell. Nothing is
-    queued."""
+    """Run the checks of `POST /v1/jobs` without queueing a job.
+
+    Data sets that are not uploaded yet cannot be checked. The errors are those of `POST /v1/jobs`.
+    """
     jobs.check(queue, draft)
 
 
 @router.get("", summary="List jobs, newest first")
 @needs(READ)
 def list_jobs(queue: JobQueueDep, loaded: LoadedModelsDep, page: PageQuery) -> JobPage:
-    """One page of jobs with their progress."""
+    """Return one page of jobs with their progress."""
     return jobs.page(queue, loaded, page)
 
 
-@router.get("/{job}", summary="One job and its progress", responses=responses(NotFoundError))
+@router.get("/{job}", summary="Retrieve a job and its progress", responses=responses(NotFoundError))
 @needs(READ)
 def show(queue: JobQueueDep, loaded: LoadedModelsDep, job: str) -> Job:
-    """State, progress, and the version it made or why it failed."""
+    """Return a job's state and progress, and the version that it created or the reason why it failed."""
     return jobs.show(queue, loaded, job)
 
 
@@ -128,9 +133,13 @@ def show(queue: JobQueueDep, loaded: LoadedModelsDep, job: str) -> Job:
 async def follow(
     queue: JobQueueDep, loaded: LoadedModelsDep, stopping: StoppingDep, row: FollowedDep
 ) -> AsyncIterable[ServerSentEvent]:
-    """Server-sent events, each with the whole job as its data: `state` at the start, at every entry of its history and
-    at its end; `progress` in between, about twice a second. The answer ends with the job, or when the service stops:
-    ask again then, the first event says how it stands."""
+    """Stream the progress of a job as server-sent events. The data of every event is the whole job.
+
+    - `state` is sent at the start, at every new entry of the job's history, and at its end.
+    - `progress` is sent in between, about twice a second.
+
+    The stream ends with the job or when the service stops. Reconnect then: the first event has the current state.
+    """
     async for event in _events(queue, loaded, stopping.closing, row):
         yield event
 
@@ -138,19 +147,25 @@ async def follow(
 @router.post("/{job}/cancel", summary="Cancel a job", responses=responses(NotFoundError, ConflictError))
 @needs(TRAIN)
 def cancel(queue: JobQueueDep, job: str) -> Job:
-    """Cancel a waiting job at once, a running one within two seconds: a process that does not obey is killed."""
+    """Cancel a job: at once if it is queued, within two seconds if it runs.
+
+    A process that does not stop in time is killed.
+    """
     return jobs.cancel(queue, job)
 
 
 @router.post(
     "/{job}/retry",
     status_code=status.HTTP_202_ACCEPTED,
-    summary="Repeat a job that failed or was cancelled",
+    summary="Retry a failed or cancelled job",
     responses=responses(NotFoundError, ConflictError, BusyError),
 )
 @needs(TRAIN)
 def retry(queue: JobQueueDep, job: str, response: Response, idempotency_key: KeyHeader = None) -> Job:
-    """Queue a new job with the same request; `retry_of` names the old one. What it needs must still be there."""
+    """Queue a new job with the same request. Its `retry_of` names the old job.
+
+    The data sets, robots and models of the request must still exist.
+    """
     again = jobs.retry(queue, job, identify_request(idempotency_key, "retry", job))
     response.headers["Location"] = f"/v1/jobs/{again.id}"
     return again

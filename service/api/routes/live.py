@@ -1,4 +1,4 @@
-"""The route that follows a model live."""
+"""Route of the live events of a model."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _name(learners: LearnersDep, model: str) -> str:
 
 
 async def _followed(learners: LearnersDep, name: Annotated[str, Depends(_name)]) -> AsyncIterator[str]:
-    """The model's name; one more reader is counted while the answer lasts."""
+    """Yield the model's name, and count one follower until the answer ends."""
     with learners.live.count_one(MAX_FOLLOWERS):
         yield name
 
@@ -36,7 +36,7 @@ FollowedDep = Annotated[str, Depends(_followed)]
 async def events(
     learners: Learners, meters: Meters, closing: asyncio.Event, model: str
 ) -> AsyncIterator[ServerSentEvent]:
-    """`status` at the start and once a second, `rows` as they come; see `schema`."""
+    """Yield `status` at the start and once a second, and `rows` as they arrive."""
     feed = learners.live
     async for event in feed.follow(model, StatusReader(learners, meters, model), closing):
         yield ServerSentEvent(event=event.event, raw_data=event.data)
@@ -57,13 +57,15 @@ router = APIRouter(
 async def follow(
     learners: LearnersDep, meters: MetersDep, stopping: StoppingDep, model: FollowedDep
 ) -> AsyncIterable[ServerSentEvent]:
-    """Server-sent events of what streams and batches bring with measured torque, predicted before it is learnt.
+    """Stream measured and predicted torque as server-sent events. Rows are predicted before they are learnt.
 
-    `rows`, at most ten a second: `parts`, each of one stream and revision, with torque measured, mean, standard
-    deviations and code of some 50 rows a second; all rows are counted by code. `status`, at the
-    start and about once a second: version, revision, counters, quality, latency of streams, alarms, and whether
-    learning waits for a decision. `lost`: so many events were dropped because they were not read in time. The answer
-    ends when the model is deleted or the service stops.
+    - `rows`, at most ten a second: `parts`, each of one stream and revision. A part has the measured torque, mean,
+      standard deviations and code of about 50 rows a second, and counts all rows by code.
+    - `status`, at the start and about once a second: version, revision, counters, quality, latency of streams, alarms,
+      and whether learning is paused until a person decides.
+    - `lost`: the number of events that were dropped because the client did not read them in time.
+
+    The stream ends when the model is deleted or the service stops.
     """
     async for event in events(learners, meters, stopping.closing, model):
         yield event

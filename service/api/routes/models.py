@@ -1,4 +1,4 @@
-"""Routes of models and versions, and of what takes a version elsewhere: export and import, and its arm as a URDF."""
+"""Routes of models, versions and aliases, and of export, import and the learnt URDF."""
 
 from __future__ import annotations
 
@@ -28,11 +28,13 @@ from service.foundation.fields import BINARY, upload_body
 from service.models import aliases, archive, archive_import, deletion, registry
 
 _BINARY = {"schema": BINARY}
-_BODY = upload_body("An archive as an export writes it.", {archive.MEDIA_TYPE: _BINARY}, "A .tar file")
+_BODY = upload_body("An archive written by an export.", {archive.MEDIA_TYPE: _BINARY}, "A .tar file")
 
-WhichVersion = Annotated[schema.VersionNumber | None, Query(description="The version that serves by default")]
-WhichAlias = Annotated[schema.AliasName | None, Query(description="An alias, instead of a version's number")]
-AliasPath = Annotated[schema.AliasName, Path(description="`serving`, or a name of your own")]
+WhichVersion = Annotated[
+    schema.VersionNumber | None, Query(description="A version's number. Default: the serving version")
+]
+WhichAlias = Annotated[schema.AliasName | None, Query(description="An alias instead of a version's number")]
+AliasPath = Annotated[schema.AliasName, Path(description="`serving` or a name of your choice")]
 
 router = APIRouter(prefix="/v1/models", tags=["models"], responses=responses(InvalidRequestError), route_class=Route)
 
@@ -51,17 +53,18 @@ async def import_version(
     loaded: LoadedModelsDep,
     turns: ArchivesDep,
     name: Annotated[
-        schema.ModelName | None, Query(description="Name of the model; that of the archive by default")
+        schema.ModelName | None, Query(description="Name of the model. Default: the name in the archive")
     ] = None,
     promotion: Annotated[
         PromotionOption | None,
         Query(
-            description="Whether it answers: `ask`, if the model had no version and the figures that come with it say "
-            "that it does well on what its training held out; `always`, in any case. LIPSERVE_PROMOTION by default"
+            description="When the version starts serving. `ask`: if the model has no other version and the archive's "
+            "figures on held-out data are good, else it becomes a candidate. `always`: at once. Default: "
+            "LIPSERVE_PROMOTION"
         ),
     ] = None,
 ) -> schema.Version:
-    """Check an archive and make a new version of it."""
+    """Check an archive and create a new version from it."""
     path = loaded.files.upload()
     try:
         await receive_to(request, path, Kinds({archive.MEDIA_TYPE: "tar"}, {".tar": "tar"}), loaded.storage.disk)
@@ -88,15 +91,15 @@ async def export_version(
     model: str,
     version: WhichVersion = None,
     alias: WhichAlias = None,
-    learnt: Annotated[bool, Query(description="With what it has learnt online; false: as it was trained")] = True,
+    learnt: Annotated[bool, Query(description="Include what was learnt online; false: as trained")] = True,
     format: Annotated[  # noqa: A002 - the field's own name
-        Literal["archive", "c"], Query(description="`c`: C99 for control loops, where rigid bodies are known; else 422")
+        Literal["archive", "c"], Query(description="`c`: C99 code; rigid-body estimators only, else 422")
     ] = "archive",
 ) -> StreamingResponse:
-    """One archive with all that another service needs to answer alike; `export.json` in it says what it holds.
+    """Return an archive that another service can import and serve. `export.json` in it lists the contents.
 
-    With `format=c` an archive of `lipserve_model.c` and `lipserve_model.h`: torque and its standard deviation in C99,
-    without dependencies or allocation. The header says how to use them.
+    With `format=c` the archive has `lipserve_model.c` and `lipserve_model.h`: C99 code for control loops that computes
+    torque and its standard deviation without dependencies or allocation. The header explains how to use it.
     """
     as_c = format == "c"
     archived = await to_thread.run_sync(archive.export, loaded, model, version, alias, learnt, as_c, limiter=turns)
@@ -106,7 +109,7 @@ async def export_version(
 
 @router.get(
     "/{model}/urdf",
-    summary="The arm that a version has learnt, as a URDF",
+    summary="Export the learnt arm as a URDF",
     response_class=Response,
     responses={
         **responses(NotFoundError, InvalidRequestError),
@@ -120,10 +123,10 @@ async def export_version(
 def version_urdf(
     loaded: LoadedModelsDep, model: str, version: WhichVersion = None, alias: WhichAlias = None
 ) -> Response:
-    """Links, joints, physically possible masses and friction, as they were trained, for simulators and planners.
+    """Return links, joints, friction and physically possible masses as trained, for simulators and planners.
 
-    Of estimators with rigid bodies whose geometry is known; the others answer 422. Comments in the text say what a URDF
-    has no place for, and what torque does not tell.
+    Only estimators with rigid bodies and known geometry have a URDF; others answer 422. XML comments list what a URDF
+    cannot express and which parameters torque cannot identify.
     """
     name, text = archive.write_urdf(loaded, model, version, alias)
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
@@ -133,25 +136,25 @@ def version_urdf(
 @router.get("", summary="List models, newest first")
 @needs(READ)
 def list_models(loaded: LoadedModelsDep, page: PageQuery) -> schema.ModelPage:
-    """One page of models with their versions."""
+    """Return one page of models with their versions."""
     listed = registry.page(loaded.database, page)
     loaded.announce([item.name for item in listed.items])
     return listed
 
 
-@router.get("/{model}", summary="One model and its versions", responses=responses(NotFoundError))
+@router.get("/{model}", summary="Retrieve a model and its versions", responses=responses(NotFoundError))
 @needs(READ)
 def show(loaded: LoadedModelsDep, model: str) -> schema.Model:
-    """Which versions there are and which one answers."""
+    """Return a model with all its versions and the serving version."""
     record = registry.show(loaded.database, model)
     loaded.announce([record.name])
     return record
 
 
-@router.get("/{model}/versions/{version}", summary="One version", responses=responses(NotFoundError))
+@router.get("/{model}/versions/{version}", summary="Retrieve a version", responses=responses(NotFoundError))
 @needs(READ)
 def show_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNumber) -> schema.Version:
-    """Joints, noise, training range, options, what the fit reported, and the data it came from."""
+    """Return a version: joints, noise, training range, options, report of the fit, and training data."""
     return registry.show_version(loaded.database, model, version)
 
 
@@ -163,8 +166,10 @@ def show_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNum
 )
 @needs(ADMIN)
 def delete_version(loaded: LoadedModelsDep, model: str, version: schema.VersionNumber) -> None:
-    """Delete a version that nothing needs: no alias, not the service and no job. Its number is not given
-    again."""
+    """Delete a version. Its number is not reused.
+
+    The request fails with 409 if an alias, the service or a job still needs the version.
+    """
     deletion.delete_version(loaded, model, version)
 
 
@@ -176,14 +181,20 @@ def delete_version(loaded: LoadedModelsDep, model: str, version: schema.VersionN
 )
 @needs(ADMIN)
 def delete_model(loaded: LoadedModelsDep, model: str) -> None:
-    """Delete a model with its versions, aliases and all that it has observed and learnt. Jobs and data sets stay."""
+    """Delete a model with its versions, aliases, observations and everything learnt from them.
+
+    Training jobs and data sets stay.
+    """
     deletion.delete_model(loaded, model)
 
 
 @router.get("/{model}/aliases", summary="List the aliases of a model", responses=responses(NotFoundError))
 @needs(READ)
 def list_aliases(loaded: LoadedModelsDep, model: str) -> schema.AliasList:
-    """Where each points, since when, and where it pointed before. `serving` is the version that answers by default."""
+    """Return every alias with its version, the time of its last move and its earlier versions.
+
+    `serving` names the version that answers by default.
+    """
     return aliases.page(loaded, model)
 
 
@@ -194,7 +205,10 @@ def list_aliases(loaded: LoadedModelsDep, model: str) -> schema.AliasList:
 )
 @needs(ADMIN)
 def put_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath, request: schema.AliasRequest) -> schema.Alias:
-    """Make or move an alias. The version is loaded first: queries follow in one step, and none fails or waits."""
+    """Create or move an alias.
+
+    The version is loaded before the alias moves, so that no query fails or waits.
+    """
     return aliases.put(loaded, model, alias, request)
 
 
@@ -206,16 +220,16 @@ def put_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath, request: sc
 )
 @needs(ADMIN)
 def remove_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath) -> None:
-    """Remove an alias; the version stays, and a rollback brings the alias back. `serving` cannot be removed."""
+    """Remove an alias. The version stays, and a rollback restores the alias. `serving` cannot be removed."""
     aliases.remove(loaded, model, alias)
 
 
 @router.post(
     "/{model}/aliases/{alias}/rollback",
-    summary="Point an alias to where it pointed before",
+    summary="Undo the last move of an alias",
     responses=responses(NotFoundError, ConflictError, UnreadableVersionError),
 )
 @needs(ADMIN)
 def rollback_alias(loaded: LoadedModelsDep, model: str, alias: AliasPath) -> schema.Alias:
-    """Take back the last move, the next time the one before it, and so on."""
+    """Point an alias to its previous version. Every further call undoes one earlier move."""
     return aliases.rollback(loaded, model, alias)

@@ -1,4 +1,4 @@
-"""The route of observations: decoded and taken in a thread, away from the event loop."""
+"""Route of observation batches, which are decoded and stored in a thread, away from the event loop."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ hot = APIRouter(
         BusyError,
     ),
 )
-"""The application tries it first: what pydantic takes long to read is decoded in a thread."""
+"""Matched before all other routes. Bodies that pydantic would parse slowly are decoded in a thread."""
 
 
 async def _answer(scope: Scope, body: bytes) -> Reply | None:
-    """Take a batch that can be read as it stands."""
+    """Answer a batch that needs no further checks; return None for any other."""
     if not is_json(scope):
         return None
     learners: Learners = scope["app"].state.learners
@@ -49,12 +49,14 @@ def _decoded(learners: Learners, model: str, body: bytes) -> bytes | None:
 
 @needs(UPDATE)
 async def observe(learners: LearnersDep, model: str, request: ObservationRequest) -> ObservationResponse:
-    """Take a batch of measured rows to learn from, durable once it is answered, and learnt within a moment.
+    """Store a batch of measured rows to learn from. The batch is durable once it is answered, and learnt soon after.
 
-    Each row is predicted before it is learnt. Rows that cannot be explained are kept and counted, but not learnt. Send
-    a batch again until it is answered: it is applied once. Batches may come in any order. Times must rise within a
-    stream; a robot whose clock was set goes on under another `stream_id`. Of joints in another order, say
-    `joint_names`. Batches of about a tenth of a second to a second serve best.
+    - Every row is predicted before it is learnt. Rows that the model cannot explain are stored and counted, but not
+      learnt.
+    - If no answer arrives, send the same batch again: it is applied once. Batches may arrive in any order.
+    - Times must increase within a stream. If a robot's clock was set back, continue with a new `stream_id`.
+    - If your joints have another order than the model's, give `joint_names`.
+    - Batches of 0.1 s to 1 s work best.
     """
     return await learners.threads.run(model, learners.observe, model, request)
 
@@ -63,7 +65,7 @@ hot.add_api_route(
     "/{model}/observations",
     observe,
     methods=["POST"],
-    summary="Teach a model with measured rows",
+    summary="Send an observation batch",
     response_model=ObservationResponse,
     route_class_override=hot_route(_answer),
 )

@@ -1,4 +1,4 @@
-"""Routes of torque queries, and the echo: what a request costs before anything is computed."""
+"""Routes of torque queries, and the echo, which measures the latency of a request without computation."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _CONTENT: dict[str, Any] = {
 }
 _DOCUMENTED: dict[str, Any] = {
     "requestBody": {"required": True, "content": _CONTENT},
-    "responses": {"200": {"description": "The body as it came", "content": _CONTENT}},
+    "responses": {"200": {"description": "The unchanged body", "content": _CONTENT}},
 }
 
 echo_hot = APIRouter(tags=["inference"], responses=responses(TooLargeError))
@@ -47,19 +47,20 @@ async def _echo(scope: Scope, body: bytes) -> Reply | None:
 
 @needs(PREDICT)
 async def echo(request: Request) -> Response:
-    """Answer the body as it came, on the way that a query takes, limits and all: JSON as such, anything else as octets,
-    so that nobody's page seems to be the service's.
+    """Return the body unchanged, through the same checks and limits as a query.
 
-    What a query takes longer is what the service computes; what the echo takes is HTTP, and the measuring client.
+    Use it to measure latency: the echo takes the time of HTTP and of the client. The extra time of a query is the
+    computation. JSON is returned as JSON, anything else as `application/octet-stream`.
     """
-    return Reply(await request.body(), OCTETS).response()  # with a media type, it has been answered before
+    # requests with a media type are answered by `_echo`. Octets: the body must never be shown as a page of the service
+    return Reply(await request.body(), OCTETS).response()
 
 
 echo_hot.add_api_route(
     "/v1/echo",
     echo,
     methods=["POST"],
-    summary="Answer what was sent: the floor of latency benchmarks",
+    summary="Echo a body",
     response_class=Response,
     openapi_extra=_DOCUMENTED,
     route_class_override=hot_route(_echo),
@@ -72,11 +73,14 @@ _LATE = responses(RevisionNotReachedError)
 _TAGS: list[str | Enum] = ["inference"]
 router = APIRouter(prefix="/v1/models", tags=_TAGS, responses=_ERRORS, route_class=Route)
 hot = APIRouter(prefix="/v1/models", tags=_TAGS, responses=_ERRORS)
-"""The route of a control loop, which the application tries first."""
+"""Route of control loops, matched before all other routes."""
 
 
 async def _answer(scope: Scope, body: bytes) -> Reply | None:
-    """Answer a query that can be read as it stands: one of a control loop here, any other in a thread."""
+    """Answer a query that needs no further checks; return None for any other.
+
+    A query of a control loop is computed here, any other in a thread.
+    """
     query = queries.decode(body) if is_json(scope) else None
     if query is None:
         return None
@@ -103,7 +107,7 @@ async def _in_thread(
 async def _revised(
     loaded: LoadedModels, model: str, request: schema.PredictRequest | schema.EvaluateRequest
 ) -> ServedModel | None:
-    """The version that answers, where the request waits for a revision of it; None where it does not."""
+    """Wait for the revision that a request asks for and return its version, None if it asks for none."""
     if request.min_revision is None:
         return None
     return await wait_for_revision(loaded, model, request.version, request.alias, request.min_revision)
@@ -113,8 +117,11 @@ async def _revised(
 async def predict(
     loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.PredictRequest
 ) -> Response:
-    """Answer one query or a batch. Nothing is clipped; `tau_std` grows where the model knows little."""
-    # a right query has been answered before: this reads the others, to say what is wrong, or in JSON of other dialects
+    """Predict the torque of one query or a batch, with its standard deviation.
+
+    Inputs and outputs are not clipped. `tau_std` grows far from the training data.
+    """
+    # correct queries are answered by `_answer`. The others have an error to explain, or unusual JSON
     served = await _revised(loaded, model, request)
     return Reply(await _in_thread(loaded, turns, model, request, served)).response()
 
@@ -123,33 +130,32 @@ hot.add_api_route(
     "/{model}/predict",
     predict,
     methods=["POST"],
-    summary="Torque at a motion, with its uncertainty",
+    summary="Predict torque with uncertainty",
     response_model=schema.PredictResponse,
     responses=_LATE,
     route_class_override=hot_route(_answer),
 )
 
 
-@router.post("/{model}/evaluate", summary="Compare a model with a data set", responses=_LATE)
+@router.post("/{model}/evaluate", summary="Evaluate a model on a data set", responses=_LATE)
 @needs(PREDICT)
 async def evaluate(
     loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.EvaluateRequest
 ) -> schema.EvaluateResponse:
-    """Error, coverage and density of the model's torques against measured ones, joint by joint."""
+    """Return error, coverage and negative log predictive density of the predicted torque for every joint."""
     served = await _revised(loaded, model, request)
     return await to_thread.run_sync(evaluating.evaluate, loaded, model, request, served, limiter=turns)
 
 
-@router.post("/{model}/trace", summary="Follow a model along a data set", responses=responses(DamagedDataError))
+@router.post("/{model}/trace", summary="Trace predictions along a data set", responses=responses(DamagedDataError))
 @needs(PREDICT)
 async def trace_model(
     loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.TraceRequest
 ) -> schema.TraceResponse:
-    """Measured torque beside the model's, row by row, for a plot: mean, both standard deviations and components.
+    """Return measured and predicted torque row by row, for a plot: mean, both standard deviations and components.
 
-    Where there are more rows than points, rows are chosen evenly. Each is shown as it was measured and predicted, and
-    the share of them outside the interval is fair, but a peak between two of them is missing: ask for fewer rows to
-    see all.
+    If there are more rows than points, evenly spaced rows are returned. The share of points outside the interval is
+    representative, but peaks between two points are missing. To see every row, ask for a shorter range.
     """
     return await to_thread.run_sync(evaluating.trace, loaded, model, request, limiter=turns)
 
@@ -164,5 +170,8 @@ async def trace_model(
 async def compare(
     loaded: LoadedModelsDep, turns: PredictionsDep, model: str, request: schema.CompareRequest
 ) -> schema.CompareResponse:
-    """Which of two versions predicts a data set better, joint by joint and over all, and whether that may be chance."""
+    """Return which of two versions predicts a data set better, per joint and over all joints.
+
+    The answer also says whether the difference may be due to chance.
+    """
     return await to_thread.run_sync(comparison.compare, loaded, model, request, limiter=turns)

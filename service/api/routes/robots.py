@@ -42,9 +42,12 @@ async def upload(
     request: Request,
     response: Response,
     storage: StorageDep,
-    name: Annotated[NameForPeople | None, Query(description="A name for people; the URDF's by default")] = None,
+    name: Annotated[NameForPeople | None, Query(description="Display name. Default: the name in the URDF")] = None,
 ) -> Robot:
-    """Check a URDF and store it, or say what is wrong with it. No file that it names is opened."""
+    """Check a URDF and store it as a robot. Files that it refers to, such as meshes, are not opened.
+
+    A wrong URDF is rejected: `detail` names what is wrong.
+    """
     kinds = Kinds({"application/xml": "urdf", "text/xml": "urdf"}, {".urdf": "urdf", ".xml": "urdf"})
     _, content = await receive(request, kinds)
     await to_thread.run_sync(storage.disk.reserve, len(content))
@@ -56,28 +59,34 @@ async def upload(
 @router.get("", summary="List uploaded robots, newest first")
 @needs(READ)
 def list_robots(storage: StorageDep, page: PageQuery) -> RobotPage:
-    """One page of uploaded robots with their joints."""
+    """Return one page of uploaded robots with their joints."""
     return store.page(storage.database, page)
 
 
-@router.get("/profiles", summary="List the robots known by name")
+@router.get("/profiles", summary="List robot profiles")
 @needs(READ)
 def profiles() -> ProfileList:
-    """Joints, limits and the meaning of effort of each. Uploads may name any as their robot, jobs those with a URDF."""
+    """Return the joints, limits and meaning of the effort column of every robot known by name.
+
+    Uploads may name any of them as their `robot`. Training jobs may name those that have a URDF.
+    """
     return ProfileList(items=store.list_profiles())
 
 
-@router.get("/profiles/{name}", summary="One robot known by name, or uploaded", responses=responses(NotFoundError))
+@router.get("/profiles/{name}", summary="Retrieve a robot profile", responses=responses(NotFoundError))
 @needs(READ)
 def profile(storage: StorageDep, name: str) -> RobotProfile:
-    """Joints, limits and the meaning of effort of a robot, by its name or the id of an uploaded URDF."""
+    """Return joints, limits and the meaning of the effort column of one robot.
+
+    `name` is a name from `GET /v1/robots/profiles` or the id of an uploaded URDF.
+    """
     return store.show_profile(storage.database, name)
 
 
-@router.get("/{robot}", summary="One uploaded robot", responses=responses(NotFoundError))
+@router.get("/{robot}", summary="Retrieve an uploaded robot", responses=responses(NotFoundError))
 @needs(READ)
 def show(storage: StorageDep, robot: str) -> Robot:
-    """Name, joints and hash of an uploaded URDF."""
+    """Return name, joints and hash of an uploaded URDF."""
     return store.show(storage.database, robot)
 
 
@@ -89,5 +98,5 @@ def show(storage: StorageDep, robot: str) -> Robot:
 )
 @needs(TRAIN)
 def delete(storage: StorageDep, robot: str) -> None:
-    """Delete an uploaded URDF. Models trained with it keep their copy."""
+    """Delete an uploaded URDF. Models trained with it keep their own copy."""
     store.delete(storage.database, robot)

@@ -1,4 +1,4 @@
-"""What extends uvicorn: connections, sockets, and the protocol of streams."""
+"""Extensions of uvicorn: connections, sockets, and the WebSocket protocol."""
 
 HOLDS_FOR = {"uvicorn": ">=0.54,<0.60", "websockets": ">=15,<18"}
-"""Versions whose internals these extend: a test compares them with what is installed and with pyproject.toml."""
+"""Supported versions, whose internals are extended here. A test checks them against pyproject.toml."""

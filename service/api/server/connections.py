@@ -1,5 +1,4 @@
-"""Connections: how many there may be, an end to those whose clients neither ask nor read, and the WebSocket's, which
-also says when bytes arrived and why the service goes away."""
+"""HTTP and WebSocket connections of uvicorn, with limits on their number and on idle or slow clients."""
 
 from __future__ import annotations
 
@@ -24,46 +23,46 @@ from websockets.protocol import State
 
 from service.api.errors import refuse
 from service.api.limits.requests import HEALTH, PATIENCE, ClientPatience
-from service.api.server.room import Room
+from service.api.server.connection_limit import ConnectionLimit
 from service.foundation.errors import BusyError, ErrorBody, ErrorResponse
 from service.foundation.settings import Settings
 
-REFUSED = 64
-"""Connections beyond the most there may be that are told so; others are closed without a word."""
+MAX_REFUSED_CONNECTIONS = 64
+"""Connections beyond the limit that are answered with 429; further ones are closed without an answer."""
 
 
 class GuardedProtocol(HttpToolsProtocol):
-    """One HTTP connection, with limits. Times are looked at when something happens rarely, not with each request."""
+    """One HTTP connection, with limits. Its timers are set on rare events, not with every request."""
 
     patience: ClassVar[ClientPatience]
-    room: ClassVar[Room]
+    limit: ClassVar[ConnectionLimit]
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._head: asyncio.TimerHandle | None = None  # until when a request has to have come, line and headers
-        self._unread: asyncio.TimerHandle | None = None  # until when the client has to have read something
+        self._head: asyncio.TimerHandle | None = None  # deadline for the request line and headers
+        self._unread: asyncio.TimerHandle | None = None  # deadline for the client to read something
         self._left, self._resumed = 0, False
-        self._upgraded = False  # to a stream, which reads the socket from then on
+        self._upgraded = False  # to a stream, which then reads the socket
         self._known: object = None
         self.peer: str | None = None
         self._overhead = 0
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin, unless there are too many connections, none of which gives way."""
+        """Accept the connection, or refuse it if there are too many and none is idle."""
         super().connection_made(transport)
-        self.peer = self.room.peer(self.client)
-        beyond, why = self.room.admit(self, self.connections)
-        if beyond > REFUSED:
+        self.peer = self.limit.find_peer(self.client)
+        beyond, why = self.limit.admit(self, self.connections)
+        if beyond > MAX_REFUSED_CONNECTIONS:
             transport.abort()
             return
         if beyond > 0:
-            self.app = _Crowded(self.app, why)
+            self.app = _Refusing(self.app, why)
             self.ws_protocol_class = None
         self._head = self.loop.call_later(self.patience.header_s, self._late)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Forget the connection."""
-        self.room.gone(self)
+        """Remove the connection and its timers."""
+        self.limit.remove(self)
         self._cancel_head()
         if self._unread is not None:
             self._unread.cancel()
@@ -71,14 +70,14 @@ class GuardedProtocol(HttpToolsProtocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes from the socket."""
+        """Handle bytes from the socket."""
         self._overhead += len(data)
         super().data_received(data)
         if self._upgraded:
             return
         cycle = self.cycle
         if cycle is None or cycle.response_complete:
-            # part of a line and of headers, or what is left of a body that was refused
+            # part of a request line and headers, or the rest of a rejected body
             if self._head is None and not self.transport.is_closing():
                 self._head = self.loop.call_later(self.patience.header_s, self._late)
         else:
@@ -90,54 +89,54 @@ class GuardedProtocol(HttpToolsProtocol):
             self._too_long()
 
     def on_headers_complete(self) -> None:
-        """Begin a request. Trailers, which httptools gives as headers, do not reach it."""
+        """Start a request. Trailers, which httptools reports as headers, are ignored."""
         if sum(name == b"host" for name, _ in self.headers) > 1:
-            raise ValueError("several Host headers")  # httptools makes an answer of 400 of it
-        self.room.busy(self)
+            raise ValueError("several Host headers")  # httptools answers 400
+        self.limit.mark_busy(self)
         super().on_headers_complete()
         self.headers = list(self.headers)
 
     def on_body(self, body: bytes) -> None:
-        """Take a piece of a body; beside bodies, as much again may come: lengths of their pieces."""
+        """Handle a piece of a body; it allows as many bytes of chunk lengths besides."""
         self._overhead -= 2 * len(body)
         super().on_body(body)
 
     def on_response_complete(self) -> None:
-        """Go on after an answer, which may not have left yet."""
+        """Mark the connection idle after an answer, which may not have been sent completely."""
         super().on_response_complete()
         unread = self.transport.get_write_buffer_size() > 0
         if unread and self._unread is None:
             self._watch_reading()
-        if self.cycle.response_complete:  # else the next one waits already
-            self.room.rest(self, unread)
+        if self.cycle.response_complete:  # else the next request has begun
+            self.limit.mark_idle(self, unread)
 
-    def leave(self) -> None:
-        """Close at once, for one that may be about to ask."""
+    def drop(self) -> None:
+        """Close at once, to make room for a new connection."""
         self.transport.abort()
 
     def pause_writing(self) -> None:
-        """Wait until the client reads on."""
+        """Stop writing until the client reads."""
         super().pause_writing()
         if self._unread is None:
             self._watch_reading()
 
     def resume_writing(self) -> None:
-        """Write on."""
+        """Resume writing."""
         self._resumed = True
         super().resume_writing()
 
     def handle_websocket_upgrade(self) -> None:
-        """Leave the connection to a stream, which has limits of its own."""
+        """Hand the connection over to a stream, which has its own limits."""
         self._upgraded = True
         self._cancel_head()
         super().handle_websocket_upgrade()
 
     def send_400_response(self, msg: str) -> None:
-        """Answer what is no HTTP."""
-        self._say(HTTPStatus.BAD_REQUEST, "invalid_request", msg)
+        """Answer bytes that are not HTTP."""
+        self._refuse(HTTPStatus.BAD_REQUEST, "invalid_request", msg)
 
     def _unsupported_upgrade_warning(self) -> None:
-        """Do not log, as often as clients like, what they would have liked to speak."""
+        """Log nothing: clients could fill the log."""
 
     def _cancel_head(self) -> None:
         if self._head is not None:
@@ -145,50 +144,50 @@ class GuardedProtocol(HttpToolsProtocol):
             self._head = None
 
     def _late(self) -> None:
-        """Close a connection on which no request came in time."""
+        """Close a connection without a request in time."""
         self._head = None
         if self.transport.is_closing():
             return
         if self._overhead > 0 and self.cycle is None:
-            message = f"the request's line and headers did not come within {self.patience.header_s:g} s"
-            self._say(HTTPStatus.REQUEST_TIMEOUT, "request_timeout", message)
+            message = f"The request line and headers did not arrive within {self.patience.header_s:g} s."
+            self._refuse(HTTPStatus.REQUEST_TIMEOUT, "request_timeout", message)
         else:
             self.transport.close()
 
     def _too_long(self) -> None:
-        """Close a connection whose headers, or those after a body, have no end."""
+        """Close a connection with too long headers or trailers."""
         if self.transport.is_closing():
             return
         if self.cycle is None or self.cycle.response_complete:
-            message = f"the request's line and headers have more than {self.patience.header_bytes} bytes"
-            self._say(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "too_large", message)
+            message = f"The request line and headers have more than {self.patience.header_bytes} bytes."
+            self._refuse(HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE, "too_large", message)
         else:
             self.transport.abort()
 
     def _watch_reading(self) -> None:
-        self._left, self._resumed = self._waiting(), False
-        self._unread = self.loop.call_later(self.patience.answer_s, self._look_reading)
+        self._left, self._resumed = self._count_unread(), False
+        self._unread = self.loop.call_later(self.patience.answer_s, self._check_reading)
 
-    def _look_reading(self) -> None:
-        """Give up a client that has read nothing for a while; look again at one that reads slowly."""
+    def _check_reading(self) -> None:
+        """Close the connection if the client has read nothing since the last check; else check again later."""
         self._unread = None
         if not self.transport.get_write_buffer_size():
             return
-        if self._waiting() >= self._left and not self._resumed:
+        if self._count_unread() >= self._left and not self._resumed:
             self.transport.abort()
         else:
             self._watch_reading()
 
-    def _waiting(self) -> int:
-        """Bytes that the client has not taken: here, and in the kernel, whose buffers hide a slow reader for long."""
+    def _count_unread(self) -> int:
+        """Return the bytes not sent yet, including the kernel's buffer, which can hide a slow reader for long."""
         waiting = self.transport.get_write_buffer_size()
-        with suppress(OSError, ValueError):  # a kernel that does not tell, a socket that is closed
+        with suppress(OSError, ValueError):  # a kernel without this call, a closed socket
             number = self.transport.get_extra_info("socket").fileno()
             waiting += int.from_bytes(fcntl.ioctl(number, termios.TIOCOUTQ, bytes(4)), sys.byteorder)
         return waiting
 
-    def _say(self, status: HTTPStatus, code: str, message: str) -> None:
-        """Answer what did not become a request, and close."""
+    def _refuse(self, status: HTTPStatus, code: str, message: str) -> None:
+        """Answer bytes that did not become a request, and close."""
         body = ErrorResponse(error=ErrorBody(code=code, message=message)).model_dump()
         content = json.dumps(body).encode()
         head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(content)
@@ -196,8 +195,8 @@ class GuardedProtocol(HttpToolsProtocol):
         self.transport.close()
 
 
-class _Crowded:
-    """What answers on a connection that is one too many: health as always, anything else with 429."""
+class _Refusing:
+    """The application of a connection beyond the limit: answers health as usual and anything else with 429."""
 
     def __init__(self, app: ASGIApp, why: str) -> None:
         self.app, self.why = app, why
@@ -207,25 +206,25 @@ class _Crowded:
             await self.app(scope, receive, send)
             return
         headers = {"Retry-After": "1", "Connection": "close"}
-        await refuse(BusyError(f"{self.why}: try again", headers=headers), scope, receive, send)
+        await refuse(BusyError(f"{self.why} Try again later.", headers=headers), scope, receive, send)
 
 
 def guarded(settings: Settings, patience: ClientPatience = PATIENCE) -> type[GuardedProtocol]:
-    """Class of connections with the limits of the settings, for `uvicorn.Config(http=...)`."""
-    return type("GuardedProtocol", (GuardedProtocol,), {"patience": patience, "room": Room(settings)})
+    """Return a connection class with the limits of the settings, for `uvicorn.Config(http=...)`."""
+    return type("GuardedProtocol", (GuardedProtocol,), {"patience": patience, "limit": ConnectionLimit(settings)})
 
 
 CONNECTION = "lipserve.connection"
 """Key of the connection in the `state` of an ASGI scope."""
 MAX_FRAME_BYTES = 64 * 1024
-"""Largest frame that a stream reads."""
+"""Max size of a frame that a stream reads."""
 
 
 class StreamProtocol(WebSocketsSansIOProtocol):
-    """For `uvicorn.run(ws=StreamProtocol)`: one WebSocket connection.
+    """One WebSocket connection, for `uvicorn.run(ws=StreamProtocol)`.
 
-    While a message waits for the application, uvicorn does not read on; so all messages that wait arrived together, and
-    `arrived` is when, in seconds of `time.perf_counter`.
+    uvicorn stops reading while a message waits for the application, so all waiting messages arrived together. `arrived`
+    is their time of arrival, in seconds of `time.perf_counter`.
     """
 
     def __init__(
@@ -242,20 +241,20 @@ class StreamProtocol(WebSocketsSansIOProtocol):
     async def _run(self, scope: asgi.Scope, receive: asgi.ASGIReceiveCallable, send: asgi.ASGISendCallable) -> None:
         try:
             await self._application(scope, receive, send)
-        finally:  # no cycles: what exists when a model is loaded is frozen, and freed only where nothing refers to it
+        finally:  # no reference cycles: objects that exist when a model loads are frozen and not garbage-collected
             self.app_state.pop(CONNECTION, None)
             self.scope["state"].pop(CONNECTION, None)
             self.app = self._application
         if self.initial_response is not None:
-            self.handshake_complete = True  # by a refusal, which uvicorn would log as a handshake left open
+            self.handshake_complete = True  # else uvicorn logs the refused handshake as still open
 
     def data_received(self, data: bytes) -> None:
-        """Take bytes from the socket."""
+        """Handle bytes from the socket."""
         self.arrived = perf_counter()
         super().data_received(data)
 
     def send_receive_event_to_app(self) -> None:
-        """Hand on a message; a text that is none ends the stream, and is not logged: clients may send any number."""
+        """Pass a message on. A text that is not UTF-8 ends the stream, without a log line per text."""
         if self.curr_msg_data_type == "text" and not self.close_sent:
             try:
                 b"".join(self.frames).decode()
@@ -269,25 +268,25 @@ class StreamProtocol(WebSocketsSansIOProtocol):
         super().send_receive_event_to_app()
 
     def abort(self) -> None:
-        """Close at once, whatever is still to be written: for a client that does not read."""
+        """Close at once, with unsent data: for a client that does not read."""
         self.transport.abort()
 
     def end(self, code: int, reason: str) -> None:
-        """Close although the client goes on asking: what it sends is dropped until it has answered the close."""
+        """Close while the client is sending. Its messages are dropped until it answers the close."""
         if not self.handshake_complete or self.close_sent or self.conn.state is not State.OPEN:
             return
         self.stop_keepalive()
         self.queue.put_nowait({"type": "websocket.disconnect", "code": code, "reason": reason})
         self.conn.send_close(code, reason)
         self.transport.write(b"".join(self.conn.data_to_send()))
-        self.close_sent = self.disconnected = True  # nothing is sent any more: the application learns so when it tries
+        self.close_sent = self.disconnected = True  # further sends of the application fail
         if self.read_paused:
             self.read_paused = False
             self.transport.resume_reading()
         self.close_timer = self.loop.call_later(3.0, self.transport.abort)  # for the client to answer the close
 
     def shutdown(self) -> None:
-        """Close because the server stops: 1001, "going away", where uvicorn says 1012, "service restart"."""
+        """Close because the server stops, with 1001 "going away" instead of uvicorn's 1012 "service restart"."""
         if self.handshake_complete and self.conn.state is State.OPEN:
             self.stop_keepalive()
             self.queue.put_nowait({"type": "websocket.disconnect", "code": int(CloseCode.GOING_AWAY)})

@@ -1,4 +1,4 @@
-"""Where the service listens: the TCP port and, if it is asked for, a Unix-domain socket beside it."""
+"""The sockets of the service: a TCP port and an optional Unix-domain socket."""
 
 from __future__ import annotations
 
@@ -24,47 +24,47 @@ logger = logging.getLogger(__name__)
 
 BACKLOG = 128
 DRAIN_S = 5
-"""Longest wait in s for answers in progress when the service stops."""
+"""Max wait in s for running requests when the service stops."""
 
 
 class SocketError(OSError):
-    """There can be no socket at the path; the message says why and what would do."""
+    """The port or socket cannot be opened."""
 
 
 def check_port(host: str, port: int) -> None:
-    """Look before the service starts whether it can listen at an address; raise SocketError."""
+    """Check that the port is free; raise SocketError."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     try:
         socket.create_server((host, port), family=family).close()
     except OSError as error:
         reason = error.strerror or str(error)
-        expected = f"one that is free at {host}: {reason}; --port names another, 0 takes any"
-        raise SocketError(f"port is {port}, expected {expected}") from error
+        message = f"Cannot listen on port {port} of {host}: {reason}. Set another --port, or 0 for any free port."
+        raise SocketError(message) from error
 
 
 class UnixSocket:
-    """A listening socket in the file system; who connects before the service has started waits for it.
+    """A listening Unix-domain socket. Clients that connect before the service has started wait.
 
-    The file that a dead service left is replaced. Raise SocketError where a live one listens, where anything but a
-    socket lies at the path, or where there can be none.
+    A socket file left by a dead service is replaced. Raise SocketError if another service listens at the path, if the
+    path is not a socket, or if no socket can be created there.
     """
 
     def __init__(self, path: Path, mode: int) -> None:
         self.path = path
-        _make_room(path)
+        _remove_stale(path)
         self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             self.listener.bind(os.fspath(path))
-        except OSError as error:  # no such folder, no right to write in it, a path too long
+        except OSError as error:  # missing folder, missing permission, path too long
             self.listener.close()
             reason = error.strerror or str(error)
-            raise SocketError(f"uds is {str(path)!r}, expected a path where a socket can be made: {reason}") from error
+            raise SocketError(f"Cannot create the socket {str(path)!r}: {reason}") from error
         self._identity = _identity(path)
         path.chmod(mode)  # nobody can connect before it listens
         self.listener.listen(BACKLOG)
 
     def remove(self) -> None:
-        """Remove the file, unless another one has taken its place."""
+        """Remove the file, unless it has been replaced by another."""
         if _identity(self.path) == self._identity:
             self.path.unlink(missing_ok=True)
 
@@ -75,10 +75,10 @@ class UnixSocket:
 
 
 class Server(uvicorn.Server):
-    """uvicorn's server with a second listener, which of itself takes a port or a socket, not both.
+    """uvicorn's server, listening on both a port and a Unix-domain socket.
 
-    Told to stop, it first says so for `notice_s`, then takes no more connections and finishes what it has begun. Told a
-    second time, it ends at once.
+    After the first stop signal it reports "not ready" for `notice_s`, then closes its listeners and finishes running
+    requests. A second signal ends it at once.
     """
 
     def __init__(self, config: uvicorn.Config, unix: UnixSocket | None, stopping: StopState, notice_s: float) -> None:
@@ -90,20 +90,20 @@ class Server(uvicorn.Server):
         await super().startup(sockets)
         if self.unix is None:
             return
-        made: Any = self.config.http_protocol_class  # uvicorn's type of it says nothing of its arguments
+        made: Any = self.config.http_protocol_class  # uvicorn's type lacks the arguments
         protocol = functools.partial(
             made, config=self.config, server_state=self.server_state, app_state=self.lifespan.state
         )
         loop = asyncio.get_running_loop()
-        # among the servers that shutdown closes
+        # shutdown closes all of `servers`
         self.servers.append(await loop.create_unix_server(protocol, sock=self.unix.listener, backlog=BACKLOG))
         logger.info("listening on the Unix-domain socket %s", self.unix.path)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """Give notice, remove the socket, and stop as usual: the signal that stops uvicorn ends the process after."""
+        """Report "not ready" for `notice_s`, remove the socket, and stop as usual."""
         self.stopping.begun = True
         if self.notice_s:
-            logger.info("stopping in %g s: no longer ready, but still answering", self.notice_s)
+            logger.info("stopping in %g s; not ready, but still answering", self.notice_s)
             await asyncio.sleep(self.notice_s)
         self.stopping.closing.set()
         if self.unix is not None:
@@ -111,7 +111,7 @@ class Server(uvicorn.Server):
         await super().shutdown(sockets)
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """Stop at the first signal, end at the second: what is durable is so already."""
+        """Stop at the first signal, exit at the second. Acknowledged data are already durable."""
         if self.should_exit:
             if self.unix is not None:
                 self.unix.remove()
@@ -121,10 +121,10 @@ class Server(uvicorn.Server):
 
 
 def serve(config: uvicorn.Config, uds: Path | None, mode: int, stopping: StopState, notice_s: float = 0.0) -> None:
-    """Serve until a signal comes, on the port of the config and on a socket at the path `uds`.
+    """Serve on the port of the config and on a socket at the path `uds`, until a signal stops the service.
 
-    notice_s: how long it still answers after the signal, while `stopping` says that it was told. Raise SocketError
-    before anything starts; end the process where the start fails.
+    It still answers for `notice_s` after the signal, while `stopping` reports it. Raise SocketError before anything
+    starts; exit the process if the start fails.
     """
     unix = None if uds is None else UnixSocket(uds, mode)
     server = Server(config, unix, stopping, notice_s)
@@ -139,24 +139,24 @@ def serve(config: uvicorn.Config, uds: Path | None, mode: int, stopping: StopSta
         sys.exit(STARTUP_FAILURE)
 
 
-def _make_room(path: Path) -> None:
-    """Remove what a dead service left at the path; raise SocketError for anything else there."""
+def _remove_stale(path: Path) -> None:
+    """Remove the socket of a dead service; raise SocketError if anything else is at the path."""
     try:
         kind = path.lstat().st_mode
-    except OSError:  # nothing, or no folder: binding says
+    except OSError:  # nothing there, or no folder, which bind reports
         return
     if not stat.S_ISSOCK(kind):
-        raise SocketError(f"uds is {str(path)!r}, where something lies that is no socket: expected another path")
+        raise SocketError(f"{str(path)!r} exists and is not a socket. Set another path.")
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.settimeout(1.0)
         code = probe.connect_ex(os.fspath(path))
     if code == errno.ECONNREFUSED:
         path.unlink(missing_ok=True)
     elif code in (0, errno.EAGAIN):
-        raise SocketError(f"uds is {str(path)!r}, where another service listens: stop it, or set another path")
+        raise SocketError(f"Another service listens at {str(path)!r}. Stop it, or set another path.")
     else:
         reason = os.strerror(code)
-        raise SocketError(f"uds is {str(path)!r}, where a socket lies that does not answer: {reason}; set another path")
+        raise SocketError(f"The socket {str(path)!r} does not answer: {reason}. Set another path.")
 
 
 def _identity(path: Path) -> tuple[int, int] | None:

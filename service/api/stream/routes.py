@@ -1,4 +1,4 @@
-"""WebSocket routes: streams of torque queries, and an echo as the floor of their latency."""
+"""WebSocket routes: streams of torque queries, and an echo to measure latency without computation."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from service.api.server.connections import CONNECTION, StreamProtocol
 from service.api.stream.session import Conversation, Echo, Session
 from service.contract.models import ALIAS
 from service.contract.predictions import one_choice
-from service.foundation.errors import NotFoundError, NotReadyError, invalid_request
+from service.foundation.errors import NotFoundError, NotReadyError, invalid_request, readable
 from service.learning.learners import Learners
 from service.models.served import wait_for_revision
 from service.runtime.counted import OpenCounter
@@ -32,8 +32,8 @@ PARAMETERS = {
     "stream_id": (STREAM_ID, f"a name that matches {STREAM_ID}"),
     "min_revision": (NUMBER, "a revision of the version"),
 }
-"""What the address of a stream may say: how each is written, and that in words."""
-LEAST = {"version": 1, "min_revision": 0}
+"""Query parameters of a stream: pattern, and its description for errors."""
+MIN_VALUES = {"version": 1, "min_revision": 0}
 PATH, ECHO_PATH = "/v1/models/{model}/stream", "/v1/echo/stream"
 
 
@@ -49,13 +49,13 @@ def router() -> APIRouter:
 
 
 class Streams(OpenCounter):
-    """How many connections are open."""
+    """Counter of open streams."""
 
-    too_many = "{} streams are open, the most there may be: close one, or try again later"
+    too_many = "Too many streams: {} are open. Close one, or try again later."
 
 
 class EchoRoute:
-    """ASGI application of the echo. path: its address, by which metrics and logs name it."""
+    """ASGI application of the echo; `path` is its name in metrics and logs."""
 
     path = ECHO_PATH
     rule = Rule(PREDICT, lasting=True)
@@ -64,15 +64,15 @@ class EchoRoute:
         self.streams = streams
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Talk with one client. What is raised before it is accepted is answered in HTTP."""
+        """Serve one client. An error raised before the connection is accepted is answered in HTTP."""
         learners: Learners = scope["app"].state.learners
         with self.streams.count_one(learners.settings.max_streams):
             conversation = await self.conversation(learners, scope, receive, send)
-            with suppress(ClientDisconnected):  # no error: it went away while it was answered, or its key ended
+            with suppress(ClientDisconnected):  # the client disconnected during an answer, or its key became invalid
                 await conversation.run()
 
     async def conversation(self, learners: Learners, scope: Scope, receive: Receive, send: Send) -> Conversation:
-        """Return what talks with the client; raise ServiceError where the address is wrong."""
+        """Return the conversation with the client; raise ServiceError for a wrong address."""
         return Echo(_connection(scope), receive, send, learners.settings)
 
 
@@ -82,11 +82,13 @@ class StreamRoute(EchoRoute):
     path = PATH
 
     async def conversation(self, learners: Learners, scope: Scope, receive: Receive, send: Send) -> Conversation:
-        """Return what talks with the client; raise InvalidRequestError, NotFoundError, UnreadableVersionError or
-        RevisionNotReachedError."""
+        """Return the conversation with the client.
+
+        Raise InvalidRequestError, NotFoundError, UnreadableVersionError or RevisionNotReachedError.
+        """
         asked = _parameters(scope["query_string"])
         model, version, alias = scope["path_params"]["model"], asked.version, asked.alias
-        # with 0 it waits for nothing but the model to be in memory
+        # with `min_revision` 0 this only loads the model
         served = await wait_for_revision(learners.loaded, model, version, alias, asked.min_revision)
         pinned = version is not None
         meter = scope["app"].state.meters.stream(served.name)
@@ -95,17 +97,17 @@ class StreamRoute(EchoRoute):
 
 
 class NoRoute:
-    """ASGI application of all other addresses, which Starlette would refuse without a word. To be the last."""
+    """ASGI application of all other addresses, which answers with an error. It must be the last route."""
 
     rule = Rule(ADMIN)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Refuse to talk: raise NotFoundError."""
-        raise NotFoundError(f"no stream at {scope['path'][:200]}: streams are at {PATH}")
+        """Raise NotFoundError."""
+        raise NotFoundError(f"There is no stream at {scope['path'][:200]}. Streams are at {PATH}.")
 
 
-class Asked(NamedTuple):
-    """What the address of a stream says. min_revision: that its first answer has at least."""
+class StreamParameters(NamedTuple):
+    """Query parameters of a stream. `min_revision` is the min revision of its first answer."""
 
     version: int | None
     alias: str | None
@@ -116,27 +118,27 @@ class Asked(NamedTuple):
     payload: bool
 
 
-def _parameters(query: bytes) -> Asked:
-    """Read the query of an address; raise InvalidRequestError."""
+def _parameters(query: bytes) -> StreamParameters:
+    """Parse the query of an address; raise InvalidRequestError."""
     given: dict[str, str] = {}
     for name, value in parse_qsl(query.decode("ascii", "backslashreplace"), keep_blank_values=True):
         if name not in PARAMETERS:
-            raise invalid_request(
-                name, value, "no parameter but version, alias, std, scale, payload, stream_id and min_revision"
-            )
+            known = ", ".join(PARAMETERS)
+            message = f"Unknown stream parameter `{readable(name[:200])}`. Parameters: {known}."
+            raise invalid_request(name, value, f"one of the parameters {known}", message)
         pattern, expected = PARAMETERS[name]
-        if not re.fullmatch(pattern, value) or (name in LEAST and not LEAST[name] <= int(value) < 2**31):
+        if not re.fullmatch(pattern, value) or (name in MIN_VALUES and not MIN_VALUES[name] <= int(value) < 2**31):
             raise invalid_request(name, value, expected)
         given[name] = value
     version = int(given["version"]) if "version" in given else None
     one_choice(version, given.get("alias"))
     std, revision = given.get("std") == "1", int(given.get("min_revision", 0))
     scale, payload = given.get("scale") == "1", given.get("payload") == "1"
-    return Asked(version, given.get("alias"), std, given.get("stream_id"), revision, scale, payload)
+    return StreamParameters(version, given.get("alias"), std, given.get("stream_id"), revision, scale, payload)
 
 
 def _connection(scope: Scope) -> StreamProtocol:
     connection = scope.get("state", {}).get(CONNECTION)
     if not isinstance(connection, StreamProtocol):
-        raise NotReadyError("streams need the server that `lipserve serve` starts")
+        raise NotReadyError("Streams only work on a server that was started with `lipserve serve`.")
     return connection

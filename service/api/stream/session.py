@@ -1,5 +1,4 @@
-"""One WebSocket connection: a message in, a message out, in order, and an end to clients that are gone; and streams of
-torque queries to one model, some of which carry torque to learn from."""
+"""Conversations over one WebSocket connection: the echo, and streams of torque queries that can also be learnt from."""
 
 from __future__ import annotations
 
@@ -19,9 +18,10 @@ from starlette.types import Message, Receive, Send
 
 from lipcore.model.external import external
 from service.api.access.middleware import subprotocol_of
+from service.api.errors import UNEXPECTED_ERROR
 from service.api.limits.requests import PATIENCE
 from service.api.server.connections import StreamProtocol
-from service.api.stream.learning import Learning, Taught
+from service.api.stream.learning import FrameLearning, LearningFrame
 from service.contract import frames
 from service.foundation.errors import ErrorBody, ErrorResponse, ServiceError, invalid_request
 from service.foundation.settings import Settings
@@ -38,10 +38,10 @@ logger = logging.getLogger(__name__)
 
 
 class Conversation(ABC):
-    """Answers messages one by one, reading the next when the answer is written.
+    """Answers messages in order, one at a time, and closes idle or unresponsive connections.
 
-    ASGI's own calls rather than Starlette's WebSocket: that costs 3 µs a message, 1 µs as here.
-    left: when the last answer had been written, in seconds of `time.perf_counter`.
+    It uses ASGI directly: 1 µs per message, instead of 3 µs with Starlette's WebSocket. `left` is the time when the
+    last answer was written, in seconds of `time.perf_counter`.
     """
 
     def __init__(self, connection: StreamProtocol, receive: Receive, send: Send, settings: Settings) -> None:
@@ -53,14 +53,14 @@ class Conversation(ABC):
 
     @abstractmethod
     async def reply(self, message: Message, arrived: float) -> bytes:
-        """Return the answer to a message that arrived at a time of `time.perf_counter`."""
+        """Return the answer to a message; `arrived` is a time of `time.perf_counter`."""
 
     async def greet(self) -> None:
-        """Say what a client has to know before it asks."""
+        """Send what a client needs before its first message."""
         return
 
     async def run(self) -> None:
-        """Accept the connection and talk until either side ends it."""
+        """Accept the connection and answer messages until either side closes it."""
         receive, send, connection, reply = self.receive, self.send, self.connection, self.reply
         await receive()
         await send({"type": "websocket.accept", "subprotocol": subprotocol_of(connection.scope["subprotocols"])})
@@ -74,24 +74,26 @@ class Conversation(ABC):
                     return
                 answer = await reply(message, arrived)
                 self._writing = True
-                self.left = perf_counter()  # since when the answer waits, should it have to
+                self.left = perf_counter()  # start of a possible wait for the client to read
                 await send({"type": "websocket.send", "bytes": answer})
                 self.left = perf_counter()
                 if self._texts:
                     await self._write_texts()
                 self._writing = False
-                # neither call above lets others run when messages wait: a client that sends many must not hold up all
+                # with waiting messages, no call above yields to other tasks: a fast client must not block them
                 await asyncio.sleep(0)
         finally:
             self._timer.cancel()
 
     async def send_text(self, text: str) -> None:
-        """Send a text between answers: now, or after the answer that is being written. One caller at a time. A client
-        that does not read it is cut off as one that does not read its answers; one that is gone misses it."""
+        """Send a text now or after the answer that is being written. Only one caller at a time.
+
+        The connection of a client that does not read it is aborted. Nothing happens if the client has disconnected.
+        """
         self._texts.append(text)
         if self._writing:
             return
-        with suppress(OSError, RuntimeError):  # gone, or closing, which uvicorn says in its own way
+        with suppress(OSError, RuntimeError):  # disconnected, or closing: uvicorn's RuntimeError
             try:
                 async with asyncio.timeout(PATIENCE.frame_s):
                     await self._write_texts()
@@ -104,10 +106,10 @@ class Conversation(ABC):
 
     def _watch(self) -> None:
         period = min(self.settings.stream_idle_s, PATIENCE.frame_s)
-        self._timer = asyncio.get_running_loop().call_later(period, self._look)
+        self._timer = asyncio.get_running_loop().call_later(period, self._check_timeouts)
 
-    def _look(self) -> None:
-        """End a connection that is idle or does not read. Looked at now and then: a timer a frame costs time."""
+    def _check_timeouts(self) -> None:
+        """Close a connection that is idle or does not read. A periodic check is cheaper than one timer per frame."""
         waited = perf_counter() - self.left
         if self._writing and waited >= PATIENCE.frame_s:
             self.connection.abort()
@@ -118,12 +120,12 @@ class Conversation(ABC):
 
     async def _close_idle(self) -> None:
         reason = f"no frame for {self.settings.stream_idle_s:g} s (LIPSERVE_STREAM_IDLE_S)"
-        with suppress(OSError):  # gone already
+        with suppress(OSError):  # already disconnected
             await self.send({"type": "websocket.close", "code": 1000, "reason": reason})
 
 
 class Echo(Conversation):
-    """Sends back what comes: the floor that answers are compared with."""
+    """Returns every message unchanged, to measure latency without computation."""
 
     async def reply(self, message: Message, arrived: float) -> bytes:
         """Return the message itself."""
@@ -133,7 +135,7 @@ class Echo(Conversation):
 
 
 class FrameReader:
-    """Reads frames of one robot into a single buffer, which the next frame overwrites."""
+    """Reads frames of one robot into a buffer, which the next frame overwrites."""
 
     def __init__(self, joint_names: tuple[str, ...], position_limits: Array) -> None:
         self.joint_names, self.n_joints, self._limits = joint_names, len(joint_names), position_limits
@@ -142,14 +144,16 @@ class FrameReader:
         self._lengths = {torque: frames.request_bytes(self.n_joints, torque) for torque in (False, True)}
 
     def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
-        """Return q, dq, ddq of a frame, (3, n), whose header is already read; raise InvalidRequestError. Torque that it
-        carries must be there, and is not looked at: see `torque`."""
+        """Return q, dq, ddq of a frame, (3, n), whose header was read before; raise InvalidRequestError.
+
+        The presence of the torque is checked, but not its values: see `torque`.
+        """
         if n != self.n_joints:
             raise invalid_request("n", n, f"{self.n_joints} joints: {', '.join(self.joint_names)}")
         if flags >= 2 * frames.ASK_EXTERNAL:
             expected = (
-                f"a sum of {frames.ASK_STD} to be answered tau_std, {frames.ASK_LEARN} to be learnt from, and "
-                f"{frames.ASK_EXTERNAL} to be answered the external torque"
+                f"a sum of {frames.ASK_STD} (return tau_std), {frames.ASK_LEARN} (learn from tau) and "
+                f"{frames.ASK_EXTERNAL} (return the external torque)"
             )
             raise invalid_request("flags", flags, expected)
         length = self._lengths[torque := flags > frames.ASK_STD]
@@ -157,17 +161,15 @@ class FrameReader:
             expected = f"{length} bytes for {n} joints{' with tau' if torque else ''}"
             raise invalid_request("frame", f"{len(data)} bytes long", expected)
         if not 0.0 <= budget < inf:
-            raise invalid_request("deadline", budget, "seconds, or 0 for none")
-        # a copy, because the model takes aligned and writable memory, and the message is neither for certain
+            raise invalid_request("deadline", budget, "a number of seconds, or 0 for none")
+        # a copy: the model needs aligned, writable memory, which the message may not be
         self._numbers[:] = np.frombuffer(data, frames.NUMBER, 3 * n, frames.REQUEST.size)
         self._query.check(self._limits)
         return self.motion
 
     def torque(self, data: bytes) -> Array:
-        """Return tau, (n,), of a frame that has been read; raise InvalidRequestError where it is not finite."""
-        tau = np.array(
-            np.frombuffer(data, frames.NUMBER, self.n_joints, self._lengths[False]), np.float64
-        )  # see `read`
+        """Return tau, (n,), of a frame checked by `read`; raise InvalidRequestError if it is not finite."""
+        tau = np.array(np.frombuffer(data, frames.NUMBER, self.n_joints, self._lengths[False]), np.float64)
         finite = np.isfinite(tau)
         if not finite.all():
             joint = int(finite.argmin())
@@ -176,12 +178,21 @@ class FrameReader:
 
 
 class Session(Conversation):
-    """Answers every frame from the version that is current when the frame is taken; holds that version in memory.
+    """Answers every frame with the version that is current at that time, and keeps that version in memory.
 
-    meter: counts what it answers; pinned: whether it stays with this version; std: whether every answer carries
-    tau_std; stream_id: source of the torques that frames carry, None where they carry none; alias: that it follows,
-    None: the version that serves; scale, payload: whether every answer carries the factor on its intervals, and
-    what the arm carries.
+    Args:
+        connection: The WebSocket connection.
+        receive: ASGI's `receive`.
+        send: ASGI's `send`.
+        learners: The learners of the service.
+        served: The first version.
+        meter: Counts the answers.
+        pinned: Whether to stay with this version.
+        std: Whether every answer includes tau_std.
+        stream_id: Stream to learn from; None if frames are not learnt.
+        alias: Alias to follow; None for the serving version.
+        scale: Whether every answer includes the factor on the half width of its intervals.
+        payload: Whether every answer includes the mass of the payload.
     """
 
     def __init__(
@@ -203,23 +214,23 @@ class Session(Conversation):
         self._loaded, self._name = learners.loaded, served.name
         self._pin = served.version if pinned else None
         self._alias = None if alias == SERVING else alias
-        self._std, self._late = std, 0
-        self._scale, self._payload, self._stream_id = scale, payload, stream_id
+        self._sends_std, self._late = std, 0
+        self._sends_scale, self._sends_payload, self._stream_id = scale, payload, stream_id
         self._meter, self._deadline = meter, learners.settings.stream_deadline_s
-        self._learning = None if stream_id is None else Learning(learners, stream_id, self.send_text)
-        self._take(served)
+        self._learning = None if stream_id is None else FrameLearning(learners, stream_id, self.send_text)
+        self._use_version(served)
 
     async def run(self) -> None:
-        """Talk until either side ends it; what was taught until then is logged all the same."""
+        """Answer frames until either side closes the connection, then log the remaining frames to learn from."""
         try:
             await super().run()
         finally:
             if self._learning is not None:
                 await self._learning.close()
-                self._learning = None  # which refers to this: no cycles, see StreamProtocol
+                self._learning = None  # no reference cycle, see StreamProtocol
 
     async def greet(self) -> None:
-        """Send what holds for all answers of the version."""
+        """Send the properties of the version, which hold for all its answers."""
         model = self._served.model
         hello = {
             "layout": frames.LAYOUT,
@@ -234,38 +245,37 @@ class Session(Conversation):
         await self.send({"type": "websocket.send", "text": json.dumps(hello)})
 
     async def reply(self, message: Message, arrived: float) -> bytes:
-        """Return the answer frame; whatever is wrong becomes an error frame."""
+        """Return the answer frame, or an error frame."""
         sequence, flags = 0, frames.UNREAD
         try:
             data = message.get("bytes")
             if data is None:
                 raise invalid_request("frame", "a text message", "a binary message")
             if len(data) < frames.REQUEST.size:
-                expected = f"a header of {frames.REQUEST.size} bytes, and numbers"
+                expected = f"a header of {frames.REQUEST.size} bytes and numbers"
                 raise invalid_request("frame", f"{len(data)} bytes long", expected)
             sequence, asked, n, budget = frames.REQUEST.unpack_from(data)
             flags = 0
             current = self._loaded.hot(self._name, self._pin, self._alias)
-            if current is not self._served or self._loads.model_for(self._stream_id) is not self._carried:
-                await self._follow(current)
+            if current is not self._served or self._payloads.model_for(self._stream_id) is not self._payload_model:
+                await self._update_version(current)
             motion = self._reader.read(data, asked, n, budget)
             if asked & frames.ASK_LEARN:
                 await self._admit(sequence, asked)
             compares = asked >= frames.ASK_EXTERNAL
-            tau, std, covariance, fallback = self._answer(motion, self._std or asked != 0, compares)
+            tau, std, covariance, fallback = self._answer(motion, self._sends_std or asked != 0, compares)
             check_answer("tau", tau)
             if std is not None:
                 check_answer("tau_std", std)
             factor, more = self._served.scales.of(self._stream_id), b""
-            mean = tau if fallback is None else fallback.mean  # for learning and external torque
+            mean = tau if fallback is None else fallback.mean  # posterior mean for learning and external torque
             if compares:
                 more = self._external(data, mean, std, covariance, factor)
         except ServiceError as error:
             return self._refuse(sequence, flags, arrived, error)
-        except Exception as error:  # the next frame may be answered
+        except Exception as error:  # later frames may succeed
             logger.error("unexpected error in a stream of model %s", self._name, exc_info=error)
-            unexpected = ServiceError("an unexpected error; the service's log says more")
-            return self._refuse(sequence, flags, arrived, unexpected)
+            return self._refuse(sequence, flags, arrived, ServiceError(UNEXPECTED_ERROR))
         served = self._served
         flags, numbers = self._numbers(sequence, asked, arrived, data, tau, std, factor, more, mean)
         if fallback is not None:
@@ -279,25 +289,19 @@ class Session(Conversation):
         return frames.ANSWER.pack(sequence, flags, n, served.version, self._late, served.revision, seconds) + numbers
 
     async def _admit(self, sequence: int, flags: int) -> None:
-        """Wait until there is room for a frame to learn from; raise InvalidRequestError where it may not be learnt."""
-        if self._pin is not None:
-            expected = (
-                f"no {frames.ASK_LEARN}: a stream pinned to a version only asks; leave version out of the address"
-            )
-            raise invalid_request("flags", flags, expected)
-        if self._alias is not None:
-            expected = f"no {frames.ASK_LEARN}: only the version that serves learns; leave alias out of the address"
-            raise invalid_request("flags", flags, expected)
+        """Wait until there is room for a frame to learn from; raise InvalidRequestError if the stream cannot learn."""
+        for name, value in (("version", self._pin), ("alias", self._alias)):
+            if value is not None:
+                reason = f"only the serving version learns; remove {name} from the address"
+                raise invalid_request("flags", flags, f"no flag {frames.ASK_LEARN}: {reason}")
         if self._learning is None:
-            expected = (
-                f"a name of the torque's source in the address, as in ?stream_id=arm-1, for flag {frames.ASK_LEARN}"
-            )
+            expected = f"a name in the address, as in ?stream_id=arm-1, for flag {frames.ASK_LEARN}"
             raise invalid_request("stream_id", "missing", expected)
         await self._learning.admit(sequence)
 
     def _external(self, data: bytes, mean: Array, std: Array | None, covariance: Array | None, factor: Array) -> bytes:
-        """Numbers of the external torque of a frame; raise InvalidRequestError."""
-        assert std is not None  # both are asked for
+        """Return the bytes of the external torque of a frame; raise InvalidRequestError."""
+        assert std is not None  # the flag requests both
         assert covariance is not None
         measured, noise_std = self._reader.torque(data), self._noise_std
         seen = external(measured[None], mean[None], std[None], noise_std, factor, covariance[None])
@@ -316,26 +320,28 @@ class Session(Conversation):
         external: bytes,
         mean: Array,
     ) -> tuple[int, bytes]:
-        """Flags and numbers of an answer. A frame to learn from is gathered with the posterior mean at that time."""
+        """Return flags and numbers of an answer; collect a frame to learn from with its posterior mean."""
         flags, numbers = 0, tau.tobytes()
         if std is not None:
             flags, numbers = frames.HAS_STD, numbers + std.tobytes()
         if asked > frames.ASK_STD:
             if asked & frames.ASK_LEARN:
                 assert self._learning is not None  # the frame was admitted
-                assert std is not None  # every flag asks for it
+                assert std is not None  # every flag requests it
                 posterior = mean.tobytes() + std.tobytes()
                 self._learning.add(
-                    Taught(self._served, self._carried is not None, sequence, arrived, data, posterior, factor)
+                    LearningFrame(
+                        self._served, self._payload_model is not None, sequence, arrived, data, posterior, factor
+                    )
                 )
-            if not (asked & frames.ASK_STD or self._std):  # its standard deviation was for the record, or the test
+            if not (asked & frames.ASK_STD or self._sends_std):  # only needed for learning or external torque
                 flags, numbers = 0, tau.tobytes()
-        if self._scale:
+        if self._sends_scale:
             flags, numbers = flags | frames.HAS_SCALE, numbers + factor.tobytes()
         if external:
             flags, numbers = flags | frames.HAS_EXTERNAL, numbers + external
-        if self._payload:
-            carried = self._loads.mass(self._stream_id) or (nan, nan)
+        if self._sends_payload:
+            carried = self._payloads.mass(self._stream_id) or (nan, nan)
             flags, numbers = flags | frames.HAS_PAYLOAD, numbers + np.array(carried).tobytes()
         return flags, numbers
 
@@ -348,28 +354,30 @@ class Session(Conversation):
         )
         return header + body.model_dump_json().encode()
 
-    async def _follow(self, current: ServedModel | None) -> None:
-        """Take the version that is current; None: it has been dropped from memory, maybe for a newer one. Raise
-        NotFoundError where the version, the alias or the model has been deleted."""
-        self._carry()
+    async def _update_version(self, current: ServedModel | None) -> None:
+        """Switch to the current version; None if it is no longer in memory, perhaps because of a newer one.
+
+        Raise NotFoundError if the version, alias or model has been deleted.
+        """
+        self._update_payload()
         if current is None:
             meant = self._loaded.newest(self._name, self._alias) if self._pin is None else self._pin
             if meant == self._served.version and not self._loaded.is_deleted(self._name, meant):
-                return  # it is held here
+                return  # this session keeps it in memory
             current = await to_thread.run_sync(self._loaded.get, self._name, self._pin, self._alias)
         known = self._served.version
-        self._take(current)
+        self._use_version(current)
         if current.version != known:
             await self.greet()
 
-    def _take(self, served: ServedModel) -> None:
-        self._served, self._loads, self._noise_std = served, served.payloads, np.array(served.noise_std)
-        self._carry()
+    def _use_version(self, served: ServedModel) -> None:
+        self._served, self._payloads, self._noise_std = served, served.payloads, np.array(served.noise_std)
+        self._update_payload()
         limits = served.model.position_limits(self.settings.max_position)
         self._reader = FrameReader(served.model.joint_names, limits)
 
-    def _carry(self) -> None:
-        """Answer with what the arm carries, as far as that is known by now."""
-        self._carried = self._loads.model_for(self._stream_id)
-        model = self._carried or self._served.model
+    def _update_payload(self) -> None:
+        """Use the model with the currently known payload."""
+        self._payload_model = self._payloads.model_for(self._stream_id)
+        model = self._payload_model or self._served.model
         self._answer = model.answer_fully

@@ -1,4 +1,4 @@
-"""Columns of Arrow as columns of numbers: cells of text, and what is nested: `name[0]` of lists, `name.part` else."""
+"""Converting Arrow columns to columns of numbers: text cells, lists (`name[0]`) and structures (`name.part`)."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from service.foundation.errors import invalid_data
 
 NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 MISSING = ("", "NA", "N/A", "<NA>", "na", "null", "NULL", "None")
-"""Cells that say there is no value; `nan` in any case is a number of its own."""
+"""Cells that mean a missing value. `nan` in any case is a number."""
 _PATTERN = rf"(?i)^(?:{NUMBER}|[+-]?(?:nan|inf(?:inity)?))$"
 _COMMA = r"^([+-]?\d*),(\d+(?:[eE][+-]?\d+)?)$"
 _INT_MIN = np.iinfo(np.int64).min
 
 
 class NumberColumn:
-    """A column of numbers, NaN where a cell is missing.
+    """A text column of numbers; a missing cell becomes NaN.
 
-    decimal_comma: whether cells may be written `1,5`; it was used where `commas` is True afterwards.
+    decimal_comma: whether cells such as `1,5` are allowed; `commas` is True after one was found.
     """
 
     def __init__(self, name: str, decimal_comma: bool) -> None:
@@ -31,23 +31,23 @@ class NumberColumn:
         self.commas = False
 
     def read(self, column: pa.Array, first_row: int) -> Array:
-        """Some cells (rows,); raise InvalidDataError with the row, counted from 1, of the first that is no number."""
+        """Read cells (rows,); raise InvalidDataError with the row, from 1, of the first that is not a number."""
         if not self.commas:
             try:
                 return _floats(pc.cast(column, pa.float64()))
             except pa.ArrowInvalid:
-                pass  # the exception: blanks, a plus, a decimal comma, a word for "missing", or no number at all
+                pass  # rare: blanks, a plus, a decimal comma, a word for "missing", or not a number
         text = self._tidy(column)
         wrong = pc.invert(pc.fill_null(pc.match_substring_regex(text, _PATTERN), True))
         if (first := pc.index(wrong, True).as_py()) >= 0:
             raise invalid_data(f"{self.name}, row {first_row + first}", column[first].as_py() or "empty", "a number")
         try:
             return _floats(pc.cast(text, pa.float64()))
-        except pa.ArrowInvalid:  # beyond what a double holds
+        except pa.ArrowInvalid:  # too large for a double
             return np.array([np.nan if cell is None else float(cell) for cell in text.to_pylist()])
 
     def share(self, column: pa.Array) -> float:
-        """Share of the cells with anything in them that are numbers, 1 where all are empty."""
+        """Return the share of non-empty cells that are numbers, 1 if all are empty."""
         text = self._tidy(column)
         filled = len(text) - text.null_count
         return 1.0 if filled == 0 else (pc.sum(pc.match_substring_regex(text, _PATTERN)).as_py() or 0) / filled
@@ -60,13 +60,13 @@ class NumberColumn:
             marks = pc.match_substring_regex(text, _COMMA), pc.match_substring(text, ".")
             commas, points = (pc.sum(each).as_py() or 0 for each in marks)
             self.commas = 0 < commas >= points
-        if self.commas:  # then a point is none: it parts thousands, if anything
+        if self.commas:  # then a point is not decimal; it can only separate thousands
             text = pc.replace_substring_regex(pc.replace_substring(text, ".", "·"), _COMMA, r"\1.\2")
         return text
 
 
 class StampColumn:
-    """A column of dates with times (ISO 8601): seconds since the first of them."""
+    """A text column of dates with times (ISO 8601), read as seconds since the first one."""
 
     def __init__(self, name: str, kind: pa.DataType) -> None:
         self.name, self.kind = name, kind
@@ -74,7 +74,7 @@ class StampColumn:
 
     @staticmethod
     def of(name: str, column: pa.Array) -> StampColumn | None:
-        """Such a column where every cell with anything in it is a date with a time."""
+        """Return such a column if every non-empty cell is a date with a time, else None."""
         if column.null_count == len(column):
             return None
         for kind in (pa.timestamp("ns"), pa.timestamp("ns", "UTC")):
@@ -86,7 +86,7 @@ class StampColumn:
         return None
 
     def read(self, column: pa.Array, first_row: int) -> Array:
-        """Some cells (rows,) in s; raise InvalidDataError with the row of the first that is no time."""
+        """Read cells (rows,) in s; raise InvalidDataError with the row of the first that is not a time."""
         text = pc.utf8_trim_whitespace(column)
         try:
             stamps = pc.cast(text, self.kind)
@@ -102,7 +102,7 @@ class StampColumn:
 
 
 def since(stamps: pa.Array, origin: int | None, unit: float) -> tuple[Array, int | None]:
-    """Times as integers of a unit in s → seconds since the first one, which is kept exact; and that first one."""
+    """Return the seconds since the first of some integer times, exact, and that first time; unit: in s."""
     ticks = pc.fill_null(pc.cast(stamps, pa.int64()), _INT_MIN).to_numpy(zero_copy_only=False)
     given = ticks != _INT_MIN
     if origin is None and given.any():
@@ -118,19 +118,19 @@ def _floats(column: pa.Array) -> Array:
 
 
 class Node(Protocol):
-    """How a column of some type becomes columns of numbers."""
+    """A reader that turns an Arrow column into columns of numbers."""
 
     names: list[str]
     units: dict[str, str]
 
     def read(self, array: pa.Array, first_row: int) -> list[Array]:
-        """Some rows, one (rows,) a name, NaN where a value is missing; raise InvalidDataError naming the row."""
+        """Return one array (rows,) per name, NaN if a value is missing; raise InvalidDataError that names the row."""
 
 
 def plan(name: str, kind: pa.DataType, sample: pa.Array, widest: int) -> Node | None:
-    """How a column is read; None where it holds no numbers, or lists longer than `widest`.
+    """Return the reader of a column; None if it holds no numbers, or lists longer than `widest`.
 
-    sample: some of its first rows, which tell how long its lists are.
+    sample: some of its first rows, which show the length of its lists.
     """
     if isinstance(kind, pa.BaseExtensionType):
         return plan(name, kind.storage_type, _storage(sample), widest)
@@ -150,7 +150,7 @@ def plan(name: str, kind: pa.DataType, sample: pa.Array, widest: int) -> Node | 
 
 
 class _Number:
-    """Numbers of any kind."""
+    """Numbers of any type."""
 
     def __init__(self, name: str) -> None:
         self.names, self.units = [name], dict[str, str]()
@@ -160,7 +160,7 @@ class _Number:
 
 
 class _Time:
-    """Times: stamps as s since the first of them, durations and times of day as s."""
+    """Times in s: stamps since the first one, durations and times of day as they are."""
 
     def __init__(self, name: str, kind: pa.DataType) -> None:
         self.names, self.units = [name], {name: "s"}
@@ -175,7 +175,7 @@ class _Time:
 
 
 class _Struct:
-    """Parts with names of their own."""
+    """Structures of named parts."""
 
     def __init__(self, parts: dict[int, Node]) -> None:
         self.parts = parts
@@ -183,12 +183,12 @@ class _Struct:
         self.units = {name: unit for part in parts.values() for name, unit in part.units.items()}
 
     def read(self, array: pa.Array, first_row: int) -> list[Array]:
-        fields = _storage(array).flatten()  # a structure that is missing misses all its parts
+        fields = _storage(array).flatten()  # all parts of a missing structure are missing
         return [column for index, part in self.parts.items() for column in part.read(fields[index], first_row)]
 
 
 class _List:
-    """Lists of one length."""
+    """Lists that have the same length in all rows."""
 
     def __init__(self, name: str, width: int, child: Node) -> None:
         self.name, self.width, self.child = name, width, child
@@ -204,7 +204,7 @@ class _List:
         if len(wrong):
             row, count = first_row + int(wrong[0]), int(lengths[wrong[0]])
             raise invalid_data(
-                f"{self.name}, row {row}", f"{count} values", f"{self.width} values as in the rows before"
+                f"{self.name}, row {row}", f"a list of {count} values", f"{self.width} values, as in the rows before"
             )
         inner = self.child.read(array.flatten(), first_row)
         out = []
@@ -228,7 +228,7 @@ def _struct(name: str, kind: pa.DataType, sample: pa.Array, widest: int) -> Node
 
 
 def _width(sample: pa.Array) -> int:
-    """The usual length of lists, 0 where there is none."""
+    """Return the usual length of lists, 0 if there is none."""
     lengths = pc.drop_null(pc.list_value_length(sample)).to_numpy()
     widths, counts = np.unique(lengths[lengths > 0], return_counts=True)
     return int(widths[counts.argmax()]) if len(widths) and counts.max() >= SAME_LENGTH * counts.sum() else 0

@@ -1,6 +1,6 @@
-"""Files that belong together, joined side by side: positions.txt, velocities.txt and torques.txt, in a zip.
+"""Reading a zip of text tables, such as positions.txt, velocities.txt and torques.txt, joined side by side.
 
-Each is a table of text with a row a sample. One without column names is named by what its own name says it holds.
+Each has one row per sample. The columns of a file without column names get names from the file name.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from service.contract.media_types import SUFFIXES
-from service.datasets.formats.table import Table, block_rows, checked_names, first_line
-from service.datasets.formats.zips import ERRORS, PIECE, measure, open_zip, within
-from service.datasets.mapping.recognition import clocks
-from service.datasets.mapping.vocabulary import COMMANDED, MEASURED, mention, words
+from service.datasets.formats.table import Table, block_rows, clean_names, first_line, unreadable
+from service.datasets.formats.zips import COPY_BYTES, ERRORS, add_member, check_unpacked_size, open_zip
+from service.datasets.mapping.recognition import find_times
+from service.datasets.mapping.vocabulary import COMMANDED, MEASURED, find_quantity, split_words
 from service.datasets.options import ReadOptions
 from service.foundation.errors import ServiceError, invalid_data
 from service.foundation.settings import Settings
@@ -28,27 +28,28 @@ ENDINGS = tuple(suffix for suffix, kind in SUFFIXES.items() if kind == "csv")
 EXPECTED = f"a zip of files that end in {', '.join(ENDINGS)}"
 
 
-def tables_of(names: Sequence[str]) -> list[str]:
-    """The members of an archive that are joined, two and more, in its order; none where it holds anything else."""
+def find_tables(names: Sequence[str]) -> list[str]:
+    """Return the members to join, in order; an empty list if there are fewer than two, or any other file."""
     files = [name for name in names if not name.endswith("/") and not name.startswith("__MACOSX/")]
     return files if len(files) > 1 and all(name.lower().endswith(ENDINGS) for name in files) else []
 
 
 @dataclass
 class Part:
-    """A member: its name, its table, and the places of its columns that are kept: a clock that was there is not."""
+    """A member of the archive with its table."""
 
     name: str
     table: Table
     kept: list[int]
+    """Indices of the columns to keep; a time column that an earlier member has is not kept."""
 
 
 @contextmanager
 def open_joined(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
-    """Open a zip of tables of text as one table; raise InvalidDataError naming the member, or TooLargeError.
+    """Open a zip of text tables as one table; raise InvalidDataError that names the member, or TooLargeError.
 
-    Columns come in the order of the members, in whose names files that have no column names are taken for a quantity of
-    joints 1..n, or as `options.column_names` says, all columns of such files one after the other.
+    Columns come in the order of the members. A file without column names gets them from `options.column_names`, which
+    names the columns of all such files in order, or else from the quantity in its file name, for joints 1..n.
     """
     from service.datasets.formats.csv import open_csv  # noqa: PLC0415 - it imports pyarrow
 
@@ -57,49 +58,49 @@ def open_joined(path: Path, options: ReadOptions, settings: Settings) -> Iterato
             files = _unpacked(archive, Path(folder), settings)
         left = None if options.column_names is None else list(options.column_names)
         parts: list[Part] = []
-        facts = [f"{len(files)} files are joined side by side: {', '.join(files)}"]
+        facts = [f"{len(files)} files were joined side by side: {', '.join(files)}"]
         known: set[str] = set()
         for name, file in files.items():
             try:
-                table = stack.enter_context(open_csv(file, options, settings, Naming(name, left)))
+                table = stack.enter_context(open_csv(file, options, settings, ColumnNamer(name, left)))
             except ServiceError as error:
-                raise within(name, error) from None
-            repeated = known & {table.names[index] for clock in clocks(table.names) for index, _ in clock.parts}
+                raise add_member(name, error) from None
+            repeated = known & {table.names[index] for clock in find_times(table.names) for index, _ in clock.parts}
             parts.append(Part(name, table, [i for i, each in enumerate(table.names) if each not in repeated]))
             known |= set(table.names)
         if left:
-            raise invalid_data(
-                "column_names", f"{len(left)} names too many", "one a column of the files that have no names"
-            )
-        names = checked_names([part.table.names[i] for part in parts for i in part.kept])
+            value, expected = f"{len(left)} names too many", "one name per column of the files without column names"
+            raise invalid_data("column_names", value, expected, f"`column_names` has {value}, expected {expected}.")
+        names = clean_names([part.table.names[i] for part in parts for i in part.kept])
         units = {name: unit for part in parts for name, unit in part.table.units.items()}
         joined = Table(names, iter(()), units=units, facts=facts)
         joined.blocks = _side_by_side(parts, len(names), joined)
         yield joined
 
 
-class Naming:
-    """Names the columns of a member that has no names: those that are left of the options', or by its own name."""
+class ColumnNamer:
+    """Names the columns of a member without column names: the next ones of the option, or by the file name."""
 
     def __init__(self, member: str, left: list[str] | None) -> None:
         self.member, self.left = PurePosixPath(member), left
 
     def __call__(self, width: int) -> tuple[str, ...]:
-        """Names of so many columns; raise InvalidDataError where there are none."""
+        """Return names for `width` columns; raise InvalidDataError if there are none."""
         if self.left is not None:
             if len(self.left) < width:
-                raise invalid_data("column_names", f"{len(self.left)} names that are left", f"{width}, one a column")
+                value, expected = f"{len(self.left)} names left", f"{width}, one per column"
+                raise invalid_data("column_names", value, expected, f"`column_names` has {value}, expected {expected}.")
             taken, self.left[:] = self.left[:width], self.left[width:]
             return tuple(taken)
         stem = self.member.stem
-        if width == 1 and clocks([stem]):
+        if width == 1 and find_times([stem]):
             return ("t",)
-        parts = words(stem)
-        subject = mention(parts)
+        parts = split_words(stem)
+        subject = find_quantity(parts)
         if subject is None:
             expected = (
-                "column names in its first line, or a name that says what it holds, such as positions.txt; or "
-                "column_names=t,q1..q7,tau1..tau7, all columns of such files in order"
+                "column names in its first line, or a file name that says what it holds, such as positions.txt. Or set "
+                "column_names=t,q1..q7,tau1..tau7 for all columns of such files in order"
             )
             raise invalid_data("header", "missing", expected)
         expressly = any(word.text in COMMANDED | MEASURED for word in parts)
@@ -108,38 +109,38 @@ class Naming:
 
 
 def _unpacked(archive: zipfile.ZipFile, folder: Path, settings: Settings) -> dict[str, Path]:
-    """The tables of an archive by their names, under names of our own."""
-    members = [archive.getinfo(name) for name in tables_of(archive.namelist())]
+    """Unpack the tables; return the new file of each member."""
+    members = [archive.getinfo(name) for name in find_tables(archive.namelist())]
     if not members:
         raise invalid_data("file", "an archive of other files", EXPECTED)
-    measure(members, settings)
+    check_unpacked_size(members, settings)
     files = {}
     for index, member in enumerate(members):
         files[member.filename] = folder / f"{index}.txt"
         try:
             with archive.open(member) as source, files[member.filename].open("xb") as target:
-                while piece := source.read(PIECE):
+                while piece := source.read(COPY_BYTES):
                     target.write(piece)
         except ERRORS as error:
-            raise invalid_data(member.filename, first_line(error), "a member that can be unpacked") from None
+            raise unreadable(member.filename, first_line(error), "a member that can be unpacked") from None
     return files
 
 
 def _side_by_side(parts: Sequence[Part], width: int, joined: Table) -> Iterator[Array]:
-    """Blocks of all parts as one; raise InvalidDataError where they have not as many rows, or not the same times."""
-    readers = [_Rows(part) for part in parts]
+    """Yield the blocks of all parts side by side; raise InvalidDataError if their rows or times differ."""
+    readers = [_RowReader(part) for part in parts]
     row = 0
-    while (count := min([block_rows(width), *(reader.waiting() for reader in readers)])) > 0:
+    while (count := min([block_rows(width), *(reader.available() for reader in readers)])) > 0:
         taken = [reader.take(count) for reader in readers]
         _check_times(parts, taken, row)
         row += count
         yield np.hstack([block[:, part.kept] for part, block in zip(parts, taken, strict=True)])
     for reader in readers:
         joined.facts += [f"{reader.part.name}: {fact}" for fact in reader.part.table.facts]
-    totals = [row + reader.rest() for reader in readers]
+    totals = [row + reader.count_rest() for reader in readers]
     for part, total in zip(parts, totals, strict=True):
         if total != totals[0]:
-            raise invalid_data(part.name, f"{total} rows", f"{totals[0]}, as {parts[0].name} has")
+            raise invalid_data(part.name, f"a table of {total} rows", f"{totals[0]} rows, like {parts[0].name}")
 
 
 def _check_times(parts: Sequence[Part], taken: Sequence[Array], row: int) -> None:
@@ -153,33 +154,33 @@ def _check_times(parts: Sequence[Part], taken: Sequence[Array], row: int) -> Non
             if other.any():
                 place = int(other.argmax())
                 where = f"{part.name}: {name}, row {row + place + 1}"
-                raise invalid_data(where, f"{block[place, index]:.15g}", f"{known[1][place]:.15g}, as {known[0]} has")
+                raise invalid_data(where, f"{block[place, index]:.15g}", f"{known[1][place]:.15g}, as in {known[0]}")
 
 
-class _Rows:
-    """The rows of a part, as many at a time as are asked for."""
+class _RowReader:
+    """Reads the rows of a part, any number at a time."""
 
     def __init__(self, part: Part) -> None:
         self.part, self._block = part, np.empty((0, len(part.table.names)))
 
-    def waiting(self) -> int:
-        """Rows at hand; 0 at the end."""
+    def available(self) -> int:
+        """Return the number of rows of the current block; 0 at the end."""
         if len(self._block) == 0:
             try:
                 self._block = next(self.part.table.blocks, self._block)
             except ServiceError as error:
-                raise within(self.part.name, error) from None
+                raise add_member(self.part.name, error) from None
         return len(self._block)
 
     def take(self, count: int) -> Array:
-        """The next rows of those at hand."""
+        """Return the next rows of the current block."""
         taken, self._block = self._block[:count], self._block[count:]
         return taken
 
-    def rest(self) -> int:
-        """How many rows there are still."""
+    def count_rest(self) -> int:
+        """Read to the end; return the number of rows."""
         count = 0
-        while here := self.waiting():
+        while here := self.available():
             count += here
             self._block = self._block[:0]
         return count

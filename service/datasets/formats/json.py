@@ -1,5 +1,7 @@
-"""Reading JSON: one object a line, however many; or one file of an array of objects, or of an object of arrays. Of
-objects, one a sample, what is nested becomes columns `a.b` and `name[0]`."""
+"""Reading JSON: one object per line, an array of objects, or an object of arrays.
+
+Each object is a sample. Nested values become columns `a.b` and `name[0]`.
+"""
 
 from __future__ import annotations
 
@@ -15,62 +17,63 @@ import msgspec
 import numpy as np
 
 from lipcore.data.samples import Array
-from service.datasets.formats.table import MAX_COLUMNS, SAME_LENGTH, Table, block_rows, checked_names, left_out
+from service.datasets.formats.table import MAX_COLUMNS, SAME_LENGTH, Table, block_rows, clean_names, describe_unread
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, TooLargeError, invalid_data
 from service.foundation.settings import Settings
 
 MAX_BYTES = 32 * 1024 * 1024
-"""Largest JSON document, which is read as a whole; one object a line may be longer."""
+"""Max size of a JSON document, which is read as a whole. A file with one object per line may be larger."""
 MAX_LINE_BYTES = 1024 * 1024
-"""Longest line of JSON, one object a line."""
+"""Max length of a line in a file with one object per line."""
 MAX_DEPTH = 10
 
-Place = tuple[str | int, ...]
+KeyPath = tuple[str | int, ...]
+"""Keys and list indices that lead to a value in a row."""
 Node = int | dict[str, "Node | None"] | list["Node | None"]
-"""Where numbers lie in a row: the index of a column, or parts by name or place; None where there are none."""
+"""Tree of the numbers in a row: the index of a column, or parts by name or list index; None if there are none."""
 
 
-class Shape:
-    """What was seen in some rows: numbers and other values by where they lie, and how long lists are.
+class RowShape:
+    """The key paths of numbers and other values in some rows, and the lengths of lists.
 
-    Raise InvalidDataError where a row has more than `most` values, or is nested deep.
+    Raise InvalidDataError if a row has more than `max_values` values or too many levels.
     """
 
-    def __init__(self, rows: list[Any], most: int) -> None:
-        self.most = most
-        self.leaves: dict[Place, list[int]] = {}
-        self.lengths: dict[Place, Counter[int]] = {}
+    def __init__(self, rows: list[Any], max_values: int) -> None:
+        self.max_values = max_values
+        self.leaves: dict[KeyPath, list[int]] = {}
+        self.lengths: dict[KeyPath, Counter[int]] = {}
         for row in rows:
             self._gather(row, ())
 
-    def columns(self) -> tuple[list[Place], list[Place]]:
-        """Where numbers lie, in the order they were seen; and what is no number, or of no fixed shape."""
-        numbers: list[Place] = []
-        others: list[Place] = []
+    def columns(self) -> tuple[list[KeyPath], list[KeyPath]]:
+        """Return the paths of numbers in order, and the paths of values that are not numbers or have no fixed shape."""
+        numbers: list[KeyPath] = []
+        others: list[KeyPath] = []
         above = {path[:depth] for path in self.leaves for depth in range(1, len(path))}
-        alone = {path for path in above if self.leaves.get(path, (0, 0))[0]}
+        mixed = {path for path in above if self.leaves.get(path, (0, 0))[0]}
         for path, (count, other) in self.leaves.items():
             if path in above and not count and not other:
-                continue  # an object or a list that is missing
-            if count < other or not self._fixed(path) or any(path[:depth] in alone for depth in range(1, len(path))):
+                continue  # a missing object or list
+            if count < other or not self._is_fixed(path) or any(path[:depth] in mixed for depth in range(1, len(path))):
                 others.append(path)
             elif all(path[len(at)] < self.length(at) for at in self._lists(path)):  # type: ignore[operator]
                 numbers.append(path)
         return numbers, others
 
-    def length(self, path: Place) -> int:
-        """The usual length of a list."""
+    def length(self, path: KeyPath) -> int:
+        """Return the usual length of a list."""
         return self.lengths[path].most_common(1)[0][0]
 
-    def plan(self, columns: list[Place]) -> Node:
-        """Where each of these columns lies."""
+    def plan(self, columns: list[KeyPath]) -> Node:
+        """Return the tree of these columns."""
         root: Node = {}
         for index, path in enumerate(columns):
             root = self._place(root, path, 0, index)
         return root
 
-    def _place(self, node: Node | None, path: Place, depth: int, index: int) -> Node:
+    def _place(self, node: Node | None, path: KeyPath, depth: int, index: int) -> Node:
         if depth == len(path):
             return index
         head = path[depth]
@@ -83,37 +86,39 @@ class Shape:
         places[head] = self._place(places[head], path, depth + 1, index)
         return places
 
-    def _gather(self, value: Any, path: Place) -> None:
+    def _gather(self, value: Any, path: KeyPath) -> None:
         if len(path) > MAX_DEPTH:
-            raise invalid_data(name_of(path[:3]), f"nested {len(path)} deep", f"at most {MAX_DEPTH}")
+            raise invalid_data(name_of(path[:3]), f"nested {len(path)} levels deep", f"at most {MAX_DEPTH} levels")
         if type(value) is dict:
             for key, part in value.items():
                 self._gather(part, (*path, key))
         elif type(value) is list:
-            if len(value) > self.most:
-                raise invalid_data(name_of(path), f"{len(value)} values a row", f"at most {self.most}")
+            if len(value) > self.max_values:
+                expected = f"at most {self.max_values} values per row"
+                raise invalid_data(name_of(path), f"a list of {len(value)} values", expected)
             if value:
                 self.lengths.setdefault(path, Counter())[len(value)] += 1
             for place, part in enumerate(value):
                 self._gather(part, (*path, place))
         else:
             count = self.leaves.setdefault(path, [0, 0])
-            if len(self.leaves) > self.most:
-                raise invalid_data("columns", f"more than {self.most}", f"at most {self.most}")
+            if len(self.leaves) > self.max_values:
+                value, expected = f"more than {self.max_values}", f"at most {self.max_values}"
+                raise invalid_data("columns", value, expected, f"The rows have {value} columns, expected {expected}.")
             if value is not None:
                 count[type(value) not in (int, float)] += 1
 
-    def _lists(self, path: Place) -> list[Place]:
-        """The lists that a value lies in."""
+    def _lists(self, path: KeyPath) -> list[KeyPath]:
+        """Return the paths of the lists that contain a value."""
         return [path[:depth] for depth, part in enumerate(path) if isinstance(part, int)]
 
-    def _fixed(self, path: Place) -> bool:
+    def _is_fixed(self, path: KeyPath) -> bool:
         counts = [self.lengths[at] for at in self._lists(path)]
         return all(each.most_common(1)[0][1] >= SAME_LENGTH * each.total() for each in counts)
 
 
-def name_of(path: Place) -> str:
-    """The name of what lies there: `a.b[0]`."""
+def name_of(path: KeyPath) -> str:
+    """Return the column name of a path, such as `a.b[0]`."""
     name = ""
     for part in path:
         name += f"[{part}]" if isinstance(part, int) else f".{part}" if name else part
@@ -121,39 +126,41 @@ def name_of(path: Place) -> str:
 
 
 class Rows:
-    """Rows that are objects, as blocks of numbers; NaN where one is missing or null.
+    """Rows that are objects, as blocks of numbers; missing or null becomes NaN.
 
-    names: of the columns, those that hold numbers in the first rows; facts: what is left out.
+    names: the columns that hold numbers in the first rows; facts: a sentence on the columns that are not read.
     """
 
     def __init__(self, rows: Iterator[Any]) -> None:
         self._rest = rows
         self._first = list(islice(rows, 1000))  # enough rows to find the columns
         for number, row in enumerate(self._first, start=1):
-            _check(row, number)
-        shape = Shape(self._first, 2 * MAX_COLUMNS)
+            _check_row(row, number)
+        shape = RowShape(self._first, 2 * MAX_COLUMNS)
         numbers, others = shape.columns()
-        self.names = checked_names(map(name_of, numbers))
-        self.facts = left_out([name_of(path) for path in others], "they hold no numbers, or lists of different lengths")
+        self.names = clean_names(map(name_of, numbers))
+        self.facts = describe_unread(
+            [name_of(path) for path in others], "they hold no numbers, or lists of different lengths"
+        )
         self._plan = shape.plan(numbers)
 
     def blocks(self) -> Iterator[Array]:
-        """float64 (rows, columns)."""
-        most, width = block_rows(len(self.names)), len(self.names)
-        filled, block = 0, np.full((most, width), np.nan)
-        for row, each in enumerate(self._all(), start=1):
-            _check(each, row)
+        """Yield float64 (rows, columns)."""
+        step, width = block_rows(len(self.names)), len(self.names)
+        filled, block = 0, np.full((step, width), np.nan)
+        for row, each in enumerate(self._all_rows(), start=1):
+            _check_row(each, row)
             values = [np.nan] * width
             self._fill(self._plan, each, values, row)
             block[filled] = values
             filled += 1
-            if filled == most:
+            if filled == step:
                 yield block
-                filled, block = 0, np.full((most, width), np.nan)
+                filled, block = 0, np.full((step, width), np.nan)
         if filled:
             yield block[:filled]
 
-    def _all(self) -> Iterator[Any]:
+    def _all_rows(self) -> Iterator[Any]:
         yield from self._first
         self._first = []
         yield from self._rest
@@ -168,15 +175,15 @@ class Rows:
             return
         elif isinstance(node, dict):
             if type(value) is not dict:
-                raise self._other(node, value, "an object", row)
+                raise self._wrong_type(node, value, "an object", row)
             for key, part in node.items():
                 if part is not None:
                     self._fill(part, value.get(key), values, row)
         elif value != []:  # an empty list is a missing value
             if type(value) is not list:
-                raise self._other(node, value, "a list", row)
+                raise self._wrong_type(node, value, "a list", row)
             if len(value) != len(node):
-                raise self._other(node, f"{len(value)} values", f"{len(node)} values", row)
+                raise self._wrong_type(node, f"in a list of {len(value)} values", f"{len(node)} values", row)
             for part, item in zip(node, value, strict=True):
                 if part is not None:
                     self._fill(part, item, values, row)
@@ -189,59 +196,59 @@ class Rows:
         except OverflowError:
             return np.inf
 
-    def _other(self, node: Any, value: Any, expected: str, row: int) -> InvalidDataError:
-        while not isinstance(node, int):  # to the first column in there, as it has a name
+    def _wrong_type(self, node: Any, value: Any, expected: str, row: int) -> InvalidDataError:
+        while not isinstance(node, int):  # the first column below has a name for the error
             node = next(part for part in (node.values() if isinstance(node, dict) else node) if part is not None)
-        return invalid_data(f"{self.names[node]}, row {row}", value, f"{expected} as in the first rows")
+        return invalid_data(f"{self.names[node]}, row {row}", value, f"{expected}, as in the first rows")
 
 
 def decode(text: bytes) -> Any:
-    """JSON, with NaN and Infinity as Python's writer puts them; raise ValueError."""
+    """Decode JSON, also with NaN and Infinity as Python writes them; raise ValueError."""
     try:
         return msgspec.json.decode(text)
     except (msgspec.DecodeError, RecursionError):
         try:
             return json.loads(text)
         except RecursionError:
-            raise ValueError("nested too deep") from None
+            raise ValueError("nested too deeply") from None
 
 
-def _check(row: Any, number: int) -> None:
+def _check_row(row: Any, number: int) -> None:
     if type(row) is not dict:
-        raise invalid_data(f"row {number}", row, "an object with a name for every value")
+        raise invalid_data(f"row {number}", row, "an object that names every value")
 
 
-ARRAYS = "an array of objects, or an object of arrays"
+EXPECTED = "an array of objects, or an object of arrays"
 
 
 @contextmanager
 def open_json_lines(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
-    """Open a file of one JSON object a line as a table; raise InvalidDataError naming the line, or row and column."""
-    rows = Rows(_lines(path))
+    """Open a file of one JSON object per line as a table; raise InvalidDataError that names the line or the row."""
+    rows = Rows(_read_lines(path))
     yield Table(rows.names, rows.blocks(), facts=rows.facts)
 
 
 @contextmanager
 def open_json(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
-    """Open one JSON document as a table; raise InvalidDataError, or TooLargeError as it has to be in memory at once."""
+    """Open one JSON document as a table; raise InvalidDataError, or TooLargeError because it is read into memory."""
     if (size := path.stat().st_size) > MAX_BYTES:
         raise TooLargeError(
-            f"the JSON document has {size} bytes, expected at most {MAX_BYTES}: write one object a line "
-            "(NDJSON), which may be longer"
+            f"The JSON document has {size} bytes, expected at most {MAX_BYTES}. Write one object per line (NDJSON) for "
+            "larger files."
         )
-    rows, joint_names, facts = _document(path.read_bytes())
+    rows, joint_names, facts = _read_document(path.read_bytes())
     table = Rows(rows)
     yield Table(table.names, table.blocks(), joint_names=joint_names, facts=facts + table.facts)
 
 
-def _lines(path: Path) -> Iterator[Any]:
-    most = MAX_LINE_BYTES
+def _read_lines(path: Path) -> Iterator[Any]:
+    limit = MAX_LINE_BYTES
     number = 0
     with path.open("rb") as file:
-        while line := file.readline(most + 1):
+        while line := file.readline(limit + 1):
             number += 1
-            if len(line) > most:
-                raise invalid_data(f"line {number}", f"more than {most} bytes", f"lines of at most {most}")
+            if len(line) > limit:
+                raise invalid_data(f"line {number}", f"longer than {limit} bytes", f"at most {limit} bytes")
             text = line.removeprefix(b"\xef\xbb\xbf").strip() if number == 1 else line.strip()
             if not text:
                 continue
@@ -251,68 +258,70 @@ def _lines(path: Path) -> Iterator[Any]:
                 raise invalid_data(f"line {number}", f"not JSON: {error}", "one JSON object") from None
 
 
-def _document(text: bytes) -> tuple[Iterator[Any], tuple[str, ...] | None, list[str]]:
-    """Rows of a document, joint names where it has them, and facts."""
+def _read_document(text: bytes) -> tuple[Iterator[Any], tuple[str, ...] | None, list[str]]:
+    """Return the rows of a document, its joint names or None, and facts."""
     text = text.removeprefix(b"\xef\xbb\xbf")
     try:
         if text.lstrip()[:1] == b"[":
             return iter(_items(text)), None, []
         document = decode(text)
     except ValueError as error:
-        raise invalid_data("file", f"not JSON: {error}", ARRAYS) from None
+        raise invalid_data("file", f"not JSON: {error}", EXPECTED) from None
     if type(document) is not dict:
-        raise invalid_data("file", document, ARRAYS)
+        raise invalid_data("file", document, EXPECTED)
     data = document.get("data")
-    if type(document.get("columns")) is list and type(data) is list:  # as pandas writes it, orient="split"
+    if type(document.get("columns")) is list and type(data) is list:  # pandas with orient="split"
         keys = [str(key) for key in document["columns"]]
-        return (_zipped(keys, row) for row in data), None, []
-    if type(data) is list and all(type(each) is dict for each in data[:10]):  # orient="table", and others
+        return (_zip_row(keys, row) for row in data), None, []
+    if type(data) is list and all(type(each) is dict for each in data[:10]):  # pandas with orient="table", and others
         return iter(data), None, []
-    return _columns(document)
+    return _rows_of_columns(document)
 
 
 def _items(text: bytes) -> list[Any] | Iterator[Any]:
-    """Items of an array, each decoded when its turn comes where that is possible."""
+    """Return the items of an array, each decoded when it is used if that is possible."""
     try:
         return (msgspec.json.decode(each) for each in msgspec.json.decode(text, type=list[msgspec.Raw]))
     except (msgspec.DecodeError, RecursionError):
         items = decode(text)
         if type(items) is not list:
-            raise ValueError("no array") from None
+            raise ValueError("not an array") from None
         return items
 
 
-def _zipped(keys: list[str], row: Any) -> Any:
+def _zip_row(keys: list[str], row: Any) -> Any:
     return dict(zip(keys, row, strict=True)) if type(row) is list and len(row) == len(keys) else row
 
 
-def _columns(document: dict[str, Any]) -> tuple[Iterator[Any], tuple[str, ...] | None, list[str]]:
-    """Rows of an object of arrays."""
+def _rows_of_columns(document: dict[str, Any]) -> tuple[Iterator[Any], tuple[str, ...] | None, list[str]]:
+    """Return the rows of an object of arrays, its joint names or None, and facts."""
     names = document.pop("joint_names", None)
     joint_names = tuple(map(str, names)) if type(names) is list else None
     columns: dict[str, list[Any]] = {}
-    alone: list[str] = []
-    _gather("", document, columns, alone)
+    scalars: list[str] = []
+    _gather_columns("", document, columns, scalars)
     if not columns:
-        raise invalid_data("file", ", ".join(alone[:10]) or "an empty object", ARRAYS)
+        raise invalid_data(
+            "file", f"an object of the values {', '.join(scalars[:10])}" if scalars else "an empty object", EXPECTED
+        )
     lengths = Counter(map(len, columns.values()))
     rows = max(lengths, key=lambda length: (lengths[length], length))
     for name, values in columns.items():
         if len(values) != rows:
-            raise invalid_data(name, f"{len(values)} values", f"{rows} values, as most columns have")
-    facts = left_out(alone, "they are no arrays")
+            raise invalid_data(name, f"an array of {len(values)} values", f"{rows} values, like most columns")
+    facts = describe_unread(scalars, "they are not arrays")
     return ({name: values[row] for name, values in columns.items()} for row in range(rows)), joint_names, facts
 
 
-def _gather(prefix: str, value: Any, columns: dict[str, list[Any]], alone: list[str]) -> None:
+def _gather_columns(prefix: str, value: Any, columns: dict[str, list[Any]], scalars: list[str]) -> None:
     if prefix.count(".") > 20:
-        raise invalid_data("file", "nested deep", ARRAYS)
+        raise invalid_data("file", "nested too deeply", EXPECTED)
     if type(value) is list:
         columns[prefix] = value
     elif type(value) is dict and value and prefix and all(key.isdigit() for key in value):
-        columns[prefix] = list(value.values())  # as pandas writes a column: values by the number of their row
+        columns[prefix] = list(value.values())  # pandas writes a column as values by row number
     elif type(value) is dict:
         for key, part in value.items():
-            _gather(f"{prefix}.{key}" if prefix else key, part, columns, alone)
+            _gather_columns(f"{prefix}.{key}" if prefix else key, part, columns, scalars)
     else:
-        alone.append(prefix)
+        scalars.append(prefix)

@@ -1,4 +1,4 @@
-"""Reading LeRobot data sets, a folder sent as zip: `meta/info.json` says what the columns of the Parquet files are."""
+"""Reading LeRobot data sets sent as a zip; `meta/info.json` describes the columns of the Parquet files."""
 
 from __future__ import annotations
 
@@ -16,54 +16,61 @@ import numpy as np
 from lipcore.data.samples import Array
 from service.datasets.formats.json import decode
 from service.datasets.formats.parquet import ParquetSource
-from service.datasets.formats.table import Table, checked_names, first_line
-from service.datasets.formats.zips import ERRORS, INFO, by_numbers, measure, open_zip, root_of, within
+from service.datasets.formats.table import Table, clean_names, first_line, unreadable
+from service.datasets.formats.zips import (
+    ERRORS,
+    INFO_PATH,
+    add_member,
+    check_unpacked_size,
+    find_lerobot_folder,
+    numbers_in_name,
+    open_zip,
+)
 from service.datasets.options import ReadOptions
-from service.foundation.errors import ServiceError, invalid_data
+from service.foundation.errors import InvalidDataError, ServiceError, invalid_data, readable
 from service.foundation.settings import Settings
 
 EXPECTED = "a zip of a LeRobot data set: meta/info.json and data/…parquet"
-MAX_INFO = 4 * 1024 * 1024
+MAX_INFO_BYTES = 4 * 1024 * 1024
 ENDINGS = {"observation.state": ".pos", "observation.velocity": ".vel", "observation.effort": ".effort"}
 ENDINGS |= {"observation.torque": ".torque", "observation.current": ".current", "observation.acceleration": ".acc"}
-"""What a joint's name gets at its end, by the feature that it stands in."""
+"""Suffix of a joint's name by feature."""
 _ENDING = re.compile(r"\.(pos|position|vel|velocity|acc|acceleration|effort|torque|current)$")
-_PLAIN = {"timestamp": "t", "episode_index": "episode"}
+_RENAMED = {"timestamp": "t", "episode_index": "episode"}
 
 
 @contextmanager
 def open_lerobot(path: Path, options: ReadOptions, settings: Settings) -> Iterator[Table]:
-    """Open a LeRobot data set (version 2 or 3) as a table; raise InvalidDataError naming the member, or TooLargeError.
+    """Open a LeRobot data set (version 2 or 3) as a table; raise InvalidDataError or TooLargeError.
 
-    `observation.state` becomes columns by the names of its joints (`shoulder_pan.pos`), other observations alike
-    (`.vel`, `.effort`), `action` with that word in front; `t` in s and `episode` come from `timestamp` and
-    `episode_index`. One Parquet file at a time is unpacked, beside the archive, under no name.
+    `observation.state` becomes one column per joint, such as `shoulder_pan.pos`. Other observations get `.vel` or
+    `.effort`; `action` becomes a prefix. `t` in s and `episode` come from `timestamp` and `episode_index`. One Parquet
+    file at a time is unpacked, into a temporary file next to the archive.
     """
     with open_zip(path, EXPECTED) as archive:
         names = archive.namelist()
-        root = root_of(names)
+        root = find_lerobot_folder(names)
         if root is None:
-            raise invalid_data("member", "no meta/info.json", EXPECTED)
-        info = _info(archive, f"{root}{INFO}")
-        files = sorted((n for n in names if n.startswith(f"{root}data/") and n.endswith(".parquet")), key=by_numbers)
+            raise _missing(INFO_PATH)
+        info = _read_info(archive, f"{root}{INFO_PATH}")
+        files = [name for name in names if name.startswith(f"{root}data/") and name.endswith(".parquet")]
+        files.sort(key=numbers_in_name)
         if not files:
-            raise invalid_data("member", f"no {root}data/…parquet", EXPECTED)
-        measure([archive.getinfo(name) for name in files], settings)
+            raise _missing(f"{root}data/…parquet")
+        check_unpacked_size([archive.getinfo(name) for name in files], settings)
         features = info.get("features")
-        reader = _Files(archive, files, path.parent, features if isinstance(features, dict) else {}, settings)
+        reader = _ParquetFiles(archive, files, path.parent, features if isinstance(features, dict) else {}, settings)
         with reader.opened(files[0]) as first:
-            columns = checked_names(first.names)
-            facts = [f"LeRobot data set {_text(info, 'codebase_version')} of robot type {_text(info, 'robot_type')}"]
+            columns = clean_names(first.names)
+            facts = [f"LeRobot data set {_text(info, 'codebase_version')}, robot type {_text(info, 'robot_type')}"]
             facts += first.facts
-            clock = _clock(columns, info, facts)
+            clock = _find_clock(columns, info, facts)
         if any(name.endswith(".pos") for name in columns):
-            facts.append(
-                "states of LeRobot may be degrees or shares of a range: give `units` where they are not radians"
-            )
+            facts.append("LeRobot positions may be in degrees or normalised: set `units` if they are not in radians")
         yield Table(("t", *columns) if clock else columns, reader.blocks(columns, clock), units={"t": "s"}, facts=facts)
 
 
-class _Files:
+class _ParquetFiles:
     """The Parquet files of a data set, opened one after the other."""
 
     def __init__(
@@ -79,33 +86,34 @@ class _Files:
             try:
                 source = ParquetSource(file, self.settings, self._rename)
             except ServiceError as error:
-                raise within(name, error) from None
+                raise add_member(name, error) from None
             yield source
 
     def blocks(self, columns: tuple[str, ...], clock: tuple[int, float] | None) -> Iterator[Array]:
-        """Rows of all files; errors name the file that they are in."""
+        """Yield the rows of all files; an error names its file."""
         for name in self.files:
             with self.opened(name) as source:
                 if tuple(source.names) != columns:
-                    raise invalid_data(name, f"columns {', '.join(source.names)[:150]}", "those of the first file")
+                    value = f"a table of {', '.join(source.names)[:150]}"
+                    raise invalid_data(name, value, "the columns of the first file")
                 try:
                     for block in source.blocks():
                         yield block if clock is None else np.column_stack([block[:, clock[0]] * clock[1], block])
                 except ServiceError as error:
-                    raise within(name, error) from None
+                    raise add_member(name, error) from None
 
     def _unpack(self, name: str, file: IO[bytes]) -> None:
         try:
             with self.archive.open(name) as member:
                 shutil.copyfileobj(member, file, 1024 * 1024)
         except ERRORS as error:
-            raise invalid_data(name, first_line(error), "a member that can be unpacked") from None
+            raise unreadable(name, first_line(error), "a member that can be unpacked") from None
 
     def _rename(self, feature: str, names: list[str]) -> list[str]:
-        """The names of a feature's columns; `names` are those by position."""
-        if feature in _PLAIN:
-            return [_PLAIN[feature]] if len(names) == 1 else names
-        joints = _names(self.features.get(feature))
+        """Return the names of a feature's columns; `names` are the default ones, by position."""
+        if feature in _RENAMED:
+            return [_RENAMED[feature]] if len(names) == 1 else names
+        joints = _feature_names(self.features.get(feature))
         if len(joints) != len(names) or len(set(joints)) != len(joints):
             return names
         if feature in ENDINGS:
@@ -117,32 +125,37 @@ class _Files:
         return [f"{feature}.{joint}" for joint in joints]
 
 
-def _info(archive: zipfile.ZipFile, name: str) -> dict[str, Any]:
+def _missing(path: str) -> InvalidDataError:
+    message = f"The archive has no {readable(path[:200])}, expected {EXPECTED}."
+    return invalid_data("member", f"no {path}", EXPECTED, message)
+
+
+def _read_info(archive: zipfile.ZipFile, name: str) -> dict[str, Any]:
     try:
         with archive.open(name) as member:
-            text = member.read(MAX_INFO + 1)
-        info = decode(text) if len(text) <= MAX_INFO else None
+            text = member.read(MAX_INFO_BYTES + 1)
+        info = decode(text) if len(text) <= MAX_INFO_BYTES else None
     except ERRORS as error:
-        raise invalid_data(name, first_line(error), EXPECTED) from None
+        raise unreadable(name, first_line(error), EXPECTED) from None
     if not isinstance(info, dict):
-        raise invalid_data(name, info, f"an object, of at most {MAX_INFO} bytes")
+        raise invalid_data(name, info, f"a JSON object of at most {MAX_INFO_BYTES} bytes")
     return info
 
 
-def _names(feature: Any) -> list[str]:
-    """Names of a feature's parts: a list, or one within an object ({"motors": […]}), as older versions have it."""
+def _feature_names(feature: Any) -> list[str]:
+    """Return the names of a feature's parts: a list, or in older versions a list in an object ({"motors": […]})."""
     names = feature.get("names") if isinstance(feature, dict) else None
     if isinstance(names, dict):
         names = next(iter(names.values()), None)
     return [str(name) for name in names] if isinstance(names, list) else []
 
 
-def _clock(columns: tuple[str, ...], info: dict[str, Any], facts: list[str]) -> tuple[int, float] | None:
-    """Column of the number of a frame and the step of time in s, where the files hold no times."""
+def _find_clock(columns: tuple[str, ...], info: dict[str, Any], facts: list[str]) -> tuple[int, float] | None:
+    """Return the column of frame numbers and the time step in s, if the files hold no times."""
     fps = info.get("fps")
     if "t" in columns or "frame_index" not in columns or not isinstance(fps, int | float) or not 0 < fps < np.inf:
         return None
-    facts.append(f"times from the number of each frame, at {fps:g} Hz as {INFO} says")
+    facts.append(f"times are computed from frame numbers at {fps:g} Hz, the rate in {INFO_PATH}")
     return columns.index("frame_index"), 1.0 / fps
 
 

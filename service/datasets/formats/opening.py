@@ -1,4 +1,4 @@
-"""Any recording as a table: what a file is by its content, whatever it is called or sent as."""
+"""Opening a recording of any format as a table. The format is found from the content, not from the name."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import numpy as np
 
 from lipcore.data.samples import Array
 from lipcore.extras import import_extra
-from service.datasets.formats.joined import tables_of
+from service.datasets.formats.joined import find_tables
 from service.datasets.formats.json import MAX_LINE_BYTES, decode, open_json, open_json_lines
 from service.datasets.formats.npz import open_npz
 from service.datasets.formats.table import Table
-from service.datasets.formats.zips import open_zip, root_of
-from service.datasets.mapping.recognition import clocks
+from service.datasets.formats.zips import find_lerobot_folder, open_zip
+from service.datasets.mapping.recognition import find_times
 from service.datasets.options import ReadOptions
 from service.foundation.errors import ServiceError, invalid_data, invalid_request
 from service.foundation.settings import Settings
@@ -27,42 +27,42 @@ KINDS = {
     "csv": "CSV",
     "parquet": "Parquet",
     "npz": "NPZ",
-    "json_lines": "JSON, one object a line",
+    "json_lines": "JSON with one object per line",
     "json": "JSON",
     "lerobot": "a zip of a LeRobot data set",
-    "joined": "a zip of tables",
+    "joined": "a zip of text tables",
     "rosbag1": "a ROS 1 bag",
     "rosbag2": "a ROS 2 bag",
     "mcap": "MCAP",
 }
-"""What is read here, in words."""
-ALIKE: tuple[set[str | None], ...] = ({"json", "json_lines"}, {"rosbag1", "rosbag2", "mcap"})
-"""Kinds that are taken for one another so often that it is not worth telling."""
+"""Formats that can be read, in words."""
+SIMILAR_KINDS: tuple[set[str | None], ...] = ({"json", "json_lines"}, {"rosbag1", "rosbag2", "mcap"})
+"""Formats that are confused so often that the report does not mention it."""
 _MAGIC = (
     (b"PAR1", "parquet"),
     (b"SQLite format 3\0", "rosbag2"),
     (b"\x89MCAP0\r\n", "mcap"),
     (b"#ROSBAG V2.0\n", "rosbag1"),
 )
-_FOREIGN = (
+_UNSUPPORTED = (
     (b"\x89HDF\r\n\x1a\n", "HDF5"),
     (b"MATLAB 5.0 MAT-file", "MATLAB"),
     (b"ARROW1", "an Arrow file"),
     (b"FEA1", "Feather"),
-    (b"\x93NUMPY", "one NumPy array"),
+    (b"\x93NUMPY", "a single NumPy array"),
     (b"\x80\x03", "a pickle"),
     (b"\x80\x04", "a pickle"),
     (b"\x80\x05", "a pickle"),
-    (b"\x1f\x8b", "compressed by gzip"),
-    (b"\x28\xb5\x2f\xfd", "compressed by zstd"),
-    (b"BZh", "compressed by bzip2"),
-    (b"\xfd7zXZ\0", "compressed by xz"),
+    (b"\x1f\x8b", "compressed with gzip"),
+    (b"\x28\xb5\x2f\xfd", "compressed with zstd"),
+    (b"BZh", "compressed with bzip2"),
+    (b"\xfd7zXZ\0", "compressed with xz"),
     (b"7z\xbc\xaf\x27\x1c", "a 7z archive"),
     (b"Rar!", "a RAR archive"),
     (b"\xff\xfe", "text in UTF-16"),
     (b"\xfe\xff", "text in UTF-16"),
-    (b"\x89PNG", "a picture"),
-    (b"\xff\xd8\xff", "a picture"),
+    (b"\x89PNG", "an image"),
+    (b"\xff\xd8\xff", "an image"),
     (b"%PDF", "PDF"),
     (b"\xd0\xcf\x11\xe0", "an Office document"),
 )
@@ -70,54 +70,55 @@ Opener = Callable[[Path, ReadOptions, Settings], AbstractContextManager[Table]]
 
 
 def sniff(path: Path) -> str | None:
-    """One of `KINDS`; None where the content is none of them, or cannot be told. Raises nothing of damaged files."""
+    """Return the format, a key of `KINDS`, or None if it is unknown; damaged files raise no error."""
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     for magic, kind in _MAGIC:
         if head.startswith(magic):
             return kind
     if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
-        return _zip(path)
-    return _text(head)
+        return _sniff_zip(path)
+    return _sniff_text(head)
 
 
-def foreign(path: Path) -> str | None:
-    """What a file is in words, where that is known and not read here."""
+def name_unsupported(path: Path) -> str | None:
+    """Return the format in words if it is known but cannot be read."""
     with path.open("rb") as file:
         head = file.read(512)
-    for magic, kind in _FOREIGN:
+    for magic, kind in _UNSUPPORTED:
         if head.startswith(magic):
             return kind
     if head.startswith(b"PK"):
-        return "an Excel workbook" if b"[Content_Types].xml" in head else "a zip archive, damaged or of other files"
+        is_excel = b"[Content_Types].xml" in head
+        return "an Excel workbook" if is_excel else "a zip archive that is damaged or holds other files"
     return None
 
 
-def _zip(path: Path) -> str | None:
+def _sniff_zip(path: Path) -> str | None:
     try:
         with open_zip(path, "a zip archive") as archive:
             names = archive.namelist()
     except ServiceError:
         return None
-    if root_of(names) is not None:
+    if find_lerobot_folder(names) is not None:
         return "lerobot"
     if any(name.endswith((".db3", ".mcap", ".db3.zstd", ".mcap.zstd")) for name in names):
         return "rosbag2"
     if any(name.endswith(".bag") for name in names):
         return "rosbag1"
-    if tables_of(names):
+    if find_tables(names):
         return "joined"
     return "npz" if names and all(name.endswith(".npy") for name in names) else None
 
 
-def _text(head: bytes) -> str | None:
-    """JSON or CSV, where the head of a file is text."""
+def _sniff_text(head: bytes) -> str | None:
+    """Return "json", "json_lines" or "csv" if the head of a file is such text."""
     try:
         text = head.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         if error.start < len(head) - 4 or len(head) < HEAD_BYTES:
             return None
-        text = head[: error.start].decode("utf-8-sig")  # cut within a character
+        text = head[: error.start].decode("utf-8-sig")  # the head ends within a character
     text = text.lstrip()
     if not text or "\0" in text:
         return None
@@ -132,7 +133,7 @@ def _text(head: bytes) -> str | None:
         if rest.strip():
             return "json_lines"
         return "json" if any(isinstance(value, list | dict) for value in row.values()) else "json_lines"
-    # (of a line of marks nothing is left)
+    # a line of comment marks alone becomes empty
     while rest and (not (row := rest.partition("\n")[0].strip()) or line[:1] in "#%"):
         line, _, rest = (row or line).lstrip("#%"), None, rest.partition("\n")[2]
     marks = [mark for mark in ",;\t| " if mark in line and mark in row] if rest else []
@@ -143,24 +144,24 @@ def _text(head: bytes) -> str | None:
 def open_table(path: Path, kind: str | None, options: ReadOptions, settings: Settings) -> Iterator[Table]:
     """Open a recording as a table; raise InvalidDataError, TooLargeError or MissingExtraError.
 
-    kind: what it is said to be, one of `KINDS` or "zip", None where nobody says. Where its content is of another
-    kind it is read as that, which is a fact of the table; where it is none that is read here, the error names both.
+    kind: the declared format, a key of `KINDS` or "zip", or None. A file whose content has another format is read as
+    that, and the table's facts say so. If its format cannot be read, the error names both.
     """
     if path.stat().st_size == 0:
         raise invalid_data("file", "empty", KINDS.get(kind or "", "a recording"))
-    actual = _kind(path, kind)
+    actual = _decide_kind(path, kind)
     with _open(path, actual, options, settings) as table:
         if options.dt is not None:
-            _count_time(table, options.dt)
-        if kind in KINDS and kind != actual and not any({kind, actual} <= family for family in ALIKE):
-            table.facts.insert(0, f"sent as {KINDS[kind]}, but is {KINDS[actual]}: read as that")
+            _add_times(table, options.dt)
+        if kind in KINDS and kind != actual and not any({kind, actual} <= family for family in SIMILAR_KINDS):
+            table.facts.insert(0, f"the file was sent as {KINDS[kind]}, but was read as {KINDS[actual]}")
         yield table
 
 
-def _count_time(table: Table, step: float) -> None:
-    """Give a table without times those of rows that are `step` s apart; raise InvalidRequestError where it has some."""
-    if times := clocks(table.names):
-        raise invalid_request("dt", f"{step:g}", f"none, as column {times[0].name} holds times")
+def _add_times(table: Table, step: float) -> None:
+    """Add times `step` s apart to a table; raise InvalidRequestError if it has times."""
+    if times := find_times(table.names):
+        raise invalid_request("dt", f"{step:g}", f"no `dt` because column {times[0].name} holds times")
     blocks = table.blocks
 
     def timed() -> Iterator[Array]:
@@ -170,30 +171,32 @@ def _count_time(table: Table, step: float) -> None:
             row += len(block)
 
     table.names, table.blocks = ("t", *table.names), timed()
-    table.facts.append(f"times are counted in steps of {step:g} s, as the upload says")
+    table.facts.append(f"times are counted in steps of {step:g} s, as set by `dt`")
 
 
-def _kind(path: Path, kind: str | None) -> str:
-    """What a file is to be read as."""
+def _decide_kind(path: Path, kind: str | None) -> str:
+    """Return the format to read a file as."""
     actual = sniff(path)
     if actual is not None:
-        if (kind, actual) == ("json_lines", "json") and not _starts(path, b"["):
-            with path.open("rb") as file:  # a damaged first line makes lines of JSON look like a document
+        if (kind, actual) == ("json_lines", "json") and not _starts_with(path, b"["):
+            with path.open("rb") as file:  # after a damaged first line, JSON lines look like one document
                 line = file.readline(MAX_LINE_BYTES)
                 return "json_lines" if len(line.strip()) > 1 and line.endswith(b"\n") and file.read(1) else actual
         return actual
-    other = foreign(path)
-    if kind in KINDS and (other is None or (kind in ("npz", "lerobot", "joined", "rosbag2") and _starts(path, b"PK"))):
-        return kind  # whoever reads that kind says best what is wrong with it
+    other = name_unsupported(path)
+    if kind in KINDS and (
+        other is None or (kind in ("npz", "lerobot", "joined", "rosbag2") and _starts_with(path, b"PK"))
+    ):
+        return kind  # the reader of that format gives the best error
     sent = f" (sent as {KINDS[kind]})" if kind in KINDS else ""
     raise invalid_data(
         "file",
-        f"{other or 'of no known kind'}{sent}",
-        "CSV, Parquet, NPZ, JSON, a bag of ROS 1 or 2, MCAP, or a zip of a LeRobot data set, a bag, or tables of text",
+        f"{other or 'in an unknown format'}{sent}",
+        "CSV, Parquet, NPZ, JSON, a ROS 1 or ROS 2 bag, MCAP, or a zip of a LeRobot data set, a bag or text tables",
     )
 
 
-def _starts(path: Path, magic: bytes) -> bool:
+def _starts_with(path: Path, magic: bytes) -> bool:
     with path.open("rb") as file:
         return file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(magic)
 
@@ -202,7 +205,7 @@ def _open(path: Path, kind: str, options: ReadOptions, settings: Settings) -> Ab
     own: dict[str, Opener] = {"npz": open_npz, "json_lines": open_json_lines, "json": open_json}
     if kind in own:
         return own[kind](path, options, settings)
-    import_extra("pyarrow", "ingest")  # what is imported from here on stands on it
+    import_extra("pyarrow", "ingest")  # the readers below need it
     if kind in ("csv", "parquet", "lerobot", "joined"):
         opener: Opener = getattr(import_module(f"service.datasets.formats.{kind}"), f"open_{kind}")
         return opener(path, options, settings)

@@ -1,1 +1,1 @@
-"""From what a file calls its columns to positions, velocities, accelerations and torques of joints, in SI units."""
+"""Mapping a file's columns to positions, velocities, accelerations and torques of joints, in SI units."""

@@ -1,4 +1,4 @@
-"""What makes the columns of a recording usable; each rule says what is wrong, and where."""
+"""Checks of a recording's columns; an error names the column and the row."""
 
 from __future__ import annotations
 
@@ -10,33 +10,34 @@ from numpy.typing import NDArray
 
 from lipcore.data.samples import Array
 from service.foundation.errors import InvalidDataError, invalid_data
+from service.foundation.text import counted
 
 MIN_SAMPLES = 30
-"""Samples of a data set, at least."""
+"""Min samples of a data set."""
 
 
 @dataclass(frozen=True)
 class CheckOptions:
-    """Limits of usable columns."""
+    """Limits of the checks."""
 
-    constant: float = 1e-6
-    """Span in rad or m below which a joint has not moved."""
-    moved: float = 0.01
-    """Span in rad or m above which a joint that was left out has moved."""
-    jump: float = 1.0
-    """A position that jumps by a turn between two rows, within so many rad, was wrapped."""
+    min_span: float = 1e-6
+    """Min span of the positions of a joint, rad or m."""
+    max_dropped_span: float = 0.01
+    """Max span of the positions of a joint that is left out without a warning, rad or m."""
+    turn_tolerance: float = 1.0
+    """Max difference from a whole turn of a jump between two rows that is unwrapped, rad."""
     max_size: float = 1e12
-    """Max size of a time, motion or torque in SI units; beyond it, squares and differences overflow."""
+    """Max absolute value of a time, motion or torque in SI units; larger squares and differences could overflow."""
     max_step_s: float = 1.0
-    """Max step of time of a robot, s; longer ones are in another unit."""
-    window: int = 25
-    """Rows over which a signal and its derivative are compared."""
-    stretch: int = 20_000
-    """Max rows at the start of a recording that are compared so."""
-    correlation: float = 0.97
-    """Min correlation at which such a comparison counts."""
-    tolerance: float = 0.05
-    """Max relative difference between a factor and that of a unit."""
+    """Max usual time step, s; longer ones are in another unit."""
+    slope_window: int = 25
+    """Rows over which the change of a signal is compared with its derivative."""
+    max_slope_rows: int = 20_000
+    """Max rows at the start of a recording that are compared."""
+    min_correlation: float = 0.97
+    """Min correlation of a comparison that counts."""
+    unit_tolerance: float = 0.05
+    """Max relative difference between a ratio and the factor of a unit."""
 
 
 CHECKS = CheckOptions()
@@ -46,8 +47,8 @@ Rows = NDArray[np.int64]
 
 
 @dataclass
-class Seen:
-    """What was seen of a column, block after block: its range, the row of what is farthest from 0, what is missing."""
+class ColumnStats:
+    """Range, largest absolute value and missing values of a column, collected in blocks."""
 
     name: str
     low: float = np.inf
@@ -58,19 +59,19 @@ class Seen:
     first_missing: int = 0
 
     def add(self, values: Array, rows: Rows) -> None:
-        """Look at more values (M,), NaN where missing, of these rows; raise InvalidDataError where one is too large."""
-        gone = np.isnan(values)
-        if gone.any():
-            self.first_missing = self.first_missing or int(rows[gone.argmax()])
-            self.missing += int(gone.sum())
-            values, rows = values[~gone], rows[~gone]
+        """Add values (M,) of these rows, NaN if missing; raise InvalidDataError if one is too large."""
+        missing = np.isnan(values)
+        if missing.any():
+            self.first_missing = self.first_missing or int(rows[missing.argmax()])
+            self.missing += int(missing.sum())
+            values, rows = values[~missing], rows[~missing]
         if len(values) == 0:
             return
         size = np.abs(values)
         place = int(size.argmax())
         if size[place] > CHECKS.max_size:
             first = int((size > CHECKS.max_size).argmax())
-            expected = f"SI units, within ±{CHECKS.max_size:g}"
+            expected = f"a value in SI units within ±{CHECKS.max_size:g}"
             raise invalid_data(f"{self.name}, row {rows[first]}", str(values[first]), expected)
         if size[place] > abs(self.far):
             self.far, self.far_row = float(values[place]), int(rows[place])
@@ -78,12 +79,12 @@ class Seen:
 
     @property
     def span(self) -> float:
-        """Largest less smallest value; 0 where there are none."""
+        """Largest minus smallest value; 0 if there are none."""
         return max(0.0, self.high - self.low)
 
 
-class Turns:
-    """Takes jumps of a whole turn out of a joint's positions, block after block, as sensors wrap them at ±π or 2π.
+class TurnUnwrapper:
+    """Removes jumps of a whole turn from a joint's positions, which sensors wrap at ±π or 2π.
 
     count: jumps so far; first: row of the first one, counted from 1.
     """
@@ -94,8 +95,7 @@ class Turns:
         self._turned = 0.0
 
     def unwrap(self, q: Array, episode: Array | None, rows: Rows) -> Array:
-        """More positions (M,), rad, NaN where missing, of these rows, without jumps; each episode begins where it is
-        recorded."""
+        """Return positions (M,) of these rows without jumps, rad; each episode starts at its recorded value."""
         known = np.flatnonzero(~np.isnan(q))
         if len(known) == 0:
             return q
@@ -103,7 +103,7 @@ class Turns:
         numbers = np.zeros(len(known)) if episode is None else episode[known]
         last = self._last or (float(values[0]), float(numbers[0]))
         step, other = np.diff(values, prepend=last[0]), np.diff(numbers, prepend=last[1]) != 0
-        jumps = np.where((np.abs(np.abs(step) - math.tau) < CHECKS.jump) & ~other, -np.sign(step), 0.0)
+        jumps = np.where((np.abs(np.abs(step) - math.tau) < CHECKS.turn_tolerance) & ~other, -np.sign(step), 0.0)
         self._last = float(values[-1]), float(numbers[-1])
         if jumps.any():
             self.first = self.first or int(rows[known[np.flatnonzero(jumps)[0]]])
@@ -119,15 +119,15 @@ class Turns:
         return out
 
 
-class Clockwork:
-    """Watches times over blocks: within an episode they may not go backwards; where they stand still is counted."""
+class TimeChecker:
+    """Checks that times do not go back within an episode, and counts repeated ones."""
 
     def __init__(self, name: str) -> None:
         self.name, self.repeated, self.first_repeated = name, 0, 0
         self._last: tuple[float, float] | None = None
 
-    def look(self, t: Array, episode: Array | None, rows: Rows) -> None:
-        """Look at more times (M,), NaN where missing; count those that were there before. Raise InvalidDataError."""
+    def add(self, t: Array, episode: Array | None, rows: Rows) -> None:
+        """Add times (M,), NaN if missing; raise InvalidDataError if they go back."""
         known = np.flatnonzero(~np.isnan(t))
         if len(known) == 0:
             return
@@ -138,16 +138,14 @@ class Clockwork:
             numbers = np.concatenate([[self._last[1]], numbers])
         self._last = float(times[-1]), float(numbers[-1])
         step = np.where(np.diff(numbers) == 0, np.diff(times), np.inf)
-        after = known[len(known) - len(step) :]  # rows that the steps lead to
+        after = known[len(known) - len(step) :]  # the row at the end of each step
         if (back := np.flatnonzero(step < 0)).size:
             place = int(back[0])
-            hint = (
-                "" if episode is not None else "; or a column `episode` that numbers recordings, where a new one starts"
-            )
+            hint = "" if episode is not None else ". If a new recording starts here, add a column `episode`"
             raise invalid_data(
                 f"{self.name}, row {rows[after[place]]}",
                 f"{times[place + 1]:.15g}",
-                f"more than {times[place]:.15g}, the time before it{hint}",
+                f"more than {times[place]:.15g}, the time of the row before{hint}",
             )
         again = after[step == 0]
         if len(again):
@@ -156,60 +154,57 @@ class Clockwork:
 
 
 def check_episodes(values: Array, rows: Rows, name: str) -> None:
-    """Raise InvalidDataError where a number of an episode is not whole."""
+    """Raise InvalidDataError if an episode number is not a whole number."""
     wrong = ~np.isfinite(values) | (values != np.floor(values)) | (np.abs(values) > 2**53)
     if wrong.any():
         place = int(wrong.argmax())
         raise invalid_data(f"{name}, row {rows[place]}", float(values[place]), "a whole number")
 
 
-def check_rows(rows: int, missing: int, repeated: int, least: int, seen: list[Seen]) -> None:
-    """Raise InvalidDataError where too few rows are complete and have times of their own."""
+def check_rows(rows: int, missing: int, repeated: int, min_samples: int, stats: list[ColumnStats]) -> None:
+    """Raise InvalidDataError if too few rows are complete and have a new time."""
     if 2 * missing > rows:
-        worst = max(seen, key=lambda each: each.missing)
+        worst = max(stats, key=lambda each: each.missing)
         raise invalid_data(
             f"{worst.name}, row {worst.first_missing}",
-            f"not a finite number, nor in {worst.missing} of {rows} rows in all",
-            "at most half of the rows with something missing",
+            f"not a finite number, as in {worst.missing} of {rows} rows",
+            "a finite number in at least half of the rows",
         )
     usable = max(0, rows - missing - repeated)
-    if usable < least:
-        why = [f"{missing} with something missing"] if missing else []
-        why += [f"{repeated} whose time was there before"] if repeated else []
-        left_out = f", those left out {' and '.join(why)}" if why else ""
-        raise invalid_data("rows", usable, f"at least {least} samples{left_out}")
+    if usable < min_samples:
+        why = [f"{missing} have missing values"] if missing else []
+        why += [f"{repeated} repeat the time of the row before"] if repeated else []
+        unused = f" Of {rows} rows, {' and '.join(why)}." if why else ""
+        found, expected = counted(usable, "usable row"), f"at least {min_samples}"
+        raise invalid_data("rows", usable, expected, f"The file has {found}, expected {expected}.{unused}")
 
 
-def check_positions(seen: list[tuple[str, Seen]], max_position: float, certain: bool) -> None:
-    """Raise InvalidDataError where positions are too large for SI units, unless these are certain, or a joint has not
-    moved."""
-    farthest = max((each for _, each in seen), key=lambda each: abs(each.far))
-    if abs(farthest.far) > max_position and not certain:
+def check_positions(stats: list[tuple[str, ColumnStats]], max_position: float, has_unit: bool) -> None:
+    """Raise InvalidDataError if positions without a stated unit are too large for SI units, or a joint did not move."""
+    farthest = max((each for _, each in stats), key=lambda each: abs(each.far))
+    if abs(farthest.far) > max_position and not has_unit:
         raise invalid_data(
             f"{farthest.name}, row {farthest.far_row}",
             f"{farthest.far:g}",
-            f'radians (or metres) within ±{max_position:g}: are these degrees? Then say units={{"q": "deg"}}, or '
-            'units={"q": "rad"} if joints turn on',
+            f'radians or metres within ±{max_position:g}. Set units={{"q": "deg"}} if these are degrees, or '
+            'units={"q": "rad"} if the joint turns this far',
         )
-    for joint, each in seen:
-        if each.span < CHECKS.constant:
-            raise invalid_data(
-                each.name,
-                f"constant at {each.low:g}",
-                f"a joint that moves: leave out locked joints, drop_joints={joint}",
-            )
+    for joint, each in stats:
+        if each.span < CHECKS.min_span:
+            expected = f"a joint that moves. Leave out locked joints with drop_joints={joint}"
+            raise invalid_data(each.name, f"constant at {each.low:g}", expected)
 
 
-def check_torques(seen: list[tuple[str, Seen]]) -> None:
-    """Raise InvalidDataError where a torque is the same in all rows: nobody has measured it."""
-    constant = [(joint, each) for joint, each in seen if each.span == 0]
+def check_torques(stats: list[tuple[str, ColumnStats]]) -> None:
+    """Raise InvalidDataError if a torque is the same in all rows, because then it was not measured."""
+    constant = [(joint, each) for joint, each in stats if each.span == 0]
     for joint, each in constant:
-        hint = "" if len(constant) == len(seen) else f"; without any, leave it out: drop_joints={joint}"
-        raise invalid_data(each.name, f"constant at {each.low:g}", f"torque measured while the joint moved{hint}")
+        hint = "" if len(constant) == len(stats) else f". Leave out a joint without one with drop_joints={joint}"
+        raise invalid_data(each.name, f"constant at {each.low:g}", f"a torque measured while the joint moved{hint}")
 
 
-def epoch_unit(t: Array, rows: Rows, name: str) -> None:
-    """Raise InvalidDataError where times that nobody gave a unit are too large for seconds since whenever."""
+def check_epoch_unit(t: Array, rows: Rows, name: str) -> None:
+    """Raise InvalidDataError if times without a unit are too large for seconds since 1970."""
     large = np.abs(t) > CHECKS.max_size
     if large.any():
         value = float(t[large.argmax()])
@@ -218,17 +213,17 @@ def epoch_unit(t: Array, rows: Rows, name: str) -> None:
 
 
 def _seconds(unit: str) -> str:
-    return f'seconds, or its unit: units={{"t": "{unit}"}} if it is {unit}, units={{"t": "s"}} if it is s'
+    return f'seconds. Set units={{"t": "{unit}"}} if it is in {unit}, or units={{"t": "s"}} if it is in s'
 
 
-def check_time_unit(t: Array, given: bool, name: str) -> None:
-    """Raise InvalidDataError where times can hardly be seconds; given: whether somebody says what they are."""
+def check_time_unit(t: Array, has_unit: bool, name: str) -> None:
+    """Raise InvalidDataError if the time steps are too long for seconds; has_unit: whether a unit is stated."""
     step = np.diff(t[~np.isnan(t)])
     step = step[step > 0]
     usual = float(np.median(step)) if len(step) else 0.0
-    if given or usual < CHECKS.max_step_s:
+    if has_unit or usual < CHECKS.max_step_s:
         return
-    unit = "ms" if usual < 500 else "us" if usual < 500e3 else "ns"  # of rates from 2 to 1000 Hz
+    unit = "ms" if usual < 500 else "us" if usual < 500e3 else "ns"  # for rates from 2 to 1000 Hz
     raise invalid_data(name, f"in steps of {usual:g}", _seconds(unit))
 
 
@@ -240,52 +235,52 @@ UNITS_OF_RATIO: tuple[tuple[float, tuple[str, str] | None, tuple[str, str] | Non
     (1000.0, ("dq", "mm/s"), ("ddq", "mm/s^2")),
     (1e-3, ("q", "mm"), ("dq", "mm/s")),
 )
-"""By how much a derivative is too large where it, or what it is of, is in another unit: for dq of q, for ddq of dq."""
+"""Ratio of a derivative to the slope of its signal, and the wrong unit it indicates: for q and dq, for dq and ddq."""
 
 
 def slope_ratio(t: Array, values: Array, derivative: Array) -> float | None:
-    """How many times as large a derivative is as the slope of what it is of; None where the data cannot tell.
+    """Return the ratio of a derivative to the slope of its signal; None if their correlation is too low.
 
-    All (M,), of one contiguous recording. Compares the change of `values` over some rows with the integral of the
-    derivative, which noise hardly disturbs.
+    All arrays (M,), from one contiguous recording. The change of `values` over some rows is compared with the integral
+    of the derivative, which is robust to noise.
     """
-    window = CHECKS.window
+    window = CHECKS.slope_window
     if len(t) < 2 * window:
         return None
     steps = np.diff(t) * (derivative[1:] + derivative[:-1]) / 2
     integral = np.concatenate([[0.0], np.cumsum(steps)])
     expected, integrated = values[window:] - values[:-window], integral[window:] - integral[:-window]
     product, size, other = float(expected @ integrated), float(expected @ expected), float(integrated @ integrated)
-    if not product**2 > CHECKS.correlation**2 * size * other:
+    if not product**2 > CHECKS.min_correlation**2 * size * other:
         return None
     return product / size
 
 
-def wrong_unit(ratios: list[float | None], derivative: str) -> InvalidDataError | None:
-    """The error where ratios of joints say that a derivative, dq or ddq, and what it is of have units that differ."""
+def find_unit_error(ratios: list[float | None], derivative: str) -> InvalidDataError | None:
+    """Return the error if the ratios of the joints show that dq or ddq does not match the unit of its signal."""
     known = [each for each in ratios if each is not None]
     if 2 * len(known) <= len(ratios):
         return None
     ratio = float(np.median(known))
     for value, of_dq, of_ddq in UNITS_OF_RATIO:
         hint = of_dq if derivative == "dq" else of_ddq
-        if hint is not None and abs(ratio / value - 1) < CHECKS.tolerance:
+        if hint is not None and abs(ratio / value - 1) < CHECKS.unit_tolerance:
             quantity, unit = hint
             return invalid_data(
                 derivative,
                 f"{ratio:.3g} times the slope of {'q' if derivative == 'dq' else 'dq'}",
-                f'both in SI units; say units={{"{quantity}": "{unit}"}} if {quantity} is in {unit}',
+                f'both in SI units. Set units={{"{quantity}": "{unit}"}} if {quantity} is in {unit}',
             )
     return None
 
 
-def first_stretch(t: Array, episode: Array | None, missing: NDArray[np.bool_]) -> slice:
-    """The first contiguous rows of a recording, CHECKS.stretch at most, that is long enough to tell of its units."""
+def find_slope_rows(t: Array, episode: Array | None, missing: NDArray[np.bool_]) -> slice:
+    """Return the first contiguous rows that are long enough to compare slopes, at most `max_slope_rows`."""
     breaks = missing[1:] | missing[:-1]
     if episode is not None:
         breaks |= np.diff(episode) != 0
     ends = np.concatenate([[0], np.flatnonzero(breaks) + 1, [len(t)]])
     lengths = np.diff(ends)
-    long = np.flatnonzero(lengths >= 4 * CHECKS.window)
+    long = np.flatnonzero(lengths >= 4 * CHECKS.slope_window)
     place = int(long[0]) if len(long) else int(lengths.argmax())
-    return slice(int(ends[place]), int(min(ends[place + 1], ends[place] + CHECKS.stretch)))
+    return slice(int(ends[place]), int(min(ends[place + 1], ends[place] + CHECKS.max_slope_rows)))

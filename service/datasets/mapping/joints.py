@@ -1,4 +1,4 @@
-"""The joints of a recording: what they are called, which are kept, in which order."""
+"""The joints of a recording: their names, selection and order."""
 
 from __future__ import annotations
 
@@ -7,34 +7,35 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from lipcore.profiles import Profile
-from service.datasets.mapping.recognition import JOINT, Family, Key
+from service.datasets.mapping.recognition import JOINT, Family, JointKey
 from service.datasets.options import UploadOptions
 from service.foundation.errors import InvalidDataError, invalid_data, invalid_request
 from service.foundation.fields import first_repeat
 
-MAX_NAME = 100
+MAX_NAME_CHARS = 100
 _NUMBER = re.compile(r"\d{1,9}")
-_SHOWN = 12
+_MAX_LISTED = 12
 
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of the file.
+    """A joint of the file."""
 
-    label: what the file calls it; index: of its position's column; place: among all `of` joints.
-    """
-
-    key: Key
+    key: JointKey
     label: str
+    """Name in the file."""
     name: str
     index: int
+    """Index of the column of its position."""
     place: int
+    """Index among all joints of the file."""
     of: int
+    """Number of joints of the file."""
 
 
 @dataclass(frozen=True)
-class Order:
-    """Joints kept, in order, and left out; constants: N·m/A of those kept, where the robot says them."""
+class JointOrder:
+    """Joints that are kept, in order, and joints that are left out; constants: N·m/A of those kept, if known."""
 
     kept: tuple[Joint, ...]
     dropped: tuple[Joint, ...]
@@ -42,11 +43,11 @@ class Order:
     notes: tuple[str, ...]
 
 
-def order_of(positions: Family) -> tuple[Joint, ...]:
-    """All joints of a file, by number where it numbers them, else in the file's order."""
+def list_joints(positions: Family) -> tuple[Joint, ...]:
+    """Return all joints of a file, ordered by number if they have numbers, else as in the file."""
     items = list(positions.members.items())
     if not positions.listed:
-        items.sort(key=_by_number(positions))
+        items.sort(key=_number_key(positions))
     return tuple(
         Joint(
             key,
@@ -60,63 +61,63 @@ def order_of(positions: Family) -> tuple[Joint, ...]:
     )
 
 
-def arrange(
+def arrange_joints(
     positions: Family,
     joint_names: tuple[str, ...] | None,
     options: UploadOptions,
     robot: Profile | None,
     max_joints: int,
-) -> Order:
-    """Name and order the joints, leave out what the user or the robot leaves out; raise InvalidDataError."""
+) -> JointOrder:
+    """Name, select and order the joints by the options and the robot; raise InvalidDataError."""
     _check_numbers(positions)
-    joints = _named(order_of(positions), joint_names, options)
-    chosen, left_out = _chosen(joints, options)
+    joints = _name_joints(list_joints(positions), joint_names, options)
+    chosen, left_out = _select_joints(joints, options)
     notes: list[str] = []
     constants = None
     kept: tuple[Joint, ...] = chosen
     if robot is not None:
-        kept, constants, notes = _as_robot(joints, chosen, options, robot)
+        kept, constants, notes = _match_robot(joints, chosen, options, robot)
         left_out += tuple(joint for joint in chosen if joint.index not in {each.index for each in kept})
     if not 1 <= len(kept) <= max_joints:
         raise invalid_data("joints", len(kept), f"1 to {max_joints}")
-    if robot is None and _alphabetical(kept):
+    if robot is None and _is_alphabetical(kept):
         notes.append(
-            "joints come in the order of the alphabet, as some drivers list them: if that is not from base to tip, "
-            "say it with joints, or the robot"
+            "the joints are in alphabetical order, as some drivers list them: if this is not from base to tip, set the "
+            "order with `joints` or set `robot`"
         )
     if [joint.index for joint in kept] != sorted(joint.index for joint in kept):
-        notes.append(f"joints are put in the order {', '.join(joint.name for joint in kept)}")
+        notes.append(f"joints were put in the order {', '.join(joint.name for joint in kept)}")
     names = options.read.joint_names
     if names is not None and len(names) == len(kept) != len(joints):
         kept = tuple(replace(joint, name=name) for joint, name in zip(kept, names, strict=True))
     check_names(tuple(joint.name for joint in kept))
-    return Order(kept, left_out, constants, tuple(notes))
+    return JointOrder(kept, left_out, constants, tuple(notes))
 
 
 def check_names(names: tuple[str, ...]) -> None:
-    """Raise InvalidDataError unless the names of joints are distinct and printable."""
+    """Raise InvalidDataError if joint names are repeated or not printable."""
     for index, name in enumerate(names):
-        if not name or len(name) > MAX_NAME or not name.isprintable():
-            raise invalid_data(f"joint_names[{index}]", name, f"1 to {MAX_NAME} printable characters")
+        if not name or len(name) > MAX_NAME_CHARS or not name.isprintable():
+            raise invalid_data(f"joint_names[{index}]", name, f"1 to {MAX_NAME_CHARS} printable characters")
     if (twice := first_repeat(names)) is not None:
-        raise invalid_data(f"joint_names[{twice}]", names[twice], "names that differ")
+        raise invalid_data(f"joint_names[{twice}]", names[twice], "a different name for each joint")
 
 
 def _check_numbers(positions: Family) -> None:
-    """Where joints only have numbers, none may be missing."""
+    """Raise InvalidDataError if joints have only numbers and a number is missing."""
     labels = [member.label for member in positions.members.values()]
     if positions.listed or not all(label.isdecimal() for label in labels):
         return
     numbers = sorted(key for key in positions.members if isinstance(key, int))
     first = min(map(int, labels))
-    # from 0 or from 1 on; `missing` is the number as the file would write it
+    # numbers start at 0 or 1 in the file, at 1 in the keys
     missing = next((place for place, key in enumerate(numbers, start=1) if key != place), None)
     if missing is not None:
         name = positions.pattern.replace(JOINT, str(missing - (first == 0)))
         raise invalid_data(f"column {name}", "missing", f"positions of joints {first or 1} to {max(map(int, labels))}")
 
 
-def _by_number(positions: Family) -> Callable[[tuple[Key, object]], tuple[int, ...]]:
+def _number_key(positions: Family) -> Callable[[tuple[JointKey, object]], tuple[int, ...]]:
     labels = {key: member.label for key, member in positions.members.items()}
     alike = len({_NUMBER.sub("#", label) for label in labels.values()}) == 1
     if not alike and not positions.numbered:
@@ -124,39 +125,41 @@ def _by_number(positions: Family) -> Callable[[tuple[Key, object]], tuple[int, .
     return lambda item: tuple(int(each) for each in _NUMBER.findall(labels[item[0]])) or (0,)
 
 
-def _named(joints: tuple[Joint, ...], joint_names: tuple[str, ...] | None, options: UploadOptions) -> tuple[Joint, ...]:
+def _name_joints(
+    joints: tuple[Joint, ...], joint_names: tuple[str, ...] | None, options: UploadOptions
+) -> tuple[Joint, ...]:
     names = options.read.joint_names
-    least = len(joints) - len(options.drop_joints) if options.joints is None else len(options.joints)
+    kept = len(joints) - len(options.drop_joints) if options.joints is None else len(options.joints)
     if names is not None and len(names) == len(joints):
         return tuple(replace(joint, name=name) for joint, name in zip(joints, names, strict=True))
-    if names is not None and len(names) != least:
-        raise invalid_data("joint_names", f"{len(names)} names", f"{len(joints)} names, one a joint")
-    # a file names joints apart from its columns where these only have numbers
+    if names is not None and len(names) != kept:
+        raise invalid_data("joint_names", f"{len(names)} names", f"{len(joints)} names, one per joint")
+    # use the separate joint names of a file only if its columns have numbers
     if joint_names is not None and len(joint_names) == len(joints) and all(isinstance(j.key, int) for j in joints):
         return tuple(replace(joint, name=name) for joint, name in zip(joints, joint_names, strict=True))
     return joints
 
 
-def _chosen(joints: tuple[Joint, ...], options: UploadOptions) -> tuple[tuple[Joint, ...], tuple[Joint, ...]]:
-    dropped = [_find(joints, name, "drop_joints") for name in options.drop_joints]
-    asked = list(joints) if options.joints is None else [_find(joints, name, "joints") for name in options.joints]
+def _select_joints(joints: tuple[Joint, ...], options: UploadOptions) -> tuple[tuple[Joint, ...], tuple[Joint, ...]]:
+    dropped = [_find_joint(joints, name, "drop_joints") for name in options.drop_joints]
+    asked = list(joints) if options.joints is None else [_find_joint(joints, name, "joints") for name in options.joints]
     if len({joint.index for joint in asked}) < len(asked):
-        raise invalid_request("joints", ", ".join(options.joints or ()), "every joint once")
+        raise invalid_request("joints", ", ".join(options.joints or ()), "each joint only once")
     kept = tuple(joint for joint in asked if joint not in dropped)
     return kept, tuple(joint for joint in joints if joint not in kept)
 
 
-def _find(joints: tuple[Joint, ...], name: str, option: str) -> Joint:
+def _find_joint(joints: tuple[Joint, ...], name: str, option: str) -> Joint:
     for joint in joints:
         if name.lower() in (joint.name.lower(), joint.label.lower()):
             return joint
-    raise invalid_data(option, name, f"joints of the file: {_listed([joint.name for joint in joints])}")
+    raise invalid_data(option, name, f"one of the joints of the file: {_listed([joint.name for joint in joints])}")
 
 
-def _as_robot(
+def _match_robot(
     joints: tuple[Joint, ...], chosen: tuple[Joint, ...], options: UploadOptions, robot: Profile
 ) -> tuple[tuple[Joint, ...], tuple[float, ...] | None, list[str]]:
-    """Those of the chosen joints that the robot has, from base to tip and with its names."""
+    """Return the chosen joints that the robot has, from base to tip and with its names, their constants, and notes."""
     notes, names = [], robot.joint_names
     constants = None if robot.torque_constants is None else list(robot.torque_constants)
     places = robot.order_of([joint.name for joint in joints])
@@ -166,7 +169,7 @@ def _as_robot(
         if len(chosen) != len(names) or not (options.read.joint_names or all(isinstance(j.key, int) for j in chosen)):
             raise _mismatch(robot, chosen)
         ordered = list(chosen)
-        notes.append(f"joints are taken as those of {robot.name} in order")
+        notes.append(f"joints are assigned to those of {robot.name} by their order")
     else:
         ordered = [joints[place] for place in places]
     called = {joint.index: place for place, joint in enumerate(ordered)} if len(ordered) == len(names) else {}
@@ -178,12 +181,14 @@ def _as_robot(
             raise invalid_request("joints", ", ".join(options.joints), expected)
         kept, others = list(chosen), []
     if others:
-        notes.append(f"left out, as {robot.name} has no such joints: {_listed([joint.name for joint in others])}")
+        notes.append(
+            f"joints left out because {robot.name} does not have them: {_listed([joint.name for joint in others])}"
+        )
     if options.read.joint_names is None:
         renamed = [replace(j, name=names[called[j.index]]) if j.index in called else j for j in kept]
         if any(a.name != b.name for a, b in zip(kept, renamed, strict=True)):
-            pairs = [f"{a.name} is {b.name}" for a, b in zip(kept, renamed, strict=True) if a.name != b.name]
-            notes.append(f"joints get the names that {robot.name} has: {_listed(pairs)}")
+            pairs = [f"{a.name} → {b.name}" for a, b in zip(kept, renamed, strict=True) if a.name != b.name]
+            notes.append(f"joints are renamed to those of {robot.name}: {_listed(pairs)}")
         kept = renamed
     known = constants is not None and all(joint.index in called for joint in kept)
     values = tuple(float(constants[called[joint.index]]) for joint in kept) if known and constants else None
@@ -194,16 +199,16 @@ def _mismatch(robot: Profile, chosen: Sequence[Joint]) -> InvalidDataError:
     return invalid_data(
         "joints",
         _listed([joint.name for joint in chosen]),
-        f"those of {robot.name}, {_listed(robot.joint_names)}: say joint_names as the robot has them, in the file's "
-        "order, or leave other joints out with drop_joints",
+        f"the joints of {robot.name}: {_listed(robot.joint_names)}. Set `joint_names` to the robot's names in the "
+        "order of the file, or leave out other joints with `drop_joints`",
     )
 
 
-def _alphabetical(joints: Sequence[Joint]) -> bool:
+def _is_alphabetical(joints: Sequence[Joint]) -> bool:
     names = [joint.name for joint in joints]
     numbered = len({_NUMBER.sub("#", name) for name in names}) < len(names)
     return len(names) > 2 and not numbered and names == sorted(names)
 
 
 def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:_SHOWN]) + (" …" if len(names) > _SHOWN else "")
+    return ", ".join(names[:_MAX_LISTED]) + (" …" if len(names) > _MAX_LISTED else "")

@@ -1,4 +1,4 @@
-"""Which columns of a file become which of a data set, and in which order their joints come."""
+"""Mapping the columns of a file to those of a data set, and ordering the joints."""
 
 from __future__ import annotations
 
@@ -6,49 +6,53 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from lipcore.profiles import Profile
-from service.datasets.mapping.choice import Torque, choose, source, source_or_none, torque
-from service.datasets.mapping.joints import Joint, arrange
-from service.datasets.mapping.recognition import Family, Rank, clocks, is_episode
-from service.datasets.mapping.vocabulary import KNOWN, factor
+from service.datasets.mapping.choice import TorqueMeaning, choose_families, find_member, interpret_torque, member_of
+from service.datasets.mapping.joints import Joint, arrange_joints
+from service.datasets.mapping.recognition import Family, Rank, columns_hint, find_times, is_episode
+from service.datasets.mapping.vocabulary import KNOWN_UNITS, unit_factor
 from service.datasets.options import UploadOptions
-from service.foundation.errors import invalid_data, invalid_request
+from service.foundation.errors import InvalidDataError, invalid_data, invalid_request, readable
 from service.foundation.text import counted
 
-LISTED = 8
-"""Most columns that a sentence names."""
+MAX_LISTED = 8
+"""Max columns that a sentence names."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A column of the file: its index and name there, SI units in one of its unit; unit: as given, None for SI."""
+    """A column of the file."""
 
     index: int
     name: str
     factor: float = 1.0
+    """Factor to SI."""
     unit: str | None = None
+    """Unit as given; None for SI."""
 
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """What to read. t: columns that add up to the time, none where there is no time; joints: names of those kept;
-    places: theirs among all joints of the file.
-
-    quantities: of q, tau, and of dq and ddq where there are any, one column a joint; dropped: of joints left out, by
-    name, the column of their position; unused: names of all other columns; notes: what was understood, in sentences.
-    """
+    """The columns to read."""
 
     t: tuple[Source, ...]
+    """Columns that add up to the time; empty if there is no time."""
     episode: Source | None
     joints: tuple[str, ...]
+    """Names of the joints that are kept."""
     places: tuple[int, ...]
+    """Their indices among all joints of the file."""
     quantities: Mapping[str, tuple[Source, ...]]
+    """One column per joint for q and tau, and for dq and ddq if there are any."""
     dropped: Mapping[str, Source]
+    """Column of the position by name of each joint that is left out."""
     unused: tuple[str, ...]
-    torque: Torque
+    """Names of all other columns."""
+    torque: TorqueMeaning
     notes: tuple[str, ...]
+    """Sentences for the report on how the columns are read."""
 
 
-def resolve(
+def map_columns(
     names: Sequence[str],
     units: Mapping[str, str],
     joint_names: tuple[str, ...] | None,
@@ -56,21 +60,21 @@ def resolve(
     robot: Profile | None,
     max_joints: int,
 ) -> ColumnMap:
-    """Find the columns; raise InvalidDataError that says what is missing or doubled, or how to tell what is unclear.
+    """Find the columns to read; raise InvalidDataError if one is missing, repeated or ambiguous.
 
-    units: of columns by name, where the file says them; joint_names: of joints 1..n, where it says them.
+    units: by column name, if the file states them; joint_names: of joints 1..n, if the file states them.
     """
     _check_options(names, options)
-    families = choose(names, options)
-    order = arrange(families.positions, joint_names, options, robot, max_joints)
-    chosen = families.complete(order.kept)
+    families = choose_families(names, options)
+    order = arrange_joints(families.positions, joint_names, options, robot, max_joints)
+    chosen = families.choose(order.kept)
     quantities = {
         quantity: tuple(_source(names, units, options, family, joint) for joint in order.kept)
         for quantity, family in chosen.items()
     }
     tau = chosen["tau"]
     tau_units = [each.unit for each in quantities["tau"]]
-    meaning = torque(tau, tau_units, options, robot, order.constants, families.commanded(order.kept))
+    meaning = interpret_torque(tau, tau_units, options, robot, order.constants, families.commanded_pattern(order.kept))
     for factors in (meaning.constants, meaning.factors):
         if factors is not None:
             quantities["tau"] = tuple(
@@ -81,8 +85,9 @@ def resolve(
     read = [*(each for row in quantities.values() for each in row), *times, *([episode] if episode else [])]
     used = {each.index for each in read}
     if len(used) < len(read):
-        raise invalid_data("columns", "the same for several quantities", "a column of its own for each")
-    left_out = [source_or_none(family, joint) for family in chosen.values() for joint in order.dropped]
+        message = "A column is used for several quantities. Set `columns` so that each quantity has its own columns"
+        raise invalid_data("columns", "the same for several quantities", "different columns for each", message)
+    left_out = [find_member(family, joint) for family in chosen.values() for joint in order.dropped]
     used |= {each.index for each in left_out if each is not None}
     unused = tuple(name for index, name in enumerate(names) if index not in used)
     notes = [*order.notes, *_notes(chosen, quantities, times, episode), *families.notes(chosen), *meaning.notes]
@@ -105,7 +110,7 @@ def resolve(
 def _source(
     names: Sequence[str], units: Mapping[str, str], options: UploadOptions, family: Family, joint: Joint
 ) -> Source:
-    member = source(family, joint)
+    member = member_of(family, joint)
     name, quantity = names[member.index], family.quantity
     unit = options.read.units.get(name) or options.read.units.get(quantity) or units.get(name) or member.unit
     return _scaled(member.index, name, quantity, unit)
@@ -114,15 +119,15 @@ def _source(
 def _scaled(index: int, name: str, quantity: str, unit: str | None) -> Source:
     if unit is None:
         return Source(index, name)
-    scale = factor(quantity, unit)
+    scale = unit_factor(quantity, unit)
     if scale is None:
-        raise invalid_data(f"unit of {name}", unit, f'{KNOWN[quantity]}: say it, units={{"{quantity}": "…"}}')
+        raise invalid_data(f"unit of {name}", unit, f'{KNOWN_UNITS[quantity]}. Set units={{"{quantity}": "…"}}')
     return Source(index, name, scale, unit)
 
 
 def _time(names: Sequence[str], units: Mapping[str, str], options: UploadOptions) -> tuple[Source, ...]:
     given, unit = options.read.columns.get("t"), options.read.units.get("t")
-    times = clocks(names)
+    times = find_times(names)
     if given is not None:
         name = _single("t", given, names)
         parts: tuple[tuple[int, str | None], ...] = ((names.index(name), None),)
@@ -133,7 +138,7 @@ def _time(names: Sequence[str], units: Mapping[str, str], options: UploadOptions
         best = [clock for clock in times if clock.rank == times[0].rank]
         if len(best) > 1:
             listed = _listed([clock.name for clock in best])
-            raise invalid_data("time", listed, f'one of them: columns={{"t": "{best[0].name}"}}')
+            raise _ambiguous("time", listed, "t", best[0].name)
         parts = best[0].parts
     return tuple(
         _scaled(
@@ -155,9 +160,15 @@ def _episode(names: Sequence[str], options: UploadOptions) -> Source | None:
     if len(exact) > 1:
         listed = [names[index] for index in exact]
         if len(set(listed)) < len(listed):
-            raise invalid_data(f"column {exact[1] + 1}", names[exact[1]], "every column once")
-        raise invalid_data("episode", _listed(listed), f'one of them: columns={{"episode": "{listed[0]}"}}')
+            raise invalid_data(f"column {exact[1] + 1}", names[exact[1]], "each column only once")
+        raise _ambiguous("episode", _listed(listed), "episode", listed[0])
     return Source(exact[0], names[exact[0]]) if exact else None
+
+
+def _ambiguous(field: str, listed: str, quantity: str, name: str) -> InvalidDataError:
+    hint = f"one of them, for example {columns_hint({quantity: name})}"
+    message = f"The {field} could be read from {readable(listed[:200])}. Choose {hint}"
+    return invalid_data(field, listed, hint, message)
 
 
 def _single(quantity: str, given: str | tuple[str, ...], names: Sequence[str]) -> str:
@@ -169,10 +180,11 @@ def _single(quantity: str, given: str | tuple[str, ...], names: Sequence[str]) -
 
 def _check_options(names: Sequence[str], options: UploadOptions) -> None:
     for name, unit in options.read.units.items():
-        if name in KNOWN and factor(name, unit) is None:
-            raise invalid_request(f"units.{name}", unit, KNOWN[name])
-        if name not in KNOWN and name not in names:
-            raise invalid_request(f"units.{name}", unit, f"the unit of one of {', '.join(KNOWN)}, or of a column")
+        if name in KNOWN_UNITS and unit_factor(name, unit) is None:
+            raise invalid_request(f"units.{name}", unit, KNOWN_UNITS[name])
+        if name not in KNOWN_UNITS and name not in names:
+            field, expected = f"units.{name}", f"one of {', '.join(KNOWN_UNITS)} or a column of the file"
+            raise invalid_request(field, unit, expected, f"{readable(field[:200])} is not {expected}")
 
 
 def _notes(
@@ -181,7 +193,7 @@ def _notes(
     times: Sequence[Source],
     episode: Source | None,
 ) -> list[str]:
-    """Which columns were taken for what, where their names or units are not those that are documented."""
+    """Return sentences on columns whose names or units are not the documented ones."""
     out = []
     for quantity, row in quantities.items():
         if chosen[quantity].rank != Rank.CANONICAL:
@@ -198,5 +210,5 @@ def _notes(
 
 
 def _listed(names: Sequence[str]) -> str:
-    rest = len(names) - LISTED
-    return ", ".join(names[:LISTED]) + (f" and {rest} more" if rest > 0 else "")
+    rest = len(names) - MAX_LISTED
+    return ", ".join(names[:MAX_LISTED]) + (f" and {rest} more" if rest > 0 else "")

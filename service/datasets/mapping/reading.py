@@ -1,4 +1,4 @@
-"""Reading a file's table into columns in SI units on disk, once from its beginning to its end."""
+"""Reading a file's table into columns in SI units on disk, in one pass."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from lipcore.profiles import Profile
 from lipcore.vocabulary import TorqueConvention
 from service.datasets.formats.table import Table
 from service.datasets.mapping import checks
-from service.datasets.mapping.checks import Clockwork, Rows, Seen, Turns
-from service.datasets.mapping.choice import MOTION
-from service.datasets.mapping.mapping import ColumnMap, Source, resolve
+from service.datasets.mapping.checks import ColumnStats, Rows, TimeChecker, TurnUnwrapper
+from service.datasets.mapping.choice import MOTION, WARNING
+from service.datasets.mapping.mapping import ColumnMap, Source, map_columns
 from service.datasets.options import UploadOptions
 from service.datasets.staging import EPISODE, TIME, Staged, column
 from service.foundation.errors import invalid_data
@@ -28,7 +28,7 @@ from service.storage.disk import Disk, DiskBudget
 
 @dataclass(frozen=True)
 class Recording:
-    """A `Read` as it is told to another process. joint_names and lengths: of its columns."""
+    """The part of a `ReadResult` that is sent to another process; joint_names, lengths: of its columns."""
 
     joint_names: tuple[str, ...]
     lengths: dict[str, int]
@@ -38,17 +38,15 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Read:
-    """A recording as it was read.
-
-    staged: its columns; facts: figures for the report, JSON; noted: sentences that tell what was understood and what
-    was left out.
-    """
+class ReadResult:
+    """A recording after reading."""
 
     staged: Staged
     torque_convention: TorqueConvention
     facts: dict[str, Any]
+    """Figures for the report, JSON."""
     noted: list[str]
+    """Sentences for the report on how columns were read and what was ignored."""
 
 
 def read(
@@ -59,13 +57,13 @@ def read(
     settings: Settings,
     disk: Disk | DiskBudget,
     min_samples: int = checks.MIN_SAMPLES,
-) -> Read:
-    """Read a table's columns to files in a folder; raise InvalidDataError, StorageFullError.
+) -> ReadResult:
+    """Read a table's columns to files in a folder; raise InvalidDataError or StorageFullError.
 
-    Every row of the file becomes one: values that are missing or infinite become NaN, and such rows are left out when
-    the recording is prepared, as are those whose time was there in the row before.
+    Every row of the file is kept; missing and infinite values become NaN. The preparation later removes rows with NaN
+    and rows that repeat the time of the row before.
     """
-    mapped = resolve(table.names, table.units, table.joint_names, options, robot, settings.max_joints)
+    mapped = map_columns(table.names, table.units, table.joint_names, options, robot, settings.max_joints)
     reader = _Reader(mapped, Staged(folder, mapped.joints, disk), settings, min_samples)
     for block in table.blocks:
         reader.add(block)
@@ -82,83 +80,84 @@ def read(
         "torque_factors": None if mapped.torque.factors is None else list(mapped.torque.factors),
         "rows_read": reader.rows,
         "turns": {name: each.count for name, each in zip(mapped.joints, reader.turns, strict=True) if each.count},
-        "repeated_stamps": reader.clockwork.repeated,
-        "first_repeated_row": reader.clockwork.first_repeated or None,
+        "repeated_stamps": reader.times.repeated,
+        "first_repeated_row": reader.times.first_repeated or None,
         "missing_rows": int(reader.staged.missing().sum()),
         "first_missing_row": reader.first_missing,
     }
-    return Read(reader.staged, mapped.torque.convention, facts, noted)
+    return ReadResult(reader.staged, mapped.torque.convention, facts, noted)
 
 
 class _Reader:
-    """Takes block after block; keeps of them what the checks at the end need."""
+    """Stages the blocks of a table and collects the statistics for the final checks."""
 
     def __init__(self, mapped: ColumnMap, staged: Staged, settings: Settings, min_samples: int) -> None:
         self.mapped, self.staged, self.settings, self.min_samples = mapped, staged, settings, min_samples
         self.rows = 0
-        self.time = Seen(mapped.t[0].name) if mapped.t else None
+        self.time = ColumnStats(mapped.t[0].name) if mapped.t else None
         self.time_has_unit = any(each.unit is not None for each in mapped.t)
-        self.clockwork = Clockwork(mapped.t[0].name if mapped.t else TIME)
-        self.seen = {quantity: [Seen(each.name) for each in row] for quantity, row in mapped.quantities.items()}
-        self.turns = [Turns() for _ in mapped.joints]
-        self.left_out = {name: Seen(each.name) for name, each in mapped.dropped.items()}
+        self.times = TimeChecker(mapped.t[0].name if mapped.t else TIME)
+        self.stats = {quantity: [ColumnStats(each.name) for each in row] for quantity, row in mapped.quantities.items()}
+        self.turns = [TurnUnwrapper() for _ in mapped.joints]
+        self.left_out = {name: ColumnStats(each.name) for name, each in mapped.dropped.items()}
         self.absent = {quantity for quantity in MOTION if quantity in mapped.quantities}
-        """Those of which there was no value yet: perhaps there is none at all."""
+        """Quantities without a value so far."""
 
     def add(self, block: Array) -> None:
-        """Take a block (M, columns); raise InvalidDataError."""
+        """Read a block (M, columns); raise InvalidDataError."""
         rows = np.arange(self.rows + 1, self.rows + len(block) + 1)
         self.rows += len(block)
         if self.rows > self.settings.max_samples:
-            raise invalid_data("rows", self.rows, f"at most {self.settings.max_samples} samples")
+            expected = f"at most {self.settings.max_samples}"
+            raise invalid_data("rows", self.rows, expected, f"The file has too many rows, expected {expected}.")
         episode = None
         if self.mapped.episode is not None:
             episode = np.ascontiguousarray(block[:, self.mapped.episode.index])
             checks.check_episodes(episode, rows, self.mapped.episode.name)
         t = self._time(block, rows)
         if t is not None:
-            self.clockwork.look(t, episode, rows)
+            self.times.add(t, episode, rows)
         self._stage(block, rows, t, episode)
 
     def finish(self) -> None:
-        """Check the whole; raise InvalidDataError."""
+        """Check the whole recording; raise InvalidDataError."""
         for quantity in self.absent:
-            del self.seen[quantity]
+            del self.stats[quantity]
         missing = self.staged.missing()
-        seen = [each for row in self.seen.values() for each in row] + ([self.time] if self.time else [])
-        checks.check_rows(len(missing), int(missing.sum()), self.clockwork.repeated, self.min_samples, seen)
+        stats = [each for row in self.stats.values() for each in row] + ([self.time] if self.time else [])
+        checks.check_rows(len(missing), int(missing.sum()), self.times.repeated, self.min_samples, stats)
         if self.mapped.t:
             checks.check_time_unit(self.staged.read(TIME), self.time_has_unit, self.mapped.t[0].name)
-        joints = list(zip(self.mapped.joints, self.seen["q"], strict=True))
-        unit = all(each.unit is not None for each in self.mapped.quantities["q"])
-        checks.check_positions(joints, self.settings.max_position, unit)
-        checks.check_torques(list(zip(self.mapped.joints, self.seen["tau"], strict=True)))
+        joints = list(zip(self.mapped.joints, self.stats["q"], strict=True))
+        has_unit = all(each.unit is not None for each in self.mapped.quantities["q"])
+        checks.check_positions(joints, self.settings.max_position, has_unit)
+        checks.check_torques(list(zip(self.mapped.joints, self.stats["tau"], strict=True)))
         self._check_slopes(missing)
 
     def notes(self) -> list[str]:
-        """What of the file is not used after all."""
-        out = [f"{quantity} has no values and is taken as not given" for quantity in MOTION if quantity in self.absent]
+        """Return sentences on values that were changed or not used."""
+        out = [f"{quantity} has no values and is ignored" for quantity in MOTION if quantity in self.absent]
         for name, turns in zip(self.mapped.joints, self.turns, strict=True):
             if turns.count:
                 out.append(
-                    f"the position of {name} jumps by whole turns, {counted(turns.count, 'time')}, first in row "
-                    f"{turns.first}: these were taken out"
+                    f"the position of {name} jumps by whole turns {counted(turns.count, 'time')}, first in row "
+                    f"{turns.first}; the jumps were removed"
                 )
         for name, each in self.left_out.items():
-            if each.span > checks.CHECKS.moved:
+            if each.span > checks.CHECKS.max_dropped_span:
                 out.append(
-                    f"warning: {name} is left out though it moved by {each.span:.3g}, which acts on the torques of "
-                    "the others"
+                    f"{WARNING}{name} is left out although it moved by {each.span:.3g}. This affects the torques of "
+                    "the other joints."
                 )
             else:
-                out.append(f"{name} is left out; it did not move")
+                out.append(f"{name} is left out and did not move")
         return out
 
     @property
     def first_missing(self) -> int | None:
-        """Row of the file that is the first to lack a value, counted from 1; None where none does."""
-        seen = [each for row in self.seen.values() for each in row] + ([self.time] if self.time else [])
-        return min((each.first_missing for each in seen if each.missing), default=None)
+        """First row of the file with a missing value, counted from 1; None if there is none."""
+        stats = [each for row in self.stats.values() for each in row] + ([self.time] if self.time else [])
+        return min((each.first_missing for each in stats if each.missing), default=None)
 
     def _time(self, block: Array, rows: Rows) -> Array | None:
         if self.time is None:
@@ -166,7 +165,7 @@ class _Reader:
         parts = [_scaled(block, each) for each in self.mapped.t]
         t = parts[0] if len(parts) == 1 else np.sum(parts, axis=0)
         if not self.time_has_unit:
-            checks.epoch_unit(t, rows, self.time.name)
+            checks.check_epoch_unit(t, rows, self.time.name)
         self.time.add(t, rows)
         return t
 
@@ -178,12 +177,12 @@ class _Reader:
             columns[EPISODE] = episode
         for quantity, row in self.mapped.quantities.items():
             values = [_scaled(block, each) for each in row]
-            for each, seen in zip(values, self.seen[quantity], strict=True):
-                seen.add(each, rows)
+            for each, stats in zip(values, self.stats[quantity], strict=True):
+                stats.add(each, rows)
             if quantity in self.absent:
                 if all(np.isnan(each).all() for each in values):
                     continue
-                self._begin(quantity)
+                self._fill_before(quantity)
             if quantity == "q":
                 values = [turns.unwrap(each, episode, rows) for turns, each in zip(self.turns, values, strict=True)]
             for joint, each in enumerate(values):
@@ -192,36 +191,36 @@ class _Reader:
             self.left_out[name].add(_scaled(block, source), rows)
         self.staged.append(columns)
 
-    def _begin(self, quantity: str) -> None:
-        """The first values of a quantity come late: all rows before lack it."""
+    def _fill_before(self, quantity: str) -> None:
+        """Write NaN for a quantity in all rows before its first value."""
         self.absent.discard(quantity)
         if before := self.staged.rows:
             for joint in range(self.staged.n_joints):
                 self.staged.append({column(quantity, joint): np.full(before, np.nan)})
 
     def _check_slopes(self, missing: NDArray[np.bool_]) -> None:
-        """Velocities have to be the slopes of positions, accelerations those of velocities: else units are wrong."""
-        if not self.mapped.t or "dq" not in self.seen:
+        """Raise InvalidDataError if velocities or accelerations do not match the slopes of their signals."""
+        if not self.mapped.t or "dq" not in self.stats:
             return
         t = self.staged.read(TIME)
         episode = self.staged.read(EPISODE) if EPISODE in self.staged else None
-        part = checks.first_stretch(t, episode, missing)
-        for of, derivative in (("q", "dq"), ("dq", "ddq")):
-            if derivative in self.seen:
+        part = checks.find_slope_rows(t, episode, missing)
+        for signal, derivative in (("q", "dq"), ("dq", "ddq")):
+            if derivative in self.stats:
                 ratios = [
                     checks.slope_ratio(
                         t[part],
-                        self.staged.read(column(of, joint))[part],
+                        self.staged.read(column(signal, joint))[part],
                         self.staged.read(column(derivative, joint))[part],
                     )
                     for joint in range(self.staged.n_joints)
                 ]
-                if (error := checks.wrong_unit(ratios, derivative)) is not None:
+                if (error := checks.find_unit_error(ratios, derivative)) is not None:
                     raise error
 
 
 def _scaled(block: Array, source: Source) -> Array:
-    """A column in SI units, NaN where it is not finite."""
+    """Return a column in SI units, NaN if not finite."""
     with np.errstate(over="ignore", invalid="ignore"):
         values: Array = block[:, source.index] * source.factor
     values[~np.isfinite(values)] = np.nan
@@ -229,7 +228,7 @@ def _scaled(block: Array, source: Source) -> Array:
 
 
 def _columns(mapped: ColumnMap, staged: Staged) -> dict[str, list[str]]:
-    """Names of the file's columns by what they were read as."""
+    """Return the names of the file's columns by quantity."""
     rows: dict[str, Sequence[Source]] = {
         TIME: mapped.t,
         EPISODE: [mapped.episode] if mapped.episode else [],

@@ -1,4 +1,4 @@
-"""Which column is which quantity of which joint, as far as its name tells."""
+"""Finding the quantity and joint of a column from its name."""
 
 from __future__ import annotations
 
@@ -11,40 +11,42 @@ from enum import IntEnum
 
 from service.datasets.mapping.vocabulary import (
     COMMANDED,
-    FOREIGN,
     MEASURED,
     NEUTRAL,
-    Mention,
+    OTHER_QUANTITIES,
+    QuantityMention,
     Word,
-    factor,
-    in_header,
-    mention,
-    words,
+    find_quantity,
+    split_unit,
+    split_words,
+    unit_factor,
 )
 
 JOINT = "{joint}"
-"""In a pattern: where the joint's name or number is."""
-Key = int | str
-"""What tells a joint within a file: its number, from 1 on, or its name in small letters."""
+"""Placeholder for a joint's name or number in a pattern."""
+JointKey = int | str
+"""Key of a joint in a file: its number, from 1, or its name in lower case."""
 _NUMBERED = re.compile(r"(?:joint|jnt|axis|motor|[aj])?[\s_.\-\[(]*0*(\d{1,6})[\])]*")
 _PATHS = re.compile(r"[/.:]")
 _ADJECTIVES = MEASURED | COMMANDED | {"current"}
-MAX_NAME = 150
-"""Longer names are not looked at."""
+MAX_NAME_CHARS = 150
+"""Longer column names are ignored."""
 
 
 class Rank(IntEnum):
-    """How a family's columns are named, the best first: as documented, measured, neither, commanded."""
+    """Preference of a family by its column names, the best first."""
 
     CANONICAL = 0
+    """The documented names, q1…."""
     MEASURED = 1
     PLAIN = 2
-    AIM = 3
+    """Neither measured nor commanded by name."""
+    COMMANDED = 3
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """What a column's name says. joint: "" where no joint is named; kind: of word, see QUANTITY_WORDS."""
+class NameReading:
+    """One interpretation of a column's name. joint: "" if none is named; kind: of word, see QUANTITY_WORDS."""
 
     quantity: str
     kind: str
@@ -56,7 +58,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Member:
-    """A joint's column of a family: its index, what the file calls the joint, the unit in its name."""
+    """A joint's column in a family: its index, the joint's name in the file, and the unit in the column's name."""
 
     index: int
     label: str
@@ -65,39 +67,41 @@ class Member:
 
 @dataclass
 class Family:
-    """Columns of one quantity that are named alike, by joint in the file's order; listed: one by one, by the user."""
+    """Columns of one quantity with the same name pattern, by joint in the file's order."""
 
     quantity: str
     kind: str
     pattern: str
     rank: Rank
-    members: dict[Key, Member] = field(default_factory=dict)
-    doubled: list[int] = field(default_factory=list)
+    members: dict[JointKey, Member] = field(default_factory=dict)
+    repeated: list[int] = field(default_factory=list)
+    """Indices of further columns of joints that already have one."""
     listed: bool = False
+    """Whether the user listed the columns."""
 
     @property
     def numbered(self) -> bool:
-        """Whether all its joints have numbers."""
+        """Whether all joints have numbers."""
         return all(isinstance(key, int) for key in self.members)
 
 
-def families(names: Sequence[str]) -> list[Family]:
-    """Sort columns into families; a name that can be read in two ways belongs to the larger family."""
-    seen = [sightings(name) for name in names]
+def find_families(names: Sequence[str]) -> list[Family]:
+    """Sort columns into families; a name with several interpretations belongs to the largest family."""
+    readings = [interpret_name(name) for name in names]
     sizes: dict[tuple[str, ...], int] = defaultdict(int)
-    for each in seen:
-        for sighting in each:
-            sizes[_alike(sighting)] += 1
-    chosen: dict[tuple[str, ...], list[tuple[int, Sighting]]] = defaultdict(list)
-    for index, each in enumerate(seen):
+    for each in readings:
+        for reading in each:
+            sizes[_family_key(reading)] += 1
+    chosen: dict[tuple[str, ...], list[tuple[int, NameReading]]] = defaultdict(list)
+    for index, each in enumerate(readings):
         if each:
-            best = max(each, key=lambda sighting: sizes[_alike(sighting)])
-            chosen[_alike(best)].append((index, best))
+            best = max(each, key=lambda reading: sizes[_family_key(reading)])
+            chosen[_family_key(best)].append((index, best))
     return [_family(group) for group in chosen.values()]
 
 
-def keys(labels: Sequence[str]) -> list[Key]:
-    """Keys of joints that a file calls so; numbers that start at 0 are counted from 1, what has no name is joint 1."""
+def keys_of_joints(labels: Sequence[str]) -> list[JointKey]:
+    """Return the keys of joints with these labels; numbers from 0 are shifted to 1, an empty label is joint 1."""
     numbers = [_NUMBERED.fullmatch(label.strip().lower()) for label in labels]
     shift = int(any(match is not None and int(match[1]) == 0 for match in numbers))
     return [
@@ -106,19 +110,21 @@ def keys(labels: Sequence[str]) -> list[Key]:
     ]
 
 
-def sightings(name: str) -> list[Sighting]:
-    """The ways in which a column's name can be read, the likeliest first; none where it says nothing of a joint."""
-    if len(name) > MAX_NAME:
+def interpret_name(name: str) -> list[NameReading]:
+    """Return the interpretations of a column's name, the most likely first; empty if it names no quantity."""
+    if len(name) > MAX_NAME_CHARS:
         return []
-    for before, unit in in_header(name):
+    for before, unit in split_unit(name):
         parsed = _parse(before, unit, name[len(before) :])
-        if parsed and (factor(parsed[0].quantity, unit) is not None or name[len(before) :].lstrip()[:1] in ("[", "(")):
+        if parsed and (
+            unit_factor(parsed[0].quantity, unit) is not None or name[len(before) :].lstrip()[:1] in ("[", "(")
+        ):
             return parsed
     return _parse(name, None, "")
 
 
-def unfold(pattern: str, names: Sequence[str], quantity: str) -> Family:
-    """The columns that a user's pattern stands for."""
+def expand_pattern(pattern: str, names: Sequence[str], quantity: str) -> Family:
+    """Return the columns that match a user's pattern."""
     before, _, after = pattern.partition(JOINT)
     matches = [
         (index, name[len(before) : len(name) - len(after)])
@@ -127,69 +133,71 @@ def unfold(pattern: str, names: Sequence[str], quantity: str) -> Family:
     ]
     if JOINT not in pattern:
         matches = [(index, "") for index, name in enumerate(names) if name == pattern]
-    seen = next((s for index, _ in matches for s in sightings(names[index]) if s.quantity == quantity), None)
-    kind = quantity if seen is None else seen.kind
-    rank = Rank.AIM if seen is not None and seen.rank == Rank.AIM else Rank.PLAIN
+    first = next((s for index, _ in matches for s in interpret_name(names[index]) if s.quantity == quantity), None)
+    kind = quantity if first is None else first.kind
+    rank = Rank.COMMANDED if first is not None and first.rank == Rank.COMMANDED else Rank.PLAIN
     units = [_unit_of(names[index]) for index, _ in matches]
-    alike = [
-        Sighting(quantity, kind, pattern, label, rank, unit) for (_, label), unit in zip(matches, units, strict=True)
+    readings = [
+        NameReading(quantity, kind, pattern, label, rank, unit) for (_, label), unit in zip(matches, units, strict=True)
     ]
-    if not alike:
+    if not readings:
         return Family(quantity, kind, pattern, Rank.PLAIN)
-    return _family([(index, each) for (index, _), each in zip(matches, alike, strict=True)])
+    return _family([(index, each) for (index, _), each in zip(matches, readings, strict=True)])
 
 
 def _unit_of(name: str) -> str | None:
-    return next((sighting.unit for sighting in sightings(name)), None)
+    return next((reading.unit for reading in interpret_name(name)), None)
 
 
-def _alike(sighting: Sighting) -> tuple[str, ...]:
-    return sighting.quantity, sighting.pattern.lower()
+def _family_key(reading: NameReading) -> tuple[str, ...]:
+    return reading.quantity, reading.pattern.lower()
 
 
-def _family(group: list[tuple[int, Sighting]]) -> Family:
+def _family(group: list[tuple[int, NameReading]]) -> Family:
     first = group[0][1]
     out = Family(first.quantity, first.kind, first.pattern, first.rank)
-    for (index, sighting), key in zip(group, keys([each.joint for _, each in group]), strict=True):
+    for (index, reading), key in zip(group, keys_of_joints([each.joint for _, each in group]), strict=True):
         if key in out.members:
-            out.doubled.append(index)
+            out.repeated.append(index)
         else:
-            out.members[key] = Member(index, sighting.joint, sighting.unit)
+            out.members[key] = Member(index, reading.joint, reading.unit)
     return out
 
 
-def _parse(name: str, unit: str | None, ending: str) -> list[Sighting]:
-    parts = words(name)
-    subject = mention(parts)
-    if subject is None or any(word.text in FOREIGN for word in parts):
+def _parse(name: str, unit: str | None, ending: str) -> list[NameReading]:
+    parts = split_words(name)
+    subject = find_quantity(parts)
+    if subject is None or any(word.text in OTHER_QUANTITIES for word in parts):
         return []
     behind = parts[subject.last :]
     inner = _inner_unit(subject, behind) if unit is None else ()
     unit = " ".join(inner) or unit
-    # Franka marks a desired value behind its quantity: q_d, tau_J_d; elsewhere `d` may be anything
-    aimed = any(word.text in COMMANDED for word in parts) or any(word.text == "d" for word in behind[:2])
+    # Franka marks desired values with `d` after the quantity: q_d, tau_J_d; elsewhere `d` may be anything
+    commanded = any(word.text in COMMANDED for word in parts) or any(word.text == "d" for word in behind[:2])
     measured = any(word.text in MEASURED for word in parts)
     out = []
     for start, end in _joints(name, parts, subject, inner):
         pattern = (name[:start] + JOINT + name[end:] if end > start else name) + ending
         canonical = re.fullmatch(r"d?d?q\{joint\}|tau\{joint\}", pattern.removesuffix(ending).rstrip()) is not None
-        rank = Rank.AIM if aimed else Rank.CANONICAL if canonical else Rank.MEASURED if measured else Rank.PLAIN
-        out.append(Sighting(subject.quantity, subject.kind, pattern, name[start:end], rank, unit))
+        rank = (
+            Rank.COMMANDED if commanded else Rank.CANONICAL if canonical else Rank.MEASURED if measured else Rank.PLAIN
+        )
+        out.append(NameReading(subject.quantity, subject.kind, pattern, name[start:end], rank, unit))
     return out
 
 
-def _inner_unit(subject: Mention, behind: list[Word]) -> tuple[str, ...]:
-    """Words between a quantity and a joint's number that are a unit: of `pos_deg_1`, `vel_rad_s_1`."""
+def _inner_unit(subject: QuantityMention, behind: list[Word]) -> tuple[str, ...]:
+    """Return the unit between a quantity and a joint's number, as in `pos_deg_1` and `vel_rad_s_1`."""
     texts = [word.text for word in behind]
     for end in range(len(texts) - 1, 0, -1):
         unit = " ".join(texts[:end])
-        if len(unit) > 1 and factor(subject.quantity, unit) is not None:
+        if len(unit) > 1 and unit_factor(subject.quantity, unit) is not None:
             return tuple(texts[:end])
     return ()
 
 
-def _joints(name: str, parts: list[Word], subject: Mention, unit: tuple[str, ...]) -> list[tuple[int, int]]:
-    """Where a joint may be named: first the likeliest."""
+def _joints(name: str, parts: list[Word], subject: QuantityMention, unit: tuple[str, ...]) -> list[tuple[int, int]]:
+    """Return where a joint may be named in `name`, (start, end), the most likely first."""
     besides = MEASURED | COMMANDED | NEUTRAL | {"d", *unit}
     behind = [word for word in parts[subject.last :] if word.text not in besides]
     if len(behind) == 1 and behind[0].text.isdecimal():
@@ -203,65 +211,67 @@ def _joints(name: str, parts: list[Word], subject: Mention, unit: tuple[str, ...
     if ahead and not all(word.text in ("joint", "joints", "state") for word in ahead):
         out.append(_last_part(name, ahead))
     if behind:
-        place = (behind[0].start, _closed(name, behind[0].start, behind[-1].end))
-        # `joint1_torque_sensor2`: the number ahead is the joint's
+        place = (behind[0].start, _end_with_bracket(name, behind[0].start, behind[-1].end))
+        # in `joint1_torque_sensor2` the first number is the joint's
         out.insert(len(out) if any(word.text.isdecimal() for word in ahead) else 0, place)
     return out or [(0, 0)]
 
 
 def _last_part(name: str, ahead: list[Word]) -> tuple[int, int]:
-    """Of `joint_states/panda_joint1` the joint is what comes last."""
-    start, end = ahead[0].start, _closed(name, ahead[0].start, ahead[-1].end)
+    """Return the last part of a path: the joint in `joint_states/panda_joint1`."""
+    start, end = ahead[0].start, _end_with_bracket(name, ahead[0].start, ahead[-1].end)
     cuts = [match.end() for match in _PATHS.finditer(name, start, ahead[-1].start)]
     inner = max(cuts, default=start)
     return (inner, end) if name[inner:end].strip("_ -") else (start, end)
 
 
-def _closed(name: str, start: int, end: int) -> int:
-    """The end of a joint's name, with the bracket that it closes with: `joint[1]`."""
+def _end_with_bracket(name: str, start: int, end: int) -> int:
+    """Return the end of a joint's name, including a closing bracket as in `joint[1]`."""
     return end + 1 if name[end : end + 1] == "]" and "[" in name[start:end] else end
 
 
 _TIMES = re.compile(r"(?:_*|%|elapsed[_ ]?|log[_ ]?|ros[_ ]?|robot[_ ]?)(?:t|time|times|timestamp|timestamps|stamp)")
-_HALVES = re.compile(r"(.*?)(nsecs?|nanosecs?|nanoseconds|secs?|seconds)")
+_SPLIT_STAMP = re.compile(r"(.*?)(nsecs?|nanosecs?|nanoseconds|secs?|seconds)")
 
 
 def is_episode(name: str) -> bool:
-    """Whether a column numbers contiguous recordings."""
+    """Return whether a column holds the numbers of contiguous recordings."""
     return re.fullmatch(r"(episode|trajectory|run)(_index|_id)?", name.strip().lower()) is not None
 
 
 @dataclass(frozen=True)
 class TimeColumn:
-    """A time that a file holds: (index, unit) of the column, or of its whole seconds and the rest; rank: 0 is `t`."""
+    """A time in a file, in one column or in two."""
 
     name: str
     rank: int
+    """0 for `t`, 1 for stamps of messages, 2 for others."""
     parts: tuple[tuple[int, str | None], ...]
+    """(index, unit) of the column, or of the columns of whole seconds and nanoseconds."""
 
 
-def clocks(names: Sequence[str]) -> list[TimeColumn]:
-    """Times among the columns, best first: `t`, then stamps of messages, then all others."""
-    out, halved = _halved(names)
+def find_times(names: Sequence[str]) -> list[TimeColumn]:
+    """Return the times among the columns, best first: `t`, then stamps of messages, then others."""
+    out, split = _find_split_stamps(names)
     for index, name in enumerate(names):
         if name == "t":
             out.append(TimeColumn(name, 0, ((index, None),)))
-        elif index not in halved and len(name) <= MAX_NAME:
-            for before, unit in [*in_header(name), (name, None)]:
+        elif index not in split and len(name) <= MAX_NAME_CHARS:
+            for before, unit in [*split_unit(name), (name, None)]:
                 last = _PATHS.split(before.strip().lower())[-1].strip()
-                if _TIMES.fullmatch(last) and (unit is None or factor("t", unit) is not None):
-                    # rostopic writes nanoseconds
+                if _TIMES.fullmatch(last) and (unit is None or unit_factor("t", unit) is not None):
+                    # `rostopic echo -p` writes nanoseconds
                     stamp_unit = "ns" if unit is None and (name == "%time" or name.startswith("field.header")) else unit
                     out.append(TimeColumn(name, 1 if last == "stamp" else 2, ((index, stamp_unit),)))
                     break
     return sorted(out, key=lambda clock: clock.rank)
 
 
-def _halved(names: Sequence[str]) -> tuple[list[TimeColumn], set[int]]:
-    """Stamps in two columns, whole seconds and nanoseconds, as ROS has them; and the indices of these columns."""
+def _find_split_stamps(names: Sequence[str]) -> tuple[list[TimeColumn], set[int]]:
+    """Return stamps in two columns, whole seconds and nanoseconds as in ROS, and the indices of these columns."""
     halves: dict[str, dict[str, int]] = defaultdict(dict)
     for index, name in enumerate(names):
-        if len(name) <= MAX_NAME and (match := _HALVES.fullmatch(name.strip().lower())):
+        if len(name) <= MAX_NAME_CHARS and (match := _SPLIT_STAMP.fullmatch(name.strip().lower())):
             last = [part for part in re.split(r"[/.:_ ]", match[1]) if part][-1:]
             if not last or last[0] in ("stamp", "time", "timestamp", "header"):
                 halves[match[1]]["ns" if match[2].startswith("n") else "s"] = index
@@ -274,5 +284,5 @@ def _halved(names: Sequence[str]) -> tuple[list[TimeColumn], set[int]]:
 
 
 def columns_hint(columns: Mapping[str, str]) -> str:
-    """How to say what columns are called: the option `columns`."""
+    """Return the option `columns` for these column names."""
     return f"columns={json.dumps(dict(columns), ensure_ascii=False)}"

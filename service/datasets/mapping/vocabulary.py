@@ -1,4 +1,4 @@
-"""The words and units in columns' names: `tau_J1`, `jointPosition1` and `panda_joint1/position [deg]` alike."""
+"""Words and units in column names such as `tau_J1`, `jointPosition1` and `panda_joint1/position [deg]`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _POSITIONS = {
     **{"m": 1.0, "cm": 1e-2, "mm": 1e-3},
 }
 CURRENTS = {"a": 1.0, "ma": 1e-3}
-FACTORS: dict[str, dict[str, float]] = {
+UNIT_FACTORS: dict[str, dict[str, float]] = {
     "t": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
     "q": _POSITIONS,
     "dq": {f"{unit}s{end}": factor for unit, factor in _POSITIONS.items() for end in ("", "1")}
@@ -26,15 +26,15 @@ FACTORS: dict[str, dict[str, float]] = {
         **CURRENTS,
     },
 }
-"""SI units in one of each unit by quantity, units as `plain` writes them: rad/s and rad_s are rads."""
-KNOWN = {
+"""Factor to SI by quantity and unit, as `normalise_unit` writes it: rad/s and rad_s are rads."""
+KNOWN_UNITS = {
     "t": "s, ms, us, ns or min",
     "q": "rad, mrad, deg, rev, m, cm or mm",
     "dq": "rad/s, deg/s, rev/s, rpm, m/s or mm/s",
     "ddq": "rad/s^2, deg/s^2, rev/s^2, rpm/s, m/s^2 or mm/s^2",
     "tau": "N*m, mN*m, N*cm, N*mm, kgf*cm, N, or A or mA of motor current",
 }
-"""What to tell users of the units of a quantity."""
+"""Units by quantity, for error messages."""
 
 _SPELLINGS = (
     (re.compile(r"[µμ]"), "u"),
@@ -67,8 +67,8 @@ QUANTITY_WORDS: dict[str, tuple[str, str]] = {
     **dict.fromkeys(("effort", "efforts", "eff"), ("tau", "effort")),
     **dict.fromkeys(("current", "currents", "cur", "iq", "i"), ("tau", "current")),
 }
-"""Quantity by word, and what kind of word it is: an effort may be a torque or a current."""
-TWO_WORDS: dict[tuple[str, ...], tuple[str, str]] = {
+"""Quantity and kind by word; an effort may be a torque or a current."""
+PHRASES: dict[tuple[str, ...], tuple[str, str]] = {
     ("q", "dot"): ("dq", "velocity"),
     ("q", "dot", "dot"): ("ddq", "acceleration"),
     ("q", "ddot"): ("ddq", "acceleration"),
@@ -80,62 +80,62 @@ COMMANDED = frozenset(
     ("target", "desired", "des", "commanded", "command", "cmd", "reference", "ref", "setpoint", "goal", "action")
 )
 NEUTRAL = frozenset(("joint", "joints", "jnt", "j", "axis", "motor", "filtered", "raw", "state", "value", "link"))
-FOREIGN = (
+OTHER_QUANTITIES = (
     frozenset(("tcp", "ee", "eef", "cartesian", "pose", "orientation", "quaternion", "wrench", "twist", "imu"))
     | {"gyro", "accelerometer", "gravity", "coriolis", "friction", "momentum", "ext", "external", "limit", "limits"}
     | {"residual", "error", "err", "std", "variance", "hat", "temperature", "temp", "voltage"}
 )
-"""A column with such a word is no position, velocity, acceleration or whole torque of a joint."""
-_VOCABULARY = frozenset(QUANTITY_WORDS) | MEASURED | COMMANDED | NEUTRAL | FOREIGN
+"""Words of columns that are not the position, velocity, acceleration or whole torque of a joint."""
+_VOCABULARY = frozenset(QUANTITY_WORDS) | MEASURED | COMMANDED | NEUTRAL | OTHER_QUANTITIES
 
 
 @lru_cache(maxsize=1024)
-def plain(unit: str) -> str:
-    """A unit without what spellings differ in: case, blanks, signs of multiplication and division, full words."""
+def normalise_unit(unit: str) -> str:
+    """Return a unit in one spelling: lower case, abbreviated, without blanks and operators."""
     text = unit.lower()[:40]
     for spelling, short in _SPELLINGS:
         text = spelling.sub(short, text)
     return text
 
 
-def factor(quantity: str, unit: str) -> float | None:
-    """SI units in one `unit` of t, q, dq, ddq or tau (A for currents); None where it is no unit of that."""
-    return FACTORS.get(quantity, {}).get(plain(unit))
+def unit_factor(quantity: str, unit: str) -> float | None:
+    """Return the factor to SI of a unit of t, q, dq, ddq or tau (to A for currents); None for other units."""
+    return UNIT_FACTORS.get(quantity, {}).get(normalise_unit(unit))
 
 
 def is_current(unit: str | None) -> bool:
-    """Whether this is a unit of electric current."""
-    return unit is not None and plain(unit) in CURRENTS
+    """Return whether this is a unit of electric current."""
+    return unit is not None and normalise_unit(unit) in CURRENTS
 
 
-def in_header(name: str) -> Iterator[tuple[str, str]]:
-    """The ways in which a column's name may end in a unit: what is before it, and the unit. Likeliest first.
+def split_unit(name: str) -> Iterator[tuple[str, str]]:
+    """Yield the ways to split a column's name into a name and a unit, the most likely first.
 
-    `q1 [deg]`, `q1 (deg)`, `q1_deg`, `dq1_deg_per_s`. What is in brackets may be no unit at all.
+    Examples: `q1 [deg]`, `q1 (deg)`, `q1_deg`, `dq1_deg_per_s`. Text in brackets may not be a unit.
     """
     text = name.rstrip()
     opening = text.rfind({"]": "[", ")": "("}.get(text[-1:], "\n"))
     if opening > 0:
         before, unit = text[:opening], text[opening + 1 : -1].strip()
-        # without a blank it may be a joint's number or name, as in `position[3]`
+        # without a blank it may be a joint, as in `position[3]`
         if before[-1].isspace() or _is_unit(unit):
             yield before.rstrip(), unit
         return
     for place in [each.start() for each in re.finditer(r"[_ ]", name)][-4:]:
         before, unit = name[:place], name[place + 1 :]
-        # one letter is a unit only where nothing else can be meant: of q1_m, but not of q_m
-        single = len(plain(unit)) == 1 and not re.search(r"(?i)(\d\]?|time|stamp|elapsed|\bt)$", before)
+        # a single letter is a unit only if it is unambiguous: in q1_m, but not in q_m
+        single = len(normalise_unit(unit)) == 1 and not re.search(r"(?i)(\d\]?|time|stamp|elapsed|\bt)$", before)
         if before and not unit.rpartition("_")[2].isdecimal() and not single and _is_unit(unit):
             yield before, unit
 
 
 def _is_unit(text: str) -> bool:
-    return any(plain(text) in units for units in FACTORS.values())
+    return any(normalise_unit(text) in units for units in UNIT_FACTORS.values())
 
 
 @dataclass(frozen=True)
 class Word:
-    """A word or number of a name: small letters, and where it is."""
+    """A word in lower case or a number, with its place in a name."""
 
     text: str
     start: int
@@ -143,8 +143,8 @@ class Word:
 
 
 @dataclass(frozen=True)
-class Mention:
-    """Where a name speaks of a quantity: words first to last, the latter not included."""
+class QuantityMention:
+    """A quantity in a name: the words first to last, last excluded."""
 
     quantity: str
     kind: str
@@ -152,8 +152,8 @@ class Mention:
     last: int
 
 
-def words(name: str) -> list[Word]:
-    """Cut a name into words and numbers."""
+def split_words(name: str) -> list[Word]:
+    """Split a name into words and numbers."""
     cut_words = []
     for piece in re.finditer(r"[^\W\d_]+|\d+", name):
         text, start = piece.group(), piece.start()
@@ -171,16 +171,16 @@ def words(name: str) -> list[Word]:
     return cut_words
 
 
-def mention(parts: list[Word]) -> Mention | None:
-    """The quantity that words speak of: the last one, as `current_position` is a position."""
+def find_quantity(parts: list[Word]) -> QuantityMention | None:
+    """Return the last quantity among the words: `current_position` is a position."""
     last = None
     place = 0
     while place < len(parts):
         for length in (3, 2, 1):
             texts = tuple(word.text for word in parts[place : place + length])
-            meaning = TWO_WORDS.get(texts) if length > 1 else QUANTITY_WORDS.get(texts[0])
+            meaning = PHRASES.get(texts) if length > 1 else QUANTITY_WORDS.get(texts[0])
             if meaning is not None:
-                last = Mention(*meaning, place, place + length)
+                last = QuantityMention(*meaning, place, place + length)
                 place += length - 1
                 break
         place += 1

@@ -1,1 +1,1 @@
-"""What is told of a recording: how it was sampled, what is wrong with it, what it can teach, what to record next."""
+"""The report on a recording: sampling, faults, excitation, and what to record next."""

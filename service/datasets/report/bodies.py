@@ -1,12 +1,12 @@
-"""Measured torque against what a robot's rigid bodies need for the same motion, gravity apart from the rest.
+"""Comparison of measured torque with the torque that a robot's rigid bodies need for the same motion.
 
-Joint by joint, with G the torque that the URDF's gravity asks for and B that of inertia and velocities,
+Each joint is fitted by itself, with G the URDF's gravity torque and B its inertial and velocity torque:
 
     tau = g G + b B + v dq + c sign(dq) + o.
 
-A recording of that robot in SI units has g = 1, and b = 1 or, with rotors that the URDF lacks, somewhat more. Standard
-deviations are those of leaving out an eighth of the recording at a time, and errors are those on the eighth that was
-left out: rows that follow each other err alike.
+A recording of that robot in SI units has g = 1, and b = 1, or more if the URDF lacks rotors. Standard deviations and
+errors come from fits that leave out one eighth of the recording at a time, because errors of neighbouring rows are
+correlated.
 """
 
 from __future__ import annotations
@@ -33,29 +33,29 @@ class BodiesOptions:
     """Numbers of the comparison of torque with a robot's rigid bodies."""
 
     ridge: float = 1e-10
-    """Penalty, as a share of a column's mean square: collinear columns get weights that no two eighths agree on."""
+    """Penalty, as a share of a column's mean square: small, so that weights of collinear columns vary between fits."""
     floor: float = 1e-4
-    """Error, as a share of a torque's variance, that units and clocks leave: less is no better."""
+    """Error, as a share of a torque's variance, that units and clocks cause: a smaller error counts as this one."""
     min_moving: float = 0.2
-    """Share of rows in which a joint has to move for the others to be ignored."""
+    """Min share of moving rows for which a joint's rows at rest are ignored."""
     rows: int = 400
-    """Rows that are enough to compare orders of joints by."""
+    """Max rows on which orders of joints are compared."""
     visible: float = 0.2
     """Share of a torque's standard deviation above which a part of it is visible."""
-    gain: float = 3.0
-    """Ratio of errors that another order of joints has to reach, in the mean over those that change place."""
+    min_gain: float = 3.0
+    """Min ratio of errors for another order of joints, geometric mean over the joints that move."""
     explained: float = 0.5
-    """Share of each such joint's torque that the other order has to explain."""
+    """Min explained share of each such joint's torque in the other order."""
 
 
 BODIES = BodiesOptions()
 
 
 @dataclass(frozen=True)
-class Blocks:
-    """Least squares of k columns y with p columns x, and again without each of eight blocks of rows.
+class BlockFit:
+    """Least-squares fit of k columns y with p columns x, repeated without each of eight blocks of rows.
 
-    weights: (p, k); std: (p, k), by leaving out blocks; errors: (8, k), mean squares on the block left out.
+    weights: (p, k); std: (p, k), by jackknife over the blocks; errors: (8, k), mean squares on each held-out block.
     """
 
     weights: Array
@@ -63,7 +63,7 @@ class Blocks:
     errors: Array
 
     @classmethod
-    def fit(cls, x: Array, y: Array) -> Blocks:
+    def of(cls, x: Array, y: Array) -> BlockFit:
         """Fit y (R, k) with x (R, p)."""
         scale = np.sqrt(np.mean(x**2, axis=0))
         x = x / np.where(scale > 0, scale, 1.0)
@@ -91,63 +91,60 @@ class Signals(NamedTuple):
     tau: Array
 
     def take(self, columns: Sequence[int] | NDArray[np.int64]) -> Signals:
-        """The same with joints in another order."""
+        """Return the same signals with joints in another order."""
         return Signals(*(each[:, columns] for each in self))
 
 
 class Bodies:
-    """Rigid-body torques of a robot whose joints come in the order of the data."""
+    """Rigid-body torques of a robot, with joints in the order of the data."""
 
     def __init__(self, urdf: str, name: str, names: tuple[str, ...], limits: Limits) -> None:
-        """Raise MissingExtraError, or ValueError where the URDF cannot be used for these joints."""
+        """Raise MissingExtraError, or ValueError if the URDF cannot be used for these joints."""
         robot = RigidBody.from_urdf(urdf, names, limits.joint_types, limits.urdf_joints, name)
         self.name, self.names, self.urdf_joints = name, names, robot.urdf_joints
         self._arm = arm_of_robot(robot)
 
     def torque(self, q: Array, dq: Array, ddq: Array, down: Sequence[float] | Array) -> Array:
-        """Torque (R, n), N·m, of motion (R, n) each, with gravity `down` (3,) m/s² in the base's frame."""
+        """Return torque (R, n), N·m, of motion (R, n) each, with gravity `down` (3,) m/s² in the base's frame."""
         arm, out = self._arm, np.zeros(q.shape)
         motions = np.stack([q, dq, ddq], axis=1)
         arm_torques(arm.geometry.constants, np.array(down, np.float64), arm.parameters, arm.order, motions, out)
         return out
 
     def parts(self, signals: Signals) -> tuple[Array, Array]:
-        """Torques of gravity and of the rest, (R, n) each."""
+        """Return the torque of gravity, and of inertia and velocities, (R, n) each."""
         rest = self.torque(*signals[:3], (0.0, 0.0, 0.0))
         return self.torque(*signals[:3], self._arm.geometry.gravity) - rest, rest
 
-    def sideways(self, q: Array) -> tuple[Array, Array]:
-        """Torques of gravity along two horizontal axes of the URDF's base, (R, n) each."""
+    def horizontal_gravity(self, q: Array) -> tuple[Array, Array]:
+        """Return torques of gravity along two horizontal axes of the URDF's base, (R, n) each."""
         still = np.zeros_like(q)
         along = np.eye(3)[np.argsort(np.abs(self._arm.geometry.gravity))[:2]]
         first, second = (self.torque(q, still, still, 9.81 * axis) for axis in along)
         return first, second
 
 
-def design(gravity: Array, rest: Array, dq: Array) -> Array:
-    """Columns (R, 5) of a joint's fit: gravity, inertia, velocity, its smoothed sign, a constant; from its own (R,)."""
+def design_matrix(gravity: Array, rest: Array, dq: Array) -> Array:
+    """Return columns (R, 5) of a joint's fit: gravity, inertia, velocity, its smoothed sign and a constant."""
     return np.column_stack([gravity, rest, dq, np.tanh(dq / SIGN_WIDTH), np.ones(len(dq))])
 
 
 @dataclass(frozen=True)
-class Against:
-    """Factors of gravity and of the rest by joint, (n,) each, with standard deviations, and how well they are known.
-
-    visible: (n, 2) standard deviation of gravity's and the rest's torque, as far as the other columns do not explain
-    it, over that of the measured torque; errors: (8, n) mean squares on eighths left out, as shares of its
-    variance.
-    """
+class Comparison:
+    """Torque compared with that of a robot: factors of gravity and inertia by joint, (n,) each."""
 
     gravity: Array
     gravity_std: Array
     inertia: Array
     inertia_std: Array
     visible: Array
+    """Part of the gravity and inertia torque that other columns do not explain, as a share of tau's spread, (n, 2)."""
     errors: Array
+    """Mean squares on each held-out eighth, as shares of the torque's variance, (8, n)."""
 
     @property
     def explained(self) -> Array:
-        """Share of the variance that is explained on eighths left out, (n,), 0 at least."""
+        """Explained share of the variance on held-out eighths, (n,), at least 0."""
         return np.asarray(np.clip(1 - self.errors.mean(0), 0.0, 1.0))
 
     @property
@@ -160,32 +157,34 @@ class Against:
         """Mean logarithm of the errors."""
         return float(np.log(self.errors + BODIES.floor).mean())
 
-    def steady(self, joint: int, part: int) -> bool:
-        """Whether a factor, of gravity (0) or the rest (1), is told from 0 by three standard deviations, and its
-        torque is a visible part of the joint's."""
+    def is_significant(self, joint: int, part: int) -> bool:
+        """Return whether a factor differs from 0 by three standard deviations and its torque is visible.
+
+        part: 0 is gravity, 1 is inertia.
+        """
         value, std = ((self.gravity, self.gravity_std), (self.inertia, self.inertia_std))[part]
         size = abs(value[joint])
         return bool(size > 3 * std[joint] and size * self.visible[joint, part] > BODIES.visible)
 
 
-def moving(dq: Array) -> NDArray[np.int64]:
-    """Rows in which a joint with velocities (R,) moves; all where it seldom does. At rest it holds any torque."""
+def moving_rows(dq: Array) -> NDArray[np.int64]:
+    """Return the rows in which a joint moves, or all if it seldom does; at rest, friction may hold any torque."""
     rows = np.flatnonzero(np.abs(dq) > SIGN_WIDTH)
     return rows if len(rows) > BODIES.min_moving * len(dq) else np.arange(len(dq))
 
 
-def _fits(bodies: Bodies, signals: Signals) -> Iterator[tuple[Array, float, Blocks]]:
-    """Columns of each joint's fit where it moves, the variance of its torque there, and the fit."""
+def _fits(bodies: Bodies, signals: Signals) -> Iterator[tuple[Array, float, BlockFit]]:
+    """Yield for each joint the columns of its fit, the variance of its torque and the fit, on moving rows."""
     gravity, rest = bodies.parts(signals)
     for joint in range(signals.q.shape[1]):
-        rows = moving(signals.dq[:, joint])
-        columns = design(gravity[rows, joint], rest[rows, joint], signals.dq[rows, joint])
+        rows = moving_rows(signals.dq[:, joint])
+        columns = design_matrix(gravity[rows, joint], rest[rows, joint], signals.dq[rows, joint])
         tau = signals.tau[rows, joint, None]
-        yield columns, max(float(tau.var()), 1e-300), Blocks.fit(columns, tau)
+        yield columns, max(float(tau.var()), 1e-300), BlockFit.of(columns, tau)
 
 
-def compare(bodies: Bodies, signals: Signals) -> Against:
-    """Fit each joint's torque."""
+def compare(bodies: Bodies, signals: Signals) -> Comparison:
+    """Fit each joint's torque with gravity, inertia and friction."""
     factors, stds, visible, errors = [], [], [], []
     for columns, variance, fit in _fits(bodies, signals):
         factors.append(fit.weights[:2, 0])
@@ -198,21 +197,21 @@ def compare(bodies: Bodies, signals: Signals) -> Against:
             sizes.append(np.sqrt(np.mean(left**2) / variance))
         visible.append(sizes)
     (gravity, inertia), (gravity_std, inertia_std) = np.transpose(factors), np.transpose(stds)
-    return Against(gravity, gravity_std, inertia, inertia_std, np.array(visible), np.transpose(errors))
+    return Comparison(gravity, gravity_std, inertia, inertia_std, np.array(visible), np.transpose(errors))
 
 
 @dataclass(frozen=True)
 class Order:
-    """Column of the data that belongs to each joint, (n,), and the mean logarithm of the errors so."""
+    """Column of the data that belongs to each joint, (n,), and the mean logarithm of its errors."""
 
     column: tuple[int, ...]
     error: float
 
 
-def torque_order(bodies: Bodies, signals: Signals) -> Order | None:
-    """Columns of the measured torque as joints need them, where these are clearly not their own.
+def find_torque_order(bodies: Bodies, signals: Signals) -> Order | None:
+    """Return another order of the torque columns, if it is clearly better.
 
-    Every column is fitted with the torque and friction of every joint; the assignment with the least errors counts.
+    Every column is fitted with the torque and friction of every joint. The assignment with the smallest errors wins.
     """
     from scipy.optimize import linear_sum_assignment  # noqa: PLC0415 - serving does without it
 
@@ -220,8 +219,8 @@ def torque_order(bodies: Bodies, signals: Signals) -> Order | None:
     dq, tau, n = signals.dq, signals.tau, signals.q.shape[1]
     errors = np.empty((FIT.parts, n, n))
     for joint in range(n):
-        rows = moving(dq[:, joint])
-        fit = Blocks.fit(design(gravity[rows, joint], rest[rows, joint], dq[rows, joint]), tau[rows])
+        rows = moving_rows(dq[:, joint])
+        fit = BlockFit.of(design_matrix(gravity[rows, joint], rest[rows, joint], dq[rows, joint]), tau[rows])
         errors[:, joint] = fit.errors / np.maximum(tau[rows].var(axis=0), 1e-300)
     logs = np.log(errors + BODIES.floor)
     _, column = linear_sum_assignment(logs.mean(0))
@@ -229,16 +228,16 @@ def torque_order(bodies: Bodies, signals: Signals) -> Order | None:
     if not len(moved):
         return None
     gain = logs[:, moved, moved] - logs[:, moved, column[moved]]
-    # columns of joints without much torque might go anywhere: all that change have to be explained
+    # columns with little torque fit any joint: the explained share of each that moves counts
     explained = 1 - errors.mean(0)[moved, column[moved]]
-    clear = (gain.mean(1) > 0).all() and gain.mean() > np.log(BODIES.gain) and (explained > BODIES.explained).all()
+    clear = (gain.mean(1) > 0).all() and gain.mean() > np.log(BODIES.min_gain) and (explained > BODIES.explained).all()
     return Order(tuple(column.tolist()), float(logs.mean(0)[np.arange(n), column].mean())) if clear else None
 
 
-def joint_order(bodies: Bodies, signals: Signals, against: Against) -> Order | None:
-    """Columns of all data as the robot's joints need them, where these are clearly not those of the data.
+def find_joint_order(bodies: Bodies, signals: Signals, comparison: Comparison) -> Order | None:
+    """Return another order of the joints in all columns, if it is clearly better.
 
-    Tried are the order of the alphabet, the reverse and rotations; the best of them is bettered by exchanging two.
+    Candidates are the alphabetical order, the reverse and rotations. Exchanges of two joints improve the best one.
     """
     rows, n = signals.q.shape
     few = Signals(*(each[np.linspace(0, rows - 1, min(rows, BODIES.rows)).astype(np.int64)] for each in signals))
@@ -260,20 +259,20 @@ def joint_order(bodies: Bodies, signals: Signals, against: Against) -> Order | N
         if not error(better) < error(best):
             break
         best = better
-    # joints with little torque stay where they are, unless another place is clearly better
+    # joints with little torque keep their place, unless another one is clearly better
     for a, b in combinations(range(n), 2):
         back = _exchanged(best, a, b)
-        if _moved(back) < _moved(best) and n * (error(back) - error(best)) < 2 * np.log(BODIES.gain):
+        if _moved(back) < _moved(best) and n * (error(back) - error(best)) < 2 * np.log(BODIES.min_gain):
             best = back
     moved = [joint for joint in range(n) if best[joint] != joint]
     if not moved:
         return None
     there = compare(bodies, signals.take(best))
-    gain = (np.log(against.errors + BODIES.floor) - np.log(there.errors + BODIES.floor)).sum(1) / len(moved)
-    steady = [joint for joint in range(n) if there.steady(joint, 0)]
+    gain = (np.log(comparison.errors + BODIES.floor) - np.log(there.errors + BODIES.floor)).sum(1) / len(moved)
+    significant = [joint for joint in range(n) if there.is_significant(joint, 0)]
     explained = np.median(there.explained[moved])
-    clear = (gain > 0).all() and gain.mean() > np.log(BODIES.gain) and explained > BODIES.explained
-    return Order(best, there.error) if clear and steady and (there.gravity[steady] > 0).all() else None
+    clear = (gain > 0).all() and gain.mean() > np.log(BODIES.min_gain) and explained > BODIES.explained
+    return Order(best, there.error) if clear and significant and (there.gravity[significant] > 0).all() else None
 
 
 def _moved(order: tuple[int, ...]) -> int:

@@ -1,12 +1,13 @@
-"""How a recording was moved, and how well that would tell friction and a robot's inertial parameters.
+"""Motion of a recording, and how well it determines friction and a robot's inertial parameters.
 
-A friction weight's standard deviation is that of least squares with the noise that the fit leaves, over as many
-independent rows as the recording has: two a period of the low-pass. It is judged by the torque it stands for (viscous:
-at the usual speed) as a share of the spread of the joint's torque, see FrictionOptions.
+The standard deviation of a friction coefficient is that of least squares, with the noise level of the fit's residual
+and the effective samples of the recording, two per period of the low-pass. The verdict depends on the torque of this
+deviation (viscous: at the root-mean-square speed) as a share of the torque's standard deviation, see
+`FrictionOptions`.
 
-Rigid bodies are judged by the regressor of the robot's URDF at few rows, against that of random motion over its whole
-range. In coordinates in which random motion excites every base parameter by 1, the recording excites some more and some
-less; the least excited one limits what can be identified.
+For rigid bodies, the regressor of the robot's URDF at a subset of rows is compared with that of random motion over the
+whole range. In coordinates in which random motion excites every base parameter by 1, the least excited one limits the
+identification.
 """
 
 from __future__ import annotations
@@ -25,22 +26,23 @@ from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.friction import FRICTION_TERMS, SIGN_WIDTH
 from lipcore.robots.urdf import PARAMETERS, RigidBody
 from service.contract.datasets import JointExcitation, Verdict, Weight, WholeExcitation
+from service.datasets.report import texts
 from service.datasets.report.fit import FIT, OWN_FEATURES, Fit, friction_terms, own_features
 from service.datasets.report.signals import Limits, Rows, spread
 
 
 @dataclass(frozen=True)
 class FrictionOptions:
-    """When a recording determines a joint's friction."""
+    """Thresholds of determined friction."""
 
     max_shares: tuple[tuple[float, Verdict], ...] = ((0.02, "well"), (0.1, "poorly"))
-    """Max share of the torque's spread that a weight's standard deviation stands for, by verdict."""
+    """Max torque of a coefficient's standard deviation, as a share of the torque's spread, by verdict."""
     negative_stds: float = 2.0
-    """Min standard deviations below zero of negative friction."""
+    """Standard deviations below 0 at which friction is negative."""
     negative_share: float = 0.03
-    """Min share of the torque's spread of negative friction."""
+    """Share of the torque's spread above which friction is negative."""
     slow: float = 0.1
-    """Speed in rad/s or m/s below which motion is slow: Coulomb friction and stiction show there."""
+    """Speed in rad/s or m/s below which motion is slow and shows Coulomb friction and stiction."""
     seldom: float = 0.005
     """Share of samples below which a direction, or slow motion, counts as absent."""
     prior: float = 3.0
@@ -53,9 +55,9 @@ FRICTION = FrictionOptions()
 def joint_excitation(
     joint: int, name: str, columns: dict[str, Array], part: Rows, fit: Fit, noise: float, limits: Limits | None
 ) -> JointExcitation:
-    """Judge one joint's motion, columns by quantity (M,) and the part of each row.
+    """Judge one joint's motion by its columns by quantity, (M,), and the part of each row.
 
-    fit: of all joints; noise: std of what it leaves of the joint's torque, N·m.
+    fit: of all joints; noise: standard deviation of the fit's residual, N·m.
     """
     q, dq, ddq, tau = (columns[quantity] for quantity in ("q", "dq", "ddq", "tau"))
     stds = friction_stds(fit, joint, noise, float(np.sqrt(np.mean(tau**2))))
@@ -72,24 +74,24 @@ def joint_excitation(
         forwards=forwards,
         backwards=backwards,
         still=1.0 - forwards - backwards,
-        reversals=reversals(dq, part),
+        reversals=count_reversals(dq, part),
         slow_forwards=float(np.mean(slow & (dq > SIGN_WIDTH))),
         slow_backwards=float(np.mean(slow & (dq < -SIGN_WIDTH))),
-        **weights([(None, std) for std in stds], speed, spread(tau), min(forwards, backwards) < FRICTION.seldom),
+        **judge_friction([(None, std) for std in stds], speed, spread(tau), min(forwards, backwards) < FRICTION.seldom),
         collinear=worst,
         collinear_term=term,
     )
 
 
 Estimate = tuple[float | None, float | None]
-"""A weight and its standard deviation, None where the data say nothing of it."""
+"""A coefficient and its standard deviation, None if the data do not determine it."""
 
 
-def weights(friction: Sequence[Estimate], speed: float, torque: float, one_way: bool) -> dict[str, Weight]:
-    """Judge a joint's viscous, Coulomb and offset weights.
+def judge_friction(friction: Sequence[Estimate], speed: float, torque: float, one_way: bool) -> dict[str, Weight]:
+    """Judge a joint's viscous friction, Coulomb friction and offset.
 
-    speed: root mean square; torque: standard deviation of the joint's; one_way: whether one direction is
-    absent, so that nothing but standstill would tell Coulomb friction from an offset, which it does not.
+    speed: root mean square; torque: standard deviation; one_way: whether one direction is absent, so that Coulomb
+    friction cannot be separated from an offset.
     """
     sizes = (float(speed), 1.0, 1.0)
     out = {
@@ -103,22 +105,23 @@ def weights(friction: Sequence[Estimate], speed: float, torque: float, one_way: 
 
 
 def friction_stds(fit: Fit, joint: int, noise: float, torque: float) -> tuple[float | None, float | None, float]:
-    """Standard deviations of viscous, Coulomb and offset weights, None where the data say nothing of one.
+    """Return standard deviations of viscous friction, Coulomb friction and offset, None if undetermined.
 
-    The weights themselves, beside terms that may be any function of motion, are not worth much: on simulated arms some
-    were many standard deviations off. torque: root mean square of the joint's, N·m; nothing else that is fitted may be
-    more than FRICTION.prior times it.
+    The estimates themselves are not reliable beside terms that may be any function of motion: on simulated arms, some
+    were wrong by many standard deviations.
+
+    torque: root mean square of the joint's torque, N·m; FRICTION.prior times it limits the other fitted terms.
     """
     variance = noise**2 * len(fit.rows) / fit.independent
     known = np.isfinite(fit.scales)
     prior = np.full(len(fit.scales), FRICTION.prior * torque)
-    # cos q, sin q: their raw weights are torques
+    # unscaled weights of cos q and sin q are torques
     waves = np.flatnonzero([name in ("cos q", "sin q") for name in OWN_FEATURES] * (len(prior) // len(OWN_FEATURES)))
     prior[waves] *= np.where(known[waves], fit.scales[waves], 1.0)
     information = variance / np.maximum(prior, 1e-150) ** 2
     own = friction_terms(joint)
     information[list(own)] = 0.0
-    # (C⁻¹ + D)⁻¹ without the inverse of C, which may be all but singular
+    # (C⁻¹ + D)⁻¹ without the inverse of C, which may be nearly singular
     root = np.sqrt(information)
     inner = np.eye(len(root)) + root[:, None] * fit.covariance * root
     pulled = fit.covariance * root
@@ -131,15 +134,15 @@ def friction_stds(fit: Fit, joint: int, noise: float, torque: float) -> tuple[fl
     return viscous, coulomb, float(np.sqrt(offset))
 
 
-def reversals(dq: Array, part: Rows) -> int:
-    """How often a velocity (M,) changes its sign within a part, by more than SIGN_WIDTH to either side."""
+def count_reversals(dq: Array, part: Rows) -> int:
+    """Count sign changes of a velocity (M,) within parts, ignoring magnitudes up to SIGN_WIDTH."""
     moving = np.flatnonzero(np.abs(dq) > SIGN_WIDTH)
     forwards, home = dq[moving] > 0, part[moving]
     return int(np.sum((forwards[1:] != forwards[:-1]) & (home[1:] == home[:-1])))
 
 
 def collinearity(q: Array, dq: Array, ddq: Array) -> tuple[float, str]:
-    """Largest share of one of OWN_FEATURES that the other four explain, and which one; 1 where one does not vary."""
+    """Return the largest share of one of OWN_FEATURES that the others explain, and its name; 1 if one is constant."""
     raw = np.column_stack(own_features(q, dq, ddq))
     centred = raw - raw.mean(axis=0)
     scale = centred.std(axis=0)
@@ -166,7 +169,7 @@ def _weight(value: float | None, std: float | None, factor: float, torque: float
     if std is None or torque == 0:
         return Weight(value=value, std=std, share=None, verdict="not determined")
     share = std * factor / torque
-    verdict = next((v for most, v in FRICTION.max_shares if share <= most), "not determined")
+    verdict = next((v for max_share, v in FRICTION.max_shares if share <= max_share), "not determined")
     negative = friction and verdict == "well" and value is not None and value < -FRICTION.negative_stds * std
     negative = negative and -(value or 0.0) * factor > FRICTION.negative_share * torque
     return Weight(value=value, std=std, share=share, verdict=verdict, implausible=negative)
@@ -174,7 +177,7 @@ def _weight(value: float | None, std: float | None, factor: float, torque: float
 
 @dataclass(frozen=True)
 class ReferenceOptions:
-    """Random motion that a recording's excitation of rigid bodies is compared with."""
+    """Random motion with which a recording's excitation of rigid bodies is compared."""
 
     max_equations: int = 14_000
     """Max rows times joints of the recording: 2000 rows of 7 joints."""
@@ -183,13 +186,13 @@ class ReferenceOptions:
     equations: int = 3500
     """Rows times joints of random motion."""
     min_effect: float = 1e-8
-    """Relative size below which a combination of parameters has no effect on torques."""
+    """Relative size below which a combination of parameters has no effect on torque."""
     resolution: float = 1e-13
-    """Smallest relative information about a weight that differs from none."""
+    """Min relative information about a coefficient; less counts as none."""
     excited: float = 0.01
     """Share of random motion's excitation above which a base parameter counts as excited."""
     speed: float = 1.0
-    """Speed in rad/s or m/s where no limit is known."""
+    """Speed in rad/s or m/s if no limit is known."""
     turn_s: float = 0.5
     """Time in s in which the speed reverses."""
 
@@ -199,7 +202,7 @@ REFERENCE = ReferenceOptions()
 
 @dataclass(frozen=True)
 class RigidExcitation:
-    """What the URDF tells of a recording. friction: each joint's weights in the order FRICTION_TERMS."""
+    """Excitation of rigid bodies. friction: each joint's coefficients in the order FRICTION_TERMS."""
 
     whole: WholeExcitation
     friction: list[list[Estimate]]
@@ -207,8 +210,10 @@ class RigidExcitation:
 
 @dataclass(frozen=True)
 class _Reference:
-    """Random motion. regressor: (E, 10 n); base: columns that span it, (b,); back: (10 n, b) from coordinates in which
-    it excites everything by 1.
+    """Random motion.
+
+    regressor: (E, 10 n); base: columns that span it, (b,); back: (10 n, b), from coordinates in which random motion
+    excites everything by 1.
     """
 
     regressor: Array
@@ -227,18 +232,18 @@ def judge_rigid_bodies(
     independent: float,
     gravity: bool,
 ) -> RigidExcitation | str:
-    """Judge rows of motion q, dq, ddq and torque, (R, n) each; a sentence says why the URDF cannot be used for them.
+    """Judge rows of motion q, dq, ddq and torque, (R, n) each, or return why the URDF cannot be used.
 
-    noise: std of what is left of each joint's torque, (n,) N·m; independent: samples that the rows stand for; gravity:
-    whether torques contain it.
+    noise: standard deviation of each joint's residual, (n,) N·m; independent: effective samples of the recording;
+    gravity: whether torques contain it.
     """
     if limits.urdf_joints is None:
-        return f"not all joints are those of robot {name}: its rigid bodies were not used"
+        return texts.bodies_incomplete(name)
     try:
         robot = RigidBody.from_urdf(urdf, names, limits.joint_types, limits.urdf_joints, name)
         kernel = ArmKernel(arm_of_robot(robot, gravity, "zero"))
     except (MissingExtraError, ValueError) as error:
-        return f"the rigid bodies of robot {name} were not used: {error}"
+        return texts.bodies_unusable(name, error)
     n, size = len(names), len(names) * PARAMETERS
     reference = _reference(kernel, limits)
     rows = np.linspace(0, len(motion[0]) - 1, min(len(motion[0]), REFERENCE.max_equations // n)).astype(np.int64)
@@ -254,7 +259,7 @@ def judge_rigid_bodies(
         projected += both.T @ (tau[first : first + len(some)] / loudness).reshape(-1)
     excited, modes = np.linalg.eigh(reference.back.T @ gram @ reference.back / (n * len(q)))
     shares = np.sqrt(np.maximum(excited, 0.0))
-    # whose parameters the least excited mode moves, weighed by the torque that random motion makes of them
+    # share of each body in the least excited mode, weighted by its torque under random motion
     weakest = (reference.regressor * (reference.back @ modes[:, 0])).reshape(-1, n, PARAMETERS).sum(axis=2)
     whole = WholeExcitation(
         parameters=len(reference.base),
@@ -282,7 +287,7 @@ def _reference(kernel: ArmKernel, limits: Limits) -> _Reference:
 
 
 def _friction(dq: Array) -> Array:
-    """Friction's features as equations, row by row and joint by joint: (R n, 3 n)."""
+    """Return friction's features as equations, by row and then by joint: (R n, 3 n)."""
     rows, n = dq.shape
     out = np.zeros((rows, n, n, len(FRICTION_TERMS)))
     joints = np.arange(n)
@@ -291,7 +296,7 @@ def _friction(dq: Array) -> Array:
 
 
 def _friction_weights(information: Array, projected: Array, back: Array) -> list[list[Estimate]]:
-    """The friction's weights beside unknown inertial parameters; information: (13 n, 13 n); projected: (13 n,)."""
+    """Estimate friction beside unknown inertial parameters; information: (13 n, 13 n); projected: (13 n,)."""
     size, count = back.shape
     turn = np.zeros((len(information), count + len(information) - size))
     turn[:size, :count], turn[size:, count:] = back, np.eye(len(information) - size)
@@ -306,7 +311,7 @@ def _friction_weights(information: Array, projected: Array, back: Array) -> list
 
 
 def _condition(gram: Array) -> float | None:
-    """Condition of a matrix with columns of equal norm, from its Gram matrix; None beyond what that can tell."""
+    """Return the condition number of a matrix, columns scaled to equal norm, by its Gram matrix; None if too large."""
     norm = np.sqrt(np.diag(gram))
     if (norm == 0).any():
         return None
@@ -315,7 +320,7 @@ def _condition(gram: Array) -> float | None:
 
 
 def _regressors(kernel: ArmKernel, q: Array, dq: Array, ddq: Array) -> Iterator[tuple[int, Array]]:
-    """The joint-torque regressor in blocks of equations, (E, 10 n) each, with the first row of motion of each."""
+    """Yield the joint-torque regressor in blocks of equations, (E, 10 n), with the first row of motion of each."""
     rows = max(1, REFERENCE.chunk // q.shape[1])
     for first in range(0, len(q), rows):
         part = slice(first, first + rows)
@@ -325,7 +330,7 @@ def _regressors(kernel: ArmKernel, q: Array, dq: Array, ddq: Array) -> Iterator[
 
 
 def _random_motion(limits: Limits, rows: int) -> tuple[Array, Array, Array]:
-    """Positions over the whole range, speeds up to the limits and accelerations that reverse them soon, (rows, n)."""
+    """Return positions over the whole range, speeds up to the limits and matching accelerations, (rows, n)."""
     rng = np.random.default_rng(7)
     lower = np.where(np.isnan(limits.lower), -np.pi, limits.lower)
     upper = np.where(np.isnan(limits.upper), np.pi, limits.upper)

@@ -1,9 +1,9 @@
-"""A fit of torque to motion that needs no robot.
+"""Fit of torque to motion without a robot model.
 
-Of each joint the fit has velocity, its smoothed sign, acceleration, cos q and sin q, unpenalised; and random products
-of the kind that an arm's torque is made of, gravity, inertia and velocities' products under cosines of sums of
-neighbouring angles, penalised by as much as generalised cross-validation asks for. On simulated arms with known delays
-it is the second kind that makes lags right.
+Features of each joint are velocity, its smoothed sign, acceleration, cos q and sin q, without penalty. Further features
+are random terms of the form of an arm's torque: gravity, inertia and velocity products, times cosines of sums of
+neighbouring angles. Generalised cross-validation sets their penalty. On simulated arms with known delays, lags are
+correct only with these terms.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ class MotionFitOptions:
     max_neighbours: int = 3
     """Max joints whose angles are summed."""
     ridge: float = 1e-9
-    """Penalty of the joints' own features, as a share of their variance: collinear features stay harmless."""
+    """Penalty of the joints' own features, as a share of their variance, for collinear features."""
     max_used: float = 0.5
-    """Max share of the independent rows that the weights use up."""
+    """Max degrees of freedom of the fit, as a share of the independent rows."""
     min_spread: float = 1e-9
     """Spread, relative to the size, at which a feature is constant."""
     parts: int = 8
@@ -44,29 +44,30 @@ FIT = MotionFitOptions()
 
 @dataclass(frozen=True)
 class Fit:
-    """Features of R rows of motion, factored once for any torque.
-
-    rows: (R,) of the prepared recording; whitened: (p, R), its product with itself is the hat matrix; covariance:
-    (5 n, 5 n) of the joints' own weights, noise variance 1, features scaled; means, scales: (5 n,) of these features,
-    scale infinite where one is constant; independent: how many samples of the recording count as independent.
-    """
+    """Features of R rows of motion, factored once for any torque."""
 
     rows: Rows
+    """Rows of the prepared recording, (R,)."""
     whitened: Array
+    """Whitened features W, (p, R); the hat matrix is Wᵀ W."""
     covariance: Array
+    """Covariance of the joints' own weights for noise variance 1 and scaled features, (5 n, 5 n)."""
     means: Array
+    """Means of the joints' own features, (5 n,)."""
     scales: Array
+    """Standard deviations of these features, infinite for a constant one, (5 n,)."""
     independent: float
+    """Effective samples of the recording."""
 
     def residuals(self, y: Array) -> Array:
-        """What the fit leaves of torques y (R, k), means taken out: (R, k)."""
+        """Return the residuals of torques y (R, k), means removed: (R, k)."""
         centred = y - y.mean(axis=0)
         return np.asarray(centred - self.whitened.T @ (self.whitened @ centred))
 
     def held_out(self, y: Array) -> Array:
-        """Squared error on each eighth of the rows of fits without it, of torques y (R, k): (8, k).
+        """Return the squared error of torques y (R, k) on each held-out eighth of the rows: (8, k).
 
-        With the residual r and the hat matrix H of all rows, that on a part B is (I − H_BB)⁻¹ r_B.
+        With the residual r and the hat matrix H of all rows, the held-out residual of a part B is (I − H_BB)⁻¹ r_B.
         """
         left, rows = self.residuals(y), len(y)
         hat = np.vstack([np.full(rows, rows**-0.5), self.whitened])
@@ -79,19 +80,20 @@ class Fit:
 
 
 def friction_terms(joint: int) -> tuple[int, int]:
-    """Places of a joint's velocity and of its smoothed sign among the joints' own features."""
+    """Return the indices of a joint's velocity and its smoothed sign among the joints' own features."""
     return len(OWN_FEATURES) * joint, len(OWN_FEATURES) * joint + 1
 
 
 def make_fit(rows: Rows, q: Array, dq: Array, ddq: Array, tau: Array, independent: float) -> Fit:
-    """Factor the features of some rows; q, dq, ddq, tau: (R, n) of these, the last to choose the penalty by.
+    """Factor the features of some rows, and choose the penalty by their torque; q, dq, ddq, tau: (R, n).
 
-    independent: how many samples of the recording count as independent.
+    independent: effective samples of the recording.
     """
     joints = q.shape[1]
     own, means, scales = _scaled([f for j in range(joints) for f in own_features(q[:, j], dq[:, j], ddq[:, j])])
     lower = np.linalg.cholesky(own.T @ own + FIT.ridge * len(rows) * np.eye(own.shape[1]))
-    inverse = np.asarray(np.linalg.inv(lower), np.float64)  # not that of the product: features may be nearly collinear
+    # the inverse of the product would be inaccurate for nearly collinear features
+    inverse = np.asarray(np.linalg.inv(lower), np.float64)
     free, whitened = inverse.T @ inverse, inverse @ own.T
     products, _, _ = _scaled(_products(q, dq, ddq))
     shared = own.T @ products
@@ -116,12 +118,12 @@ def make_fit(rows: Rows, q: Array, dq: Array, ddq: Array, tau: Array, independen
 
 
 def own_features(q: Array, dq: Array, ddq: Array) -> tuple[Array, ...]:
-    """One joint's velocity, smoothed sign of it, acceleration, cos q and sin q, from columns (R,)."""
+    """Return one joint's velocity, its smoothed sign, acceleration, cos q and sin q, from columns (R,)."""
     return dq, np.tanh(dq / SIGN_WIDTH), ddq, np.cos(q), np.sin(q)
 
 
 def _products(q: Array, dq: Array, ddq: Array) -> list[Array]:
-    """Random terms of an arm's torque, the same every time: three columns (R,) a product."""
+    """Return random terms of an arm's torque with a fixed seed: three columns (R,) per angle."""
     rng = np.random.default_rng(5)
     joints = q.shape[1]
     out = []
@@ -136,7 +138,7 @@ def _products(q: Array, dq: Array, ddq: Array) -> list[Array]:
 
 
 def _scaled(columns: list[Array]) -> tuple[Array, Array, Array]:
-    """Columns with zero mean and unit variance, their means and scales; constant ones become zero."""
+    """Return columns with zero mean and unit variance, their means and scales; constant columns become zero."""
     raw = np.column_stack(columns)
     means: Array = raw.mean(axis=0)
     wide = raw.std(axis=0)
@@ -147,7 +149,7 @@ def _scaled(columns: list[Array]) -> tuple[Array, Array, Array]:
 
 
 def _penalty(values: Array, projected: Array, rest: Array, own: int, independent: float) -> float | None:
-    """The penalty that generalised cross-validation likes best; None where there are rows for no products at all.
+    """Return the best penalty by generalised cross-validation, None if there are too few rows for products.
 
     values: (p,) squared singular values of the products; projected: (p, n) torques along them; rest: (R, n) torques.
     """

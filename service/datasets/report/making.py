@@ -1,4 +1,4 @@
-"""The report of a data set, made column by column: of what spans several joints only few rows are taken."""
+"""The report of a data set. It is made column by column; figures on several joints use a subset of rows."""
 
 from __future__ import annotations
 
@@ -15,26 +15,33 @@ from lipcore.preparation.recipe import Recipe
 from lipcore.profiles import Profile
 from service.contract import datasets as schema
 from service.datasets.mapping.choice import WARNING
-from service.datasets.report.advice import advice, in_words, warnings
-from service.datasets.report.bodies import Against, Bodies, Signals, compare
-from service.datasets.report.causes import TorqueWork, causes
-from service.datasets.report.excitation import FRICTION, RigidExcitation, joint_excitation, judge_rigid_bodies, weights
+from service.datasets.report import texts
+from service.datasets.report.advice import collect_advice, collect_warnings, describe_excitation
+from service.datasets.report.bodies import Bodies, Comparison, Signals, compare
+from service.datasets.report.causes import TorqueWork, find_faults
+from service.datasets.report.excitation import (
+    FRICTION,
+    RigidExcitation,
+    joint_excitation,
+    judge_friction,
+    judge_rigid_bodies,
+)
 from service.datasets.report.fit import make_fit
-from service.datasets.report.lag import Lags, clear, no_lags, shifts
+from service.datasets.report.lag import Lags, is_nonzero, shifts, unknown_lags
 from service.datasets.report.remedies import Upload
-from service.datasets.report.robots import bodies_of, proposed, suggestion, unnamed
+from service.datasets.report.robots import ask_for_robot, bodies_of, find_candidates, suggest_robot
 from service.datasets.report.signals import (
     Limits,
     RecordedTimes,
-    against_limits,
+    analyse_times,
     bounds,
-    finite,
+    compare_with_limits,
+    detect_saturation,
+    finite_or_none,
+    is_smoothed,
     limits_of,
-    look_at_clock,
-    noise_or_share,
+    noise_or_default,
     number_parts,
-    saturation,
-    smoothed,
     spread,
     thin,
     white_noise,
@@ -51,37 +58,37 @@ def make_report(
     gravity: bool = True,
     source: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The report as JSON, see DatasetReport.
+    """Return the report as JSON, see `DatasetReport`.
 
-    noted: what was found while the file was read; recipe: that of the preparation, the defaults where None; gravity:
-    whether torques contain it; source: what the file's columns were taken as, None where that is not known.
+    noted: notes and warnings of the reader; recipe: of the preparation, None for the defaults; gravity: whether torques
+    contain it; source: how the file's columns were read, None if unknown.
     """
     recipe = recipe or Recipe()
     names = raw.joint_names
     limits = limits_of(profile, names)
-    clock = look_at_clock(raw, recipe.gap_steps, prepared.repeated)
-    recorded = _look_at_raw(raw, clock, limits)
-    samples = _look_at_samples(prepared, limits)
+    times = analyse_times(raw, recipe.gap_steps, prepared.repeated)
+    recorded = _analyse_raw(raw, times, limits)
+    samples = _analyse_samples(prepared, limits)
     upload, signals = Upload(names, gravity, source), Signals(*samples.motion, samples.tau)
-    candidates, best = proposed(names, signals) if profile is None else ((), None)
+    candidates, best = find_candidates(names, signals) if profile is None else ((), None)
     known = profile if best is None else profiles.profile(best)
     rigid = _rigid_bodies(known, limits_of(known, names), prepared, samples, gravity)
     excitation = _excitation(samples, rigid)
     reading = [note for note in noted if not note.startswith(WARNING)]
     warned = [note.removeprefix(WARNING) for note in noted if note.startswith(WARNING)]
     if profile is not None and limits is None:
-        reading.append(f"the joints of robot {profile.name} are not those of the data: limits were not compared")
+        reading.append(texts.no_joint_matches(profile.name))
     if profile is not None and limits is not None and limits.by_order:
-        reading.append(f"joints were taken for those of robot {profile.name} by their order")
+        reading.append(texts.matched_by_order(profile.name))
     if isinstance(rigid, str) and profile is not None:
         reading.append(rigid)
-    if isinstance(rigid, RigidExcitation) and profile is None:
-        reading.append(f"friction is judged beside the rigid bodies of {best}, as whose the joints are called")
-    against, remedies = _against_robot(known, upload, signals, samples, excitation)
-    proposal = suggestion(upload, candidates, best)
+    if isinstance(rigid, RigidExcitation) and best is not None:
+        reading.append(texts.bodies_suggested(best))
+    against, remedies = _compare_with_robot(known, upload, signals, samples, excitation)
+    proposal = suggest_robot(upload, candidates, best)
     suggested = [] if proposal is None else [proposal]
-    unknown = unnamed(len(names)) if profile is None and proposal is None else None
-    named = [each.text for each in suggested] + ([] if unknown is None else [unknown])
+    unknown = ask_for_robot(len(names)) if profile is None and proposal is None else None
+    robot_advice = [each.text for each in suggested] + ([] if unknown is None else [unknown])
     report = schema.DatasetReport(
         rows_uploaded=raw.rows,
         rows=prepared.staged.rows,
@@ -97,13 +104,13 @@ def make_report(
         torque_noise_estimate=samples.noise,
         warnings=warned
         + [each.text for each in remedies]
-        + warnings(clock.timing, recorded.saturation, recorded.limits, samples.lags, raw.rows),
+        + collect_warnings(times.timing, recorded.saturation, recorded.limits, samples.lags, raw.rows),
         reading=reading,
         recipe=recipe.to_json(),
         source=source,
         steps=prepared.steps,
         robot=None if profile is None or limits is None else profile.name,
-        timing=clock.timing,
+        timing=times.timing,
         saturation=recorded.saturation,
         limits=recorded.limits,
         lag=samples.lags,
@@ -111,14 +118,14 @@ def make_report(
         excitation=excitation,
         against_robot=against,
         remedies=remedies + suggested,
-        advice=named + advice(clock.timing, excitation, recorded.limits, recorded.noise),
+        advice=robot_advice + collect_advice(times.timing, excitation, recorded.limits, recorded.noise),
     )
     return report.model_dump(mode="json")
 
 
 @dataclass(frozen=True)
 class _Recorded:
-    """What the signals as recorded show, joint by joint."""
+    """Findings about the signals as recorded, joint by joint."""
 
     saturation: list[schema.JointSaturation]
     limits: list[schema.JointLimits]
@@ -127,34 +134,38 @@ class _Recorded:
 
 @dataclass(frozen=True)
 class _Samples:
-    """What the samples show. ranges: smallest and largest by quantity and joint; noise: white, of the torque; left: std
-    of the torque that no motion explains, both N·m; motion: q, dq, ddq at few rows, (R, n) each, tau: torque there;
-    speeds, torques: root mean square and standard deviation, (n,); work: of all torques.
-    """
+    """Findings about the prepared samples."""
 
     ranges: dict[str, list[tuple[float, float]]]
+    """Smallest and largest value by quantity and joint."""
     noise: list[float]
-    left: Array
+    """White noise of each joint's torque, N·m."""
+    residuals: Array
+    """Standard deviation of the torque that motion does not explain, (n,) N·m."""
     speeds: Array
+    """Root mean square of the velocity, (n,)."""
     torques: Array
+    """Standard deviation of the torque, (n,)."""
     lags: list[schema.Lag]
     excitation: list[schema.JointExcitation]
     motion: tuple[Array, Array, Array]
+    """q, dq and ddq at a subset of rows, (R, n) each."""
     tau: Array
+    """Torque at these rows, (R, n)."""
     work: TorqueWork
 
 
-def _look_at_raw(raw: Staged, clock: RecordedTimes, limits: Limits | None) -> _Recorded:
+def _analyse_raw(raw: Staged, times: RecordedTimes, limits: Limits | None) -> _Recorded:
     out = _Recorded([], [], [])
-    some_missing = bool(clock.missing.any())
+    some_missing = bool(times.missing.any())
     for joint, name in enumerate(raw.joint_names):
         columns = raw.joint(joint)
-        noise = {each: white_noise(columns[each], clock.part, robust=True) for each in ("tau", "dq") if each in columns}
-        smooth = smoothed(columns["tau"], clock.part, noise["tau"])
+        noise = {each: white_noise(columns[each], times.part, robust=True) for each in ("tau", "dq") if each in columns}
+        smooth = is_smoothed(columns["tau"], times.part, noise["tau"])
         if some_missing:
-            columns = {each: values[~clock.missing] for each, values in columns.items()}
-        out.limits.append(against_limits(joint, name, columns, limits))
-        out.saturation.append(saturation(joint, name, columns["q"], columns["tau"], limits))
+            columns = {each: values[~times.missing] for each, values in columns.items()}
+        out.limits.append(compare_with_limits(joint, name, columns, limits))
+        out.saturation.append(detect_saturation(joint, name, columns["q"], columns["tau"], limits))
         torque, velocity = None if smooth else noise["tau"], noise.get("dq")
         out.noise.append(
             schema.JointNoise(
@@ -174,50 +185,50 @@ def _share(level: float | None, values: Array) -> float | None:
     return None if level is None or wide == 0 else level / wide
 
 
-def _look_at_samples(prepared: Prepared, limits: Limits | None) -> _Samples:
+def _analyse_samples(prepared: Prepared, limits: Limits | None) -> _Samples:
     staged, rate = prepared.staged, prepared.rate_hz
     part = number_parts(staged.rows, [np.diff(staged.read(EPISODE)) != 0])
     starts, ends = bounds(part)
     steps = None if rate is None else shifts(rate, int((ends - starts).max()))
-    # figures on several joints together are taken over a few rows
+    # figures on several joints use a subset of rows
     rows = thin(part, 2000, 0 if steps is None else int(steps[-1]))
     motion = (staged.table("q", rows), staged.table("dq", rows), staged.table("ddq", rows))
     tau = staged.table("tau", rows)
     fit = make_fit(rows, *motion, tau=tau, independent=_independent(prepared))
     lags = None if steps is None or rate is None else Lags(fit, steps, rate)
     ranges: dict[str, list[tuple[float, float]]] = {quantity: [] for quantity in QUANTITIES}
-    levels, left, speeds, torques = np.empty((4, staged.n_joints))
+    levels, residuals, speeds, torques = np.empty((4, staged.n_joints))
     joint_lags, excitation, power = [], [], np.zeros(staged.rows)
     for joint, name in enumerate(staged.joint_names):
         columns = {quantity: staged.read(column(quantity, joint)) for quantity in QUANTITIES}
         for quantity, values in columns.items():
             ranges[quantity].append((float(values.min()), float(values.max())))
-        levels[joint] = noise_or_share(columns["tau"], part)
+        levels[joint] = noise_or_default(columns["tau"], part)
         power += columns["tau"] * columns["dq"]
         speeds[joint], torques[joint] = np.sqrt(np.mean(columns["dq"] ** 2)), columns["tau"].std()
         if lags is None:
-            left[joint] = np.sqrt(np.mean(fit.residuals(columns["tau"][rows, None]) ** 2))
+            residuals[joint] = np.sqrt(np.mean(fit.residuals(columns["tau"][rows, None]) ** 2))
         else:
-            lag, left[joint] = lags.of_joint(name, columns["tau"])
+            lag, residuals[joint] = lags.estimate_joint(name, columns["tau"])
             joint_lags.append(lag)
-        excitation.append(joint_excitation(joint, name, columns, part, fit, float(left[joint]), limits))
+        excitation.append(joint_excitation(joint, name, columns, part, fit, float(residuals[joint]), limits))
     if lags is None:
-        why = "no times were given" if rate is None else "the contiguous parts are too short"
-        joint_lags = no_lags(staged.joint_names, why)
+        why = texts.NO_TIMES if rate is None else texts.SHORT_PARTS
+        joint_lags = unknown_lags(staged.joint_names, why)
     else:
-        joint_lags.insert(0, lags.of_all())
+        joint_lags.insert(0, lags.combine())
         for joint, name in enumerate(staged.joint_names):
             torque = staged.read(column("tau", joint))
             for lag in (joint_lags[0], joint_lags[joint + 1]):
-                if clear(lag) and lags.lowers(torque, lag.seconds or 0.0):
+                if is_nonzero(lag) and lags.lowers_error(torque, lag.seconds or 0.0):
                     lag.improves.append(name)
     return _Samples(
-        ranges, levels.tolist(), left, speeds, torques, joint_lags, excitation, motion, tau, TorqueWork.of(power)
+        ranges, levels.tolist(), residuals, speeds, torques, joint_lags, excitation, motion, tau, TorqueWork.of(power)
     )
 
 
 def _independent(prepared: Prepared) -> float:
-    """Samples that count as independent: after a low-pass two a period of its cut-off, else all."""
+    """Return the effective samples: two per period of the low-pass cut-off, without a low-pass all."""
     samples = float(prepared.staged.rows)
     if prepared.cutoff_hz is None or prepared.rate_hz is None:
         return samples
@@ -231,18 +242,18 @@ def _rigid_bodies(
         return None
     names, independent = prepared.staged.joint_names, _independent(prepared)
     return judge_rigid_bodies(
-        profile.urdf, profile.name, names, limits, samples.motion, samples.tau, samples.left, independent, gravity
+        profile.urdf, profile.name, names, limits, samples.motion, samples.tau, samples.residuals, independent, gravity
     )
 
 
 def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> schema.Excitation:
-    """What motion alone says, and instead of its judgement of friction that beside rigid bodies where there are any."""
+    """Return the excitation; rigid bodies, if known, replace the judgement of friction by motion alone."""
     if not isinstance(rigid, RigidExcitation):
         out = schema.Excitation(friction_beside="any motion", joints=samples.excitation, whole=None, text="")
     else:
         joints = [
             each.model_copy(
-                update=weights(friction, speed, torque, min(each.forwards, each.backwards) < FRICTION.seldom)
+                update=judge_friction(friction, speed, torque, min(each.forwards, each.backwards) < FRICTION.seldom)
             )
             for each, friction, speed, torque in zip(
                 samples.excitation, rigid.friction, samples.speeds, samples.torques, strict=True
@@ -252,33 +263,33 @@ def _excitation(samples: _Samples, rigid: RigidExcitation | str | None) -> schem
     dq = samples.motion[1]
     out.standstill = float(np.mean(np.all(np.abs(dq) < SIGN_WIDTH, axis=1)))
     out.motion_dimensions = motion_dimensions(dq)
-    out.text = in_words(out)
+    out.text = describe_excitation(out)
     return out
 
 
-def _against_robot(
+def _compare_with_robot(
     robot: Profile | None, upload: Upload, signals: Signals, samples: _Samples, excitation: schema.Excitation
 ) -> tuple[schema.AgainstRobot | None, list[schema.Remedy]]:
-    """Torque against that of the robot, given or suggested by the joints' names; and what is wrong."""
+    """Compare torque with that of the robot, named or suggested by the joint names, and find faults."""
     bodies = None if robot is None else bodies_of(robot, upload.names)
-    against = None if bodies is None else compare(bodies, signals)
-    wrong = causes(upload, bodies, against, signals, excitation.joints, samples.work)
-    return None if bodies is None or against is None else _figures(bodies, against), wrong
+    comparison = None if bodies is None else compare(bodies, signals)
+    faults = find_faults(upload, bodies, comparison, signals, excitation.joints, samples.work)
+    return None if bodies is None or comparison is None else _show(bodies, comparison), faults
 
 
-def _figures(bodies: Bodies, against: Against) -> schema.AgainstRobot:
+def _show(bodies: Bodies, comparison: Comparison) -> schema.AgainstRobot:
     joints = []
     for joint, name in enumerate(bodies.names):
-        # else a factor of it is one of rounding
-        visible_parts = [bool(visible > 1e-3) for visible in against.visible[joint]]
+        # a factor of an invisible part would be rounding noise
+        visible_parts = [bool(visible > 1e-3) for visible in comparison.visible[joint]]
         joints.append(
             schema.JointAgainstRobot(
                 joint=name,
-                gravity=finite(against.gravity[joint]) if visible_parts[0] else None,
-                gravity_std=finite(against.gravity_std[joint]) if visible_parts[0] else None,
-                inertia=finite(against.inertia[joint]) if visible_parts[1] else None,
-                inertia_std=finite(against.inertia_std[joint]) if visible_parts[1] else None,
-                explained=float(against.explained[joint]),
+                gravity=finite_or_none(comparison.gravity[joint]) if visible_parts[0] else None,
+                gravity_std=finite_or_none(comparison.gravity_std[joint]) if visible_parts[0] else None,
+                inertia=finite_or_none(comparison.inertia[joint]) if visible_parts[1] else None,
+                inertia_std=finite_or_none(comparison.inertia_std[joint]) if visible_parts[1] else None,
+                explained=float(comparison.explained[joint]),
             )
         )
     return schema.AgainstRobot(robot=bodies.name, joints=joints)

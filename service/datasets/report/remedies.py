@@ -1,4 +1,4 @@
-"""What an upload was read as, and the options that put right what is wrong with it."""
+"""How an upload was read, and the options that correct its faults."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ import numpy as np
 
 from lipcore.profiles import profile
 from service.contract.datasets import Cause, Remedy
-from service.datasets.mapping.choice import listed as numbers
+from service.datasets.mapping.choice import format_numbers as numbers
+from service.datasets.report.texts import with_upload
 
 
 @dataclass(frozen=True)
 class Upload:
-    """What a recording was read as.
-
-    names: of the data's joints; gravity: whether torques are to contain it; source: what the columns were taken as, see
-    `reading.read`, None where nothing is known.
-    """
+    """How a recording was read."""
 
     names: tuple[str, ...]
+    """Joints of the data."""
     gravity: bool
+    """Whether torques were read as torques with gravity."""
     source: Mapping[str, Any] | None
+    """How the columns were read, as in `Recording.facts`; None if unknown."""
 
     @property
     def n_joints(self) -> int:
@@ -34,40 +34,45 @@ class Upload:
 
     @property
     def effort(self) -> str | None:
-        """What the torque was taken as."""
+        """What the torque column was read as, see `Effort`."""
         return None if self.source is None else self.source["effort"]
 
-    def factors(self, by: Sequence[float]) -> dict[str, str]:
-        """Options that multiply the torques once more, by (n,)."""
+    def scaled_torque(self, by: Sequence[float]) -> dict[str, str]:
+        """Return options that multiply the torques by further factors (n,)."""
         before = (self.source or {}).get("torque_factors") or [1.0] * self.n_joints
         return {"torque_factors": _joined([a * b for a, b in zip(before, by, strict=True)])}
 
-    def constants(self, by: Sequence[float]) -> dict[str, str]:
-        """Options that take the torques for currents of these constants (n,), N·m/A, times the upload's if any."""
+    def torque_constants(self, by: Sequence[float]) -> dict[str, str]:
+        """Return options that read the torques as motor currents.
+
+        by: torque constants (n,), N·m/A, which the constants of the upload, if any, are multiplied by.
+        """
         before = (self.source or {}).get("torque_constants") or [1.0] * self.n_joints
         return {"effort": "current", "torque_constants": _joined([a * b for a, b in zip(before, by, strict=True)])}
 
     def robot(self, name: str) -> dict[str, str]:
-        """Options that name a robot, and keep measured torque for what it is where the robot's drivers give others."""
+        """Return options that name a robot, and keep measured torque if the robot's default is another effort."""
         other = self.effort == "measured" and profile(name).effort in ("current", "commanded")
         return {"robot": name, **({"effort": "measured"} if other else {})}
 
     def torque_columns(self, column: Sequence[int]) -> dict[str, str] | None:
-        """Options that read the torque of joint j from the column that joint column[j] has, (n,); None where joints
-        were left out."""
+        """Return options that read torque from other columns, or None if joints were left out.
+
+        column: for each joint, the joint whose column has its torque, (n,).
+        """
         if self.source is None or self.source["dropped_joints"]:
             return None
         names = self.source["columns"]["tau"]
         return {"columns": json.dumps({"tau": self._in_file([str(names[k]) for k in column])}, ensure_ascii=False)}
 
     def joint_names(self, names: Sequence[str]) -> dict[str, str] | None:
-        """Options that call the joints so, (n,); None where joints were left out."""
+        """Return options that rename the joints, (n,), or None if joints were left out."""
         if self.source is None or self.source["dropped_joints"]:
             return None
         return {"joint_names": ",".join(self._in_file(names))}
 
     def _in_file(self, values: Sequence[str]) -> list[str]:
-        """Values of the joints in the file's order."""
+        """Return values of the joints in the file's order."""
         assert self.source is not None
         return [values[joint] for joint in np.argsort(self.source["places"])]
 
@@ -76,15 +81,21 @@ def _joined(values: Sequence[float]) -> str:
     return numbers(values).replace(" ", "")
 
 
-def remedy(cause: Cause, joints: Sequence[str], text: str, options: dict[str, str] | None = None) -> Remedy:
-    """A cause in words, with the options as the command line takes them."""
+def make_remedy(
+    cause: Cause,
+    joints: Sequence[str],
+    text: str,
+    options: dict[str, str] | None = None,
+    only_if: str | None = None,
+) -> Remedy:
+    """Return a fault with its correction, options as on the command line. only_if: condition of the correction."""
     if options is not None:
-        text += f": upload it with `{flags(options)}`"
+        text = with_upload(text, format_flags(options), only_if)
     return Remedy(cause=cause, joints=list(joints), text=text, options=options)
 
 
-def flags(options: Mapping[str, str]) -> str:
-    """Options of an upload as the command line takes them."""
+def format_flags(options: Mapping[str, str]) -> str:
+    """Format options of an upload for the command line."""
     out = []
     for name, value in options.items():
         if name == "columns":

@@ -1,5 +1,4 @@
-"""When samples were taken, and one joint's signals: against what its robot can do, signs that its torque was cut off,
-and their white noise."""
+"""Times of a recording, and signals of one joint: limits, saturation and white noise."""
 
 from __future__ import annotations
 
@@ -20,9 +19,9 @@ Rows = NDArray[np.int64]
 
 
 def number_parts(rows: int, breaks: list[NDArray[np.bool_]]) -> Rows:
-    """Number of the part that each row belongs to, from 0, (rows,).
+    """Return the part of each row, numbered from 0, (rows,).
 
-    breaks: (rows - 1,) each, true where a row does not follow the one before.
+    breaks: (rows - 1,) each, true if a row does not follow the one before.
     """
     part = np.zeros(rows, np.int64)
     if rows > 1 and breaks:
@@ -31,33 +30,33 @@ def number_parts(rows: int, breaks: list[NDArray[np.bool_]]) -> Rows:
 
 
 def bounds(part: Rows) -> tuple[Rows, Rows]:
-    """First rows of the parts, and the rows after their last ones, (P,) each."""
+    """Return the first row of each part and the row after its last one, (P,) each."""
     if len(part) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     changes = np.flatnonzero(np.diff(part)) + 1
     return np.concatenate([[0], changes]), np.concatenate([changes, [len(part)]])
 
 
-def thin(part: Rows, most: int, margin: int = 0) -> Rows:
-    """At most `most` rows, evenly spread over all that are `margin` rows and more from either end of their part."""
+def thin(part: Rows, max_rows: int, margin: int = 0) -> Rows:
+    """Return at most `max_rows` rows, evenly spread, at least `margin` rows from both ends of their part."""
     starts, ends = bounds(part)
     starts, inner = starts + margin, np.maximum(0, ends - starts - 2 * margin)
     before = np.concatenate([[0], np.cumsum(inner)])
     total = int(before[-1])
     if total == 0:
         return np.zeros(0, np.int64)
-    chosen = np.arange(total) if total <= most else np.linspace(0, total - 1, most).astype(np.int64)
+    chosen = np.arange(total) if total <= max_rows else np.linspace(0, total - 1, max_rows).astype(np.int64)
     home = np.searchsorted(before, chosen, side="right") - 1
     return np.asarray(starts[home] + chosen - before[home], np.int64)
 
 
-def finite(value: float | np.floating) -> float | None:
-    """A number for JSON: None where it is infinite or none."""
+def finite_or_none(value: float | np.floating) -> float | None:
+    """Return a number for JSON, None if it is infinite or NaN."""
     return float(value) if np.isfinite(value) else None
 
 
 def spread(values: Array) -> float:
-    """Standard deviation, 0 where there are no values."""
+    """Return the standard deviation, 0 if there are no values."""
     return float(values.std()) if len(values) else 0.0
 
 
@@ -65,7 +64,7 @@ def spread(values: Array) -> float:
 class RecordedTimes:
     """Times of a raw recording.
 
-    part: number of the contiguous part that each row belongs to, (N,); missing: rows that lack a value, (N,).
+    part: number of each row's contiguous part, (N,); missing: whether a row lacks a value, (N,).
     """
 
     timing: Timing
@@ -73,10 +72,10 @@ class RecordedTimes:
     missing: NDArray[np.bool_]
 
 
-def look_at_clock(raw: Staged, gap_steps: float, repeated: int) -> RecordedTimes:
-    """Judge the times of a raw recording.
+def analyse_times(raw: Staged, gap_steps: float, repeated: int) -> RecordedTimes:
+    """Analyse the times of a raw recording.
 
-    gap_steps: a step of time longer than so many usual ones is a gap; repeated: stamps left out while it was read.
+    gap_steps: a longer time step, in median steps, is a gap; repeated: time stamps dropped while reading.
     """
     missing = raw.missing()
     breaks = [missing[1:] | missing[:-1]]
@@ -87,7 +86,7 @@ def look_at_clock(raw: Staged, gap_steps: float, repeated: int) -> RecordedTimes
     t = raw.read(TIME)
     steps = np.diff(t)
     inside = ~np.logical_or.reduce(breaks) & np.isfinite(steps)
-    inside &= steps > 0  # rows that repeat a stamp are counted by whoever leaves them out
+    inside &= steps > 0  # rows with a repeated time stamp are counted in `repeated`
     usual = float(np.median(steps[inside])) if inside.any() else 0.0
     if usual <= 0:
         return RecordedTimes(_without_times(int(missing.sum())), number_parts(raw.rows, breaks), missing)
@@ -98,17 +97,17 @@ def look_at_clock(raw: Staged, gap_steps: float, repeated: int) -> RecordedTimes
     timing = Timing(
         rate_hz=1 / usual,
         duration_s=float(steps[even].sum()),
-        jitter_p50=finite(middle),
-        jitter_p99=finite(far),
+        jitter_p50=finite_or_none(middle),
+        jitter_p99=finite_or_none(far),
         jitter_max=float(deviation.max()) if len(deviation) else None,
-        gaps=_longest(t, steps, np.flatnonzero(gap)),
+        gaps=_longest_gaps(t, steps, np.flatnonzero(gap)),
         repeated_stamps=repeated,
         missing_rows=int(missing.sum()),
     )
     return RecordedTimes(timing, number_parts(raw.rows, [*breaks, gap]), missing)
 
 
-def _longest(t: Array, steps: Array, gaps: NDArray[np.intp]) -> list[Gap]:
+def _longest_gaps(t: Array, steps: Array, gaps: NDArray[np.intp]) -> list[Gap]:
     longest = np.sort(gaps[np.argsort(-steps[gaps], kind="stable")[:20]])
     return [Gap(t=float(t[row]), seconds=float(steps[row])) for row in longest]
 
@@ -128,14 +127,14 @@ def _without_times(missing: int) -> Timing:
 
 @dataclass(frozen=True)
 class SaturationOptions:
-    """When a torque counts as cut off."""
+    """Thresholds of a saturated torque."""
 
     at_limit: float = 0.99
-    """Share of the torque limit from which on a torque counts as saturated."""
+    """Share of the torque limit above which a torque counts as saturated."""
     min_run: int = 5
-    """Equal extreme torques in a row, while the joint moves, that are no chance."""
+    """Min equal extreme torques in a row, while the joint moves, that count as clipped."""
     rounding: float = 1e-9
-    """Share of the span that counts as equal to the largest value: rounding of a text file."""
+    """Difference from the largest value, as a share of the span, that counts as equal: rounding of a text file."""
 
 
 SATURATION = SaturationOptions()
@@ -143,10 +142,10 @@ SATURATION = SaturationOptions()
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the recording's n joints, (n,) each, NaN where unknown, as of a joint that is none of the robot's.
+    """Limits of the recording's n joints, (n,) each, NaN if unknown.
 
-    urdf_joints: what the profile calls these joints, None where one is not its; by_order: whether the joints were taken
-    in the profile's order, as their names say nothing.
+    urdf_joints: the profile's names of these joints, None if it lacks one; by_order: whether joints were matched by
+    order, because no name matches.
     """
 
     joint_types: tuple[JointType, ...]
@@ -159,7 +158,7 @@ class Limits:
 
 
 def limits_of(profile: Profile | None, names: tuple[str, ...]) -> Limits | None:
-    """Limits for a recording with these joints; None without a profile, or where none of its joints is among them."""
+    """Return limits for a recording with these joints, None without a profile or without a joint that matches."""
     if profile is None:
         return None
     matched = profile.match(names)
@@ -186,8 +185,8 @@ def limits_of(profile: Profile | None, names: tuple[str, ...]) -> Limits | None:
     )
 
 
-def against_limits(joint: int, name: str, columns: dict[str, Array], limits: Limits | None) -> JointLimits:
-    """Compare one joint's columns by quantity, values missing ones left out, with its robot's limits."""
+def compare_with_limits(joint: int, name: str, columns: dict[str, Array], limits: Limits | None) -> JointLimits:
+    """Compare one joint with its limits. columns: by quantity, without missing values."""
     lower, upper, speed, torque = (
         (np.nan,) * 4
         if limits is None
@@ -198,8 +197,8 @@ def against_limits(joint: int, name: str, columns: dict[str, Array], limits: Lim
     if np.isfinite(upper) and len(q):
         range_used = float(np.ptp(q)) / (upper - lower)
         beyond_range = float(np.mean((q < lower) | (q > upper)))
-    speed_used, beyond_speed = _against(dq, speed)
-    torque_used, beyond_torque = _against(tau, torque)
+    speed_used, beyond_speed = _relate_to_limit(dq, speed)
+    torque_used, beyond_torque = _relate_to_limit(tau, torque)
     return JointLimits(
         joint=name,
         range_used=range_used,
@@ -211,40 +210,40 @@ def against_limits(joint: int, name: str, columns: dict[str, Array], limits: Lim
     )
 
 
-def saturation(joint: int, name: str, q: Array, tau: Array, limits: Limits | None) -> JointSaturation:
-    """Look for flat tops of one joint's torque; q, tau: (N,), values missing ones left out."""
+def detect_saturation(joint: int, name: str, q: Array, tau: Array, limits: Limits | None) -> JointSaturation:
+    """Detect flat tops of one joint's torque; q, tau: (N,), without missing values."""
     limit = np.nan if limits is None else float(limits.torque[joint])
     at_limit = float(np.mean(np.abs(tau) >= SATURATION.at_limit * limit)) if np.isfinite(limit) and len(tau) else None
     span = float(np.ptp(tau)) if len(tau) else 0.0
     if span == 0:
         return JointSaturation(joint=name, at_largest=0.0, flat=0.0, at_limit=at_limit)
     top, bottom = tau >= tau.max() - SATURATION.rounding * span, tau <= tau.min() + SATURATION.rounding * span
-    # a robot that stands still holds its torque: only what stays equal while the position changes was cut off
+    # at rest, torque is constant anyway: only torque that stays equal while the position changes is clipped
     moved = np.concatenate([[True], np.diff(q) != 0])
-    flat = _in_runs(top & moved) + _in_runs(bottom & moved)
+    flat = _count_in_runs(top & moved) + _count_in_runs(bottom & moved)
     return JointSaturation(joint=name, at_largest=float(np.mean(top | bottom)), flat=flat / len(tau), at_limit=at_limit)
 
 
-def _against(values: Array, limit: float) -> tuple[float | None, float | None]:
-    """Largest magnitude over a limit, and the share beyond it; None where it is not known."""
+def _relate_to_limit(values: Array, limit: float) -> tuple[float | None, float | None]:
+    """Return the largest magnitude divided by a limit, and the share beyond the limit; None if unknown."""
     if not np.isfinite(limit) or len(values) == 0:
         return None, None
     size = np.abs(values)
     return float(size.max()) / limit, float(np.mean(size > limit))
 
 
-def _in_runs(mask: np.ndarray) -> int:
-    """Rows of a mask (N,) that are part of runs of SATURATION.min_run and more."""
+def _count_in_runs(mask: np.ndarray) -> int:
+    """Count the rows of a mask (N,) in runs of at least SATURATION.min_run."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
     lengths = edges[1::2] - edges[::2]
     return int(lengths[lengths >= SATURATION.min_run].sum())
 
 
 def white_noise(values: Array, part: Rows, robust: bool = False) -> float | None:
-    """Standard deviation of the white noise on smooth signals; None where the parts are too short to tell.
+    """Return the standard deviation of the white noise on smooth signals, None if the parts are too short.
 
-    values: (N,), missing ones NaN; part: number of the part of each row, ascending, (N,). A missing value has to be a
-    part of its own. robust: by the median of the differences, so that jumps, as of Coulomb friction, count for nothing.
+    values: (N,), NaN if missing; part: part of each row, ascending, (N,); a missing value is a part of its own.
+    robust: use the median of the differences, which jumps, as of Coulomb friction, do not affect.
     """
     levels: list[float] = []
     difference = values
@@ -254,32 +253,32 @@ def white_noise(values: Array, part: Rows, robust: bool = False) -> float | None
             continue
         within = difference[part[order:] == part[:-order]]
         if len(within) > 2 * order:
-            levels.append(_size(within, robust) / comb(2 * order, order) ** 0.5)
+            levels.append(_noise_level(within, robust) / comb(2 * order, order) ** 0.5)
     return min(levels) if levels else None
 
 
 @dataclass(frozen=True)
 class SmoothingOptions:
-    """When the noise of a torque counts as filtered out, by the spectra of pieces of the signal."""
+    """Thresholds of filtered torque noise, by the spectra of pieces of the signal."""
 
     rows: int = 128
     """Rows of a piece."""
     max_pieces: int = 200
     """Max pieces."""
     max_top: float = 0.02
-    """Power at the top of the spectrum over that in its middle, below which there is a filter of two poles or more:
-    white noise has 1, one pole 0.2, and so have jumps, as of friction."""
+    """Ratio of power at the top of the spectrum to that in its middle, below which the signal was filtered with at
+    least two poles. White noise has 1; one pole, or jumps as of friction, have 0.2."""
     min_noise: float = 1e-6
-    """Noise over the spread below which it is that of numbers."""
+    """Ratio of noise to the signal's standard deviation below which there is only rounding."""
 
 
 SMOOTHING = SmoothingOptions()
 
 
-def smoothed(values: Array, part: Rows, level: float | None) -> bool:
-    """Whether a torque's noise was filtered out before it was recorded, so that its level tells nothing.
+def is_smoothed(values: Array, part: Rows, level: float | None) -> bool:
+    """Return whether a torque's noise was filtered out before recording, so that its level means nothing.
 
-    values: (N,), missing ones NaN; part: of each row, as in `white_noise`; level: what that says.
+    values: (N,), NaN if missing; part: as in `white_noise`; level: the result of `white_noise`.
     """
     wide = spread(values[np.isfinite(values)])
     if level is None or wide == 0:
@@ -300,8 +299,8 @@ def smoothed(values: Array, part: Rows, level: float | None) -> bool:
     return bool(top.mean() < SMOOTHING.max_top * middle.mean())
 
 
-def _size(differences: Array, robust: bool) -> float:
-    """Their root mean square, or what it would be by their median; coarse signals mostly have none that is not 0."""
+def _noise_level(differences: Array, robust: bool) -> float:
+    """Return the root mean square, or its estimate by the median unless that is 0, as of coarse signals."""
     if robust:
         some = differences[:: max(1, len(differences) // 200_000)]  # enough for a median
         middle = 1.4826 * float(np.median(np.abs(some)))  # the factor of normal noise
@@ -310,7 +309,7 @@ def _size(differences: Array, robust: bool) -> float:
     return float(np.sqrt(np.dot(differences, differences) / len(differences)))
 
 
-def noise_or_share(values: Array, part: Rows) -> float:
-    """The same, a tenth of the spread where the parts are too short: equal to `noise_level`."""
+def noise_or_default(values: Array, part: Rows) -> float:
+    """Return `white_noise`, or a tenth of the standard deviation if the parts are too short, as `noise_level` does."""
     level = white_noise(values, part)
     return 0.1 * float(values.std()) if level is None else level

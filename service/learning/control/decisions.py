@@ -46,8 +46,10 @@ def find_learnt(session: Session, model: str, stream_id: str, sequence: int) -> 
     """Return the batch with exactly this sequence; raise NotFoundError, or ConflictError if it was undone."""
     batch = status.find_batch(session, model, stream_id, sequence)
     if batch.sequence != sequence:
-        together = f"{batch.sequence}: frames {batch.sequence} to {batch.last_sequence} were logged together"
-        raise invalid_request("sequence", sequence, together)
+        message = (
+            f"Frames {batch.sequence} to {batch.last_sequence} were logged together: use sequence {batch.sequence}."
+        )
+        raise invalid_request("sequence", sequence, str(batch.sequence), message)
     if batch.void:
         raise ConflictError(f"batch {sequence} of stream {stream_id!r} {UNDONE_TEXTS[read_state(session, batch)]}")
     return batch
@@ -77,7 +79,7 @@ def _check_fold(session: Session, model: str, version: int, batch: EventRow) -> 
         name = f"batch {batch.sequence} of stream {batch.stream_id!r}"
         raise ConflictError(
             f"{name} can no longer be unlearnt: the log does not reach back to a stored state without it. Roll back to "
-            "an earlier revision, or train the model anew"
+            "an earlier revision, or retrain the model"
         )
 
 
@@ -106,7 +108,8 @@ def rollback(learners: Learners, model: str, request: schema.RollbackRequest) ->
     """
     if (request.revision is None) == (request.version is None):
         given = "neither" if request.revision is None else "both"
-        raise invalid_request("revision or version", given, "exactly one of the two")
+        message = f"Expected either `revision` or `version`, got {given}."
+        raise invalid_request("revision or version", given, "exactly one of the two", message)
     if request.version is not None:
         return _to_version(learners, model, request.version)
     assert request.revision is not None
@@ -119,7 +122,7 @@ def _to_revision(learners: Learners, model: str, revision: int) -> schema.Rolled
     with learners.turn(model), learners.database.transaction(model) as session:
         newest = status.read_newest_revision(session, model, version)
         if revision >= newest:
-            raise invalid_request("revision", revision, f"one below {newest}, the newest of version {version}")
+            raise invalid_request("revision", revision, f"less than {newest}, the newest of version {version}")
         _check_reach(revision, version, status.list_reachable(session, model, version))
         to = log.start_of(session, model, version) + revision
         undone = select(func.count()).where(
@@ -146,15 +149,15 @@ def _check_reach(revision: int, version: int, ranges: list[status.Range]) -> Non
     oldest = next((first for first, last in ranges if last > 0), 0)
     listed = ", ".join(str(first) if first == last else f"{first} to {last}" for first, last in ranges)
     raise ConflictError(
-        f"revision {revision} of version {version} cannot be made again: no snapshot is as old and the log does not "
-        f"reach back, or a rollback has undone it. The oldest that can, but for 0 as trained, is {oldest}",
+        f"revision {revision} of version {version} cannot be restored: its snapshots and log are no longer kept, or a "
+        f"rollback has undone it. Apart from 0, as trained, the oldest revision that can be restored is {oldest}",
         [problem("revision", revision, f"one of {listed}")],
     )
 
 
 def _to_version(learners: Learners, model: str, version: int) -> schema.RolledBack:
     if version == find_serving_version(learners.database, model):
-        raise ConflictError(f"version {version} of model {model!r} serves already")
+        raise ConflictError(f"version {version} of model {model!r} is already the serving version")
     learners.loaded.get(model, version)  # load first: no request waits for it, and it fails before the change
     with learners.database.transaction() as session:
         manifest = session.get_one(VersionRow, (model, version)).manifest
@@ -285,15 +288,15 @@ def _refusal(session: Session, batch: EventRow, codes: Collection[str]) -> Excep
     counts = rows.take(_complete(rows)).rejected()
     offered = [code for code in schema.REPLAYABLE if code in counts]
     if done := [code for code in offered if code in codes and code in _replayed(session, batch)]:
-        return ConflictError(f"rows of {name} with the code {', '.join(done)} have been replayed: they are learnt once")
-    has = f"those of {name} whose rows can be learnt: {', '.join(offered) or 'there are none'}"
+        return ConflictError(f"rows of {name} with the code {', '.join(done)} have already been replayed")
+    has = f"codes of rows of {name} that can be learnt: {', '.join(offered) or 'there are none'}"
     return invalid_request("codes", ", ".join(codes), has)
 
 
 def _read_pause(session: Session, model: str) -> dict[str, Any]:
     held = owner.read_pause(session, model)
     if held is None:
-        raise ConflictError(f"model {model!r} is not held for a change: there is nothing to decide")
+        raise ConflictError(f"learning of model {model!r} is not paused: there is nothing to decide")
     return held
 
 

@@ -56,9 +56,9 @@ def read_payloads(learners: Learners, model: str) -> Payloads:
         default = None if held is None else _payload_body(held.estimate, tip)
     reason = None
     if carrier is None:
-        reason = f"estimator {served.model.estimator.name} knows no arm: train rigid-body or auto"
+        reason = f"estimator {served.model.estimator.name} has no arm: train with rigid-body or auto"
     elif not watched:
-        reason = "the option `payloads` of learning is switched off"
+        reason = "the learning option `payloads` is off"
     return Payloads(
         model=model,
         version=served.version,
@@ -89,7 +89,8 @@ def declare(learners: Learners, model: str, request: PayloadRequest) -> Payloads
         with np.errstate(over="raise", invalid="raise"):  # sums of huge numbers overflow
             Body(request.mass, np.array(request.com), inertia)
     except (ValueError, FloatingPointError) as error:
-        raise invalid_request("inertia", request.inertia, f"that of a body which can exist: {error}") from error
+        message = f"No body has this mass and inertia: {error}."
+        raise invalid_request("inertia", request.inertia, "the inertia of a possible body", message) from error
     known = {"mass": request.mass, "com": request.com, "inertia": request.inertia}
     return _declare(learners, model, request.stream_id, known)
 
@@ -103,15 +104,15 @@ def _declare(learners: Learners, model: str, stream_id: str | None, known: dict[
     served = learners.loaded.get(model, None)
     if served.carrier is None:
         raise ConflictError(
-            f"version {served.version} of model {model!r}, estimator {served.model.estimator.name}, knows no arm that "
-            "could carry anything: train rigid-body or auto"
+            f"version {served.version} of model {model!r}, of estimator {served.model.estimator.name}, has no arm, so "
+            "it cannot have a payload: train with rigid-body or auto"
         )
     monitor = learners.monitor(model)
     with learners.turn(model):
         with learners.database.transaction(model) as session:
             source = None if stream_id is None else log.stream(session, model, stream_id)
             if stream_id is not None and source is None:
-                expected = "a stream whose observations have come, or no stream_id: then it holds for all"
+                expected = "a stream that has sent observations, or no stream_id to declare it for all streams"
                 raise NotFoundError(f"no stream {stream_id!r}", [problem("stream_id", stream_id, expected)])
             declared, received = {"stream_id": stream_id, "body": known}, time.time()
             event = log.append(session, model, "payload", declared, received)

@@ -152,7 +152,7 @@ def find_batch(session: Session, model: str, stream_id: str, sequence: int) -> E
         return event
     source = log.stream(session, model, stream_id)
     if source is not None and is_forgotten(source, sequence):
-        raise NotFoundError(f"batch {sequence} of stream {stream_id!r} is no longer kept, if it has come")
+        raise NotFoundError(f"batch {sequence} of stream {stream_id!r} is no longer in the log, if it was ever sent")
     raise not_found("batch", f"{sequence} of stream {stream_id}")
 
 

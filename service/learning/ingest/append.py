@@ -168,7 +168,7 @@ class ObservationLog:
                 with self.turn(monitor, model), self.database.transaction(model) as session:
                     monitor.streams.expire(session, model, time.time() - self.settings.observation_retention_s)
             except Exception as error:  # the batch is logged nevertheless
-                logger.error("the log of model %s was not brought within its limits", model, exc_info=error)
+                logger.error("could not delete old batches from the log of model %s", model, exc_info=error)
 
 
 def _judge_options(options: LearningOptions) -> JudgeOptions:

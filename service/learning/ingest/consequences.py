@@ -7,20 +7,12 @@ from sqlalchemy.orm import Session
 
 from lipcore.online.judging import Judgement
 from service.contract.observations import LearningOptions
-from service.foundation.text import percent
 from service.journal import undo
 from service.journal.alarms import raise_alarm
-from service.learning import owner
+from service.learning import owner, texts
 from service.models.loaded import ServedModel
 from service.storage import audit
 from service.storage.database import EventRow
-
-CONSEQUENCES = {
-    "hold": "nothing is learnt until its owner has decided",
-    "waits": "learning is held already, and none of this is learnt until its owner has decided",
-    "adapt": "a new regime begins, in which what was learnt before counts less",
-    "learn": "learning goes on as before",
-}
 
 
 def apply_judgement(
@@ -48,31 +40,22 @@ def _unlearn_stream(session: Session, event: EventRow) -> None:
 
 def raise_clock_alarm(session: Session, model: str, stream_id: str, leap: float) -> None:
     """Raise the alarm of a stream whose clock is ahead of its rows' arrival."""
-    message = (
-        f"the clock of stream {stream_id} has leapt {leap:.0f} s ahead of its rows' arrival. These rows wait: they are "
-        "logged with the code time_jump, and can be replayed. Set the clock back, or go on under another stream_id"
-    )
-    raise_alarm(session, model, "clock", message, {"stream_id": stream_id, "ahead_s": leap})
+    evidence = {"stream_id": stream_id, "ahead_s": leap}
+    raise_alarm(session, model, "clock", texts.describe_clock(stream_id, leap), evidence)
 
 
 def _alarm(session: Session, served: ServedModel, follows: str, judgement: Judgement, event: EventRow) -> None:
-    """Raise the alarm of a change, and pause learning if the owner is to decide. follows: a key of `CONSEQUENCES`."""
+    """Raise the alarm of a change, and pause learning if `follows`, a key of `texts.CONSEQUENCES`, is "hold"."""
     change, names = judgement.change, served.model.joint_names
     assert change is not None
     evidence = judgement.evidence(names) | {"stream_id": event.stream_id, "sequence": event.sequence}
     joints = ", ".join(names[joint] for joint in change.joints)
-    finding = f"does not fit what was learnt any more: {evidence['suspect']}?"
-    if judgement.departed is not None:
-        finding = (
-            f"has left what version {judgement.departed.version} was trained on, step by step ({evidence['cause']}):"
-        )
-    message = f"the torque of {joints} {finding} {CONSEQUENCES[follows]}"
     if judgement.opened is not None:
-        share = percent(judgement.opened.coverage.mean())
-        message = (
-            f"stream {event.stream_id} does not fit the model: {share} of its first second lies within the 95 % band; "
-            f"is it this robot, with the friction and the payload that were learnt? {CONSEQUENCES[follows]}"
-        )
+        message = texts.describe_opening(str(event.stream_id), float(judgement.opened.coverage.mean()), follows)
+    elif judgement.departed is not None:
+        message = texts.describe_departure(joints, judgement.departed.version, follows)
+    else:
+        message = texts.describe_change(joints, evidence["suspect"], follows)
     raise_alarm(session, served.name, "change", message, evidence)
     known = {"at": change.at, "event": event.number}
     if follows == "hold":

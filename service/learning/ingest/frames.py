@@ -141,7 +141,7 @@ def _check_repeated(session: Session, frames: Frames, old: NDArray[np.bool_]) ->
         for name in QUANTITIES:
             if not np.array_equal(getattr(frames, name)[place], getattr(rows, name)[there], equal_nan=True):
                 raise ConflictError(
-                    f"frame {sequence} of stream {frames.stream_id!r} has come before with another {name}: {REUSE_HINT}"
+                    f"frame {sequence} of stream {frames.stream_id!r} was sent before with another {name}: {REUSE_HINT}"
                 )
     assert event is not None
     start = log.start_of(session, frames.model, frames.served.version)
@@ -161,7 +161,8 @@ def _read_logged(session: Session, frames: Frames, sequence: int) -> tuple[Event
 
 def _sequence_error(frames: Frames, sequence: int) -> ConflictError:
     return ConflictError(
-        f"frame {sequence} of stream {frames.stream_id!r} comes after one of a higher sequence: sequences must rise"
+        f"frame {sequence} of stream {frames.stream_id!r} comes after one with a higher sequence: sequences must "
+        "increase"
     )
 
 

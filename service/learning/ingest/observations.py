@@ -37,7 +37,7 @@ from service.storage.database import EventRow, StreamRow
 
 MAX_ROWS = 5000
 """Max rows of one observation batch."""
-REUSE_HINT = "a sequence is used once, so a new run needs a stream_id of its own, or higher sequences"
+REUSE_HINT = "use another stream_id for a new run, or higher sequences"
 """Advice at the end of an error message."""
 
 
@@ -111,7 +111,7 @@ def _derive_accelerations(
     try:
         how = acceleration.Derivation.of(batch.t, log.find_adjacent_window(session, *key))
     except DerivationError as error:
-        raise invalid_request(error.field, error.value, error.expected) from error
+        raise invalid_request(error.field, error.value, error.expected, str(error)) from error
     before, after = (log.read_adjacent_rows(session, *key, way, 2 * how.half) for way in (-1, 1))
     found = acceleration.derive_rows(dated.rows, how, before, after, limits)
     derived = DerivedAcceleration(delay_s=how.delay_s, window=how.half, rate_hz=how.rate, carried=found.carried)
@@ -144,9 +144,11 @@ def validate_batch(request: ObservationRequest, model: TorqueModel) -> MeasuredR
     if rows > MAX_ROWS:
         raise invalid_request("q", f"{rows} rows", f"at most {MAX_ROWS} in one batch")
     if request.t is not None and request.t.shape != (rows,):
-        raise invalid_request("t", f"{len(request.t)} numbers long", f"{rows}, one a row of q")
+        message = f"`t` has {len(request.t)} values; `q` has {rows} rows."
+        raise invalid_request("t", f"{len(request.t)} values", f"{rows} values, one for each row", message)
     if request.t is None and request.ddq is None:
-        raise invalid_request("ddq", "missing, and t too", "accelerations, or times to derive them from dq with")
+        message = "`ddq` is required unless `t` is given."
+        raise invalid_request("ddq", "missing", "accelerations, or times `t` to derive them", message)
     order = slice(None) if request.joint_names is None else find_columns(request.joint_names, model.joint_names)
     q, dq, tau = (_ordered(values, order) for values in (request.q, request.dq, request.tau))
     return MeasuredRows(request.t, q, dq, None if request.ddq is None else _ordered(request.ddq, order), tau)
@@ -165,9 +167,12 @@ def find_columns(given: Sequence[str], joints: Sequence[str]) -> list[int]:
         if name not in joints:
             raise invalid_request(f"joint_names[{index}]", name, f"one of the model's joints: {', '.join(joints)}")
         if name in given[:index]:
-            raise invalid_request(f"joint_names[{index}]", name, "each joint once")
+            field = f"joint_names[{index}]"
+            raise invalid_request(field, name, "no joint twice", f"`{field}` repeats joint {name}.")
     if missing := [name for name in joints if name not in given]:
-        raise invalid_request("joint_names", f"without {', '.join(missing)}", "all of the model's joints")
+        lacking = ", ".join(missing)
+        message = f"`joint_names` lacks {lacking}."
+        raise invalid_request("joint_names", f"without {lacking}", "all of the model's joints", message)
     return [given.index(name) for name in joints]
 
 
@@ -198,7 +203,7 @@ def find_acknowledgement(
         return None
     if event.digest != content:
         name = f"batch {request.sequence} of stream {request.stream_id!r}"
-        raise ConflictError(f"{name} has come before with other content: {REUSE_HINT}")
+        raise ConflictError(f"{name} was sent before with other content: {REUSE_HINT}")
     return ObservationResponse.model_validate(
         {**(event.report or {}), "duplicate": True, "state": read_state(session, event)}
     )
@@ -208,8 +213,8 @@ def check_not_expired(source: StreamRow | None, sequence: int) -> None:
     """Raise ExpiredError if a batch that is not in the log may have been deleted from it."""
     if source is not None and is_forgotten(source, sequence):
         raise ExpiredError(
-            f"it is not known any more whether batch {sequence} of stream {source.stream_id!r} has come before: "
-            f"batches up to {source.forgotten} are no longer kept"
+            f"it is unknown whether batch {sequence} of stream {source.stream_id!r} was sent before: batches up to "
+            f"{source.forgotten} are no longer kept"
         )
 
 

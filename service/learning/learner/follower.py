@@ -172,7 +172,7 @@ class Follower:
             reason = translate_error(error)
             if reason is None:
                 raise
-            logger.warning("what version %d of model %s has learnt is not stored: %s", self.version, self.model, reason)
+            logger.warning("could not store the state of version %d of model %s: %s", self.version, self.model, reason)
             return
         self._stored = self.number
 

@@ -110,7 +110,7 @@ class Learner:
             with self.database.session() as session:
                 version = registry.serving_version(session, model)
         except Exception:  # a database error: the follower keeps its state
-            logger.exception("which version of model %r learns cannot be read: tried again", model)
+            logger.exception("could not read which version of model %r learns; retrying", model)
             self._unread[model] = time.monotonic() + MIN_PAUSE_S
             return
         self._unread.pop(model, None)
@@ -145,7 +145,7 @@ class Learner:
         try:
             follower.store()
         except Exception:  # the log still has everything
-            logger.exception("version %d of model %r could not be stored", key[1], key[0])
+            logger.exception("could not store the state of version %d of model %r", key[1], key[0])
 
     def _fail(self, key: Key, error: Exception) -> LearningFailure:
         logger.error("version %d of model %r cannot learn", key[1], key[0], exc_info=error)

@@ -194,7 +194,7 @@ class Feed(OpenCounter):
     positions: the last finite position of each model's robot, rad (m).
     """
 
-    too_many = "models are followed {} times, the most there may be: close one, or try again later"
+    too_many = "{} live views of models are open, the max: close one, or retry later"
     headers: ClassVar = {"Retry-After": "5"}
 
     def __init__(self) -> None:
@@ -302,7 +302,7 @@ class FollowedModel:
                 except NotFoundError:  # it was deleted
                     return
                 except Exception:  # a database error, which may be over at the next tick
-                    logger.exception("model %s, which is followed, could not be looked at", self.model)
+                    logger.exception("could not read the state of model %s for its live view", self.model)
                 with suppress(TimeoutError):
                     await asyncio.wait_for(closing.wait(), TICK_S)
         finally:

@@ -20,6 +20,7 @@ from service.foundation.errors import ServiceError
 from service.journal import log, undo
 from service.journal.alarms import raise_alarm
 from service.journal.arrivals import NewBatch
+from service.learning import texts
 from service.learning.ingest.monitor import Monitor
 from service.learning.weigher.messages import (
     MAX_STREAMS,
@@ -101,7 +102,9 @@ class Weighing:
             self._forget_sent(stream)  # the dropped batch may have carried the state
             if batch.received - self._behind_at >= MIN_ALARM_PAUSE_S:
                 self._behind_at = batch.received
-                text = "rows come faster than payloads are weighed: the oldest are passed over, now of %r of %s"
+                text = (
+                    "rows come faster than payloads are estimated: the oldest are skipped, now of stream %r of model %s"
+                )
                 logger.warning(text, batch.stream_id, served.name)
 
     def forget(self, model: str) -> None:
@@ -131,7 +134,7 @@ class Weighing:
         try:
             self._log_payload(monitor, served, message)
         except ServiceError as error:  # answers use the payload all the same, and the next batch's report contains it
-            logger.error("what stream %r of model %r carries is not logged: %s", stream_id, model, error)
+            logger.error("could not log the payload of stream %r of model %r: %s", stream_id, model, error)
 
     def _forget_sent(self, stream: Stream) -> None:
         """Mark a stream as not sent, so that its next rows carry its payload and posterior."""
@@ -177,7 +180,6 @@ class Weighing:
 def _describe_watch(stream_id: str, watch: PayloadTracker) -> tuple[str, dict[str, object]]:
     """Return the text of an alarm and its evidence."""
     if watch.held is None:
-        return f"stream {stream_id} has put its payload down", {}
+        return texts.describe_put_down(stream_id), {}
     mean, std = watch.held.estimate.mass
-    text = f"stream {stream_id} carries {mean:.2f} ± {std:.2f} kg more than it was trained with"
-    return text, {"mass": {"mean": mean, "std": std}}
+    return texts.describe_payload(stream_id, mean, std), {"mass": {"mean": mean, "std": std}}

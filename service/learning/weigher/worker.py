@@ -138,7 +138,7 @@ class Weigher:
             PayloadTracker(n).step(carrier, Rows(time_, q, dq, ddq, tau, np.zeros(WARM_UP_ROWS, np.uint8)))
             estimate(carrier, Rows(time_, q, dq, ddq, 1.1 * tau, np.zeros(WARM_UP_ROWS, np.uint8)).take(slice(0, 10)))
         except Exception:  # its streams raise the error again
-            logger.exception("version %d of model %s cannot be made ready for payloads", version, model)
+            logger.exception("could not prepare version %d of model %s for payloads", version, model)
 
     def follow(self, stream: Stream, given: Sequence[StreamRows]) -> Iterator[Message]:
         """Follow rows of a stream and yield its payload if it has changed."""
@@ -152,11 +152,11 @@ class Weigher:
             followed.watch = followed.watch.step(followed.carrier, rows)
             followed.received = given[-1].received
         except np.linalg.LinAlgError as error:  # of rows that no arm explains
-            logger.error("the payload of stream %r of model %s is watched anew: %s", stream[2], stream[0], error)
+            logger.error("the payload estimate of stream %r of model %s starts again: %s", stream[2], stream[0], error)
             self._streams.pop(stream, None)
             return
         except Exception:
-            logger.exception("the payload of stream %r of model %s is not followed", stream[2], stream[0])
+            logger.exception("could not estimate the payload of stream %r of model %s", stream[2], stream[0])
             self._streams.pop(stream, None)
             return
         if followed.refining is None:
@@ -189,7 +189,7 @@ class Weigher:
             followed.watch = followed.watch.refined(done.value)
         except np.linalg.LinAlgError as error:
             followed.refining = None
-            logger.warning("the payload of stream %r of model %s is not refined: %s", stream[2], stream[0], error)
+            logger.warning("could not refine the payload of stream %r of model %s: %s", stream[2], stream[0], error)
         self._left -= time.process_time() - began
         yield from self._report(stream, followed)
 

@@ -101,7 +101,7 @@ class Sqlite:
         with self.engine.connect() as connection:
             busy, _, _ = connection.execute(text("PRAGMA wal_checkpoint(TRUNCATE)")).one()
         if busy:
-            logger.warning("another process reads the database: the log of its writes is kept until it is full")
+            logger.warning("another process reads the database, so its write-ahead log could not be emptied")
 
     def close(self) -> None:
         """Close all connections."""

@@ -159,8 +159,8 @@ def _read(url: str) -> URL:
         return make_url(url).set(drivername="postgresql+psycopg")
     except (ArgumentError, ValueError):  # without its own text, which may contain part of the password
         raise ArgumentError(
-            "LIPSERVE_DATABASE_URL cannot be read, expected postgresql://user:password@host:port/name, with what is "
-            "neither letter nor digit in the password as %XX"
+            "LIPSERVE_DATABASE_URL cannot be read, expected postgresql://user:password@host:port/name; write special "
+            "characters of the password as %XX"
         ) from None
 
 

@@ -27,7 +27,7 @@ def check_sha256(path: Path, sha256: str) -> None:
     except FileNotFoundError:
         raise DamagedFileError(f"{path.name} is missing") from None
     if digest != sha256:
-        raise DamagedFileError(f"{path.name} does not have the sha256 that was kept of it")
+        raise DamagedFileError(f"{path.name} does not match its stored sha256")
 
 
 def write_durably(path: Path, write: Callable[[IO[bytes]], Result], draft: Path | None = None) -> Result:

@@ -105,7 +105,7 @@ class RetryingStore:
             except FilesUnreachableError as error:
                 if time.monotonic() + pause > end:
                     raise
-                logger.warning("%s: asked again in %g s", error.strerror, pause)
+                logger.warning("%s; retrying in %g s", error.strerror, pause)
             time.sleep(pause)
             pause = min(2 * pause, 8.0)
 

@@ -202,7 +202,7 @@ class SharedFiles:
         try:
             self.delete_version(name)
         except OSError as error:
-            logger.warning("files of a version that was not made are left for a day: %s", error)
+            logger.warning("could not delete files of a failed version; they stay for a day: %s", error)
 
     def _old(self, before: float, prefix: str) -> Iterator[Entry]:
         return (each for each in self.objects.list(prefix) if each.modified < before)

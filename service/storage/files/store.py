@@ -267,7 +267,7 @@ def _forgiven() -> Iterator[None]:
     try:
         yield
     except FilesUnreachableError as error:
-        logger.warning("a file is left in the shared store until it is swept: %s", error.strerror)
+        logger.warning("could not delete a file of the shared store; the next sweep will: %s", error.strerror)
 
 
 def _samples(dataset: str) -> str:
@@ -307,4 +307,4 @@ def _beside(database: Database, files: Files) -> None:
     try:
         sweep_unnamed(database, files)
     except Exception as error:  # retried at the next start
-        logger.warning("what interrupted writes have left is not swept now: %s", error)
+        logger.warning("could not delete files of interrupted writes: %s", error)

@@ -1,25 +1,25 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// LIPServe's torque stream for controllers: C++17, one header, POSIX sockets and nothing else.
+// LIPServe torque stream for controllers: one header, C++17 and POSIX sockets only.
 //
 //     lipserve::Options options;
 //     options.model = "panda-sim";
 //     options.joints = 7;
-//     lipserve::Client client(options);                 // all memory is allocated here
+//     lipserve::Client client(options);                 // allocates all memory
 //     if (client.connect(lipserve::Deadline::in(5.0)) != lipserve::Status::ok) puts(client.error().message);
 //     lipserve::Answer answer;
 //     lipserve::Query query{q, dq, ddq};
 //     if (client.ask(query, answer, lipserve::Deadline::in(0.0005)) == lipserve::Status::ok) use(answer.tau);
 //
-// What holds for every call:
-//   - It waits for nothing beyond its deadline, a moment on CLOCK_MONOTONIC. What has come until it looks counts.
-//   - It allocates nothing, throws nothing, takes no lock and raises no SIGPIPE. The constructor allocates; it throws
-//     nothing either: what is wrong with the options is the status (`invalid`) of every call.
-//   - A lost connection is had again by the calls themselves, a step at a time, each within its own deadline.
-//   - What was taught is kept until the service has acknowledged it, and is sent again over the next connection under
-//     its old sequence; the service learns it once.
-// A client is used by one thread at a time. TLS is not spoken: put a proxy beside the controller, or a Unix socket.
-// The protocol: docs/reference/stream-protocol.md.
+// Guarantees of every call:
+//   - It never waits beyond its deadline on CLOCK_MONOTONIC. Data that have arrived by the last check are used.
+//   - It does not allocate, throw, lock or raise SIGPIPE. Only the constructor allocates. It does not throw: if an
+//     option is wrong, every call returns `invalid`.
+//   - Calls reconnect after a lost connection, step by step, within their own deadlines.
+//   - Torques given to `teach` are kept until the service acknowledges them. After a reconnection they are sent again
+//     with the same sequence, and the service learns them once.
+// Use a client from one thread at a time. There is no TLS: use a proxy on the controller's host, or a Unix socket.
+// Protocol: docs/reference/stream-protocol.md.
 
 #ifndef LIPSERVE_CLIENT_HPP
 #define LIPSERVE_CLIENT_HPP
@@ -45,20 +45,20 @@
 namespace lipserve {
 
 // ---------------------------------------------------------------------------------------------------------------------
-// What a controller sees
+// Types of the interface
 // ---------------------------------------------------------------------------------------------------------------------
 
 enum class Status : std::uint8_t {
   ok,
-  timeout,      // connected, but no answer by the deadline: the last one that came is answered, `late`, if there is one;
-                // one that comes after all is dropped and counted as stale
-  unreachable,  // no connection now; it is had again as soon as there is a service
-  refused,      // the service said no, to this query or to the connection
-  full,         // more is taught and not acknowledged than `Options::backlog` holds; this one is not kept
-  invalid,      // an argument or an option is wrong
+  timeout,      // connected, but no answer by the deadline: the last received answer, if any, is returned as `late`;
+                // an answer that arrives afterwards is dropped and counted as stale
+  unreachable,  // not connected; the client reconnects as soon as the service is available
+  refused,      // the service rejected this query or the connection
+  full,         // `Options::backlog` torques are not acknowledged yet; this one is not kept
+  invalid,      // an argument or an option is invalid
 };
 
-/// A moment on CLOCK_MONOTONIC.
+/// Point in time on CLOCK_MONOTONIC.
 struct Deadline {
   std::int64_t ns = 0;
 
@@ -67,127 +67,128 @@ struct Deadline {
     clock_gettime(CLOCK_MONOTONIC, &moment);
     return at(moment);
   }
-  /// What clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, …) takes.
+  /// From a timespec as used by clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, …).
   static Deadline at(const timespec& moment) {
     return {std::int64_t{moment.tv_sec} * 1'000'000'000 + std::int64_t{moment.tv_nsec}};
   }
-  /// So many seconds from now: at once for what is not above 0, at most a year.
+  /// Seconds from now, between 0 and a year.
   static Deadline in(double seconds) { return {now().ns + span(seconds)}; }
-  /// Seconds as nanoseconds, between 0 and a year.
+  /// Convert seconds to nanoseconds, limited to 0 to a year.
   static std::int64_t span(double seconds) {
     constexpr double year = 31'536'000.0;
     return seconds > 0.0 ? static_cast<std::int64_t>((seconds < year ? seconds : year) * 1e9) : 0;
   }
 };
 
-/// One motion, `joints` numbers each: q rad (prismatic: m), dq rad/s (m/s), ddq rad/s² (m/s²), and where it was
-/// measured tau, N·m (N).
+/// One motion, with arrays of `joints` numbers: q, rad (prismatic: m); dq, rad/s (m/s); ddq, rad/s² (m/s²); optional
+/// measured torque tau, N·m (N).
 struct Query {
   const double* q = nullptr;
   const double* dq = nullptr;
   const double* ddq = nullptr;
   const double* tau = nullptr;
-  bool std = true;        // answer tau_std, too
-  bool external = false;  // answer how much of tau the model does not explain
-  bool learn = false;     // of `ask`: learn from tau after the answer
-  double budget = 0.0;    // s that the service may take before it counts the answer as late; 0: none
+  bool std = true;        // request tau_std
+  bool external = false;  // request the external torque: the part of tau that the model does not explain
+  bool learn = false;     // for `ask`: let the model learn from tau after the answer
+  double budget = 0.0;    // max time in the service before it counts the answer as late, s; 0: none
 };
 
-/// What was answered, N·m. The arrays have `joints` numbers, are null where not asked for, and are the client's: they
-/// hold until its next call.
+/// Answer of the service; torques in N·m (N). Arrays have `joints` numbers and are null if not requested. The client
+/// owns them; they are valid until its next call.
 struct Answer {
   std::uint32_t sequence = 0;
   std::uint32_t version = 0;
-  std::uint64_t revision = 0;      // online updates that it contains
-  bool late = false;               // after the deadline, or it left the service after its budget
-  std::uint32_t late_answers = 0;  // of this connection
-  double seconds = 0.0;            // that the service took
+  std::uint64_t revision = 0;      // number of online updates included
+  bool late = false;               // received after the deadline, or sent by the service after the query's budget
+  std::uint32_t late_answers = 0;  // number of late answers of this connection
+  double seconds = 0.0;            // time in the service, s
   const double* tau = nullptr;
-  const double* tau_std = nullptr;           // of the function
-  /// Factor on the half width of intervals: tau ± 1.96 · scale · √(tau_std² + noise_std²) holds 95 % of measurements.
+  const double* tau_std = nullptr;           // standard deviation of the predicted torque, without measurement noise
+  /// Factor on the half width of intervals: 95 % of measurements are in tau ± 1.96 · scale · √(tau_std² + noise_std²).
   const double* scale = nullptr;
-  const double* tau_external = nullptr;      // tau of the query less the mean. No safety function
+  const double* tau_external = nullptr;      // measured − predicted torque. Not a safety function
   const double* tau_external_std = nullptr;
   const double* tau_external_z = nullptr;
-  double external_statistic = 0.0;           // χ² of all joints together
-  double external_p = 0.0;                   // probability of a larger one where nothing touches the arm
-  /// Some joint's torque went back to gravity, offset and friction, or to the training's mean: the training does not
-  /// determine it at this motion.
+  double external_statistic = 0.0;           // χ² statistic of all joints
+  double external_p = 0.0;                   // probability of a larger statistic without external torque
+  /// The training data do not determine some joint's torque at this motion; that torque is gravity, offset and friction
+  /// only, or the mean of the training data.
   bool fallback = false;
   bool has_payload = false;
-  double payload_mass = 0.0;                 // kg; both NaN where nothing is carried as far as is known
+  double payload_mass = 0.0;                 // estimated mass, kg; both NaN without a payload
   double payload_std = 0.0;
 };
 
-/// The last thing that went wrong, in words for people.
+/// Last error, with a text for people.
 struct Error {
   Status status = Status::ok;
-  int http = 0;                    // status of a connection that was refused
-  int close = 0;                   // code of a connection that the service closed
-  std::uint32_t sequence = 0;      // of the query that was refused
-  char code[40] = {};              // as the service says, else unreachable, closed, timeout, protocol, full, invalid
+  int http = 0;                    // HTTP status of a refused connection
+  int close = 0;                   // close code of a connection closed by the service
+  std::uint32_t sequence = 0;      // sequence of the rejected query
+  char code[40] = {};              // code of the service, or unreachable, closed, timeout, protocol, full, invalid
   char message[600] = {};
 };
 
-/// What has become of the torques taught; all of it is durable in the service.
+/// Totals of the torques that were sent to learn from; all of them are durable in the service.
 struct Learnt {
   struct Count {
     char code[24] = {};
     std::uint64_t count = 0;
   };
-  std::int64_t through = -1;       // newest sequence that is settled; -1 before there is one
-  std::uint64_t accepted = 0;      // new, and learnt from
-  std::uint64_t duplicates = 0;    // known before: their first acknowledgement was lost
-  std::uint64_t rejected = 0;      // logged, but kept out of learning; by code:
+  std::int64_t through = -1;       // newest sequence that is acknowledged or refused; -1: none
+  std::uint64_t accepted = 0;      // new and learnt from
+  std::uint64_t duplicates = 0;    // logged before: their first acknowledgement was lost
+  std::uint64_t rejected = 0;      // logged but not learnt; `codes` has the numbers by code
   Count codes[12];
-  std::uint64_t refused = 0;       // not logged: lost, `Client::refusal` says why
-  std::uint64_t revision = 0;      // answers of it and above contain them
+  std::uint64_t refused = 0;       // not logged, so lost; `Client::refusal` has the reason
+  std::uint64_t revision = 0;      // answers of this revision and later ones include these torques
 };
 
 struct Counters {
-  std::uint64_t asked = 0, answered = 0;   // by `ask`
-  std::uint64_t stale = 0;                 // answers that came after their `ask` had given up
-  std::uint64_t taught = 0;                // kept by `teach` or `ask`
-  std::uint64_t resent = 0;                // taught frames sent once more over a new connection
+  std::uint64_t asked = 0, answered = 0;   // queries and answers of `ask`
+  std::uint64_t stale = 0;                 // answers that arrived after their `ask` had returned
+  std::uint64_t taught = 0;                // torques kept by `teach` or `ask`
+  std::uint64_t resent = 0;                // torques sent again over a new connection
   std::uint64_t connections = 0, losses = 0;
 };
 
-/// What holds for all answers of a version.
+/// Description of the version that answers.
 struct Hello {
   std::uint32_t version = 0;
   std::uint64_t revision = 0;
   char torque_convention[64] = {};
   double max_position = 0.0;
-  const double* noise_std = nullptr;            // N·m, of the measurement around the function
+  const double* noise_std = nullptr;            // standard deviation of a measurement around the torque, N·m
   const char (*joint_names)[64] = nullptr;
 };
 
-/// Texts have to hold only while the client is made.
+/// Options of a client. Strings must be valid only during construction.
 struct Options {
   const char* model = nullptr;
   unsigned joints = 0;
   const char* url = nullptr;        // http://host:port or unix:///path; null: LIPSERVE_URL, else http://127.0.0.1:8000
   const char* key = nullptr;        // API key; null: LIPSERVE_API_KEY, else none
-  const char* stream_id = nullptr;  // name of the source of the torques to learn from; null: only ask
-  const char* alias = nullptr;      // follow it, or
-  unsigned version = 0;             // pin a version; 0 and null: whatever serves
-  bool scale = false;               // answers carry the factor on their intervals
-  bool payload = false;             // answers carry what the arm carries
-  /// Of the first frame. A stream_id knows its sequences for good: who continues one begins above the last it has sent.
+  const char* stream_id = nullptr;  // name of the robot or recording to learn from; null: do not learn
+  const char* alias = nullptr;      // alias of the version, followed if it moves
+  unsigned version = 0;             // version number; without version and alias: the serving version
+  bool scale = false;               // request the factor on intervals with every answer
+  bool payload = false;             // request the estimated payload with every answer
+  /// Sequence of the first frame. The service remembers the sequences of a stream_id: to continue one, start above the
+  /// last sequence sent.
   std::uint32_t first_sequence = 1;
-  /// Torques that may wait for their acknowledgement: 16 s of 1 kHz, 4 MB for seven joints.
+  /// Max number of unacknowledged torques: the default is 16 s at 1 kHz, 4 MB for seven joints.
   std::size_t backlog = 16384;
-  /// Frames of each kind, asked and taught, that may wait for their answers. What is sent again after a lost connection
-  /// delays an `ask` by at most so many answers.
+  /// Max number of unanswered frames, for queries and for torques to learn from. Torques that are sent again after a
+  /// reconnection delay an `ask` by at most so many answers.
   unsigned window = 4;
-  double attempt_s = 2.0;           // longest wait for one connection
-  double silence_s = 3.0;           // an answer that takes longer: the connection counts as lost
-  double retry_first_s = 0.01;      // wait before the next attempt, doubled from one to the next
-  double retry_most_s = 1.0;
+  double attempt_s = 2.0;           // max duration of one attempt to connect, s
+  double silence_s = 3.0;           // if no answer arrives for this time, the connection counts as lost, s
+  double retry_first_s = 0.01;      // pause before the next attempt to connect, s; doubles each time
+  double retry_most_s = 1.0;        // max pause, s
 };
 
 // ---------------------------------------------------------------------------------------------------------------------
-// Layout 1 of the frames: little-endian, no padding
+// Frame layout 1: little-endian, no padding
 // ---------------------------------------------------------------------------------------------------------------------
 
 namespace frames {
@@ -198,7 +199,7 @@ constexpr unsigned ask_std = 1, ask_learn = 2, ask_external = 4;
 constexpr unsigned has_std = 1, late = 2, error = 4, unread = 8, has_scale = 16, has_external = 32, has_payload = 64;
 constexpr unsigned fallback = 128;
 
-/// Write the low bytes of a number; return where the next one goes.
+/// Write the low bytes of a number; return the end.
 inline std::uint8_t* put(std::uint8_t* out, std::uint64_t value, unsigned bytes) {
   for (unsigned k = 0; k < bytes; ++k) *out++ = static_cast<std::uint8_t>(value >> (8 * k));
   return out;
@@ -225,10 +226,10 @@ inline double get(const std::uint8_t* in) {
 
 constexpr std::size_t request_bytes(std::size_t joints, bool tau) { return request_head + (tau ? 4 : 3) * 8 * joints; }
 
-/// Most numbers of an answer: mean, std, scale, three of external torque; statistic, p, and the payload's two.
+/// Max number of values of an answer: mean, std, scale, three arrays of external torque; statistic, p, payload's two.
 constexpr std::size_t answer_numbers(std::size_t joints) { return 6 * joints + 4; }
 
-/// Write a request; return its length. out: `request_bytes`.
+/// Write a request to a buffer of `request_bytes`; return its length.
 inline std::size_t write(std::uint8_t* out, std::uint32_t sequence, const Query& query, std::size_t joints) {
   const bool tau = query.learn || query.external;
   const unsigned flags =
@@ -240,8 +241,8 @@ inline std::size_t write(std::uint8_t* out, std::uint32_t sequence, const Query&
   return static_cast<std::size_t>(end - out);
 }
 
-/// Read an answer that is no error; false where it has another length or number of joints. numbers: `answer_numbers`,
-/// which the answer points into.
+/// Read an answer that is not an error; return false if length or number of joints do not match. The answer points into
+/// `numbers`, a buffer of `answer_numbers`.
 inline bool read(const std::uint8_t* data, std::size_t size, std::size_t joints, double* numbers, Answer& answer) {
   if (size < answer_head) return false;
   const std::uint64_t flags = get(data + 4, 2);
@@ -286,7 +287,7 @@ namespace detail {
 // Text without allocation
 // ---------------------------------------------------------------------------------------------------------------------
 
-/// Appends to a buffer that ends with 0; what does not fit is left out, and no UTF-8 character is cut in two.
+/// Appends to a zero-terminated buffer; text that does not fit is cut off at a whole UTF-8 character.
 class Text {
  public:
   template <std::size_t Size>
@@ -324,7 +325,7 @@ class Text {
   }
   Text& add(int number) { return add(std::int64_t{number}); }
   Text& add(unsigned number) { return add(std::uint64_t{number}); }
-  /// A Unicode character, as UTF-8.
+  /// Append a Unicode character as UTF-8.
   Text& character(std::uint32_t code) {
     const auto tail = [code](unsigned shift) { return static_cast<char>(0x80U | ((code >> shift) & 0x3FU)); };
     if (code < 0x80) return add(static_cast<char>(code));
@@ -343,7 +344,7 @@ class Text {
     bytes[count++] = tail(0);
     return add(bytes, count);
   }
-  /// Part of an address: all but letters, digits and -._~ as %XX.
+  /// Append text percent-encoded for a URL: all but letters, digits and -._~ become %XX.
   Text& quoted(const char* text) {
     for (; *text; ++text) {
       const auto byte = static_cast<std::uint8_t>(*text);
@@ -359,7 +360,7 @@ class Text {
  private:
   Text& trimmed() {
     if (!full_) return *this;
-    char* start = next_;  // of the last character
+    char* start = next_;  // start of the last character
     while (start != begin_ && (static_cast<std::uint8_t>(start[-1]) & 0xC0U) == 0x80U) --start;
     if (start == begin_) return *this;
     const auto lead = static_cast<std::uint8_t>(*--start);
@@ -371,14 +372,14 @@ class Text {
   bool full_ = false;
 };
 
-/// A value within a JSON text, read in place. Where the text is cut short, what comes before the cut can still be read.
+/// Value within a JSON text, read in place. If the text is truncated, the part before the cut can be read.
 class Json {
  public:
   Json() = default;
   Json(const char* begin, const char* end) : at_(space(begin, end)), end_(end) {}
 
   bool there() const { return at_ != nullptr && at_ != end_; }
-  /// The member of an object, or nothing.
+  /// Return a member of an object, or an empty value.
   Json member(const char* name) const {
     Json found;
     each([&](const Json& key, const Json& value) {
@@ -388,8 +389,7 @@ class Json {
     });
     return found;
   }
-  /// Call visit(key, value) for the members of an object, or the elements of an array, which have no key, while it is
-  /// true.
+  /// Call visit(key, value) for members of an object or elements of an array (without key), while it returns true.
   template <class Visit>
   void each(Visit visit) const {
     if (!there() || (*at_ != '{' && *at_ != '[')) return;
@@ -409,7 +409,7 @@ class Json {
       else return;
     }
   }
-  /// Copy a string, what fits of it; false where it is none.
+  /// Copy a string as far as it fits; return false if the value is not a string.
   bool text(char* out, std::size_t size) const {
     Text copy(out, size);
     if (!there() || *at_ != '"') return false;
@@ -421,7 +421,7 @@ class Json {
       if (++at == end_) break;
       if (*at == 'u') {
         std::uint32_t code = hex(at + 1);
-        if (code >> 10 == 0x36 && end_ - at > 10 && at[5] == '\\' && at[6] == 'u') {  // the first of a pair
+        if (code >> 10 == 0x36 && end_ - at > 10 && at[5] == '\\' && at[6] == 'u') {  // first half of a surrogate pair
           code = 0x10000 + ((code & 0x3FFU) << 10) + (hex(at + 7) & 0x3FFU);
           at += 6;
         }
@@ -431,10 +431,11 @@ class Json {
         copy.add(unescaped(*at));
       }
     }
-    copy.add("");  // no half character at the end
+    copy.add("");  // trims a partial character at the end
     return true;
   }
-  /// A number to about its last digit, without the locale that strtod obeys; `otherwise` where it is none.
+  /// Return a number, accurate to about the last digit and independent of the locale (unlike strtod); `otherwise` if
+  /// the value is not a number.
   double number(double otherwise) const {
     if (!there()) return otherwise;
     const char* at = at_;
@@ -466,7 +467,7 @@ class Json {
     value /= divisor;
     return static_cast<double>(negative ? -value : value);
   }
-  /// A whole number; -1 where it is none.
+  /// Return an integer; -1 if the value is not one.
   std::int64_t integer() const {
     if (!there()) return -1;
     const char* at = *at_ == '-' ? at_ + 1 : at_;
@@ -496,7 +497,7 @@ class Json {
     while (at != end && (*at == ' ' || *at == '\t' || *at == '\n' || *at == '\r')) ++at;
     return at;
   }
-  /// Where a value ends.
+  /// Return the end of a value.
   static const char* past(const char* at, const char* end) {
     int depth = 0;
     bool quoted = false;
@@ -533,7 +534,7 @@ class Json {
 // WebSocket (RFC 6455)
 // ---------------------------------------------------------------------------------------------------------------------
 
-/// SHA-1, which the handshake wants; of no use for secrets.
+/// SHA-1 for the handshake; not for secrets.
 inline void sha1(const std::uint8_t* data, std::size_t size, std::uint8_t (&digest)[20]) {
   std::uint32_t state[5] = {0x67452301U, 0xEFCDAB89U, 0x98BADCFEU, 0x10325476U, 0xC3D2E1F0U};
   const auto turn = [](std::uint32_t value, unsigned by) { return value << by | value >> (32 - by); };
@@ -562,7 +563,7 @@ inline void sha1(const std::uint8_t* data, std::size_t size, std::uint8_t (&dige
   for (std::size_t k = 0; k < 20; ++k) digest[k] = static_cast<std::uint8_t>(state[k / 4] >> (24 - 8 * (k % 4)));
 }
 
-/// out: 4 ⌈size / 3⌉ letters and a 0.
+/// Write base64 text: 4 ⌈size / 3⌉ characters and a 0.
 inline void base64(const std::uint8_t* data, std::size_t size, char* out) {
   constexpr char letters[] = "ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
   for (std::size_t k = 0; k < size; k += 3) {
@@ -577,7 +578,7 @@ inline void base64(const std::uint8_t* data, std::size_t size, char* out) {
   *out = 0;
 }
 
-/// What a server answers to the 24 letters of a Sec-WebSocket-Key. out: 28 letters and a 0.
+/// Write the Sec-WebSocket-Accept for a Sec-WebSocket-Key of 24 characters: 28 characters and a 0.
 inline void accept_of(const char* key, char (&out)[29]) {
   char joined[64];
   Text text(joined);
@@ -590,16 +591,15 @@ inline void accept_of(const char* key, char (&out)[29]) {
 
 enum Opcode : std::uint8_t { continued = 0, text = 1, binary = 2, closing = 8, ping = 9, pong = 10 };
 
-constexpr std::size_t most_head = 14;  // bytes before the payload of a frame
-constexpr std::size_t most_control = 125;  // bytes of a ping, pong or close
+constexpr std::size_t most_head = 14;  // max bytes before the payload of a frame
+constexpr std::size_t most_control = 125;  // max bytes of a ping, pong or close
 
-/// Write a whole message as one frame, masked as a client has to; return its length, at most most_head more than the
-/// payload's.
+/// Write a message as one masked frame; return its length, at most `most_head` more than that of the payload.
 inline std::size_t seal(std::uint8_t* out, Opcode opcode, const std::uint8_t* payload, std::size_t size,
                         std::uint32_t mask) {
   std::uint8_t* next = out;
   *next++ = static_cast<std::uint8_t>(0x80U | opcode);
-  const unsigned wide = size < 126 ? 0 : size < 65536 ? 2 : 8;  // bytes of a length that does not fit into seven bits
+  const unsigned wide = size < 126 ? 0 : size < 65536 ? 2 : 8;  // bytes of an extended length
   *next++ = static_cast<std::uint8_t>(0x80U | (wide == 0 ? size : wide == 2 ? 126U : 127U));
   for (unsigned k = wide; k-- > 0;) *next++ = static_cast<std::uint8_t>(std::uint64_t{size} >> (8 * k));
   std::uint8_t key[4];
@@ -610,7 +610,7 @@ inline std::size_t seal(std::uint8_t* out, Opcode opcode, const std::uint8_t* pa
   return static_cast<std::size_t>(next - out);
 }
 
-/// Takes messages out of bytes, however those are cut. Of a message larger than its buffer the beginning is kept.
+/// Extracts messages from pieces of a byte stream. Of a message larger than the buffer, only the beginning is kept.
 class Inbox {
  public:
   enum class Event : std::uint8_t { more, message, control, broken };
@@ -618,8 +618,8 @@ class Inbox {
   void use(std::uint8_t* buffer, std::size_t capacity) { data = buffer, capacity_ = capacity; }
   void reset() { have_ = 0, need_ = 2, inside_ = open_ = false, size = length = 0, why = nullptr; }
 
-  /// Take bytes from `at` on until something is complete (then call again), or all are taken (`more`). Once broken it
-  /// stays so until `reset`.
+  /// Process bytes from `at` on until a message is complete (then call again) or all bytes are used (`more`). After
+  /// `broken`, call `reset`.
   Event take(const std::uint8_t*& at, const std::uint8_t* end) {
     for (;;) {
       if (why) return Event::broken;
@@ -645,13 +645,13 @@ class Inbox {
     }
   }
 
-  Opcode opcode = binary;          // of the message, or of the control frame
-  std::uint8_t* data = nullptr;    // of the message
-  std::size_t size = 0;            // of what is kept of it
-  std::uint64_t length = 0;        // of all of it
+  Opcode opcode = binary;          // opcode of the message or control frame
+  std::uint8_t* data = nullptr;    // message
+  std::size_t size = 0;            // bytes of the message in the buffer
+  std::uint64_t length = 0;        // bytes of the whole message
   std::uint8_t control[most_control];
   std::size_t control_size = 0;
-  const char* why = nullptr;       // it is broken
+  const char* why = nullptr;       // reason if broken
 
  private:
   bool begin() {
@@ -662,16 +662,16 @@ class Inbox {
       for (unsigned k = 2; k < need_; ++k) left_ = left_ << 8 | head_[k];
     }
     inside_ = true;
-    if (head_[0] & 0x70U) return fail("a frame with an extension that was not agreed on");
-    if (head_[1] & 0x80U) return fail("a masked frame from the service");
-    if (left_ >> 63) return fail("a frame with a length of 64 bits");
+    if (head_[0] & 0x70U) return fail("the service sent a frame with an extension that was not negotiated");
+    if (head_[1] & 0x80U) return fail("the service sent a masked frame");
+    if (left_ >> 63) return fail("the service sent a frame with an invalid length");
     if (code & 8U) {
-      if (code > pong) return fail("a frame of an unknown kind");
-      if (left_ > most_control || !(head_[0] & 0x80U)) return fail("a control frame that is too long or in parts");
+      if (code > pong) return fail("the service sent a frame with an unknown opcode");
+      if (left_ > most_control || !(head_[0] & 0x80U)) return fail("the service sent an invalid control frame");
       control_size = 0;
     } else {
-      if (code > binary) return fail("a frame of an unknown kind");
-      if ((code == continued) != open_) return fail("parts of messages out of order");
+      if (code > binary) return fail("the service sent a frame with an unknown opcode");
+      if ((code == continued) != open_) return fail("the service sent fragments of messages out of order");
       if (code != continued) message_ = static_cast<Opcode>(code), size = 0, length = 0;
       open_ = true;
     }
@@ -696,15 +696,15 @@ class Inbox {
   std::uint8_t head_[10];
   std::size_t have_ = 0, need_ = 2, capacity_ = 0;
   std::uint64_t left_ = 0;
-  bool inside_ = false;  // a frame's payload
-  bool open_ = false;    // a message in parts
+  bool inside_ = false;  // within the payload of a frame
+  bool open_ = false;    // within a fragmented message
   Opcode message_ = binary;
 };
 
-/// SplitMix64. Masks keep scripts of a browser from speaking to proxies; of a controller they need not be secret.
+/// SplitMix64 for masks of frames. Masks protect proxies from browser scripts; here they need not be secret.
 class Random {
  public:
-  /// Seed it; called once, before the loop.
+  /// Seed the generator; called once, before the control loop.
   void seed() {
     const int device = open("/dev/urandom", O_RDONLY | O_CLOEXEC);
     if (device < 0 || ::read(device, &state_, sizeof state_) != static_cast<ssize_t>(sizeof state_))
@@ -722,18 +722,18 @@ class Random {
   std::uint64_t state_ = 0;
 };
 
-/// An errno in words. strerror may allocate.
+/// Return a text for an errno; strerror may allocate.
 inline const char* words(int number) {
   switch (number) {
-    case ECONNREFUSED: return "nobody listens there (connection refused)";
+    case ECONNREFUSED: return "connection refused: is the service running?";
     case ECONNRESET: return "the connection was reset";
     case EPIPE: return "the connection was closed";
-    case ENOENT: return "there is no such socket";
+    case ENOENT: return "the socket does not exist";
     case EACCES: return "permission denied";
     case EHOSTUNREACH: return "no route to the host";
     case ENETUNREACH: return "no route to the network";
-    case ETIMEDOUT: return "the network gave up";
-    case EAGAIN: return "its queue of connections is full";
+    case ETIMEDOUT: return "the connection timed out";
+    case EAGAIN: return "the service's queue of connections is full";
     case EMFILE: return "too many open files";
     default: return "system error";
   }
@@ -742,89 +742,90 @@ inline const char* words(int number) {
 }  // namespace detail
 
 // ---------------------------------------------------------------------------------------------------------------------
-// The client
+// Client
 // ---------------------------------------------------------------------------------------------------------------------
 
 class Client {
  public:
-  /// Allocate all memory and look up the host's name; nothing is sent. Where options are wrong, every call returns
-  /// `invalid`, and `error` says what is.
+  /// Allocate all memory and resolve the host's name; send nothing. If an option is wrong, every call returns `invalid`
+  /// and `error` has the reason.
   explicit Client(const Options& options);
   ~Client() { close(); }
   Client(const Client&) = delete;
   Client& operator=(const Client&) = delete;
 
-  /// Wait for the service: until it answers, refuses this client (`refused`: a key, a name), or the deadline.
+  /// Wait until the stream is open, the service refuses it (`refused`, e.g. a wrong key or name), or the deadline.
   Status connect(Deadline until);
 
-  /// Ask for the torque at a motion. Returns at once where there is no connection and none can be tried before the
-  /// deadline. With `learn` the torque is kept whatever the status, but for `full` and `invalid`; it goes out in its
-  /// turn, behind what was taught before: a loop that asks and teaches at its rate does both apart, and asks first.
+  /// Request the torque at a motion. Returns at once if there is no connection and no attempt is due before the
+  /// deadline. With `learn`, the torque is kept unless the status is `full` or `invalid`; it is sent after the torques
+  /// that were kept before. In a control loop, call `ask` first, then `teach`.
   Status ask(const Query& query, Answer& answer, Deadline until);
 
-  /// Teach the torque measured at a motion: keep it, send it if that is possible without waiting. `ok`: it is kept.
+  /// Let the model learn from the torque measured at a motion: keep it, and send it if possible without waiting. `ok`:
+  /// it is kept.
   Status teach(const Query& query);
 
-  /// Take what has come, send what can be sent, and go on with connecting; wait for nothing. For loops that rarely ask.
+  /// Receive, send and reconnect as far as possible without waiting. For loops that rarely call `ask`.
   void tick() { run(Deadline::now(), false, [] { return false; }); }
 
-  /// Wait until the service has acknowledged or refused everything that was taught.
+  /// Wait until the service has acknowledged or refused all torques that were sent to learn from.
   Status flush(Deadline until);
 
-  /// End the connection without waiting. What is taught and not acknowledged is kept; the next call connects again.
+  /// Close the connection without waiting. Unacknowledged torques are kept; the next call connects again.
   void close();
 
   bool connected() const { return stage_ == Stage::open; }
-  /// Torques that are neither acknowledged nor refused.
+  /// Number of torques that are neither acknowledged nor refused.
   std::size_t unsettled() const { return unsettled_; }
   const Hello& hello() const { return hello_; }
   const Learnt& learnt() const { return learnt_; }
   const Counters& counters() const { return counters_; }
-  /// The last thing that went wrong; stays when all is well again.
+  /// Last error; it is kept after recovery.
   const Error& error() const { return error_; }
-  /// Why the last of the torques were refused that count as `Learnt::refused`.
+  /// Reason of the last refusal that `Learnt::refused` counts.
   const Error& refusal() const { return refusal_; }
 
  private:
   using Event = detail::Inbox::Event;
   enum class Stage : std::uint8_t {
-    broken,      // wrong options
-    down,        // waits for the next attempt
-    connecting,  // until the socket can be written to
-    upgrading,   // until the answer to the HTTP request is there
-    greeting,    // until the service has said what its answers are
+    broken,      // invalid options
+    down,        // waiting for the next attempt
+    connecting,  // waiting for the socket to become writable
+    upgrading,   // waiting for the answer to the HTTP request
+    greeting,    // waiting for the first message of the service
     open,
   };
   struct Address {
     sockaddr_storage place;
     socklen_t size;
   };
-  /// A frame that waits for its answer; they come in order.
+  /// Frame that waits for its answer; answers arrive in order.
   struct Flight {
     std::uint32_t sequence;
     bool taught;
-    std::uint64_t place;  // of what is taught, see `head_`
+    std::uint64_t place;  // position of a torque to learn from, see `head_`
   };
   struct Taught {
     std::uint32_t sequence;
     bool settled;
   };
 
-  // options, and what is made of them
+  // options
   bool read_options(const Options& options);
   bool read_url(const char* url);
   bool look_up(const char* host, const char* port);
   bool allocate(const Options& options);
   bool wrong(const char* name, const char* value, const char* expected);
 
-  // a connection, step by step
+  // connection
   template <class Done>
   Status run(Deadline until, bool patient, Done done);
   void begin(std::int64_t now);
   void begin_upgrade();
   void give_up(std::int64_t now);
   Status absent() {
-    if (!*error_.code) say(error_, down_, "unreachable", "the connection is not there yet");
+    if (!*error_.code) say(error_, down_, "unreachable", "not connected yet");
     return down_;
   }
   void finish_connecting();
@@ -838,7 +839,7 @@ class Client {
     drop(status, code);
   }
 
-  // what comes
+  // receiving
   void take_upgrade(const std::uint8_t* data, std::size_t size);
   void take_refusal(const char* body, std::size_t size, int http);
   static const char* header(const char* head, std::size_t size, const char* name, std::size_t& length);
@@ -850,7 +851,7 @@ class Client {
   void take_answer();
   void take_error(const Flight& flight);
 
-  // what goes
+  // sending
   bool check(const Query& query, bool tau);
   bool keep(const Query& query);
   void fill();
@@ -867,48 +868,48 @@ class Client {
     say(error, status, code);
     detail::Text(error.message).add(message);
   }
-  /// The code and message of a JSON error, and the first of its details; false where there is none.
+  /// Read code and message of a JSON error; return false if there is none.
   static bool read_error(const detail::Json& object, Error& error);
 
   template <class T>
   static bool make(std::unique_ptr<T[]>& array, std::size_t count) {
-    array.reset(new (std::nothrow) T[count]());  // written to: its pages are there before the loop
+    array.reset(new (std::nothrow) T[count]());  // zeroed, so that its pages are mapped before the control loop
     return array != nullptr;
   }
 
   Stage stage_ = Stage::down;
-  Status down_ = Status::unreachable;  // what calls return while there is no connection
+  Status down_ = Status::unreachable;  // status of calls without a connection
   int socket_ = -1;
   std::size_t joints_ = 0, window_ = 0;
   bool learns_ = false;
 
   Address addresses_[8];
   std::size_t address_count_ = 0, address_ = 0;
-  char host_[300] = {}, head_text_[2048] = {};  // head_text_: of the request that opens a stream, up to its key
-  char key_[25] = {};                           // of the handshake
+  char host_[300] = {}, head_text_[2048] = {};  // head_text_: HTTP request that opens a stream, up to its key
+  char key_[25] = {};                           // key of the handshake
 
   std::int64_t attempt_ns_ = 0, silence_ns_ = 0, retry_first_ns_ = 0, retry_most_ns_ = 0;
   std::int64_t attempt_until_ = 0, heard_ = 0, retry_at_ = 0, backoff_ = 0;
 
   std::unique_ptr<std::uint8_t[]> in_, out_, message_, frame_, kept_;
   std::size_t in_size_ = 0, out_size_ = 0, out_begin_ = 0, out_end_ = 0, message_size_ = 0, frame_bytes_ = 0;
-  std::size_t frame_size_ = 0;  // of the frame that is asked; 0 where it is among those taught
-  std::size_t gathered_ = 0;   // of the answer to the request for a stream
-  std::size_t head_size_ = 0;  // of its headers, 0 until they are there
+  std::size_t frame_size_ = 0;  // bytes of the frame of `ask`; 0 if it is in the backlog
+  std::size_t gathered_ = 0;   // received bytes of the answer to the HTTP request
+  std::size_t head_size_ = 0;  // bytes of its headers, 0 until they are complete
   detail::Inbox inbox_;
   detail::Random random_;
 
-  // taught frames at head_ … tail_ − 1 are kept, those before sent_ are on their way over this connection, those before
-  // sent_ever_ were so over some; the place modulo the backlog is where one lies
+  // the backlog has the frames at positions head_ … tail_ − 1; those before sent_ were sent over this connection, those
+  // before sent_ever_ over any; the index in the ring buffer is the position modulo backlog_
   std::unique_ptr<Taught[]> taught_;
   std::size_t backlog_ = 0, unsettled_ = 0;
   std::uint64_t head_ = 0, sent_ = 0, sent_ever_ = 0, tail_ = 0;
 
-  std::unique_ptr<Flight[]> flights_;  // ring
+  std::unique_ptr<Flight[]> flights_;  // ring buffer
   std::size_t flight_first_ = 0, flight_count_ = 0, asks_flying_ = 0;
 
-  std::uint64_t sequence_ = 0;  // of the next frame; of what is taught it ends at 2³²
-  std::uint32_t asked_ = 0;     // sequence of the frame that `ask` waits for
+  std::uint64_t sequence_ = 0;  // sequence of the next frame; to learn from, at most 2³² − 1
+  std::uint32_t asked_ = 0;     // sequence that `ask` waits for
   bool asking_ = false, ask_unsent_ = false, answered_ = false;
   Status outcome_ = Status::ok;
   Answer answer_;
@@ -937,23 +938,24 @@ inline bool Client::wrong(const char* name, const char* value, const char* expec
 inline bool Client::read_options(const Options& options) {
   if (!options.model || !*options.model) return wrong("model", "missing", "the name of a model of the service");
   if (options.joints < 1 || options.joints > 1000)
-    return wrong("joints", "out of range", "1 to 1000, as many as the model has");
-  if (options.alias && options.version) return wrong("alias", "given beside version", "one of them");
+    return wrong("joints", "out of range", "1 to 1000, the number of joints of the model");
+  if (options.alias && options.version) return wrong("alias", "set together with version", "only one of them");
   if (options.stream_id && (options.alias || options.version))
-    return wrong("stream_id", "given beside alias or version", "neither: only the version that serves learns");
+    return wrong("stream_id", "set together with alias or version", "neither: only the serving version learns");
   if (options.window < 1 || options.window > 1024) return wrong("window", "out of range", "1 to 1024");
   if (options.backlog < 1) return wrong("backlog", "0", "at least 1");
   attempt_ns_ = Deadline::span(options.attempt_s), silence_ns_ = Deadline::span(options.silence_s);
   retry_first_ns_ = Deadline::span(options.retry_first_s), retry_most_ns_ = Deadline::span(options.retry_most_s);
   if (!attempt_ns_ || !silence_ns_ || !retry_first_ns_ || retry_most_ns_ < retry_first_ns_)
-    return wrong("a time", "not above 0, or retry_most_s below retry_first_s", "seconds");
+    return wrong("attempt_s, silence_s, retry_first_s or retry_most_s", "out of range",
+                 "positive seconds, and retry_most_s not below retry_first_s");
 
   const char* const url = options.url ? options.url : std::getenv("LIPSERVE_URL");
   if (!read_url(url && *url ? url : "http://127.0.0.1:8000")) return false;
   const char* key = options.key ? options.key : std::getenv("LIPSERVE_API_KEY");
   for (const char* letter = key ? key : ""; *letter; ++letter)
-    if (*letter <= ' ' || *letter > '~')  // the key itself is not repeated
-      return wrong("key (or LIPSERVE_API_KEY)", "written with other characters than keys have", "lip_…");
+    if (*letter <= ' ' || *letter > '~')  // the message must not contain the key
+      return wrong("key (or LIPSERVE_API_KEY)", "invalid: it has characters that are not allowed", "lip_…");
 
   detail::Text request(head_text_);
   request.add("GET /v1/models/").quoted(options.model).add("/stream");
@@ -986,8 +988,8 @@ inline bool Client::read_url(const char* url) {
   if (const char* const path = after("unix://")) {
     sockaddr_un place{};
     place.sun_family = AF_UNIX;
-    if (*path != '/') return wrong("url", url, "unix:// and an absolute path, as unix:///run/lipserve.sock");
-    if (std::strlen(path) >= sizeof place.sun_path) return wrong("url", url, "a shorter path, as the system limits it");
+    if (*path != '/') return wrong("url", url, "unix:// and an absolute path, e.g. unix:///run/lipserve.sock");
+    if (std::strlen(path) >= sizeof place.sun_path) return wrong("url", url, "a shorter path (limit of the system)");
     std::strncpy(place.sun_path, path, sizeof place.sun_path - 1);
     std::memcpy(&addresses_[0].place, &place, sizeof place);
     addresses_[0].size = sizeof place;
@@ -996,7 +998,7 @@ inline bool Client::read_url(const char* url) {
     return true;
   }
   if (after("https://") || after("wss://"))
-    return wrong("url", url, "http:// or unix://: this client speaks no TLS; let a proxy on this host do so");
+    return wrong("url", url, "http:// or unix://: this client has no TLS; use a proxy on this host");
   const char* authority = after("http://");
   if (!authority) authority = after("ws://");
   if (!authority) return wrong("url", url, "http://host:port or unix:///path");
@@ -1006,7 +1008,7 @@ inline bool Client::read_url(const char* url) {
   if (size == 0 || size >= sizeof host_ || std::strpbrk(host_, "@ \r\n")) return wrong("url", url, "http://host:port");
   char name[sizeof host_];
   std::memcpy(name, host_, sizeof name);
-  char* const closing = *name == '[' ? std::strchr(name, ']') : nullptr;  // of an address of IPv6
+  char* const closing = *name == '[' ? std::strchr(name, ']') : nullptr;  // end of an IPv6 address
   char* const colon = std::strchr(closing ? closing : name, ':');
   if (colon) *colon = 0;
   if (closing) *closing = 0;
@@ -1020,7 +1022,7 @@ inline bool Client::look_up(const char* host, const char* port) {
   if (const int why = getaddrinfo(host, port, &hints, &places)) {
     say(error_, Status::invalid, "unreachable");
     detail::Text message(error_.message);
-    message.add("no address of ").add(host).add(" port ").add(port).add(": ").add(gai_strerror(why));
+    message.add("no address found for ").add(host).add(" port ").add(port).add(": ").add(gai_strerror(why));
     return false;
   }
   for (const addrinfo* each = places; each && address_count_ < 8; each = each->ai_next) {
@@ -1037,20 +1039,20 @@ inline bool Client::allocate(const Options& options) {
   frame_bytes_ = frames::request_bytes(joints_, true);
   const std::size_t longest = frames::answer_head + 8 * frames::answer_numbers(joints_) + detail::most_head;
   in_size_ = 4096 + 4 * longest;
-  message_size_ = 8192 + 256 * joints_ + longest;  // the service's first text names the joints
+  message_size_ = 8192 + 256 * joints_ + longest;  // the first message has the joint names
   out_size_ = sizeof head_text_ + 2 * window_ * (frame_bytes_ + detail::most_head) + 4 * detail::most_control;
   const bool made = make(in_, in_size_) && make(out_, out_size_) && make(message_, message_size_) &&
                     make(frame_, frame_bytes_) && make(kept_, backlog_ * frame_bytes_) && make(taught_, backlog_) &&
                     make(flights_, 2 * window_) && make(numbers_, frames::answer_numbers(joints_)) &&
                     make(noise_std_, joints_) && make(names_, joints_);
-  if (!made) return wrong("backlog", "larger than memory", "fewer torques");
+  if (!made) return wrong("backlog", "too large for the memory", "fewer torques");
   inbox_.use(message_.get(), message_size_);
   hello_.noise_std = noise_std_.get();
   hello_.joint_names = names_.get();
   return true;
 }
 
-// --- what is called --------------------------------------------------------------------------------------------------
+// --- public methods --------------------------------------------------------------------------------------------------
 
 inline Status Client::connect(Deadline until) {
   if (stage_ == Stage::down) down_ = Status::unreachable, retry_at_ = 0;
@@ -1074,13 +1076,13 @@ inline Status Client::ask(const Query& query, Answer& answer, Deadline until) {
   if (answered_) {
     status = outcome_;
     if (status == Status::ok) {
-      answer_.late |= Deadline::now().ns > until.ns;  // this thread was not let run in time
+      answer_.late |= Deadline::now().ns > until.ns;  // this thread was scheduled too late
       answer = answer_, ++counters_.answered;
     }
   } else if (status == Status::timeout) {
     say(error_, status, "timeout", "no answer by the deadline");
     error_.sequence = asked_;
-    answer = answer_, answer.late = true;  // the last one that came
+    answer = answer_, answer.late = true;  // last received answer
   }
   asking_ = ask_unsent_ = answered_ = false;
   return status;
@@ -1106,22 +1108,22 @@ inline void Client::close() {
     write_some();
   }
   if (stage_ == Stage::broken || stage_ == Stage::down) return;
-  if (stage_ == Stage::open) --counters_.losses;  // this is none
+  if (stage_ == Stage::open) --counters_.losses;  // `drop` counts a loss, but this is none
   drop(Status::unreachable, "closed", "closed by this client");
   retry_at_ = 0, backoff_ = 0;
 }
 
 inline bool Client::check(const Query& query, bool tau) {
-  if (!query.q || !query.dq || !query.ddq) return wrong("q, dq or ddq", "null", "the joints' numbers");
-  if (tau && !query.tau) return wrong("tau", "null", "the torque measured at this motion, to learn from or to compare");
+  if (!query.q || !query.dq || !query.ddq) return wrong("q, dq or ddq", "null", "one number per joint");
+  if (tau && !query.tau) return wrong("tau", "null", "the torque measured at this motion");
   if (query.learn && !learns_)
-    return wrong("stream_id of the options", "null", "the name of what the torque was measured on, to learn from it");
+    return wrong("stream_id of the options", "null", "the name of the robot or recording, which learning requires");
   return true;
 }
 
-// --- a connection, step by step --------------------------------------------------------------------------------------
+// --- connection ------------------------------------------------------------------------------------------------------
 
-/// Work until `done`, or the deadline. patient: also through the waits between attempts to connect.
+/// Receive, send and connect until `done` or the deadline. patient: also wait between attempts to connect.
 template <class Done>
 Status Client::run(Deadline until, bool patient, Done done) {
   if (stage_ == Stage::broken) return Status::invalid;
@@ -1156,15 +1158,15 @@ Status Client::run(Deadline until, bool patient, Done done) {
   }
 }
 
-/// End a connection from which nothing comes any more.
+/// Drop a connection that is silent for too long.
 inline void Client::give_up(std::int64_t now) {
   if (stage_ == Stage::open && flight_count_ && now >= heard_ + silence_ns_)
-    drop(Status::unreachable, "unreachable", "the connection is given up: no answer came for silence_s");
+    drop(Status::unreachable, "unreachable", "connection dropped: no answer within silence_s");
   else if (stage_ > Stage::down && stage_ < Stage::open && now >= attempt_until_)
-    drop(Status::unreachable, "unreachable", "the service did not take the connection within attempt_s");
+    drop(Status::unreachable, "unreachable", "the service did not accept the connection within attempt_s");
 }
 
-/// Begin to connect to the next address.
+/// Start to connect to the next address.
 inline void Client::begin(std::int64_t now) {
   const Address& address = addresses_[address_++ % address_count_];
   attempt_until_ = now + attempt_ns_;
@@ -1213,7 +1215,7 @@ inline void Client::lose(const char* what, int number) {
   drop(Status::unreachable, "unreachable");
 }
 
-/// End the connection for a reason that error_.message says already; the next attempt comes later.
+/// Close the connection and schedule the next attempt; error_.message has the reason already.
 inline void Client::drop(Status status, const char* code) {
   if (socket_ >= 0) ::close(socket_);
   if (stage_ == Stage::open) ++counters_.losses;
@@ -1229,10 +1231,10 @@ inline void Client::read_some() {
   const ssize_t size = recv(socket_, in_.get(), in_size_, 0);
   if (size < 0) {
     if (errno == EAGAIN || errno == EWOULDBLOCK || errno == EINTR) return;
-    return lose("the connection is lost", errno);
+    return lose("the connection was lost", errno);
   }
   if (stage_ == Stage::upgrading) return take_upgrade(in_.get(), static_cast<std::size_t>(size));
-  if (size == 0) return drop(Status::unreachable, "closed", "the connection is lost: the service has ended it");
+  if (size == 0) return drop(Status::unreachable, "closed", "the service closed the connection");
   take_frames(in_.get(), static_cast<std::size_t>(size));
 }
 
@@ -1243,25 +1245,25 @@ inline void Client::write_some() {
     if (out_begin_ == out_end_) out_begin_ = out_end_ = 0;
   } else if (errno != EAGAIN && errno != EWOULDBLOCK && errno != EINTR) {
     const int why = errno;
-    read_some();  // what the service may have said before it ended the connection
-    if (socket_ >= 0) lose("the connection is lost", why);
+    read_some();  // the service may have sent a reason before it closed the connection
+    if (socket_ >= 0) lose("the connection was lost", why);
   }
 }
 
-// --- what comes ------------------------------------------------------------------------------------------------------
+// --- receiving -------------------------------------------------------------------------------------------------------
 
-/// Gather the answer to the request for a stream; size 0: there is no more of it.
+/// Collect the answer to the HTTP request that opens a stream; size 0: end of the data.
 inline void Client::take_upgrade(const std::uint8_t* data, std::size_t size) {
-  // the texts of HTTP lie where messages do later
+  // HTTP text uses the buffer of messages
   const char* const begin = reinterpret_cast<const char*>(message_.get());
   std::size_t taken = 0;
   for (; taken < size && !head_size_; ++taken) {
-    if (gathered_ == message_size_) return fail("the answer to the request for a stream has no end");
+    if (gathered_ == message_size_) return fail("the headers of the HTTP answer are too long");
     message_[gathered_++] = data[taken];
     if (gathered_ >= 4 && std::memcmp(begin + gathered_ - 4, "\r\n\r\n", 4) == 0) head_size_ = gathered_;
   }
   if (!head_size_) {
-    if (size == 0) drop(Status::unreachable, "closed", "the service ended the connection before it was a stream");
+    if (size == 0) drop(Status::unreachable, "closed", "the service closed the connection before the stream was open");
     return;
   }
   const int http = gathered_ > 12 && std::memcmp(begin, "HTTP/1.", 7) == 0 ? std::atoi(begin + 9) : 0;
@@ -1280,13 +1282,14 @@ inline void Client::take_upgrade(const std::uint8_t* data, std::size_t size) {
   const char* const accept = header(begin, head_size_, "sec-websocket-accept", letters);
   const bool accepted = accept && letters == 28 && std::memcmp(accept, expected, 28) == 0;
   if (!accepted || !header(begin, head_size_, "upgrade", letters))
-    return fail("what answers is no WebSocket: it has not accepted the key");
-  if (header(begin, head_size_, "sec-websocket-extensions", letters)) return fail("an extension that nobody asked for");
+    return fail("the server is not a WebSocket server: wrong Sec-WebSocket-Accept");
+  if (header(begin, head_size_, "sec-websocket-extensions", letters))
+    return fail("the service uses a WebSocket extension that was not requested");
   stage_ = Stage::greeting;
   take_frames(data + taken, size - taken);
 }
 
-/// The value of a header, without the space around it, or null.
+/// Return the trimmed value of a header, or null.
 inline const char* Client::header(const char* head, std::size_t size, const char* name, std::size_t& length) {
   const std::size_t letters = std::strlen(name);
   for (std::size_t start = 0; start < size;) {
@@ -1310,9 +1313,9 @@ inline void Client::take_refusal(const char* body, std::size_t size, int http) {
   const bool known = read_error(detail::Json(body, body + size), said);
   detail::Text message(error_.message);
   if (known) message.add(said.message);
-  else if (http) message.add("the service refused the stream with status ").add(http);
-  else message.add("what answers at ").add(host_).add(" speaks no HTTP");
-  // what is busy or starting may take the connection soon
+  else if (http) message.add("the service refused the stream with HTTP status ").add(http);
+  else message.add("the server at ").add(host_).add(" is not an HTTP server");
+  // a service that is busy or starting may accept the connection soon
   drop(http == 429 || http >= 500 || !http ? Status::unreachable : Status::refused, known ? said.code : "refused");
   error_.http = http;
 }
@@ -1328,7 +1331,7 @@ inline void Client::take_frames(const std::uint8_t* data, std::size_t size) {
         heard_ = Deadline::now().ns;
         if (inbox_.opcode == detail::text) take_text();
         else if (stage_ == Stage::open) take_answer();
-        else return fail("an answer before the service has said what it answers");
+        else return fail("the service sent an answer before its first message");
     }
   }
 }
@@ -1339,7 +1342,7 @@ inline void Client::take_control() {
   const bool coded = inbox_.control_size >= 2;
   const int code = coded ? inbox_.control[0] << 8 | inbox_.control[1] : 1005;
   send_control(detail::closing, inbox_.control, coded ? 2 : 0);
-  send(socket_, out_.get() + out_begin_, out_end_ - out_begin_, MSG_NOSIGNAL);  // as far as it goes
+  send(socket_, out_.get() + out_begin_, out_end_ - out_begin_, MSG_NOSIGNAL);  // as far as possible without waiting
   detail::Text message(error_.message);
   message.add("the service closed the stream: ");
   if (inbox_.control_size > 2) message.add(reinterpret_cast<const char*>(inbox_.control) + 2, inbox_.control_size - 2);
@@ -1352,10 +1355,10 @@ inline void Client::take_text() {
   const char* const begin = reinterpret_cast<const char*>(inbox_.data);
   const detail::Json message(begin, begin + inbox_.size);
   if (message.member("layout").there()) return take_hello(message);
-  if (stage_ != Stage::open) return fail("a text before the service has said what it answers");
+  if (stage_ != Stage::open) return fail("the service's first message has no `layout`");
   if (const detail::Json learnt = message.member("learnt"); learnt.there()) return take_learnt(learnt);
   const detail::Json refused = message.member("refused");
-  if (!refused.there()) return;  // of a later service
+  if (!refused.there()) return;  // message of a later release
   read_error(refused, refusal_);
   refusal_.sequence = static_cast<std::uint32_t>(refused.member("first").count());
   const std::uint64_t before = unsettled_;
@@ -1365,7 +1368,7 @@ inline void Client::take_text() {
 
 inline void Client::take_hello(const detail::Json& message) {
   if (message.member("layout").integer() != frames::layout) {
-    detail::Text(error_.message).add("the service's frames have another layout than 1, which this client knows");
+    detail::Text(error_.message).add("the service's frame layout is not supported: use the client of its release");
     return drop(Status::refused, "layout");
   }
   std::size_t count = 0;
@@ -1375,7 +1378,7 @@ inline void Client::take_hello(const detail::Json& message) {
   });
   if (count != joints_) {
     detail::Text message_text(error_.message);
-    message_text.add("joints is ").add(joints_).add(", expected ").add(count).add(", as many as the model has");
+    message_text.add("joints is ").add(joints_).add(", expected ").add(count).add(", the joints of the model");
     return drop(Status::refused, "joints");
   }
   std::size_t place = 0;
@@ -1389,13 +1392,13 @@ inline void Client::take_hello(const detail::Json& message) {
   message.member("torque_convention").text(hello_.torque_convention, sizeof hello_.torque_convention);
   if (stage_ == Stage::open) return;
   stage_ = Stage::open;
-  sent_ = head_;  // what is not acknowledged goes out again
+  sent_ = head_;  // send all unacknowledged torques again
   ++counters_.connections;
 }
 
 inline void Client::take_learnt(const detail::Json& message) {
   const detail::Json through = message.member("through");
-  if (through.integer() < 0) return fail("an acknowledgement that does not say of what");
+  if (through.integer() < 0) return fail("the service sent an acknowledgement without a sequence");
   learnt_.through = through.integer();
   learnt_.accepted += message.member("accepted").count();
   learnt_.duplicates += message.member("duplicates").count();
@@ -1418,21 +1421,21 @@ inline void Client::take_learnt(const detail::Json& message) {
 
 inline void Client::take_answer() {
   backoff_ = 0;
-  if (inbox_.size < frames::answer_head || !flight_count_) return fail("an answer that nobody asked for");
+  if (inbox_.size < frames::answer_head || !flight_count_) return fail("the service sent an answer without a query");
   const Flight flight = flights_[flight_first_];
   flight_first_ = (flight_first_ + 1) % (2 * window_), --flight_count_;
   if (!flight.taught) --asks_flying_;
   const std::uint64_t flags = frames::get(inbox_.data + 4, 2);
   if (!(flags & frames::unread) && frames::get(inbox_.data, 4) != flight.sequence)
-    return fail("an answer out of order");
+    return fail("the service sent an answer out of order");
   const bool awaited = asking_ && !answered_ && flight.sequence == asked_;
   if (flags & frames::error) {
     take_error(flight);
     outcome_ = Status::refused;
   } else {
-    // of what nobody waits for only the header is looked at
+    // if nobody waits for the answer, only its header is read
     if (awaited && !frames::read(inbox_.data, inbox_.size, joints_, numbers_.get(), answer_))
-      return fail("an answer of another length than its header says");
+      return fail("the service sent an answer whose length does not match its header");
     outcome_ = Status::ok;
   }
   answered_ = answered_ || awaited;
@@ -1442,7 +1445,7 @@ inline void Client::take_answer() {
 inline void Client::take_error(const Flight& flight) {
   const char* const begin = reinterpret_cast<const char*>(inbox_.data);
   Error& error = flight.taught ? refusal_ : error_;
-  say(error, Status::refused, "refused", "the service refused a query, and did not say why");
+  say(error, Status::refused, "refused", "the service rejected a query without a reason");
   read_error(detail::Json(begin + frames::answer_head, begin + inbox_.size), error);
   error.sequence = flight.sequence;
   if (!flight.taught) return;
@@ -1460,7 +1463,7 @@ inline bool Client::read_error(const detail::Json& object, Error& error) {
   return true;
 }
 
-/// Forget what is taught with sequences from first to through: the service has it, or will not take it.
+/// Remove torques with sequences first to through from the backlog: they are acknowledged or refused.
 inline void Client::settle(std::int64_t first, std::int64_t through) {
   for (std::uint64_t place = head_; place < sent_ever_; ++place) {
     Taught& each = taught_[place % backlog_];
@@ -1473,16 +1476,16 @@ inline void Client::settle(std::int64_t first, std::int64_t through) {
   if (sent_ < head_) sent_ = head_;
 }
 
-// --- what goes -------------------------------------------------------------------------------------------------------
+// --- sending ---------------------------------------------------------------------------------------------------------
 
-/// Put a query into the backlog; false, and an error, where that cannot be.
+/// Append a query to the backlog; return false and set the error if that is impossible.
 inline bool Client::keep(const Query& query) {
   if (tail_ - head_ == backlog_) {
     say(error_, Status::full, "full");
-    detail::Text(error_.message).add("backlog is full: ").add(backlog_).add(" torques are not acknowledged yet");
+    detail::Text(error_.message).add("the backlog is full: ").add(backlog_).add(" torques are not acknowledged yet");
     return false;
   }
-  if (sequence_ > UINT32_MAX) return wrong("stream_id", "used up, all sequences gone", "a client with another one");
+  if (sequence_ > UINT32_MAX) return wrong("stream_id", "out of sequences", "a new client with another stream_id");
   const std::size_t place = tail_++ % backlog_;
   taught_[place] = {static_cast<std::uint32_t>(sequence_++), false};
   frames::write(kept_.get() + place * frame_bytes_, taught_[place].sequence, query, joints_);
@@ -1490,7 +1493,7 @@ inline bool Client::keep(const Query& query) {
   return true;
 }
 
-/// Hand to the socket what may be sent: first what is asked, then what is taught.
+/// Queue frames for the socket: first the query of `ask`, then torques to learn from.
 inline void Client::fill() {
   if (ask_unsent_ && asks_flying_ < window_) {
     ask_unsent_ = false;
@@ -1499,7 +1502,7 @@ inline void Client::fill() {
   }
   for (; sent_ < tail_ && flight_count_ - asks_flying_ < window_; ++sent_) {
     const Taught& each = taught_[sent_ % backlog_];
-    if (each.settled) continue;  // refused, and what is before it still waits
+    if (each.settled) continue;  // refused, while earlier torques are still open
     if (sent_ < sent_ever_) ++counters_.resent;
     else sent_ever_ = sent_ + 1;
     send_frame(kept_.get() + sent_ % backlog_ * frame_bytes_, frame_bytes_, {each.sequence, true, sent_});
@@ -1507,18 +1510,18 @@ inline void Client::fill() {
 }
 
 inline void Client::send_frame(const std::uint8_t* frame, std::size_t size, Flight flight) {
-  if (!flight_count_) heard_ = Deadline::now().ns;  // from here on the service owes an answer
+  if (!flight_count_) heard_ = Deadline::now().ns;  // the wait for an answer starts now
   flights_[(flight_first_ + flight_count_++) % (2 * window_)] = flight;
   send_message(detail::binary, frame, size);
 }
 
 inline void Client::send_control(detail::Opcode opcode, const std::uint8_t* payload, std::size_t size) {
-  // a service that reads nothing, and pings, gets no more of these
+  // drop control frames if the service sends pings but does not read
   const std::size_t reserved = 2 * window_ * (frame_bytes_ + detail::most_head) + 2 * detail::most_control;
   if (out_size_ - (out_end_ - out_begin_) >= reserved) send_message(opcode, payload, size);
 }
 
-/// Append to what waits for the socket; there is room for all that can be under way.
+/// Append a message to the output buffer; it has room for all frames that can be open.
 inline void Client::send_message(detail::Opcode opcode, const std::uint8_t* payload, std::size_t size) {
   if (out_end_ + size + detail::most_head > out_size_) {
     std::memmove(out_.get(), out_.get() + out_begin_, out_end_ - out_begin_);

@@ -1,4 +1,4 @@
-"""Every route of the API as a function that makes a call of it."""
+"""Functions that return the call of a route, one for each route of the API."""
 
 from lipserve.calls import datasets, inference, learning, models
 

@@ -1,4 +1,4 @@
-"""Calls about data sets and robots."""
+"""Calls for data sets and robots."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from lipserve.records.robots import Robot, RobotProfile
 from lipserve.results.series import Preview, read_preview
 
 UPLOAD_TIMEOUT = 600.0
-"""Longest wait for a recording to be read and prepared, s."""
+"""Max time for the service to read and prepare a recording, s."""
 
 
 @route("POST", "/v1/datasets", repeatable=True)
 def upload(
-    at: Route,
+    _route: Route,
     path: Path | str,
     name: str | None = None,
     *,
@@ -27,16 +27,31 @@ def upload(
     idempotency_key: str | None = None,
     **reading: Unpack[Reading],
 ) -> Call[Dataset]:
-    """Upload a recording; raise ValueError for an ending that says no format, ApiError where it is refused.
+    """Upload a recording as a new data set.
 
-    progress: show a progress bar; idempotency_key: uploads of the same file under the same key make one data set, also
-    from another client; reading: how it is to be read and prepared, such as `robot="panda"` or `units={"q": "deg"}`.
+    Args:
+        path: File: CSV, NPZ, Parquet, JSON, a ROS bag, MCAP or a zip; the suffix selects the format.
+        name: Name of the data set. Default: the file's name.
+        progress: Show a progress bar.
+        idempotency_key: Uploads of the same file with the same key give one data set, also from other clients.
+        **reading: Options for reading and preparing the file, e.g. robot="panda" or units={"q": "deg"}.
+
+    Returns:
+        The data set with its report.
+
+    Raises:
+        ValueError: The suffix is unknown.
+        ApiError: The service rejects the file.
+
+    Example:
+        >>> client.upload("run.csv", robot="panda", units={"q": "deg"}).id
+        'ds_0123456789abcdef'
     """
     path = Path(path)
     media_type = MEDIA_TYPE_OF.get(path.suffix.lower())
     if media_type is None:
-        raise ValueError(f"file is {path.name!r}, expected the ending {', '.join(SUFFIXES)}")
-    return at(
+        raise ValueError(f"file is {path.name!r}, expected one of the suffixes {', '.join(SUFFIXES)}")
+    return _route(
         record(Dataset),
         names={},
         params={"name": name or path.name, **query_of(reading)},
@@ -48,67 +63,70 @@ def upload(
 
 
 @route("GET", "/v1/datasets")
-def datasets(at: Route, upload_sha256: str | None = None) -> Call[Page[Dataset]]:
-    """All data sets, newest first; upload_sha256: only those of files with this sha256, however they were read."""
-    return at(page(Dataset), names={}, params=given(upload_sha256=upload_sha256))
+def datasets(_route: Route, upload_sha256: str | None = None) -> Call[Page[Dataset]]:
+    """List data sets, newest first. upload_sha256: only those made from files with this SHA-256."""
+    return _route(page(Dataset), names={}, params=given(upload_sha256=upload_sha256))
 
 
 @route("GET", "/v1/datasets/{dataset}")
-def dataset(at: Route, dataset: str) -> Call[Dataset]:
-    """One data set with its report; raise ApiError where there is none."""
-    return at(record(Dataset), names={"dataset": dataset})
+def dataset(_route: Route, dataset: str) -> Call[Dataset]:
+    """Return a data set with its report, by id or name."""
+    return _route(record(Dataset), names={"dataset": dataset})
 
 
 @route("GET", "/v1/datasets/{dataset}/preview")
 def preview(
-    at: Route, dataset: str, quantities: Sequence[str] | None = None, points: int | None = None
+    _route: Route, dataset: str, quantities: Sequence[str] | None = None, points: int | None = None
 ) -> Call[Preview]:
-    """A data set thinned for a plot so that no extreme is lost.
+    """Return a data set thinned for a plot, with all extremes kept.
 
-    quantities: some of q, dq, ddq, tau; points: most of one column.
+    Args:
+        dataset: Id or name of the data set.
+        quantities: Some of q, dq, ddq, tau. Default: all.
+        points: Max number of points of one column.
     """
     params = {"quantities": None if quantities is None else ",".join(quantities), "points": points}
-    return at(read_preview, names={"dataset": dataset}, params=params)
+    return _route(read_preview, names={"dataset": dataset}, params=params)
 
 
 @route("DELETE", "/v1/datasets/{dataset}")
-def delete_dataset(at: Route, dataset: str) -> Call[None]:
-    """Delete a data set, for good; models trained on it stay."""
-    return at(nothing, names={"dataset": dataset}, removes=True)
+def delete_dataset(_route: Route, dataset: str) -> Call[None]:
+    """Delete a data set permanently. Models trained on it stay."""
+    return _route(nothing, names={"dataset": dataset}, removes=True)
 
 
 @route("POST", "/v1/robots")
-def upload_robot(at: Route, path: Path | str, name: str | None = None) -> Call[Robot]:
-    """Upload a URDF; raise ApiError where it is refused."""
+def upload_robot(_route: Route, path: Path | str, name: str | None = None) -> Call[Robot]:
+    """Upload a URDF. name: name of the robot."""
     headers = {"content-type": "application/xml"}
-    return at(record(Robot), names={}, params=given(name=name), headers=headers, file=Path(path))
+    return _route(record(Robot), names={}, params=given(name=name), headers=headers, file=Path(path))
 
 
 @route("GET", "/v1/robots")
-def robots(at: Route) -> Call[Page[Robot]]:
-    """All uploaded robots, newest first."""
-    return at(page(Robot), names={})
+def robots(_route: Route) -> Call[Page[Robot]]:
+    """List uploaded robots, newest first."""
+    return _route(page(Robot), names={})
 
 
 @route("GET", "/v1/robots/{robot}")
-def robot(at: Route, robot: str) -> Call[Robot]:
-    """One uploaded robot."""
-    return at(record(Robot), names={"robot": robot})
+def robot(_route: Route, robot: str) -> Call[Robot]:
+    """Return an uploaded robot."""
+    return _route(record(Robot), names={"robot": robot})
 
 
 @route("DELETE", "/v1/robots/{robot}")
-def delete_robot(at: Route, robot: str) -> Call[None]:
-    """Delete an uploaded robot; models trained with it keep their copy."""
-    return at(nothing, names={"robot": robot}, removes=True)
+def delete_robot(_route: Route, robot: str) -> Call[None]:
+    """Delete an uploaded robot. Models trained with it keep a copy."""
+    return _route(nothing, names={"robot": robot}, removes=True)
 
 
 @route("GET", "/v1/robots/profiles")
-def profiles(at: Route) -> Call[list[RobotProfile]]:
-    """Every robot that is known by name: joints, limits, what its effort means."""
-    return at(lambda answer: page(RobotProfile)(answer).items, names={})
+def profiles(_route: Route) -> Call[list[RobotProfile]]:
+    """Return all robot profiles: joints, limits, meaning of their effort."""
+    return _route(lambda answer: page(RobotProfile)(answer).items, names={})
 
 
 @route("GET", "/v1/robots/profiles/{name}")
-def profile(at: Route, name: str) -> Call[RobotProfile]:
-    """One robot by name, or by the id of an uploaded URDF."""
-    return at(record(RobotProfile), names={"name": name})
+def profile(_route: Route, name: str) -> Call[RobotProfile]:
+    """Return a robot profile, by name or by the id of an uploaded URDF."""
+    return _route(record(RobotProfile), names={"name": name})

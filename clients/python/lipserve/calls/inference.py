@@ -1,5 +1,4 @@
-"""Calls that ask a model for torques, or how well it knows them, in the service's own way and by the Open Inference
-Protocol; and calls about the service itself."""
+"""Calls for predictions and evaluations, the Open Inference Protocol, and the state of the service."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ from lipserve.results.series import Prediction, Trace, read_prediction, read_tra
 
 @route("POST", "/v1/models/{model}/predict", repeatable=True)
 def predict(
-    at: Route,
+    _route: Route,
     model: str,
     q: ArrayLike,
     dq: ArrayLike,
@@ -41,12 +40,32 @@ def predict(
     min_revision: int | None = None,
     payload: Mapping[str, ArrayLike] | None = None,
 ) -> Call[Prediction]:
-    """Torque for arrays of shape (n,) or (N, n), and components by name; tau is for `forward_dynamics` only.
+    """Predict torques and their standard deviations at one or N motions.
 
-    The version that serves answers, unless one is named by its number or an alias. min_revision: of an acknowledgement,
-    so that the answer contains what was taught, whichever service took it; refused with 503 where it takes too long.
-    payload: what the arm carries, `mass` in kg, `com` (3,) m and, unless it is a point, `inertia` (3, 3) kg·m², both in
-    the frame of the last link, the latter about the centre of mass.
+    Args:
+        model: Name of the model.
+        q: (n,) or (N, n) positions, rad (prismatic: m).
+        dq: Velocities, rad/s, shaped as q.
+        ddq: Accelerations, rad/s², shaped as q.
+        version: Version number. Default: the serving version.
+        covariance: Return the covariance between joints too.
+        components: Components to return too, e.g. `gravity` or `inertia_matrix`.
+        tau: Torques, N·m, shaped as q; only for the component `forward_dynamics`.
+        alias: Alias of the version, instead of its number.
+        min_revision: Min revision of the answer, e.g. that of an acknowledged observation batch. The service waits
+            for it and answers 503 if that takes too long.
+        payload: `mass`, kg; `com`, (3,) m, in the frame of the last link; optional `inertia`, (3, 3) kg·m², about
+            the centre of mass (default: a point mass).
+
+    Returns:
+        The prediction, shaped as q.
+
+    Raises:
+        ApiError: The request is invalid, or there is no such model or version.
+
+    Example:
+        >>> answer = client.predict("panda-sim", [0.0] * 7, [0.0] * 7, [0.0] * 7)
+        >>> lower, upper = answer.interval(0.95)
     """
     body: dict[str, Any] = {"covariance": covariance, "components": list(components)}
     for name, values in (("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau)):
@@ -55,12 +74,12 @@ def predict(
     if payload is not None:
         body["payload"] = {name: np.asarray(value).tolist() for name, value in payload.items()}
     body |= given(version=version, alias=alias, min_revision=min_revision)
-    return at(read_prediction, names={"model": model}, json=body)
+    return _route(read_prediction, names={"model": model}, json=body)
 
 
 @route("POST", "/v1/models/{model}/evaluate", repeatable=True)
 def evaluate(
-    at: Route,
+    _route: Route,
     model: str,
     dataset: str,
     version: int | None = None,
@@ -68,25 +87,37 @@ def evaluate(
     part: Literal["all", "held_out"] = "all",
     min_revision: int | None = None,
 ) -> Call[Evaluation]:
-    """Compare a model with a data set: the version that serves, unless one is named by its number or an alias.
+    """Evaluate a model on a data set.
 
-    part: `held_out` compares with what the version's training has held out of the data set. If the version has learnt
-    that since, the figures are of the judged fit. min_revision: as of `predict`.
+    Args:
+        model: Name of the model.
+        dataset: Id or name of the data set.
+        version: Version number. Default: the serving version.
+        alias: Alias of the version, instead of its number.
+        part: `held_out`: only the part that the version's training held out. If the version was trained on that part
+            afterwards, the figures are those of the fit without it.
+        min_revision: Min revision of the version; see `predict`.
+
+    Returns:
+        Figures per joint.
+
+    Example:
+        >>> print(client.evaluate("panda-sim", "ds_0123456789abcdef"))
     """
     body = {"dataset": dataset, "part": part} | given(version=version, alias=alias, min_revision=min_revision)
-    return at(read_evaluation, names={"model": model}, json=body)
+    return _route(read_evaluation, names={"model": model}, json=body)
 
 
 @route("POST", "/v1/models/{model}/compare", repeatable=True)
-def compare(at: Route, model: str, dataset: str, first: int | str, second: int | str) -> Call[Comparison]:
-    """Compare two versions, each a number or an alias, on a data set."""
+def compare(_route: Route, model: str, dataset: str, first: int | str, second: int | str) -> Call[Comparison]:
+    """Compare two versions on a data set. first, second: version numbers or aliases."""
     body = {"dataset": dataset, "versions": [first, second]}
-    return at(read_comparison, names={"model": model}, json=body)
+    return _route(read_comparison, names={"model": model}, json=body)
 
 
 @route("POST", "/v1/models/{model}/trace", repeatable=True)
 def trace(
-    at: Route,
+    _route: Route,
     model: str,
     dataset: str,
     version: int | None = None,
@@ -97,90 +128,109 @@ def trace(
     points: int = 1000,
     components: Sequence[str] = (),
 ) -> Call[Trace]:
-    """Measured torque beside the model's at rows of a data set, evenly chosen where there are more than `points`.
+    """Return measured and predicted torque at rows of a data set.
 
-    start, stop: first row and the one to end before; components: parts of the torque by name.
+    Args:
+        model: Name of the model.
+        dataset: Id or name of the data set.
+        version: Version number. Default: the serving version.
+        alias: Alias of the version, instead of its number.
+        part: `held_out`: only the part that the version's training held out.
+        start: First row.
+        stop: Row to stop before. Default: the end.
+        points: Max number of rows; if there are more, they are chosen evenly.
+        components: Components of the torque to return too.
     """
     body = {"dataset": dataset, "part": part, "start": start, "points": points, "components": list(components)}
     body |= given(version=version, alias=alias, stop=stop)
-    return at(read_trace, names={"model": model}, json=body)
+    return _route(read_trace, names={"model": model}, json=body)
 
 
 V2_MODEL, V2_VERSION = "/v2/models/{model}", "/v2/models/{model}/versions/{version}"
 
 
 @route("GET", "/health")
-def abilities(at: Route) -> Call[Health]:
-    """What the service can do: which extras are installed there."""
-    return at(record(Health), names={})
+def abilities(_route: Route) -> Call[Health]:
+    """Return the abilities of the service: which extras are installed."""
+    return _route(record(Health), names={})
 
 
 @route("GET", "/health/live")
-def live_health(at: Route) -> Call[Live]:
-    """Whether the process is alive: it answers."""
-    return at(record(Live), names={})
+def live_health(_route: Route) -> Call[Live]:
+    """Check that the process of the service is alive."""
+    return _route(record(Live), names={})
 
 
 @route("GET", "/health/ready", repeatable=False)
-def health(at: Route) -> Call[Ready]:
-    """What works of the service; raise ApiError where it cannot answer queries now. See `ready`."""
-    return at(record(Ready), names={})
+def health(_route: Route) -> Call[Ready]:
+    """Return the state of the parts of the service; raise ApiError if it is not ready. See `ready`."""
+    return _route(record(Ready), names={})
 
 
 @route("GET", "/metrics")
-def metrics(at: Route) -> Call[str]:
-    """Metrics in the text format of Prometheus."""
-    return at(lambda answer: answer.body.decode(), names={})
+def metrics(_route: Route) -> Call[str]:
+    """Return the metrics in the text format of Prometheus."""
+    return _route(lambda answer: answer.body.decode(), names={})
 
 
 @route("POST", "/v1/echo", repeatable=True)
-def echo(at: Route, body: Any) -> Call[Any]:
-    """What was sent, as JSON: what a request costs before anything is computed."""
-    return at(document, names={}, json=body)
+def echo(_route: Route, body: Any) -> Call[Any]:
+    """Return the JSON that was sent. It measures the cost of a request without computation."""
+    return _route(document, names={}, json=body)
 
 
 @route("GET", "/v2")
-def server_metadata(at: Route) -> Call[ServerMetadata]:
-    """Name and version of the server, and the extensions of the Open Inference Protocol that it speaks."""
-    return at(record(ServerMetadata), names={})
+def server_metadata(_route: Route) -> Call[ServerMetadata]:
+    """Return name, version and extensions of the server (Open Inference Protocol)."""
+    return _route(record(ServerMetadata), names={})
 
 
 @route("GET", "/v2/health/live")
-def server_live(at: Route) -> Call[ServerLive]:
-    """Whether the server lives, by the Open Inference Protocol."""
-    return at(record(ServerLive), names={})
+def server_live(_route: Route) -> Call[ServerLive]:
+    """Return whether the server is alive (Open Inference Protocol)."""
+    return _route(record(ServerLive), names={})
 
 
 @route("GET", "/v2/health/ready", repeatable=False)
-def server_ready(at: Route) -> Call[ServerReady]:
-    """Whether the server is ready, by the Open Inference Protocol."""
-    return at(record(ServerReady), names={})
+def server_ready(_route: Route) -> Call[ServerReady]:
+    """Return whether the server is ready (Open Inference Protocol)."""
+    return _route(record(ServerReady), names={})
 
 
 @route("GET", V2_MODEL, V2_VERSION)
-def model_metadata(at: Route, model: str, version: int | None = None) -> Call[ModelMetadata]:
-    """The tensors of a model, by the Open Inference Protocol."""
-    return at(record(ModelMetadata), names={"model": model, "version": version})
+def model_metadata(_route: Route, model: str, version: int | None = None) -> Call[ModelMetadata]:
+    """Return the tensors of a model (Open Inference Protocol)."""
+    return _route(record(ModelMetadata), names={"model": model, "version": version})
 
 
 @route("GET", V2_MODEL + "/ready", V2_VERSION + "/ready")
-def model_ready(at: Route, model: str, version: int | None = None) -> Call[ModelReady]:
-    """Whether a model answers, by the Open Inference Protocol."""
-    return at(record(ModelReady), names={"model": model, "version": version})
+def model_ready(_route: Route, model: str, version: int | None = None) -> Call[ModelReady]:
+    """Return whether a model is ready (Open Inference Protocol)."""
+    return _route(record(ModelReady), names={"model": model, "version": version})
 
 
 @route("POST", V2_MODEL + "/infer", V2_VERSION + "/infer", repeatable=True)
 def infer(
-    at: Route, model: str, inputs: Mapping[str, ArrayLike], outputs: Sequence[str] = (), version: int | None = None
+    _route: Route, model: str, inputs: Mapping[str, ArrayLike], outputs: Sequence[str] = (), version: int | None = None
 ) -> Call[dict[str, Array]]:
-    """Tensors by name for tensors by name, by the Open Inference Protocol; `predict` says more of what it answers."""
+    """Run a model on named tensors (Open Inference Protocol). `predict` does the same with described results.
+
+    Args:
+        model: Name of the model.
+        inputs: Tensors by name, sent as FP64.
+        outputs: Names of the outputs. Default: all.
+        version: Version number. Default: the serving version.
+
+    Returns:
+        Tensors by name.
+    """
     tensors = []
     for name, values in inputs.items():
         numbers = np.asarray(values, np.float64)
         shape = list(numbers.shape)
         tensors.append({"name": name, "shape": shape, "datatype": "FP64", "data": numbers.ravel().tolist()})
     body: dict[str, Any] = {"inputs": tensors, **given(outputs=[{"name": name} for name in outputs] or None)}
-    return at(_tensors, names={"model": model, "version": version}, json=body)
+    return _route(_tensors, names={"model": model, "version": version}, json=body)
 
 
 def _tensors(answer: Answer) -> dict[str, Array]:

@@ -1,4 +1,4 @@
-"""Calls about learning from measured torques."""
+"""Calls for online learning from measured torques."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PAYLOAD = "/v1/models/{model}/payload"
 
 @route("POST", "/v1/models/{model}/observations", repeatable=True)
 def observe(
-    at: Route,
+    _route: Route,
     model: str,
     stream_id: str,
     sequence: int,
@@ -32,130 +32,169 @@ def observe(
     t: ArrayLike | None = None,
     joint_names: Sequence[str] | None = None,
 ) -> Call[ObservationResponse]:
-    """Teach a model with measured rows, arrays of shape (N, n) or (n,), times (N,); repeat it until it is answered.
+    """Send a batch of measured rows for a model to learn from.
 
-    A number that is not finite keeps its row out of learning. Raise ApiError where the batch is refused.
+    If the call fails, repeat it with the same sequence until it is answered. Rows with a value that is not finite are
+    not learnt.
+
+    Args:
+        model: Name of the model.
+        stream_id: Name of the robot or recording.
+        sequence: Number of the batch in its stream, counted up by one. A repeated batch is applied once.
+        q: (N, n) or (n,) positions, rad (prismatic: m).
+        dq: Velocities, rad/s, shaped as q.
+        tau: Measured torques, N·m (prismatic: N), shaped as q.
+        ddq: Accelerations, rad/s², shaped as q; required unless t is given.
+        t: (N,) times of the rows, s. Default: the time of arrival.
+        joint_names: (n,) names, if the joints are in another order than the model's.
+
+    Returns:
+        Number of accepted and rejected rows, and the revision that contains the batch.
+
+    Raises:
+        ApiError: The service rejects the batch.
+
+    Example:
+        >>> client.observe("my-arm", "cell-1", 0, q, dq, tau, ddq).accepted
+        30
     """
     body: dict[str, Any] = {"stream_id": stream_id, "sequence": sequence}
     for name, values in (("t", t), ("q", q), ("dq", dq), ("ddq", ddq), ("tau", tau)):
         if values is not None:
             numbers = np.asarray(values, dtype=np.float64)
             sendable = numbers.astype(object)
-            sendable[~np.isfinite(numbers)] = None  # JSON has no such numbers
+            sendable[~np.isfinite(numbers)] = None  # JSON has no NaN or infinity
             body[name] = sendable.tolist()
     body |= given(joint_names=None if joint_names is None else list(joint_names))
-    return at(record(ObservationResponse), names={"model": model}, json=body)
+    return _route(record(ObservationResponse), names={"model": model}, json=body)
 
 
 @route("GET", "/v1/models/{model}/observations")
 def observations(
-    at: Route, model: str, stream_id: str | None = None, rejected: bool = False
+    _route: Route, model: str, stream_id: str | None = None, rejected: bool = False
 ) -> Call[Page[Observation]]:
-    """The batches of a model's log, newest first; rejected: only those with rows that were kept out."""
+    """List the observation batches of a model, newest first. rejected: only batches with rejected rows."""
     params = {"stream_id": stream_id, "rejected": rejected or None}
-    return at(page(Observation), names={"model": model}, params=params)
+    return _route(page(Observation), names={"model": model}, params=params)
 
 
 @route("GET", BATCH)
-def observation(at: Route, model: str, stream_id: str, sequence: int, rows: bool = False) -> Call[ObservationDetail]:
-    """One batch, with its rows where asked for."""
+def observation(
+    _route: Route, model: str, stream_id: str, sequence: int, rows: bool = False
+) -> Call[ObservationDetail]:
+    """Return an observation batch. rows: include its rows."""
     names = {"model": model, "stream_id": stream_id, "sequence": sequence}
-    return at(record(ObservationDetail), names=names, params={"rows": rows})
+    return _route(record(ObservationDetail), names=names, params={"rows": rows})
 
 
 @route("DELETE", BATCH)
-def unlearn(at: Route, model: str, stream_id: str, sequence: int) -> Call[Unlearnt]:
-    """Take a batch out of what is learnt."""
-    return at(record(Unlearnt), names={"model": model, "stream_id": stream_id, "sequence": sequence})
+def unlearn(_route: Route, model: str, stream_id: str, sequence: int) -> Call[Unlearnt]:
+    """Remove the effect of a batch from the model. The batch stays in the log."""
+    return _route(record(Unlearnt), names={"model": model, "stream_id": stream_id, "sequence": sequence})
 
 
 @route("POST", BATCH + "/replay")
-def replay(at: Route, model: str, stream_id: str, sequence: int, codes: Sequence[str] | None = None) -> Call[Replayed]:
-    """Learn rows of a batch after all that were kept out, by these codes or by any."""
+def replay(
+    _route: Route, model: str, stream_id: str, sequence: int, codes: Sequence[str] | None = None
+) -> Call[Replayed]:
+    """Learn rejected rows of a batch. codes: only rows with these codes. Default: all."""
     body = given(codes=None if codes is None else list(codes))
-    return at(record(Replayed), names={"model": model, "stream_id": stream_id, "sequence": sequence}, json=body)
+    return _route(record(Replayed), names={"model": model, "stream_id": stream_id, "sequence": sequence}, json=body)
 
 
 @route("POST", "/v1/models/{model}/rollback")
-def rollback(at: Route, model: str, revision: int | None = None, version: int | None = None) -> Call[RolledBack]:
-    """Go back to a revision of the version that serves, or to another version: name one of the two."""
-    return at(record(RolledBack), names={"model": model}, json=given(revision=revision, version=version))
+def rollback(_route: Route, model: str, revision: int | None = None, version: int | None = None) -> Call[RolledBack]:
+    """Return to a revision of the serving version, or to another version: give one of the two."""
+    return _route(record(RolledBack), names={"model": model}, json=given(revision=revision, version=version))
 
 
 @route("POST", "/v1/models/{model}/refresh")
-def refresh(at: Route, model: str) -> Call[Job]:
-    """Queue a job that trains the version that serves anew, with what has been observed since."""
-    return at(record(Job), names={"model": model}, json={})
+def refresh(_route: Route, model: str) -> Call[Job]:
+    """Queue a job that retrains the serving version with all observations since."""
+    return _route(record(Job), names={"model": model}, json={})
 
 
 @route("GET", "/v1/models/{model}/quality")
-def quality(at: Route, model: str) -> Call[Quality]:
-    """How well a model predicts what it has not learnt yet, over sliding windows."""
-    return at(record(Quality), names={"model": model})
+def quality(_route: Route, model: str) -> Call[Quality]:
+    """Return the prediction errors of rows before they are learnt, over sliding windows."""
+    return _route(record(Quality), names={"model": model})
 
 
 @route("GET", "/v1/models/{model}/learning")
-def learning(at: Route, model: str) -> Call[Learning]:
-    """How a model learns, and where that stands."""
-    return at(record(Learning), names={"model": model})
+def learning(_route: Route, model: str) -> Call[Learning]:
+    """Return the learning options of a model and the state of learning."""
+    return _route(record(Learning), names={"model": model})
 
 
 @route("PUT", "/v1/models/{model}/learning")
-def put_learning(at: Route, model: str, options: Mapping[str, Any]) -> Call[Learning]:
-    """Set how a model learns: all options, those left out to their defaults. See `set_learning`."""
-    return at(record(Learning), names={"model": model}, json=dict(options))
+def put_learning(_route: Route, model: str, options: Mapping[str, Any]) -> Call[Learning]:
+    """Replace all learning options of a model; missing ones get their defaults. See `set_learning`."""
+    return _route(record(Learning), names={"model": model}, json=dict(options))
 
 
 @route("POST", "/v1/models/{model}/learning/change")
-def decide(at: Route, model: str, decision: Literal["adapt", "ignore"], replay: bool = False) -> Call[Decided]:
-    """End a hold: `adapt` to the changed robot, or `ignore`. replay: learn the rows that were kept out since."""
-    return at(record(Decided), names={"model": model}, json={"decision": decision, "replay": replay})
+def decide(_route: Route, model: str, decision: Literal["adapt", "ignore"], replay: bool = False) -> Call[Decided]:
+    """Resume paused learning.
+
+    Args:
+        model: Name of the model.
+        decision: `adapt`: the robot has changed, reduce the weight of earlier data; `ignore`: resume as before.
+        replay: Also learn the rows that were rejected during the pause.
+    """
+    return _route(record(Decided), names={"model": model}, json={"decision": decision, "replay": replay})
 
 
 @route("GET", PAYLOAD)
-def payload(at: Route, model: str) -> Call[Payloads]:
-    """What the arms of a model's streams carry, with what is not known of it."""
-    return at(record(Payloads), names={"model": model})
+def payload(_route: Route, model: str) -> Call[Payloads]:
+    """Return the payloads of a model's streams, with their uncertainty."""
+    return _route(record(Payloads), names={"model": model})
 
 
 @route("PUT", PAYLOAD)
 def declare_payload(
-    at: Route,
+    _route: Route,
     model: str,
     mass: float,
     com: ArrayLike,
     inertia: ArrayLike | None = None,
     stream_id: str | None = None,
 ) -> Call[Payloads]:
-    """Answer with a payload from now on: mass, kg, and com, (3) m, in the frame of the last link; inertia, (3, 3)
-    kg·m², about com, that of a point where None. stream_id: which robot carries it, all of the model where None."""
+    """Declare a payload. Predictions include it from now on.
+
+    Args:
+        model: Name of the model.
+        mass: Mass, kg.
+        com: (3,) centre of mass in the frame of the last link, m.
+        inertia: (3, 3) inertia about the centre of mass, kg·m². Default: a point mass.
+        stream_id: Stream of the robot that carries it. Default: all streams of the model.
+    """
     shape = None if inertia is None else np.asarray(inertia, np.float64).tolist()
     body = {"mass": float(mass), "com": np.asarray(com, np.float64).tolist()}
-    return at(record(Payloads), names={"model": model}, json=body | given(inertia=shape, stream_id=stream_id))
+    return _route(record(Payloads), names={"model": model}, json=body | given(inertia=shape, stream_id=stream_id))
 
 
 @route("DELETE", PAYLOAD)
-def remove_payload(at: Route, model: str, stream_id: str | None = None) -> Call[Payloads]:
-    """Answer without a payload from now on, a stream or all of them."""
-    return at(record(Payloads), names={"model": model}, params={"stream_id": stream_id})
+def remove_payload(_route: Route, model: str, stream_id: str | None = None) -> Call[Payloads]:
+    """Remove the payload of a stream, or of all streams if stream_id is None."""
+    return _route(record(Payloads), names={"model": model}, params={"stream_id": stream_id})
 
 
 @route("DELETE", "/v1/models/{model}/streams/{stream_id}")
-def delete_stream(at: Route, model: str, stream_id: str) -> Call[None]:
-    """Forget a stream. What it has taught stays learnt."""
-    return at(nothing, names={"model": model, "stream_id": stream_id}, removes=True)
+def delete_stream(_route: Route, model: str, stream_id: str) -> Call[None]:
+    """Delete the state of a stream. The model keeps what it learnt from it."""
+    return _route(nothing, names={"model": model, "stream_id": stream_id}, removes=True)
 
 
 @route("GET", "/v1/models/{model}/alarms")
-def alarms(at: Route, model: str) -> Call[Page[Alarm]]:
-    """A model's alarms, newest first."""
-    return at(page(Alarm), names={"model": model})
+def alarms(_route: Route, model: str) -> Call[Page[Alarm]]:
+    """List the alarms of a model, newest first."""
+    return _route(page(Alarm), names={"model": model})
 
 
 @route("GET", "/v1/models/{model}/live")
-def live(at: Route, model: str) -> Call[Live]:
-    """What streams and batches bring to a model, predicted before it is learnt, as it comes: until the service stops.
+def live(_route: Route, model: str) -> Call[Live]:
+    """Follow observations of a model live, each predicted before it is learnt, until the service stops.
 
-    Of the rows some are shown and all are counted. Whoever reads too slowly is told how much was `lost`.
+    All rows are counted, some are included. If you read too slowly, an event says how many events were lost.
     """
-    return at(read_live, names={"model": model})
+    return _route(read_live, names={"model": model})

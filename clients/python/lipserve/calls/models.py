@@ -1,4 +1,4 @@
-"""Calls about training jobs, and about models, their versions, aliases and archives, and what changed them."""
+"""Calls for training jobs, models, versions, aliases, archives and the audit log."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lipserve.states import PromotionOption
 
 @route("POST", "/v1/jobs", repeatable=True)
 def train(
-    at: Route,
+    _route: Route,
     model: str,
     datasets: Sequence[str],
     estimator: str | None = None,
@@ -34,19 +34,38 @@ def train(
 ) -> Call[Job]:
     """Queue a training job.
 
-    robot: for rigid bodies, a profile such as panda or the id of an uploaded URDF; holdout: what to hold out of the
-    data sets and judge the version on, {"share": 0.3} by default, False for nothing. The version then learns it, too,
-    unless that is {"only": True}. promotion: `ask` (default) lets the version answer if it does well there, `always` in
-    any case; base: a version of another unit of the same robot to start from, as `model:3` or `model@alias`;
-    idempotency_key: the same request under the same key queues one job, also from another client.
+    Args:
+        model: Name of the model. The job adds a version.
+        datasets: Ids or names of data sets.
+        estimator: Name of the estimator. Default: `auto`, which compares several.
+        joint_types: (n,) `revolute` or `prismatic`. Default: those of the data sets' robot, else all revolute.
+        options: Fit options; see `options` of POST /v1/jobs.
+        robot: Profile such as panda, or id of an uploaded URDF, for rigid-body estimators.
+        holdout: Part to hold out for evaluation, {"share": 0.3} by default; False for none. The version is then
+            trained on all samples, unless the part has {"only": True}.
+        promotion: `ask`: the version becomes the serving version if it passes the check on held-out data; `always`:
+            in any case. Default: the service's setting.
+        base: Version of another unit of the same robot to start from, as `model:3` or `model@alias`.
+        idempotency_key: The same request with the same key queues one job, also from other clients.
+
+    Returns:
+        The queued job; see `wait`.
+
+    Raises:
+        ApiError: The request is invalid.
+
+    Example:
+        >>> job = client.wait(client.train("my-arm", ["ds_0123456789abcdef"]))
+        >>> job.state, job.version
+        ('succeeded', 1)
     """
     body = _asked(model, datasets, estimator, joint_types, options, robot, holdout, promotion, base)
-    return at(record(Job), names={}, json=body, headers={KEY_HEADER: idempotency_key or new_key()})
+    return _route(record(Job), names={}, json=body, headers={KEY_HEADER: idempotency_key or new_key()})
 
 
 @route("POST", "/v1/jobs/check")
 def check_training(
-    at: Route,
+    _route: Route,
     model: str,
     datasets: Sequence[str] = (),
     estimator: str | None = None,
@@ -57,12 +76,12 @@ def check_training(
     promotion: PromotionOption | None = None,
     base: str | None = None,
 ) -> Call[None]:
-    """Check what `train` would be asked, before its recordings are uploaded; raise ApiError where that is wrong.
+    """Check the arguments of `train` before recordings are uploaded; raise ApiError if they are invalid.
 
-    datasets: those that are there already; without any, what depends on the data is not checked.
+    Without `datasets`, checks that depend on the data are skipped.
     """
     body = _asked(model, datasets, estimator, joint_types, options, robot, holdout, promotion, base)
-    return at(nothing, names={}, json=body)
+    return _route(nothing, names={}, json=body)
 
 
 def _asked(
@@ -76,7 +95,7 @@ def _asked(
     promotion: PromotionOption | None,
     base: str | None,
 ) -> dict[str, Any]:
-    """The body of a request to train."""
+    """Return the body of a training request."""
     body = {"model": model, "datasets": list(datasets), "options": dict(options or {})} | given(
         estimator=estimator,
         joint_types=None if joint_types is None else list(joint_types),
@@ -86,110 +105,110 @@ def _asked(
         base=base,
     )
     if holdout is False:
-        body["holdout"] = None  # said: left out it is the service's default
+        body["holdout"] = None  # explicit null: a missing field means the service's default
     return body
 
 
 @route("GET", "/v1/jobs")
-def jobs(at: Route) -> Call[Page[Job]]:
-    """All jobs, newest first."""
-    return at(page(Job), names={})
+def jobs(_route: Route) -> Call[Page[Job]]:
+    """List jobs, newest first."""
+    return _route(page(Job), names={})
 
 
 @route("GET", "/v1/jobs/{job}")
-def job(at: Route, job: str) -> Call[Job]:
-    """A job with its progress."""
-    return at(record(Job), names={"job": job})
+def job(_route: Route, job: str) -> Call[Job]:
+    """Return a job with its progress."""
+    return _route(record(Job), names={"job": job})
 
 
 @route("GET", "/v1/jobs/{job}/events")
-def job_events(at: Route, job: str) -> Call[Job]:
-    """A job as it is and at every change, until it ends or the service stops."""
-    return at(record(Job), names={"job": job})
+def job_events(_route: Route, job: str) -> Call[Job]:
+    """Follow a job: yield it now and after every change, until it ends or the service stops."""
+    return _route(record(Job), names={"job": job})
 
 
 @route("POST", "/v1/jobs/{job}/cancel")
-def cancel(at: Route, job: str) -> Call[Job]:
+def cancel(_route: Route, job: str) -> Call[Job]:
     """Cancel a job."""
-    return at(record(Job), names={"job": job})
+    return _route(record(Job), names={"job": job})
 
 
 @route("POST", "/v1/jobs/{job}/retry", repeatable=True)
-def retry(at: Route, job: str, *, idempotency_key: str | None = None) -> Call[Job]:
-    """Queue a new job that repeats one that failed or was cancelled."""
-    return at(record(Job), names={"job": job}, headers={KEY_HEADER: idempotency_key or new_key()})
+def retry(_route: Route, job: str, *, idempotency_key: str | None = None) -> Call[Job]:
+    """Queue a failed or cancelled job again, as a new job."""
+    return _route(record(Job), names={"job": job}, headers={KEY_HEADER: idempotency_key or new_key()})
 
 
 ARCHIVE_TIMEOUT = 600.0
-"""Longest wait for an archive to be packed or checked, s."""
+"""Max time for the service to pack or check an archive, s."""
 C_FILES = ("lipserve_model.c", "lipserve_model.h")
-"""What a version as C is."""
+"""Files of a version that is exported as C."""
 
 
 @route("GET", "/v1/models")
-def models(at: Route) -> Call[Page[Model]]:
-    """All models with their versions, newest first."""
-    return at(page(Model), names={})
+def models(_route: Route) -> Call[Page[Model]]:
+    """List models with their versions, newest first."""
+    return _route(page(Model), names={})
 
 
 @route("GET", "/v1/overview")
-def overview(at: Route) -> Call[Page[ModelOverview]]:
-    """All models at a glance, newest first: arm, quality, what came lately, what needs a decision."""
-    return at(page(ModelOverview), names={})
+def overview(_route: Route) -> Call[Page[ModelOverview]]:
+    """List summaries of models, newest first: arm, quality, recent observations, pending decisions."""
+    return _route(page(ModelOverview), names={})
 
 
 @route("GET", "/v1/models/{model}")
-def model(at: Route, model: str) -> Call[Model]:
-    """A model with its versions."""
-    return at(record(Model), names={"model": model})
+def model(_route: Route, model: str) -> Call[Model]:
+    """Return a model with its versions."""
+    return _route(record(Model), names={"model": model})
 
 
 @route("DELETE", "/v1/models/{model}")
-def delete_model(at: Route, model: str) -> Call[None]:
-    """Delete a model with all that it has observed and learnt, for good."""
-    return at(nothing, names={"model": model}, removes=True)
+def delete_model(_route: Route, model: str) -> Call[None]:
+    """Delete a model with its versions and observations permanently."""
+    return _route(nothing, names={"model": model}, removes=True)
 
 
 @route("GET", "/v1/models/{model}/versions/{version}")
-def version(at: Route, model: str, version: int) -> Call[Version]:
-    """One version of a model; its `arm` is what it has learnt of its robot, and `print` shows that."""
-    return at(record(Version), names={"model": model, "version": version})
+def version(_route: Route, model: str, version: int) -> Call[Version]:
+    """Return a version of a model. Its property `arm` is the estimated arm; `print` shows it."""
+    return _route(record(Version), names={"model": model, "version": version})
 
 
 @route("DELETE", "/v1/models/{model}/versions/{version}")
-def delete_version(at: Route, model: str, version: int) -> Call[None]:
-    """Delete a version that nothing needs, for good."""
-    return at(nothing, names={"model": model, "version": version}, removes=True)
+def delete_version(_route: Route, model: str, version: int) -> Call[None]:
+    """Delete a version that is not in use permanently."""
+    return _route(nothing, names={"model": model, "version": version}, removes=True)
 
 
 @route("GET", "/v1/models/{model}/aliases")
-def aliases(at: Route, model: str) -> Call[list[Alias]]:
-    """Every alias of a model, `serving` first."""
-    return at(lambda answer: page(Alias)(answer).items, names={"model": model})
+def aliases(_route: Route, model: str) -> Call[list[Alias]]:
+    """Return the aliases of a model, `serving` first."""
+    return _route(lambda answer: page(Alias)(answer).items, names={"model": model})
 
 
 @route("PUT", "/v1/models/{model}/aliases/{alias}")
-def set_alias(at: Route, model: str, alias: str, version: int | str) -> Call[Alias]:
-    """Point an alias to a version, or to where another alias points; `serving` answers where none is named."""
+def set_alias(_route: Route, model: str, alias: str, version: int | str) -> Call[Alias]:
+    """Point an alias to a version, or to the version of another alias. `serving` sets the serving version."""
     body = {"alias": version} if isinstance(version, str) else {"version": version}
-    return at(record(Alias), names={"model": model, "alias": alias}, json=body)
+    return _route(record(Alias), names={"model": model, "alias": alias}, json=body)
 
 
 @route("DELETE", "/v1/models/{model}/aliases/{alias}")
-def remove_alias(at: Route, model: str, alias: str) -> Call[None]:
-    """Remove an alias; its version stays."""
-    return at(nothing, names={"model": model, "alias": alias}, removes=True)
+def remove_alias(_route: Route, model: str, alias: str) -> Call[None]:
+    """Remove an alias. Its version stays."""
+    return _route(nothing, names={"model": model, "alias": alias}, removes=True)
 
 
 @route("POST", "/v1/models/{model}/aliases/{alias}/rollback")
-def rollback_alias(at: Route, model: str, alias: str) -> Call[Alias]:
-    """Take back the last move of an alias, the next time the one before it."""
-    return at(record(Alias), names={"model": model, "alias": alias})
+def rollback_alias(_route: Route, model: str, alias: str) -> Call[Alias]:
+    """Undo the last move of an alias; if repeated, the one before it."""
+    return _route(record(Alias), names={"model": model, "alias": alias})
 
 
 @route("GET", "/v1/models/{model}/export")
 def export(
-    at: Route,
+    _route: Route,
     model: str,
     path: Path | str,
     version: int | None = None,
@@ -197,10 +216,18 @@ def export(
     learnt: bool = True,
     format: Literal["archive", "c"] = "archive",  # noqa: A002 - the API's own name
 ) -> Call[Path]:
-    """Write a version as an archive to `path`, whole or not at all, and return it; see `import_model`.
+    """Export a version as an archive for `import_model`, or as C code.
 
-    The version that serves, unless one is named. learnt: with what it has learnt online, else as it was trained;
-    format: `c` writes `lipserve_model.c` and `lipserve_model.h` to the folder `path`, for a model of rigid bodies.
+    Args:
+        model: Name of the model.
+        path: Archive to write; it is written completely or not at all. For C: the folder.
+        version: Version number. Default: the serving version.
+        alias: Alias of the version, instead of its number.
+        learnt: Include what was learnt online; else export the version as trained.
+        format: `archive`, or `c` for `lipserve_model.c` and `lipserve_model.h` (rigid-body models only).
+
+    Returns:
+        The path.
     """
     path = Path(path)
 
@@ -210,36 +237,48 @@ def export(
             with tarfile.open(fileobj=io.BytesIO(answer.body)) as archive:
                 for name in C_FILES:
                     content = archive.extractfile(name)
-                    assert content is not None  # a plain file
+                    assert content is not None  # a regular file
                     (path / name).write_bytes(content.read())
         return path
 
     params = given(version=version, alias=alias) | {"learnt": learnt}
     if format == "c":
-        return at(read, names={"model": model}, params={**params, "format": format}, timeout=ARCHIVE_TIMEOUT)
-    return at(read, names={"model": model}, params=params, save_to=path, timeout=ARCHIVE_TIMEOUT)
+        return _route(read, names={"model": model}, params={**params, "format": format}, timeout=ARCHIVE_TIMEOUT)
+    return _route(read, names={"model": model}, params=params, save_to=path, timeout=ARCHIVE_TIMEOUT)
 
 
 @route("GET", "/v1/models/{model}/urdf")
-def urdf(at: Route, model: str, version: int | None = None, alias: str | None = None) -> Call[str]:
-    """The arm that a version has learnt, as the text of a URDF; raise ApiError for an estimator without rigid bodies.
+def urdf(_route: Route, model: str, version: int | None = None, alias: str | None = None) -> Call[str]:
+    """Return the estimated arm of a version (default: the serving one) as the text of a URDF.
 
-    The version that serves, unless one is named.
+    Raises:
+        ApiError: The estimator has no rigid bodies.
     """
-    return at(lambda answer: answer.body.decode(), names={"model": model}, params=given(version=version, alias=alias))
+    return _route(
+        lambda answer: answer.body.decode(), names={"model": model}, params=given(version=version, alias=alias)
+    )
 
 
 @route("POST", "/v1/models/import")
 def import_model(
-    at: Route, path: Path | str, name: str | None = None, promotion: PromotionOption | None = None
+    _route: Route, path: Path | str, name: str | None = None, promotion: PromotionOption | None = None
 ) -> Call[Version]:
-    """Make a new version of an archive that a service has exported; raise ApiError where it is refused.
+    """Import an exported archive as a new version.
 
-    name: of the model, that of the archive by default; promotion: `ask`, so that it answers if the model had no version
-    and it does well on what its training held out, or `always`.
+    Args:
+        path: Archive written by `export`.
+        name: Name of the model. Default: the name in the archive.
+        promotion: `ask`: the version becomes the serving version if the model had none and it passes the check on
+            held-out data; `always`: in any case.
+
+    Returns:
+        The new version.
+
+    Raises:
+        ApiError: The service rejects the archive.
     """
     headers = {"content-type": "application/x-tar"}
-    return at(
+    return _route(
         record(Version),
         names={},
         params=given(name=name, promotion=promotion),
@@ -251,16 +290,21 @@ def import_model(
 
 @route("GET", "/v1/audit")
 def audit(
-    at: Route,
+    _route: Route,
     model: str | None = None,
     key: str | None = None,
     change: str | None = None,
     since: str | None = None,
     until: str | None = None,
 ) -> Call[Page[AuditEntry]]:
-    """Who changed what of which model, newest first; of a model, of the API key of an id, or of one kind of change.
+    """List changes to models, newest first.
 
-    since, until: from a moment on and before another, ISO 8601 with a zone, as 2026-11-24T08:00:00Z.
+    Args:
+        model: Only changes to this model.
+        key: Only changes made with the API key of this id.
+        change: Only this kind of change, e.g. `alias moved`.
+        since: Only changes at or after this time: ISO 8601 with a zone, e.g. 2026-11-24T08:00:00Z.
+        until: Only changes before this time.
     """
     params = {"model": model, "key": key, "change": change, "since": since, "until": until}
-    return at(page(AuditEntry), names={}, params=params)
+    return _route(page(AuditEntry), names={}, params=params)

@@ -1,5 +1,4 @@
-"""Records of the API, such as a job: what the service says of itself, read only. `python clients/python/records.py`
-writes the modules here from the service's own schemas."""
+"""Read-only records of the API. `python clients/python/records.py` writes these modules from the service's schemas."""
 
 from __future__ import annotations
 
@@ -9,9 +8,9 @@ import msgspec
 
 
 class Record(msgspec.Struct, frozen=True):
-    """What all records can do. Fields that a later release adds are left out."""
+    """Base of records. Fields that a later release adds are ignored."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The record as the API tells it."""
+        """Return the record as in the API."""
         document: dict[str, Any] = msgspec.to_builtins(self)
         return document

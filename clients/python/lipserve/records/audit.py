@@ -1,4 +1,4 @@
-"""What changed models. Written by `python clients/python/records.py`."""
+"""Audit log. Written by `python clients/python/records.py`."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from lipserve.records import Record
 class AuditEntry(Record, frozen=True, kw_only=True):
     """One change of a model.
 
-    key: API key of who did it; null where keys are not needed, and of the service
-    key_name: Its name
-    what: Method and route of the request, `job` and its id, or `service` for what that does by itself
-    request_id: Of that request, as in the log; of a job the one that queued it
-    version: The version that it is about, null where it is about the model
-    alias: The alias that was moved; `serving` is what answers by default
-    before: What was: a version, a revision, options; null where nothing was
-    after: What is from then on; null where nothing is
+    key: Id of the API key; null without keys and for changes by the service
+    key_name: Name of the API key
+    what: Origin of the change: method and route of the request, `job` and its id, or `service`
+    request_id: Id of the request, as in the service's log; for a job, of the request that queued it
+    version: Changed version; null if the change concerns the whole model
+    alias: Alias that was moved; `serving` is the default version
+    before: Value before the change: a version, a revision or options; null if there was none
+    after: Value after the change; null if there is none
     """
 
     id: int

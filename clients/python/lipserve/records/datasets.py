@@ -10,10 +10,10 @@ from lipserve.records import Record
 
 
 class Gap(Record, frozen=True, kw_only=True):
-    """A pause within a recording.
+    """A gap in time within a recording.
 
-    t: Time of the last sample before it, s
-    seconds: How long it lasts
+    t: Time of the last sample before the gap, s
+    seconds: Duration of the gap, s
     """
 
     t: float
@@ -21,16 +21,16 @@ class Gap(Record, frozen=True, kw_only=True):
 
 
 class Timing(Record, frozen=True, kw_only=True):
-    """When samples were taken. Shares are of the usual step of time.
+    """Sampling times of the recording. Jitter is a share of the median time step.
 
-    rate_hz: Usual rate of what was uploaded; null where no times were given
-    duration_s: Time that the episodes cover, gaps left out
-    jitter_p50: Median deviation of a step from the usual one
-    jitter_p99: Deviation that 99 % of the steps stay within
-    jitter_max: Largest deviation of a step that is no gap
+    rate_hz: Median sampling rate of the upload, Hz; null if it has no times
+    duration_s: Total duration without gaps, s
+    jitter_p50: Median deviation of a time step from the median step
+    jitter_p99: 99 % quantile of that deviation
+    jitter_max: Largest deviation of a time step that is not a gap
     gaps: The longest gaps, at most 20, in order of time
-    repeated_stamps: Rows left out as their time had been there before
-    missing_rows: Rows left out as a value was missing
+    repeated_stamps: Rows dropped because their time stamp repeats an earlier one
+    missing_rows: Rows dropped because a value is missing
     """
 
     rate_hz: float | None
@@ -44,11 +44,11 @@ class Timing(Record, frozen=True, kw_only=True):
 
 
 class JointSaturation(Record, frozen=True, kw_only=True):
-    """Signs that a joint's torque was cut off. Shares are of its samples.
+    """Signs that a joint's torque was saturated. Shares are of its samples.
 
     at_largest: Share of samples at the largest or the smallest torque
-    flat: Share that stays there for five samples and longer while the joint moves
-    at_limit: Share at 99 % of the robot's torque limit and above
+    flat: Share of samples that stay there for at least five samples while the joint moves
+    at_limit: Share of samples at or above 99 % of the torque limit; null if it is unknown
     """
 
     joint: str
@@ -58,14 +58,14 @@ class JointSaturation(Record, frozen=True, kw_only=True):
 
 
 class JointLimits(Record, frozen=True, kw_only=True):
-    """A joint against the robot's limits; null where a limit is not known.
+    """A joint compared with the robot's limits. Values are null if the limit is unknown.
 
-    range_used: Share of the range of positions between smallest and largest
-    speed_used: Largest speed over the limit
-    torque_used: Largest torque over the limit
-    beyond_range: Share of samples beyond the limits of position
-    beyond_speed: Share of samples beyond the limit of speed
-    beyond_torque: Share of samples beyond the limit of torque
+    range_used: Largest less smallest position, as a share of the joint's range
+    speed_used: Largest speed divided by the speed limit
+    torque_used: Largest torque divided by the torque limit
+    beyond_range: Share of samples beyond the position limits
+    beyond_speed: Share of samples beyond the speed limit
+    beyond_torque: Share of samples beyond the torque limit
     """
 
     joint: str
@@ -78,15 +78,15 @@ class JointLimits(Record, frozen=True, kw_only=True):
 
 
 class Lag(Record, frozen=True, kw_only=True):
-    """How long the torque comes after the motion that it belongs to; negative where it comes before.
+    """Time lag of the torque behind the motion; negative if the torque is ahead.
 
-    joint: Null for all joints together
-    seconds: Null where the data cannot tell
-    std_s: Its standard deviation, from leaving out an eighth at a time
-    cost: Share of the torque's variance that the lag turns into error
-    reason: Why the data cannot tell
-    improves: Of a lag that differs from 0: joints whose torque, taken so much later, is clearly predicted better on
-        parts held out
+    joint: Joint; null for all joints combined
+    seconds: Lag, s; null if the data do not determine it
+    std_s: Standard deviation of the lag, s, from leaving out one eighth of the data at a time
+    cost: Share of the torque's variance that becomes error because of the lag
+    reason: Why the lag is unknown; null if it is known
+    improves: Joints whose torque is predicted clearly better on held-out parts if the lag is corrected. Empty unless
+        the lag differs from 0
     """
 
     joint: str | None
@@ -98,13 +98,13 @@ class Lag(Record, frozen=True, kw_only=True):
 
 
 class JointNoise(Record, frozen=True, kw_only=True):
-    """White noise of the signals as recorded; null where there are too few samples.
+    """White noise of the signals as recorded; null if there are too few samples.
 
-    torque: Standard deviation, N·m; null where the torque was smoothed, too
-    torque_share: Of the torque's spread
-    velocity: Standard deviation, rad/s; null where it was not recorded
-    velocity_share: Of the velocity's spread
-    smoothed: Torque without noise: low-passed, or simulated; nothing tells its noise
+    torque: Standard deviation of the torque noise, N·m; also null if `smoothed`
+    torque_share: Torque noise divided by the standard deviation of the torque
+    velocity: Standard deviation of the velocity noise, rad/s; also null if not recorded
+    velocity_share: Velocity noise divided by the standard deviation of the velocity
+    smoothed: The torque was low-passed or simulated, so its noise cannot be estimated
     """
 
     joint: str
@@ -116,12 +116,12 @@ class JointNoise(Record, frozen=True, kw_only=True):
 
 
 class Weight(Record, frozen=True, kw_only=True):
-    """A weight of a joint's friction: how well these data would tell it.
+    """A friction coefficient of a joint, and how well these data determine it.
 
-    value: Its estimate, N·m·s/rad or N·m, beside rigid bodies; else null
-    std: Standard deviation that they leave; null where they say nothing
-    share: Torque of that deviation over the spread of the joint's torque
-    implausible: Clearly negative friction: no joint has that
+    value: Estimate, N·m·s/rad or N·m; null unless rigid bodies are fitted too
+    std: Standard deviation; null if the data say nothing about it
+    share: Torque error at one `std`, divided by the standard deviation of the torque
+    implausible: True if friction is clearly negative, which is physically impossible
     """
 
     value: float | None = None
@@ -132,20 +132,20 @@ class Weight(Record, frozen=True, kw_only=True):
 
 
 class JointExcitation(Record, frozen=True, kw_only=True):
-    """How a joint was moved, and what that says of it.
+    """How a joint moved, and how well its motion determines friction.
 
     span: Largest less smallest position, rad or m
-    visited: Share of the robot's range, in 20 equal parts, with samples in it
-    speed_std: rad/s or m/s
-    acceleration_std: rad/s² or m/s²
-    forwards: Share of samples that move forwards, faster than 0.02 rad/s or m/s
-    backwards: Share that move backwards
-    still: Share that does neither
-    reversals: Changes of direction within an episode
+    visited: Share of 20 equal parts of the joint's range that have samples; null if unknown
+    speed_std: Standard deviation, rad/s or m/s
+    acceleration_std: Standard deviation, rad/s² or m/s²
+    forwards: Share of samples with a velocity above 0.02 rad/s or m/s
+    backwards: Share of samples with a velocity below −0.02 rad/s or m/s
+    still: Share of samples that move neither way
+    reversals: Changes of direction within episodes
     slow_forwards: Share of samples that move forwards slower than 0.1 rad/s or m/s
-    slow_backwards: Share that move backwards as slowly
-    collinear: Largest share of one of dq, sign dq, ddq, cos q, sin q that the other four explain
-    collinear_term: Which one that is
+    slow_backwards: Share of samples that move backwards slower than 0.1 rad/s or m/s
+    collinear: Of dq, sign dq, ddq, cos q and sin q, the largest share of one that the other four explain
+    collinear_term: The feature with that share
     """
 
     joint: str
@@ -167,13 +167,13 @@ class JointExcitation(Record, frozen=True, kw_only=True):
 
 
 class WholeExcitation(Record, frozen=True, kw_only=True):
-    """How well the data tell the robot's inertial parameters; needs a robot with a URDF.
+    """How well the data determine the robot's inertial parameters. Needs a robot with a URDF.
 
-    parameters: Base parameters: combinations of inertial parameters that torques depend on
-    rank: How many of them are excited at least a hundredth as much as by random motion
-    condition: Condition of the base regressor, columns of equal norm
-    weakest: Excitation of the least excited one over that of random motion
-    weakest_body: Joint that moves the body which the least excited one mostly belongs to
+    parameters: Number of base parameters: combinations of inertial parameters that affect torque
+    rank: Number of base parameters excited more than 1 % as much as by random motion
+    condition: Condition number of the base regressor, columns scaled to equal norm
+    weakest: Excitation of the least excited one divided by that of random motion
+    weakest_body: Joint that moves the body with the least excited parameters
     """
 
     parameters: int
@@ -184,13 +184,13 @@ class WholeExcitation(Record, frozen=True, kw_only=True):
 
 
 class Excitation(Record, frozen=True, kw_only=True):
-    """How well the data determine what is to be learnt.
+    """How well the motion determines friction and inertial parameters.
 
-    friction_beside: What explains the rest of the torque where the friction's weights are judged: the robot's rigid
-        bodies with unknown parameters, or, without them, any smooth function of the motion, which leaves less certain
+    friction_beside: Model of the remaining torque while friction is estimated. `rigid bodies`: the robot's, with
+        unknown parameters. `any motion`: any smooth function of the motion, which leaves friction less certain
     standstill: Share of samples in which no joint moves
-    motion_dimensions: Independent joints' worth of motion: 1 where all move together, n where each moves by itself
-    text: The same in words
+    motion_dimensions: Number of independent motions: 1 if all joints move together, n if each moves on its own
+    text: Summary in words
     """
 
     friction_beside: Literal["rigid bodies", "any motion"]
@@ -202,11 +202,11 @@ class Excitation(Record, frozen=True, kw_only=True):
 
 
 class JointAgainstRobot(Record, frozen=True, kw_only=True):
-    """A joint's torque against what the robot's rigid bodies need, friction apart; null where nothing tells it.
+    """A joint's torque, without friction, compared with the robot's rigid bodies; null if it cannot be determined.
 
-    gravity: Gravity's torque over the robot's: 1 as the URDF has it, 0 where absent
-    inertia: The same of inertia and velocities; rotors make it larger
-    explained: Share of the torque's variance that both and friction explain
+    gravity: Gravity torque divided by that of the URDF: 1 if equal, 0 if absent
+    inertia: The same for inertial and velocity torques; rotors increase it
+    explained: Share of the torque's variance that rigid bodies and friction explain
     """
 
     joint: str
@@ -218,9 +218,9 @@ class JointAgainstRobot(Record, frozen=True, kw_only=True):
 
 
 class AgainstRobot(Record, frozen=True, kw_only=True):
-    """Torque against that of a robot's rigid bodies.
+    """Measured torque compared with the torque of a robot's rigid bodies.
 
-    robot: The robot of the upload, else the one that the names of the joints suggest
+    robot: Robot of the upload, else the robot that the joint names suggest
     """
 
     robot: str
@@ -228,10 +228,10 @@ class AgainstRobot(Record, frozen=True, kw_only=True):
 
 
 class Remedy(Record, frozen=True, kw_only=True):
-    """What ruins a model, and the options of an upload of the same file that put it right.
+    """A fault that would spoil a model, and the upload options that correct it.
 
-    joints: Those concerned
-    options: Of the upload's query, to be added; null where none would do
+    joints: Affected joints
+    options: Query parameters to add when the file is uploaded again; null if none would help
     """
 
     cause: Literal[
@@ -252,27 +252,27 @@ class Remedy(Record, frozen=True, kw_only=True):
 
 
 class DatasetReport(Record, frozen=True, kw_only=True):
-    """What was found in the recording and what was done to it.
+    """Findings about a recording, and how it was prepared.
 
-    rows: Samples kept
-    episodes: Contiguous recordings
-    rate_hz: Usual sampling rate; null where no times were given
-    gaps: Gaps in time, where the recording was split
-    derived: Quantities that were not given and had to be derived
-    preparation: Every step that changed the data
-    ranges: Smallest and largest value per joint
-    torque_noise_estimate: White noise on the torque per joint, as prepared, N·m; as recorded: see noise
-    reading: What was found while the file was read, and what columns were taken as
-    source: What the file's columns were taken as, in figures
-    recipe: The choices that the preparation was made with
-    steps: The steps of `preparation` with their parameters
-    joint_types: Of the robot's joints: what a training job takes where it says nothing else
-    robot: Robot whose limits the data were compared with
-    upload_sha256: Hash of the uploaded file; null for those of earlier releases
-    lag: All joints together first, then joint by joint
+    rows: Samples after preparation
+    episodes: Number of contiguous parts
+    rate_hz: Sampling rate after preparation, Hz; null without times
+    gaps: Number of gaps in time at which the recording was split
+    derived: Quantities that were not uploaded and were derived
+    preparation: Steps that changed the data, one sentence each
+    ranges: Smallest and largest value by quantity and joint
+    torque_noise_estimate: White noise of the prepared torque per joint, N·m. `noise` has that of the recording
+    reading: How the file was read: columns, units, joints and other notes
+    source: How the file's columns were read, for programs
+    recipe: Options of the preparation
+    steps: Steps of `preparation` with their parameters
+    joint_types: Joint types of the robot, which training jobs use by default; null if unknown
+    robot: Robot whose limits were compared with the data; null if none
+    upload_sha256: Hash of the uploaded file; null if an earlier release stored it
+    lag: All joints combined first, then each joint
     against_robot: Null without a robot's URDF
-    remedies: What `warnings` and `advice` say of the upload's options, to act on
-    advice: What to record next, or to correct, one sentence each
+    remedies: Corrections of the upload's options that `warnings` and `advice` mention
+    advice: What to record next or to correct, one sentence each
     """
 
     rows_uploaded: int

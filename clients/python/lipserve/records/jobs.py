@@ -9,21 +9,21 @@ from lipserve.records.models import HeldOutQuality
 
 
 class Holdout(Record, frozen=True, kw_only=True):
-    """Part of the data that the version is judged on before it learns it: never rows at random.
+    """Part of the data that is held out to evaluate a version: contiguous rows, not random ones.
 
-    kind: Of each data set: whole `episodes`, chosen by the seed; its `last` part; some of many equal `blocks`, chosen
-        by the seed; or `auto`, the last part, unless that repeats motion that is learnt from and there are periods,
-        episodes or stretches of motion that do not: then some of these, chosen by the seed. Of several data sets of one
-        episode each, `episodes` holds out whole data sets. `stretches`: rows that are named
-    share: Of the samples, as nearly as whole episodes or blocks allow
-    blocks: Equal stretches that `blocks` chooses from
-    guard_s: Samples as near as that to the other side are left out of both, s; by default one period of the low-pass
-        that the data set was prepared with. Of a data set without times 25 samples are
-    seed: Of the choice
-    stretches: With `kind` `stretches`: by the ids of data sets, which rows to hold out, first and last (exclusive) in
-        order of episode and time. Data sets that are not named are learnt from
-    only: Whether the version never learns these samples. By default it is judged without them, and then trained on all
-        samples
+    kind: Held-out part of each data set. `last`: its last part. `episodes`: whole episodes, chosen by the seed; of
+        several data sets with one episode each, whole data sets. `blocks`: some of many equal blocks, chosen by the
+        seed. `auto`: the last part, unless that repeats motion of the training part and other periods, episodes or
+        stretches do not; then some of these, chosen by the seed. `stretches`: the given rows
+    share: Share of the samples, as closely as whole episodes or blocks allow
+    blocks: Number of equal blocks from which `blocks` chooses
+    guard_s: Samples closer than this to the other part are in neither part, s; by default one period of the data set's
+        low-pass. In a data set without times, 25 samples
+    seed: Seed of the random choice
+    stretches: For `kind` `stretches`: rows to hold out by data set id, first and last (exclusive), in order of episode
+        and time. Other data sets are used for training only
+    only: Whether the version is never trained on these samples. By default it is evaluated without them and then
+        trained on all samples
     """
 
     kind: Literal["auto", "stretches", "episodes", "last", "blocks"] = "auto"
@@ -36,12 +36,12 @@ class Holdout(Record, frozen=True, kw_only=True):
 
 
 class Refresh(Record, frozen=True, kw_only=True):
-    """A job that trains a version anew on the data of an earlier one and what has been observed since.
+    """Refresh: a job that retrains a version on its data and later observations.
 
-    version: The version that is refreshed
-    through: Last event of the model's log that it learns from
-    trigger: Why: much of the motion was beyond what the version knows, its learnt arm had left where its torque is
-        linear, or somebody asked for it
+    version: Version to refresh
+    through: Last event of the model's log that is used
+    trigger: Reason: `novelty`, much motion outside the known region; `linearisation`, the learnt arm drifted past its
+        linearisation; `asked`, a request
     """
 
     version: int
@@ -50,14 +50,14 @@ class Refresh(Record, frozen=True, kw_only=True):
 
 
 class JobProgress(Record, frozen=True, kw_only=True):
-    """How far a job is.
+    """Progress of a job.
 
     stage: waiting, loading, geometry, hyperparameters, posterior, statistics, evaluating, all_rows, saving or done.
-        `all_rows` is the last fit, on the rows held out, too
-    estimator: The one at work, where `auto` trains several
-    objective: Penalised negative log evidence, nats: falls during the fit
-    remaining_s: Roughly the seconds that are left; null until that can be told. Taken to need all iterations, though a
-        fit often converges earlier
+        `all_rows` is the final fit, held-out rows included
+    estimator: Estimator in training, if `auto` trains several
+    objective: Penalised negative log evidence, nats; decreases during the fit
+    remaining_s: Estimated remaining time, s; null until it is known. It assumes all iterations, but fits often converge
+        earlier
     """
 
     stage: str
@@ -78,9 +78,9 @@ class JobError(Record, frozen=True, kw_only=True):
 
 
 class JobChange(Record, frozen=True, kw_only=True):
-    """One thing that happened to a job.
+    """One change of a job's state.
 
-    state: From then on
+    state: New state
     """
 
     at: str
@@ -91,18 +91,18 @@ class JobChange(Record, frozen=True, kw_only=True):
 class Job(Record, frozen=True, kw_only=True):
     """A training job.
 
-    robot: Profile or id of an uploaded URDF, of estimators with rigid bodies
-    base: The version that it starts from, as `model:3`
-    holdout: What it holds out of the data sets; a refresh holds out what its version held out
-    promotion: What was asked for; the version's `promotion` says what came of it
-    refresh: What it refreshes; null for a job with data sets alone
-    attempts: Times it was started; more than one after an interruption
-    version: The version it made, once succeeded
-    quality: Of that version, on what the job held out; null where that is nothing
-    heartbeat_at: When the training process last said that it lives
-    history: What happened to it, oldest first
-    retry_of: The job that it repeats
-    request_id: Id of the request that queued it, as the service's log names it
+    robot: Profile or id of an uploaded URDF, for estimators with rigid bodies
+    base: Version that it starts from, as `model:3`
+    holdout: Held-out part of the data sets; a refresh uses that of its version
+    promotion: Requested promotion; `promotion` of the version has the outcome
+    refresh: Refreshed version; null for a job with data sets only
+    attempts: Number of starts; more than one after an interruption
+    version: Version that the job made; null unless it succeeded
+    quality: Quality of that version on the held-out part; null if nothing was held out
+    heartbeat_at: Time of the training process's last heartbeat
+    history: State changes, oldest first
+    retry_of: Job that this one repeats; null if none
+    request_id: Id of the request that queued it, as in the service's log
     """
 
     id: str

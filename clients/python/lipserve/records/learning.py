@@ -1,4 +1,4 @@
-"""How well a model learns, and what its owner sees and decides. Written by `python clients/python/records.py`."""
+"""Online learning: quality, options, decisions, alarms. Written by `python clients/python/records.py`."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from lipserve.records import Record
 
 
 class RolledBack(Record, frozen=True, kw_only=True):
-    """The model is back where it was.
+    """The model was rolled back.
 
-    undone: Batches and replays that do not teach any more
-    complete: Whether all is kept that the version learns: to an old version the log may reach back no more
+    undone: Batches and replays that were undone
+    complete: Whether the log still has everything that the version learnt. For an old version it may not
     """
 
     model: str
@@ -22,16 +22,16 @@ class RolledBack(Record, frozen=True, kw_only=True):
 
 
 class QualityWindow(Record, frozen=True, kw_only=True):
-    """Figures of the rows that arrived in the last `seconds`, and what became of these.
+    """Quality and outcomes of the rows that arrived in the last `seconds`.
 
     nmse: Mean squared error / variance of the measured torque
-    rmse: N·m
+    rmse: Root mean squared error, N·m
     coverage: Share of measurements inside the 95 % interval, noise included
     nlpd: Mean negative log predictive density, nats
-    accepted: Rows that teach
-    rejected: Rows that were kept out, by code
-    coverage_answered: As `coverage`, of intervals as they were answered, wide by their `scale`, and of contacts and
-        rows at rest, too; null where the scale is switched off
+    accepted: Rows that are learnt
+    rejected: Rejected rows, by code
+    coverage_answered: Coverage of the intervals in responses, which their `scale` widens, contacts and rows at rest
+        included; null if the scale is off
     """
 
     rows: int
@@ -46,11 +46,11 @@ class QualityWindow(Record, frozen=True, kw_only=True):
 
 
 class Quality(Record, frozen=True, kw_only=True):
-    """Prequential quality: each row is predicted by the version and revision that answered when it arrived.
+    """Prequential quality: each row is predicted by the version and revision that served when it arrived.
 
-    revision: That of answers now
-    level: Probability of the interval whose coverage is told
-    scale: Per joint, factor on the half width that questions are answered with now
+    revision: Serving revision
+    level: Probability of the interval
+    scale: Per joint, the present factor on the half width of intervals
     """
 
     model: str
@@ -63,23 +63,23 @@ class Quality(Record, frozen=True, kw_only=True):
 
 
 class LearningOptions(Record, frozen=True, kw_only=True):
-    """How a model learns from observations.
+    """Options of online learning.
 
-    enabled: False: learning is paused. Rows are judged, compared and logged, but not learnt
-    forgetting_s: Age in s at which a sample counts 1/e of a new one, in event time; null: nothing is forgotten
-    friction_walk_s: Time in s over which friction may change by about 30 %, as that of an arm that warms up does: it is
-        followed, and masses and geometry are not opened. 1800 suits most arms; null: friction stays as learnt
-    on_change: What follows a detected change of the robot, or a stream whose first second lies outside the 95 % band.
-        `hold`: nothing is learnt until its owner decides, nor of that second; `adapt`: a new regime begins; `learn`:
-        learning goes on as before
-    torque_limits: Largest |tau| of each joint's actuator in N·m, to tell saturated samples; null: not known
-    contact_threshold: Predictive standard deviations, noise included, beyond which a torque is taken for a contact
-    adaptive_intervals: Widen and narrow intervals at once, so that 95 % of what streams measure lies inside: the
-        `scale` of answers. Otherwise it is 1, as the model itself believes
-    payloads: Notice what the arm takes up and puts down, and answer with it at once; for models that know the arm.
-        Meanwhile rows teach the payload, and not the arm
-    auto_refresh: Train a new version by itself where motion leaves what is known
-    auto_promote: Let such a version serve if it predicts better
+    enabled: False pauses learning: rows are predicted, checked and logged, but not learnt
+    forgetting_s: Age at which a sample counts 1/e of a new one, s of event time; null: nothing is forgotten
+    friction_walk_s: Time over which friction may drift by about 30 %, s, as in an arm that warms up. Learning follows
+        it, and masses and geometry do not become less certain. 1800 suits most arms; null: friction does not drift
+    on_change: Reaction to a detected change of the robot, or to a stream whose first second is outside the 95 %
+        interval. `hold`: learning, also of that second, is paused until the owner decides. `adapt`: a new regime
+        begins. `learn`: learning continues as before
+    torque_limits: Max |tau| of each joint's actuator, N·m, to reject saturated samples; null: unknown
+    contact_threshold: Predictive standard deviations, noise included, beyond which a torque counts as a contact
+    adaptive_intervals: Adapt interval widths online, by the `scale` of responses, so that 95 % of the streams'
+        measurements are inside. If false, the scale is 1
+    payloads: Detect payloads that the arm picks up and puts down, and include them in predictions at once; for models
+        with arm geometry. While a payload is carried, rows update the payload, not the arm
+    auto_refresh: Retrain in the background when motion leaves the known region or the arm its linearisation
+    auto_promote: Serve the retrained version if it predicts better
     """
 
     enabled: bool = True
@@ -95,8 +95,9 @@ class LearningOptions(Record, frozen=True, kw_only=True):
 
 
 class Held(Record, frozen=True, kw_only=True):
-    """The robot seems to have changed, or a stream not to be of it (`evidence.kind` is `opening`): nothing is learnt
-    until the owner has decided, or has chosen otherwise.
+    """A detected change of the robot, or a stream that does not fit it (`evidence.kind` is `opening`).
+
+    Learning is paused until the owner decides or changes `on_change`.
 
     at: Event time of the change, Unix seconds
     """
@@ -106,14 +107,14 @@ class Held(Record, frozen=True, kw_only=True):
 
 
 class Stream(Record, frozen=True, kw_only=True):
-    """A source of observations.
+    """A stream of observations from one robot or recording.
 
-    last: Highest sequence that has come
-    last_at: When that came; null where an earlier release has logged it
-    offset_s: Event time (Unix seconds) - the stream's own time
-    gaps: Ranges [first, last] of sequences that have not come, the latest ones
-    missing: Sequences that have not come, of all gaps that are kept
-    forgotten: Up to this sequence batches are no longer kept, nor known again
+    last: Highest sequence received
+    last_at: Time of its arrival; null if an earlier release logged it
+    offset_s: Event time (Unix seconds) minus the stream's own time
+    gaps: Latest ranges [first, last] of missing sequences
+    missing: Number of missing sequences in all stored gaps
+    forgotten: Batches up to this sequence are deleted, and duplicates of them are not recognised
     """
 
     stream_id: str
@@ -127,30 +128,30 @@ class Stream(Record, frozen=True, kw_only=True):
 
 
 class Snapshot(Record, frozen=True, kw_only=True):
-    """A revision whose state is stored."""
+    """A revision with a stored state."""
 
     revision: int
     created_at: str
 
 
 class LearningStatus(Record, frozen=True, kw_only=True):
-    """Where learning stands.
+    """Status of learning.
 
-    version: The version that serves
-    revision: Its revision once all of the log is learnt
-    published: The revision that answers contain now
-    lag_events: Events of the log that answers do not contain yet
-    lag_rows: Rows to be learnt that answers do not contain yet
-    lag_s: Seconds since the first row arrived that answers do not contain yet
+    version: Serving version
+    revision: Its revision once the whole log is learnt
+    published: Serving revision
+    lag_events: Events of the log that responses do not contain yet
+    lag_rows: Rows to learn that responses do not contain yet
+    lag_s: Time since the arrival of the first row that responses do not contain yet, s
     events: Number of the newest event of the log
-    novel_share: Share of the latest samples that lie beyond the basis; null until some are learnt
-    linearisation_error: Error of taking the torque of a learnt arm as linear around the arm as trained, root mean
-        square of each joint in units of √(tau_std² + noise_std²); zero for a joint predicted as well as stated, null
-        without such an arm and until something is learnt
-    failure: Why the version does not learn, where it should; it is tried again
+    novel_share: Share of the latest samples outside the basis; null until rows are learnt
+    linearisation_error: Error of linearising the torque of a learnt arm around the trained arm: root mean square per
+        joint in units of √(tau_std² + noise_std²). Zero for a joint predicted as well as stated; null without such an
+        arm and until rows are learnt
+    failure: Why learning fails; null if it does not. It is retried
     candidate: Always null: a refreshed version is compared before it is published
     reachable: Ranges [first, last] of revisions that a rollback can return to; 0 is the version as trained
-    snapshots: Those whose state is stored, newest first
+    snapshots: Revisions with a stored state, newest first
     """
 
     version: int
@@ -171,7 +172,7 @@ class LearningStatus(Record, frozen=True, kw_only=True):
 
 
 class Learning(Record, frozen=True, kw_only=True):
-    """How a model learns, as its owner has set it, and where it stands."""
+    """Learning options of a model, and the status of its learning."""
 
     model: str
     options: LearningOptions
@@ -179,10 +180,10 @@ class Learning(Record, frozen=True, kw_only=True):
 
 
 class Decided(Record, frozen=True, kw_only=True):
-    """Learning goes on.
+    """Learning was resumed.
 
     at: Event time of the change, Unix seconds
-    rows: Rows that were kept out since and are learnt now
+    rows: Rejected rows that are learnt now
     """
 
     model: str
@@ -194,7 +195,7 @@ class Decided(Record, frozen=True, kw_only=True):
 
 
 class Alarm(Record, frozen=True, kw_only=True):
-    """Something about a learning model that its owner should know."""
+    """An alarm of a learning model for its owner."""
 
     id: int
     kind: Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock"]

@@ -1,4 +1,4 @@
-"""Events of a model followed live. Written by `python clients/python/records.py`."""
+"""Events of the live view of a model. Written by `python clients/python/records.py`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from lipserve.records.payloads import Scalar
 
 
 class LiveNovelty(Record, frozen=True, kw_only=True):
-    """Which of the rows of a stream that were shown since the last status the version's basis does not cover.
+    """Rows of a stream, shown since the last status, that the version's basis does not cover.
 
-    times: Their event times, Unix seconds
-    unknown: Rows shown of which it is not known: looking at all of them would take too long
+    times: Event times of these rows, Unix seconds
+    unknown: Shown rows that were not checked, to limit the time this takes
     """
 
     stream_id: str
@@ -22,13 +22,13 @@ class LiveNovelty(Record, frozen=True, kw_only=True):
 
 
 class LivePayload(Record, frozen=True, kw_only=True):
-    """What one robot carries, in short.
+    """Short summary of one robot's payload.
 
-    state: What its last rows show: `payload`, `contact`, `friction` (it has changed), or `none` of these
-    declared: Whether the payload was declared, and not only seen
-    since: Since when it carries what it carries, or nothing
-    rows: Rows that the payload was seen on
-    mass: kg; null: nothing that the model was not trained with
+    state: State by the latest rows: `payload`, `contact`, `friction` (changed friction) or `none`
+    declared: Whether the payload was declared rather than detected
+    since: Time since which the robot carries this payload, or none
+    rows: Rows used to estimate the payload
+    mass: Mass, kg; null without a payload
     """
 
     stream_id: str
@@ -40,14 +40,14 @@ class LivePayload(Record, frozen=True, kw_only=True):
 
 
 class LiveAnswers(Record, frozen=True, kw_only=True):
-    """Answers of the model's streams since the last status.
+    """Responses on the model's streams since the last status.
 
-    seconds: How long that was
-    count: Answers, those that were refused left out
-    late: After their deadline: the frame's own, else LIPSERVE_STREAM_DEADLINE_S
-    p50_at_most_s: Half of them took at most so long from their frame's arrival until they were ready: upper bound of a
-        bucket of the histogram in /metrics. null: there were none, or it is beyond the largest bound
-    p99_at_most_s: The same of 99 %
+    seconds: Duration, s
+    count: Number of responses without errors
+    late: Responses after their deadline: the frame's own, else LIPSERVE_STREAM_DEADLINE_S
+    p50_at_most_s: Upper bound of the median time from a frame's arrival to its response, s: a bucket bound of the
+        histogram in /metrics. Null without responses or beyond the largest bound
+    p99_at_most_s: The same for the 99 % quantile
     """
 
     seconds: float
@@ -59,28 +59,28 @@ class LiveAnswers(Record, frozen=True, kw_only=True):
 
 
 class LiveStatus(Record, frozen=True, kw_only=True):
-    """Data of a `status` event: where the model stands now.
+    """Data of a `status` event: the present status of the model.
 
-    at: When, by the service's clock, Unix seconds
-    version: The version that serves
-    revision: The revision that answers contain now
-    lag_events: Events of the log that answers do not contain yet
-    lag_rows: Rows to be learnt that answers do not contain yet
-    lag_s: Seconds since the first row arrived that answers do not contain yet
-    joint_types: What the torques' units follow from: N·m, prismatic: N
+    at: Time of the status by the service's clock, Unix seconds
+    version: Serving version
+    revision: Serving revision
+    lag_events: Events of the log that responses do not contain yet
+    lag_rows: Rows to learn that responses do not contain yet
+    lag_s: Time since the arrival of the first row that responses do not contain yet, s
+    joint_types: Types that determine the torque units: N·m, prismatic: N
     learns: False: learning is paused
-    on_change: What follows a detected change: hold, adapt or learn
-    contact_threshold: Standard deviations beyond which a row is taken for a contact
-    held: Why learning waits for a decision; null where it does not
-    failure: Why the version does not learn, where it should
-    novel_share: Share of the latest samples that lie beyond the basis; null until some are learnt
-    counts: Rows by what became of them, since the service has started; also `batches` and `duplicates`
-    level: Probability of the interval whose coverage is told
-    windows: How well it predicted, over sliding windows
-    scale: Per joint, factor on the half width that questions are answered with now
-    payloads: What each stream's arm carries; null: no arm is known
-    answers: null at first, and where there are too many models to tell apart
-    alarms: The newest ones, newest first
+    on_change: Reaction to a detected change: hold, adapt or learn
+    contact_threshold: Standard deviations beyond which a row counts as a contact
+    held: Why learning is paused until a decision; null if it is not
+    failure: Why learning fails; null if it does not
+    novel_share: Share of the latest samples outside the basis; null until rows are learnt
+    counts: Rows by outcome since the service started; also `batches` and `duplicates`
+    level: Probability of the interval
+    windows: Prediction quality over sliding windows
+    scale: Per joint, the present factor on the half width of intervals
+    payloads: Payload of each stream; null without arm geometry
+    answers: Null at first, and if the service has too many models to count them separately
+    alarms: Latest alarms, newest first
     """
 
     model: str
@@ -110,9 +110,9 @@ class LiveStatus(Record, frozen=True, kw_only=True):
 
 
 class LiveLost(Record, frozen=True, kw_only=True):
-    """Data of a `lost` event: whoever reads too slowly misses events rather than falling behind.
+    """Data of a `lost` event: a client that reads too slowly misses events.
 
-    events: Events of either kind that were dropped, the oldest ones
+    events: Number of dropped events, the oldest ones
     """
 
     events: int

@@ -8,13 +8,13 @@ from lipserve.records import Record
 
 
 class HeldOutQuality(Record, frozen=True, kw_only=True):
-    """How well the judged fit of a version predicts what was held out, per joint; null where torque does not vary.
+    """Quality of the evaluated fit of a version on the held-out part, per joint; null if torque is constant.
 
-    samples: Samples that the figures are of
+    samples: Number of held-out samples
     nmse: Mean squared error / variance of the measured torque
     coverage: Share of measurements inside the 95 % interval
-    coverage_low: Lower end of the coverage's confidence interval
-    coverage_high: Its upper end
+    coverage_low: Lower end of the confidence interval of the coverage
+    coverage_high: Upper end of this confidence interval
     """
 
     samples: int
@@ -25,12 +25,12 @@ class HeldOutQuality(Record, frozen=True, kw_only=True):
 
 
 class Promotion(Record, frozen=True, kw_only=True):
-    """Whether a version that was trained answers by itself, and why: judged by what its training held out.
+    """Whether a new version became the serving version, and why. The held-out part of its training decides.
 
-    answers: Whether it answered once it was trained; else it waits under alias `candidate`
-    passed: Whether its error is below that of the mean torque on every joint, its intervals hold 90 %, and it is not
-        worse than the version that serves; null where that cannot be told
-    serving: The version that answered until then; null where none did
+    answers: Whether it started to serve after training; else it got the alias `candidate`
+    passed: Whether its error is below that of the mean torque on every joint, coverage is at least 90 %, and it is not
+        worse than the serving version; null if that cannot be determined
+    serving: Serving version until then; null if there was none
     """
 
     answers: bool
@@ -42,8 +42,8 @@ class Promotion(Record, frozen=True, kw_only=True):
 class VersionSummary(Record, frozen=True, kw_only=True):
     """A version in the list of its model.
 
-    quality: On what its training held out; null where that was nothing
-    promotion: Whether it answers by itself, and why; null for one that was refreshed or shipped
+    quality: Quality on the held-out part of its training; null if nothing was held out
+    promotion: Whether it became the serving version, and why; null for a refreshed or shipped version
     """
 
     version: int
@@ -54,11 +54,11 @@ class VersionSummary(Record, frozen=True, kw_only=True):
 
 
 class Model(Record, frozen=True, kw_only=True):
-    """A named model. Queries are answered by the version that serves unless they name another.
+    """A named model. Queries go to its serving version unless they name another one.
 
-    latest_version: The newest version
-    serving_version: The version that answers where none is named; null where all wait as candidates
-    aliases: Names that were given to versions, `serving` aside
+    latest_version: Newest version
+    serving_version: Version that serves queries without a version; null if all versions are candidates
+    aliases: Versions by alias, without `serving`
     """
 
     name: str
@@ -70,12 +70,12 @@ class Model(Record, frozen=True, kw_only=True):
 
 
 class SelectionHeldOut(Record, frozen=True, kw_only=True):
-    """What `auto` held out to choose by; the chosen estimator has learnt it afterwards.
+    """Part that `auto` held out for the choice; the chosen estimator was then trained on it too.
 
-    blocks: Contiguous stretches that these rows are
-    repeats: All motion of the recording repeats other motion of it: figures flatter, except at the edge
-    edge_rows: Rows at the edge of the data: their states are the furthest from all others
-    edge_blocks: Contiguous stretches that the rows at the edge are
+    blocks: Number of contiguous stretches of these rows
+    repeats: Whether all motion of the recording repeats itself, so that figures are too good, except at the edge
+    edge_rows: Rows at the edge of the data, whose states are furthest from all others
+    edge_blocks: Number of contiguous stretches of the rows at the edge
     """
 
     rows: int
@@ -86,16 +86,16 @@ class SelectionHeldOut(Record, frozen=True, kw_only=True):
 
 
 class SelectionCandidate(Record, frozen=True, kw_only=True):
-    """How an estimator did on what was held out to choose by; null where it was not judged.
+    """Quality of an estimator on the part held out for the choice; null if it was not evaluated.
 
     log_density: Log predictive density, summed over the joints, nats a sample
-    difference: Of the log density from that of the best
-    standard_error: Of that difference
-    nmse: Of each joint; null where its torque does not vary
-    edge_nmse: Of each joint, squared error at the edge of the data over the torque's variance in all rows that were
-        held out; null if none of them are at the edge, and for versions of earlier releases
-    coverage: Share within the 95 % interval, of each joint
-    error: Why it could not be trained
+    difference: Log density less that of the best estimator
+    standard_error: Standard error of the difference
+    nmse: nMSE per joint; null if its torque is constant
+    edge_nmse: Per joint, mean squared error at the edge of the data / variance of the torque in all held-out rows; null
+        without rows at the edge, and for versions of earlier releases
+    coverage: Coverage of the 95 % interval per joint
+    error: Why it could not be trained; null if it was
     """
 
     estimator: str
@@ -110,9 +110,9 @@ class SelectionCandidate(Record, frozen=True, kw_only=True):
 
 
 class Selection(Record, frozen=True, kw_only=True):
-    """How `auto` has chosen the estimator.
+    """Choice of the estimator by `auto`.
 
-    table: The estimators that were trained, the simplest first
+    table: Trained estimators, simplest first
     """
 
     asked: str
@@ -123,29 +123,27 @@ class Selection(Record, frozen=True, kw_only=True):
 
 
 class Version(Record, frozen=True, kw_only=True):
-    """An immutable trained version.
+    """An immutable, trained version.
 
-    job: The job that made it; null for one that was imported or came with LIPServe
+    job: Job that trained it; null for an imported or shipped version
     noise_std: Standard deviation of the measured torque, N·m
-    training_range: Where the samples lie that it stands on
-    fit: What the fit reported
-    compact: Size of the served posterior, and how far it deviates from the exact one: `mean_rms`, `mean_max`, `std_max`
-        in standard deviations of the function, at `queries` motions
-    calibration: `function_std_factor`: what `tau_std` was multiplied by so that intervals hold on unseen motion
-    conformal: What `blocks` of the training, left out in turn, say of its intervals: `scale`, the factor on the half
-        width of each joint's, and `guaranteed`, the share of measurements that they hold then, at least; null for the
-        shipped model
+    training_range: Range of the training samples by quantity and joint
+    fit: Report of the fit
+    compact: Size of the served posterior and its deviation from the exact one at `queries` motions: `mean_rms`,
+        `mean_max` and `std_max`, in standard deviations of the function
+    calibration: `function_std_factor`: factor on `tau_std` that calibrates intervals on unseen motion
+    conformal: Calibration of intervals on `blocks` of the training data, held out in turn: `scale`, the factor on the
+        half width per joint, and `guaranteed`, the min share of measurements inside; null for the shipped model
     hyperparameters: Hyperparameters by name, mostly logarithms
-    warnings: What to be careful with: what the recording leaves open of a learnt arm, and how its fit ended
-    lineage: Data sets with their hashes, when and with which `software` it was trained, and how well it fits them
-        (`training_metrics`); also the version of another unit that it started from (`base`), and of an imported version
-        where it comes from (`imported`)
-    promotion: Whether it answers by itself; null for one that was refreshed or shipped
-    selection: How the estimator was chosen; null where it was named when the training was asked for
-    robot: The URDF of an estimator with rigid bodies, and its prior
-    parameters: `friction`; of rigid bodies also `inertia`, `rotor` and `geometry`, with standard deviations and with
-        what torque does not tell (`undetermined`). `geometry.joints` run from base to tip, `geometry.order` names the
-        model's joint at each place; all else is in the order of the model's joints
+    warnings: Limits of the version, such as unidentifiable parameters of a learnt arm or a fit that did not converge
+    lineage: Data sets with their hashes, time and `software` of the training, and `training_metrics`; also the version
+        it started from (`base`) and the origin of an imported version (`imported`)
+    promotion: Whether it became the serving version; null for a refreshed or shipped version
+    selection: Choice of the estimator; null if the request named it
+    robot: URDF and prior of an estimator with rigid bodies
+    parameters: `friction`; for rigid bodies also `inertia`, `rotor` and `geometry`, with standard deviations and
+        unidentifiable parameters (`undetermined`). `geometry.joints` run from base to tip, and `geometry.order` has the
+        model's joint at each place. All else is in the order of the model's joints
     """
 
     model: str
@@ -175,9 +173,9 @@ class Version(Record, frozen=True, kw_only=True):
 class AliasMove(Record, frozen=True, kw_only=True):
     """One move of an alias.
 
-    version: Where to; null where the alias was removed
-    before: Where from; null where the alias was new
-    rollback: Whether it took back an earlier move
+    version: New target; null if the alias was removed
+    before: Old target; null if the alias was new
+    rollback: Whether it undid an earlier move
     """
 
     version: int | None
@@ -187,10 +185,10 @@ class AliasMove(Record, frozen=True, kw_only=True):
 
 
 class Alias(Record, frozen=True, kw_only=True):
-    """A name of a version, which can be moved to another one.
+    """A movable name of a version.
 
-    previous: Where a rollback would lead; null where there is nothing to go back to
-    history: The last moves, newest first
+    previous: Version after a rollback; null if no rollback is possible
+    history: Latest moves, newest first
     """
 
     alias: str

@@ -1,4 +1,4 @@
-"""Batches that a model learns from. Written by `python clients/python/records.py`."""
+"""Observation batches. Written by `python clients/python/records.py`."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from lipserve.records import Record
 
 
 class DerivedAcceleration(Record, frozen=True, kw_only=True):
-    """How accelerations were derived: as the slope of a parabola through the velocities around a row.
+    """Derivation of accelerations: the slope of a parabola through the velocities around each row.
 
-    delay_s: How much later than its row an acceleration is known, s
-    window: Rows on either side of a row that its acceleration stands on
-    rate_hz: Rows a second
-    carried: Rows of the batches next to this one that had to wait for it, decided and counted with it
+    delay_s: Delay from a row to its acceleration, s
+    window: Rows used on either side of a row
+    rate_hz: Sampling rate of the rows, Hz
+    carried: Rows of neighbouring batches that had to wait for this one and are counted with it
     """
 
     delay_s: float
@@ -23,31 +23,31 @@ class DerivedAcceleration(Record, frozen=True, kw_only=True):
 
 
 class Derivation(Record, frozen=True, kw_only=True):
-    """What was not measured."""
+    """Derived quantities."""
 
     ddq: DerivedAcceleration
 
 
 class ObservationResponse(Record, frozen=True, kw_only=True):
-    """The rows are logged for good: `accepted` of them are learnt within a moment.
+    """Acknowledgement: the rows are logged durably, and `accepted` of them are learnt soon.
 
-    version: The version that predicted the rows before it learnt them
-    revision: Answers of this version with this `revision` or a later one contain the batch
-    rows: Rows that came
-    accepted: Rows to be learnt
-    effective_samples: Independent samples that these count as now: rows of a fast stream tell nearly the same, and with
-        `forgetting_s` late rows count less; null for a batch that an earlier release has logged
-    duplicate: Whether the batch had come before: then this is what was said the first time
-    state: What has become of the batch since
-    rejected: Rows that are kept but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`,
-        `stationary`, `contact`, `change` (a changed robot, or a stream that did not fit, and its owner has not
-        decided), `payload` (the arm carries something, of which the row teaches instead), `edge` (acceleration not
-        derivable; where the stream goes on, these are learnt with the next batch), `late` (came so late that by
-        `forgetting_s` it counts less than a thousandth), `paused` (learning is paused), `implausible` (a torque that
-        nobody has measured: zero against gravity, the model's own answer, or the same all the time while the arm moves)
-    gaps: Ranges [first, last] of sequences of the stream that have not come, the latest ones
-    derived: What was derived because it was not sent
-    held: Whether learning stands still until the model's owner has decided about a change
+    version: Version that predicted the rows before it learnt them
+    revision: Responses of this version with this `revision` or a later one contain the batch
+    rows: Rows received
+    accepted: Rows that are learnt
+    effective_samples: Effective samples of the accepted rows: neighbouring rows of a fast stream are correlated, and
+        with `forgetting_s` late rows count less. Null for a batch logged by an earlier release
+    duplicate: Whether the batch was received before; then this is its first acknowledgement
+    state: Present state of the batch
+    rejected: Rows that are stored but not learnt, by code: `non_finite`, `limit`, `time_jump`, `saturation`,
+        `stationary`, `contact`, `change` (the robot changed or the stream does not fit, and the owner has not decided
+        yet), `payload` (the arm carries a payload, which the row updates instead), `edge` (acceleration cannot be
+        derived yet; if the stream continues, these are learnt with the next batch), `late` (so late that with
+        `forgetting_s` it counts less than 0.001), `paused` (learning is paused), `implausible` (not a measured torque:
+        zero against gravity, the model's own prediction, or constant while the arm moves)
+    gaps: Latest ranges [first, last] of missing sequences of the stream
+    derived: Derived quantities; null if all were sent
+    held: Whether learning is paused until the model's owner decides about a change
     """
 
     model: str
@@ -67,15 +67,15 @@ class ObservationResponse(Record, frozen=True, kw_only=True):
 
 
 class Observation(Record, frozen=True, kw_only=True):
-    """A batch of the log, and what became of it.
+    """An observation batch of the log, and its outcome.
 
-    last_sequence: Of its last frame; equal to `sequence` where it came in one request
-    event: Its place in the model's log
-    first_at: Event time of its first row that has one
-    last_at: Event time of its last row that has one
-    version: The version that predicted its rows before they were learnt
-    accepted: Rows that teach
-    rejected: Rows that were kept out, by code
+    last_sequence: Sequence of its last frame; equal to `sequence` if it came in one request
+    event: Number of its event in the model's log
+    first_at: Event time of its first row with a time
+    last_at: Event time of its last row with a time
+    version: Version that predicted its rows before they were learnt
+    accepted: Rows that are learnt
+    rejected: Rejected rows, by code
     """
 
     stream_id: str
@@ -94,10 +94,10 @@ class Observation(Record, frozen=True, kw_only=True):
 
 
 class Figures(Record, frozen=True, kw_only=True):
-    """Per joint, over rows that could be predicted; null where there are none, nmse also where torque did not vary.
+    """Quality per joint over rows that could be predicted; null without rows, and nmse if torque is constant.
 
     nmse: Mean squared error / variance of the measured torque
-    rmse: N·m
+    rmse: Root mean squared error, N·m
     coverage: Share of measurements inside the 95 % interval, noise included
     nlpd: Mean negative log predictive density, nats
     """
@@ -110,10 +110,10 @@ class Figures(Record, frozen=True, kw_only=True):
 
 
 class Replay(Record, frozen=True, kw_only=True):
-    """Rows of a batch that were kept out at first and were learnt later.
+    """Rejected rows of a batch that were learnt later.
 
-    event: Its place in the model's log
-    codes: Codes whose rows were learnt
+    event: Number of its event in the model's log
+    codes: Codes of these rows
     """
 
     event: int
@@ -124,11 +124,11 @@ class Replay(Record, frozen=True, kw_only=True):
 
 
 class ObservationRows(Record, frozen=True, kw_only=True):
-    """All rows of a batch as they are kept; null stands for what was not a finite number.
+    """All rows of a batch as stored; null stands for a number that is not finite.
 
     time: Event time, Unix seconds
-    ddq: As sent, or as derived from dq
-    code: What became of each: learnt, non_finite, limit, time_jump, saturation, stationary, contact, change, edge,
+    ddq: Accelerations as sent, or as derived from dq
+    code: Outcome of each row: learnt, non_finite, limit, time_jump, saturation, stationary, contact, change, edge,
         payload, late, paused, implausible
     """
 
@@ -141,19 +141,19 @@ class ObservationRows(Record, frozen=True, kw_only=True):
 
 
 class ObservationDetail(Record, frozen=True, kw_only=True):
-    """A batch with its acknowledgement, how well it was predicted, and its rows where asked for.
+    """An observation batch with its acknowledgement, its quality and, if requested, its rows.
 
-    last_sequence: Of its last frame; equal to `sequence` where it came in one request
-    event: Its place in the model's log
-    first_at: Event time of its first row that has one
-    last_at: Event time of its last row that has one
-    version: The version that predicted its rows before they were learnt
-    accepted: Rows that teach
-    rejected: Rows that were kept out, by code
-    report: What its acknowledgement said
-    figures: How well its rows were predicted; null where none could be
-    observed: Its rows, where asked for. A batch whose accelerations were derived may bring along rows of the batches
-        next to it that had to wait for it
+    last_sequence: Sequence of its last frame; equal to `sequence` if it came in one request
+    event: Number of its event in the model's log
+    first_at: Event time of its first row with a time
+    last_at: Event time of its last row with a time
+    version: Version that predicted its rows before they were learnt
+    accepted: Rows that are learnt
+    rejected: Rejected rows, by code
+    report: The acknowledgement
+    figures: Quality of the predictions of its rows; null if none could be predicted
+    observed: Its rows, if requested. If accelerations were derived, they may include rows of neighbouring batches that
+        had to wait for this one
     """
 
     stream_id: str
@@ -176,10 +176,10 @@ class ObservationDetail(Record, frozen=True, kw_only=True):
 
 
 class Unlearnt(Record, frozen=True, kw_only=True):
-    """A batch was taken out.
+    """An observation batch was unlearnt.
 
-    rows: Rows that do not teach any more, replayed ones included
-    trained: Versions trained after the batch came, perhaps on its rows: nothing is taken out of these
+    rows: Rows that were unlearnt, replayed ones included
+    trained: Versions that were trained after the batch arrived and may contain its rows. They are not changed
     """
 
     model: str
@@ -192,9 +192,9 @@ class Unlearnt(Record, frozen=True, kw_only=True):
 
 
 class Replayed(Record, frozen=True, kw_only=True):
-    """Rows that were kept out are learnt.
+    """Rejected rows were learnt.
 
-    codes: Rows by the code that had kept them out
+    codes: Learnt rows, by the code that rejected them
     """
 
     model: str

@@ -1,4 +1,4 @@
-"""Models at a glance. Written by `python clients/python/records.py`."""
+"""Summaries of models. Written by `python clients/python/records.py`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from lipserve.records.models import HeldOutQuality
 class SketchedJoint(Record, frozen=True, kw_only=True):
     """A joint of a learnt arm, in the frame of the joint before it.
 
-    joint: Which of the model's joints it is, from 0
-    rotation: Of its frame with its position at zero, 3 × 3
-    translation: m
-    axis: In its own frame
-    mass: Of what it moves, itself, kg
-    centre: Of that mass, in its own frame, m
+    joint: Index of the joint in the model, from 0
+    rotation: Rotation of the joint frame at position zero, 3 × 3
+    translation: Translation of the joint frame, m
+    axis: Joint axis in the joint frame
+    mass: Mass of the link that the joint moves, kg
+    centre: Centre of mass of this link in the joint frame, m
     """
 
     joint: int
@@ -31,19 +31,19 @@ class SketchedJoint(Record, frozen=True, kw_only=True):
 
 
 class ArmSketch(Record, frozen=True, kw_only=True):
-    """Enough of an arm to draw it, joints from base to tip; `parameters` of its version has all, with uncertainty."""
+    """Geometry for a drawing of an arm, joints from base to tip. `parameters` of the version has all of it."""
 
     gravity: list[float]
     joints: list[SketchedJoint]
 
 
 class CoursePoint(Record, frozen=True, kw_only=True):
-    """Rows of a short while, each predicted before it was learnt.
+    """Rows of a short time span, each predicted before it was learnt.
 
-    at: When that while began, Unix seconds
+    at: Start of the time span, Unix seconds
     rows: Rows that could be predicted
-    innovation: Per joint, root mean square of (tau - mean) in standard deviations of a measurement, sqrt(std² +
-        noise_std²): 1 where errors are as large as the model says
+    innovation: Per joint, root mean square of (tau - mean) / sqrt(std² + noise_std²): 1 if errors are as large as
+        predicted
     """
 
     at: float
@@ -52,12 +52,12 @@ class CoursePoint(Record, frozen=True, kw_only=True):
 
 
 class RecentQuality(Record, frozen=True, kw_only=True):
-    """How well a model predicted what it observed lately.
+    """Prediction quality on recent observations.
 
-    seconds: How far it looks back
+    seconds: Length of the window, s
     nmse: Mean squared error / variance of the measured torque
     coverage: Share of measurements inside the 95 % interval, noise included
-    course: Oldest first; a while without rows is left out
+    course: Time spans, oldest first; time spans without rows are left out
     """
 
     seconds: float
@@ -68,21 +68,21 @@ class RecentQuality(Record, frozen=True, kw_only=True):
 
 
 class ModelOverview(Record, frozen=True, kw_only=True):
-    """A model at a glance.
+    """A short summary of a model.
 
-    serving_version: null where all versions wait as candidates
-    estimator: Of the version that serves, else of the newest, as all that follows
-    created_at: When that version was made
-    quality: On what its training held out; null where that was nothing
-    candidate: A version that waits under the alias `candidate`
-    arm: null: the estimator knows no arm
-    position: Where it was at the last row that this service took, rad (m); else a posture it was trained at
-    idle_s: Seconds since observations came last; null: never
-    recent: Of the quality window nearest to an hour; null while nothing that this service knows has come
-    payloads: What each stream's arm carries; null: no arm is known, or the model is not in memory
-    held: Whether learning waits for a decision
-    failure: Why the version does not learn, where it should
-    alarm: The newest one
+    serving_version: Serving version; null if all versions are candidates
+    estimator: Estimator of the serving version, else of the newest. The following fields are of this version
+    created_at: Creation time of the version
+    quality: Quality on the held-out part of its training; null if nothing was held out
+    candidate: Version under the alias `candidate`
+    arm: Null if the estimator has no arm geometry
+    position: Position at the last row that this process received, rad (m); else a posture of its training
+    idle_s: Time since the last observation, s; null if there was none
+    recent: From the quality window nearest to one hour; null if this process has no observations
+    payloads: Payload of each stream; null if the model has no arm geometry or is not in memory
+    held: Whether learning is paused until a person decides
+    failure: Why learning fails; null if it does not
+    alarm: Newest alarm
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""What arms carry. Written by `python clients/python/records.py`."""
+"""Payloads. Written by `python clients/python/records.py`."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ class Vector(Record, frozen=True, kw_only=True):
 
 
 class Tensor(Record, frozen=True, kw_only=True):
-    """A matrix of 3 × 3 and its standard deviations."""
+    """A 3 × 3 matrix and its standard deviations."""
 
     mean: list[list[float]]
     std: list[list[float]]
 
 
 class PayloadBody(Record, frozen=True, kw_only=True):
-    """A body on the last link, as far as its stream tells.
+    """Estimate of a body on the last link.
 
-    mass: kg
+    mass: Mass, kg
     com: Centre of mass in the frame of the last link, m
-    com_tip: The same in the frame of the URDF's tip, m; null without a URDF
-    inertia: About the centre of mass, along the axes of the last link, kg·m²
+    com_tip: Centre of mass in the frame of the URDF's tip, m; null without a URDF
+    inertia: Inertia about the centre of mass, along the axes of the last link, kg·m²
     """
 
     mass: Scalar
@@ -44,14 +44,14 @@ class PayloadBody(Record, frozen=True, kw_only=True):
 
 
 class StreamPayload(Record, frozen=True, kw_only=True):
-    """What one robot carries.
+    """Payload of one robot.
 
-    state: What its last rows show: `payload`, `contact`, `friction` (it has changed), or `none` of these
-    declared: Whether the payload was declared, and not only seen
-    since: Since when it carries what it carries, or nothing
-    rows: Rows that the payload was seen on
-    probabilities: Of what may have begun within the last 0.3 s
-    payload: null: it carries nothing that the model was not trained with
+    state: State by the latest rows: `payload`, `contact`, `friction` (changed friction) or `none`
+    declared: Whether the payload was declared rather than detected
+    since: Time since which the robot carries this payload, or none
+    rows: Rows used to estimate the payload
+    probabilities: Probabilities of events that may have begun within the last 0.3 s
+    payload: Null: nothing beyond what the model was trained with
     """
 
     stream_id: str
@@ -64,14 +64,14 @@ class StreamPayload(Record, frozen=True, kw_only=True):
 
 
 class Payloads(Record, frozen=True, kw_only=True):
-    """What the robots of a model carry.
+    """Payloads of a model's robots.
 
-    link: The joint that moves the last link
-    frame: Whose frame of that link centres of mass are in. `learnt`: the arm was learnt from torque alone; its origin
-        lies on the last joint's axis, and lengths, and with them masses, are as good as the geometry
-    tip: The frame of the URDF that counts as its tip
-    reason: Why nothing is watched; null where payloads are
-    default: Declared for all of the model: what streams that have sent nothing yet are answered with
+    link: Joint that moves the last link
+    frame: Frame of the centres of mass. `urdf`: of the URDF's link. `learnt`: the arm was learnt from torque alone; the
+        origin lies on the last joint's axis, and lengths and masses are as accurate as the geometry
+    tip: Frame of the URDF that is its tip
+    reason: Why payloads are not detected; null if they are
+    default: Payload declared for all robots of the model. It applies to streams without observations
     """
 
     model: str

@@ -8,17 +8,17 @@ from lipserve.records import Record
 
 
 class RobotJoint(Record, frozen=True, kw_only=True):
-    """A joint that moves on its own."""
+    """A movable joint."""
 
     name: str
     type: Literal["revolute", "prismatic"]
 
 
 class Robot(Record, frozen=True, kw_only=True):
-    """An uploaded URDF, immutable.
+    """An uploaded, immutable URDF.
 
     sha256: Hash of the URDF
-    joints: Joints that move; those that the data do not name are locked
+    joints: Movable joints. Joints that the data do not name are locked
     """
 
     id: str
@@ -29,16 +29,16 @@ class Robot(Record, frozen=True, kw_only=True):
 
 
 class ProfileJoint(Record, frozen=True, kw_only=True):
-    """A joint and its limits; null where it has none, or where none is known.
+    """A joint and its limits; null if it has none or none is known.
 
-    aliases: Other names that recordings have for it
-    turns_freely: Whether it turns without end, so that it has no range
-    lower: rad, or m where it is prismatic
-    upper: rad, or m where it is prismatic
-    max_speed: rad/s or m/s
-    max_acceleration: rad/s² or m/s²
-    max_torque: N·m or N
-    torque_constant: N·m/A, of its motor current
+    aliases: Other names of the joint in recordings
+    turns_freely: Whether the joint turns endlessly, so that it has no range
+    lower: Lower position limit, rad (prismatic: m)
+    upper: Upper position limit, rad (prismatic: m)
+    max_speed: Speed limit, rad/s (m/s)
+    max_acceleration: Acceleration limit, rad/s² (m/s²)
+    max_torque: Torque limit, N·m (N)
+    torque_constant: Torque constant of the motor current, N·m/A
     """
 
     name: str
@@ -54,14 +54,14 @@ class ProfileJoint(Record, frozen=True, kw_only=True):
 
 
 class RobotProfile(Record, frozen=True, kw_only=True):
-    """What is known of a robot: what data of it are read, checked and reported with.
+    """A known robot. Its data are read, checked and reported with this profile.
 
     joints: From base to tip
-    effort: What the effort field of its recordings is, unless the upload says: measured torque, gravity included;
-        commanded torque, added to gravity compensation; motor current, A
-    source: Of the numbers
-    urdf_available: Whether its name will do as the robot of a job with rigid bodies
-    urdf_note: Why not
+    effort: Meaning of the effort in recordings, unless the upload says otherwise: measured torque with gravity,
+        commanded torque on top of gravity compensation, or motor current in A
+    source: Source of the numbers
+    urdf_available: Whether jobs with rigid bodies can use this robot by name
+    urdf_note: Why no URDF is available; null if one is
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""The service, and what the Open Inference Protocol tells of it. Written by `python clients/python/records.py`."""
+"""State of the service, and answers of the Open Inference Protocol. Written by `python clients/python/records.py`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from lipserve.records import Record
 
 
 class Missing(Record, frozen=True, kw_only=True):
-    """What the service cannot do for want of an extra.
+    """An extra that is not installed.
 
-    gives: What it is for, in words
-    install: What installs it, where the service runs
+    gives: Purpose of the extra
+    install: Command that installs it, to be run where the service runs
     """
 
     extra: str
@@ -22,16 +22,16 @@ class Missing(Record, frozen=True, kw_only=True):
 
 
 class Health(Record, frozen=True, kw_only=True):
-    """The process answers, and what it can do.
+    """The process is running, and its capabilities.
 
-    can: What is installed besides serving, teaching and training of learnt arms, by the name of its extra: `train`, to
-        train the estimators se, gip and lse, on a GPU if there is one; `robots`, to use URDFs; `sim`, to simulate
-        robots and know them by name; `ingest`, to read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra);
-        `cluster`, to share PostgreSQL, S3 and a Dask cluster; `grpc`, to answer over gRPC; `opentelemetry`, to send
-        traces; `plot`, to draw pictures
-    missing: Of what is not installed
-    confined: What this system has to keep the process in which an upload is read from harm: limits of `memory` and
-        `processor`; `landlock`, from files; `seccomp`, from the network and other processes
+    can: Installed extras by name, besides serving, online learning and training of learnt arms: `train`, to train the
+        estimators se, gip and lse, on a GPU if there is one; `robots`, to use URDFs; `sim`, to simulate robots and know
+        them by name; `ingest`, to read CSV, Parquet, LeRobot and bags (NPZ and JSON need no extra); `cluster`, to share
+        PostgreSQL, S3 and a Dask cluster; `grpc`, to serve over gRPC; `opentelemetry`, to send traces; `plot`, to draw
+        pictures
+    missing: Extras that are not installed
+    confined: Available confinement of the process that reads uploads: limits of `memory` and `processor` time;
+        `landlock` blocks files; `seccomp` blocks the network and other processes
     """
 
     status: Literal["alive"] = "alive"
@@ -42,7 +42,7 @@ class Health(Record, frozen=True, kw_only=True):
 
 
 class Live(Record, frozen=True, kw_only=True):
-    """The process answers."""
+    """The process is running."""
 
     status: Literal["alive"] = "alive"
 
@@ -50,7 +50,7 @@ class Live(Record, frozen=True, kw_only=True):
 class Part(Record, frozen=True, kw_only=True):
     """One part of the service.
 
-    state: warning: some clients may notice something
+    state: `warning`: some clients may be affected
     """
 
     name: str
@@ -59,7 +59,7 @@ class Part(Record, frozen=True, kw_only=True):
 
 
 class Ready(Record, frozen=True, kw_only=True):
-    """The service can do what it is for."""
+    """The service is ready."""
 
     status: Literal["ready"] = "ready"
     version: str
@@ -67,7 +67,7 @@ class Ready(Record, frozen=True, kw_only=True):
 
 
 class ServerMetadata(Record, frozen=True, kw_only=True):
-    """What serves, and which extensions of the protocol it speaks."""
+    """Name and version of the server, and the supported extensions of the protocol."""
 
     name: str
     version: str
@@ -75,7 +75,7 @@ class ServerMetadata(Record, frozen=True, kw_only=True):
 
 
 class ServerLive(Record, frozen=True, kw_only=True):
-    """The process answers."""
+    """The process is alive."""
 
     live: Literal[True] = True
 
@@ -87,10 +87,10 @@ class ServerReady(Record, frozen=True, kw_only=True):
 
 
 class TensorMetadata(Record, frozen=True, kw_only=True):
-    """A tensor of a model. -1 stands for the number of queries N; an input of one query may leave this axis out.
+    """A tensor of a model. -1 stands for the number of queries N; the inputs of a single query may omit this axis.
 
     datatype: Inputs may also be FP32
-    parameters: `optional`: an input that only some outputs need
+    parameters: `optional`: only some outputs need this input
     """
 
     name: str
@@ -100,11 +100,11 @@ class TensorMetadata(Record, frozen=True, kw_only=True):
 
 
 class ModelMetadata(Record, frozen=True, kw_only=True):
-    """The tensors of a model and its versions.
+    """Tensors and versions of a model.
 
-    versions: Versions that a path may name; without one the latest answers
-    platform: `lipserve_` and the estimator
-    parameters: `version` and `revision` described here, `torque_convention`, and `joint_names`, joined by commas
+    versions: Versions that a path may name; without one, the serving version answers
+    platform: `lipserve_` and the name of the estimator
+    parameters: `version` and `revision` described here, `torque_convention`, and `joint_names`, comma-separated
     """
 
     name: str
@@ -116,7 +116,7 @@ class ModelMetadata(Record, frozen=True, kw_only=True):
 
 
 class ModelReady(Record, frozen=True, kw_only=True):
-    """The version is in memory and answers."""
+    """The version is in memory and can answer."""
 
     name: str
     ready: Literal[True] = True

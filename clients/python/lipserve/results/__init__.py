@@ -1,4 +1,4 @@
-"""Results whose numbers are arrays: from the API's JSON and back, and as plain tables."""
+"""Results with arrays: conversion from and to the API's JSON, and tables."""
 
 from __future__ import annotations
 
@@ -17,31 +17,33 @@ Result = TypeVar("Result")
 
 
 def array(values: Any) -> Array:
-    """Numbers as an array; null as NaN."""
+    """Return numbers as an array, with NaN for null."""
     return np.array(values, np.float64)
 
 
 def reading(kind: type[Result]) -> Callable[[Answer], Result]:
-    """A function that reads an answer as a dataclass of results: lists as arrays, null in them as NaN. What the
-    dataclass does not name is left out."""
+    """Return a function that reads an answer as a dataclass: lists become arrays, null becomes NaN.
+
+    Fields that the dataclass does not have are ignored.
+    """
     decode = decoder(kind, _numbers).decode
     return lambda answer: decode(answer.body)
 
 
 def _numbers(kind: Any, values: Any) -> Any:
-    """Values of a field that is annotated `NDArray[…]`, as such an array."""
+    """Convert the values of a field annotated `NDArray[…]` to an array."""
     (number,) = get_args(get_args(kind)[1])
     return np.array(values, number)
 
 
 def shape_arrays(result: Any, shape: tuple[int, ...], *names: str) -> None:
-    """Give fields of a result that has just been read their shape: JSON does not tell that of an array without rows."""
+    """Reshape array fields of a new result: JSON does not keep the shape of an array without rows."""
     for name in names:
         object.__setattr__(result, name, getattr(result, name).reshape(shape))
 
 
 def plain(value: Any) -> Any:
-    """What JSON can say of a result: arrays as lists, NaN as null; fields that are None are left out."""
+    """Convert a result to JSON types: arrays to lists, NaN to None; fields that are None are omitted."""
     if isinstance(value, np.ndarray):
         return plain(value.tolist())
     if isinstance(value, float):
@@ -57,21 +59,21 @@ def plain(value: Any) -> Any:
 
 
 class Plain:
-    """Of dataclasses: what JSON can say of them."""
+    """Base of result dataclasses, with conversion to JSON types."""
 
     def as_dict(self) -> dict[str, Any]:
-        """The result as the API tells it: lists for arrays, None for NaN; fields that are None are left out."""
+        """Return the result as in the API: lists for arrays, None for NaN; fields that are None are omitted."""
         document: dict[str, Any] = plain(self)
         return document
 
 
 def figure(value: float, form: str) -> str:
-    """A number in a form, `-` where there is none."""
+    """Format a number, `-` for NaN."""
     return "-" if np.isnan(value) else format(value, form).replace("%", " %")
 
 
 def text_table(title: str, columns: Mapping[str, Sequence[str]]) -> str:
-    """Lines of a table, the first column to the left and the others to the right."""
+    """Return a table as text, with the first column left-aligned and the others right-aligned."""
     widths = {name: max(len(name), *map(len, cells), 0) for name, cells in columns.items()}
     rows = [tuple(columns), *zip(*columns.values(), strict=True)]
     lines = [
@@ -85,7 +87,7 @@ def text_table(title: str, columns: Mapping[str, Sequence[str]]) -> str:
 
 
 def html_table(title: str, columns: Mapping[str, Sequence[str]]) -> str:
-    """The table as HTML; what it shows is escaped."""
+    """Return a table as HTML, with its texts escaped."""
     head = "".join(f"<th>{escape(name)}</th>" for name in columns)
     body = "".join(
         "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"

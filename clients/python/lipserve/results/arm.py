@@ -1,4 +1,4 @@
-"""The arm that a version has learnt: where its joints lie, what they carry, rotors and friction."""
+"""Estimated arm of a version: joint frames, bodies, rotors and friction."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from lipserve.records import models
 from lipserve.results import Array, Plain, array, html_table, text_table
 
 LIMITS = (
-    "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.",
-    "Masses are the physically possible ones nearest to what was learnt; torque off: how far theirs is from it, rms.",
+    "Torque does not distinguish an arm from its mirror image, nor determine where a frame is along its axis.",
+    "Masses are the closest physically consistent ones; torque deviation is the RMS change of torque that this causes.",
     "± is one standard deviation.",
 )
 FRICTION = {
@@ -27,66 +27,69 @@ Columns = dict[str, list[str]]
 
 @dataclass(frozen=True, eq=False)
 class Frames(Plain):
-    """Where n joints lie with all positions at zero, base to tip, in the base's frame.
-
-    mode: `learn`, `calibrate` or `fixed`; axis: (n, 3) directions; place: (n, 3) m, origins of the joints' frames;
-    turn_std, shift_std: of each joint, standard deviations across its axis, rad and m, empty where there are none.
-    """
+    """Joint frames in the base frame, with all joints at zero, from base to tip."""
 
     mode: str
+    """`learn`, `calibrate` or `fixed`."""
     axis: Array
+    """(n, 3) directions of the joint axes."""
     place: Array
+    """(n, 3) origins of the joint frames, m."""
     turn_std: tuple[tuple[float, ...], ...]
+    """Per joint, standard deviations of its rotation across its axis, rad; empty if there are none."""
     shift_std: tuple[tuple[float, ...], ...]
+    """Per joint, standard deviations of its position across its axis, m; empty if there are none."""
 
 
 @dataclass(frozen=True, eq=False)
 class Arm(Plain):
-    """What a version has learnt of an arm of n joints, base to tip; `print` shows it as tables.
-
-    frames: where the joints lie; mass, mass_std: (n) kg; centre, centre_std: (n, 3) m, centres of mass in the joints'
-    own frames, first moment over mass, their deviations to first order; rotor, rotor_std: (n) kg·m² (kg); deviation:
-    (n) N·m (N), root mean square by which the torque of these bodies differs from what was learnt; friction: by
-    `viscous`, `coulomb`, `offset` and, where it was learnt, `stribeck` means and standard deviations, (n) each;
-    undetermined: what torque does not tell of each joint and its body.
-    """
+    """Estimated arm of n joints, from base to tip; `print` shows it as tables."""
 
     joint_names: tuple[str, ...]
     joint_types: tuple[str, ...]
     frames: Frames
     mass: Array
+    """(n,) masses, kg."""
     mass_std: Array
+    """(n,) standard deviations of the masses, kg."""
     centre: Array
+    """(n, 3) centres of mass in the joint frames, m."""
     centre_std: Array
+    """(n, 3) their standard deviations to first order, m."""
     rotor: Array
+    """(n,) rotor inertias, kg·m² (prismatic: kg)."""
     rotor_std: Array
+    """(n,) standard deviations of the rotor inertias."""
     deviation: Array
+    """(n,) RMS difference between the torque of these bodies and that of the estimate, N·m (prismatic: N)."""
     friction: Mapping[str, tuple[Array, Array]]
+    """Means and standard deviations, (n,) each, of `viscous`, `coulomb`, `offset` and, if estimated, `stribeck`."""
     undetermined: tuple[tuple[str, ...], ...]
+    """Per joint, parameters that are unidentifiable from torque."""
 
     def tables(self) -> dict[str, Columns]:
-        """The tables by their titles: columns of texts, a row a joint."""
+        """Return tables by title, as columns of texts with one row per joint."""
         names, undetermined = list(self.joint_names), [", ".join(each) or "-" for each in self.undetermined]
         frames = {
             "joint": names,
             "type": list(self.joint_types),
             "axis": [_vector(each) for each in self.frames.axis],
-            "place m": [_vector(each) for each in self.frames.place],
-            "turn std °": [_list(np.degrees(each)) for each in self.frames.turn_std],
-            "shift std mm": [_list(1000 * np.array(each)) for each in self.frames.shift_std],
+            "position m": [_vector(each) for each in self.frames.place],
+            "rotation std °": [_list(np.degrees(each)) for each in self.frames.turn_std],
+            "position std mm": [_list(1000 * np.array(each)) for each in self.frames.shift_std],
         }
         bodies = {
             "joint": names,
             "mass kg": _pairs(self.mass, self.mass_std),
             **{f"centre {axis} m": _pairs(self.centre[:, k], self.centre_std[:, k]) for k, axis in enumerate("xyz")},
             "rotor kg·m²": _pairs(self.rotor, self.rotor_std),
-            "torque off N·m": [f"{each:.2g}" for each in self.deviation],
-            "torque does not tell": undetermined,
+            "torque deviation N·m": [f"{each:.2g}" for each in self.deviation],
+            "unidentifiable": undetermined,
         }
         terms = {head: _pairs(*self.friction[name]) for name, head in FRICTION.items() if name in self.friction}
         return {
-            "where the joints lie, all at zero, in the base's frame": frames,
-            "what the joints carry, in their own frames": bodies,
+            "joint frames, all joints at zero, in the base frame": frames,
+            "bodies, in their joint frames": bodies,
             "friction": {"joint": names, **terms},
         }
 
@@ -99,22 +102,22 @@ class Arm(Plain):
 
 
 class Version(models.Version, frozen=True, kw_only=True):
-    """A version as the API shows it; `arm` is what it has learnt of its arm, and `print` shows that."""
+    """Version of a model; `arm` is its estimated arm, and `print` shows it."""
 
     @property
     def arm(self) -> Arm | None:
-        """The arm, None for an estimator without rigid bodies."""
+        """Estimated arm, None for an estimator without rigid bodies."""
         return read_arm(self)
 
     def __str__(self) -> str:
         joints = f"{len(self.joint_names)} joints: {', '.join(self.joint_names)}"
         title = f"{self.model} version {self.version}: {self.estimator}, {joints}"
-        title = "\n".join([title, *(f"careful: {each}" for each in self.warnings)])
+        title = "\n".join([title, *(f"warning: {each}" for each in self.warnings)])
         return title if self.arm is None else f"{title}\n\n{self.arm}"
 
 
 def read_arm(version: models.Version) -> Arm | None:
-    """The arm of a version; None where its estimator has no rigid bodies."""
+    """Return the estimated arm of a version, None for an estimator without rigid bodies."""
     parameters = version.parameters
     if "inertia" not in parameters:
         return None

@@ -1,4 +1,4 @@
-"""How well a version predicts a data set, and how two of them differ."""
+"""Evaluation of a version on a data set, and comparison of two versions."""
 
 from __future__ import annotations
 
@@ -17,43 +17,45 @@ from lipserve.wording import percent
 
 @dataclass(frozen=True, eq=False)
 class Interval(Plain):
-    """What the central intervals of one probability hold. level: that probability; coverage: (n) share of measurements
-    inside, noise included; interval_width: (n) mean width, N·m."""
+    """Coverage and width of intervals at one level."""
 
     level: float
+    """Nominal probability of the intervals."""
     coverage: Array
+    """(n,) share of measurements inside, noise included."""
     interval_width: Array
+    """(n,) mean width, N·m."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reliability(Plain):
-    """nominal: (K) probabilities that intervals promise; observed: (n, K) shares of measurements inside."""
+    """Observed coverage against nominal probability."""
 
     nominal: Array
+    """(K,) nominal probabilities of the intervals."""
     observed: Array
+    """(n, K) shares of measurements inside."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stretches(Plain):
-    """How the error is spread over the recording. kind: stretches are `episodes`, or ten `equal` ones; samples: (S)
-    compared of each; nmse: (n, S) mean squared error within the stretch / variance of the torque over all samples."""
+    """Error along the recording, in S parts."""
 
     kind: str
+    """`episodes`, or `equal` for ten equal parts."""
     samples: NDArray[np.int64]
+    """(S,) compared samples."""
     nmse: Array
+    """(n, S) mean squared error in the part / variance of the torque over all samples."""
 
 
 @dataclass(frozen=True, eq=False)
 class Evaluation(Plain):
-    """Figures per joint, (n) each; `print` shows them as a table, `rows` lists them.
+    """Figures of a version on a data set, per joint; `print` shows a table, `rows` returns dictionaries.
 
-    samples: of the data set or the part; samples_used: that were compared; nmse: mean squared error / variance of the
-    measured torque, NaN where that does not vary; rmse: N·m; coverage: share of measurements inside the interval of
-    probability `level`, noise included; independent: errors that it stands on; coverage_low, coverage_high: its 95 %
-    confidence interval; nlpd: mean negative log predictive density, nats; interval_width: N·m; in_training: whether the
-    version has learnt these samples: then the figures flatter; repeats_training: share of them that repeat motion it
-    was trained on, and period_s: after which that repeats itself, s, None where not known; warnings: what else
-    flatters; judged: whether the figures are of the judged fit, which was trained without these samples.
+    Example:
+        >>> result = client.evaluate("panda-sim", "ds_0123456789abcdef")
+        >>> print(result)
     """
 
     model: str
@@ -61,29 +63,47 @@ class Evaluation(Plain):
     revision: int
     dataset: str
     part: str
+    """`all` or `held_out`."""
     joint_names: tuple[str, ...]
     samples: int
+    """Number of samples of the data set or part."""
     samples_used: int
+    """Number of samples compared."""
     level: float
+    """Nominal probability of the intervals."""
     nmse: Array
+    """(n,) mean squared error / variance of the measured torque; NaN for constant torque."""
     rmse: Array
+    """(n,) root mean square error, N·m."""
     coverage: Array
+    """(n,) share of measurements inside the interval, noise included."""
     nlpd: Array
+    """(n,) mean negative log predictive density, nats."""
     interval_width: Array
+    """(n,) mean width of the interval, N·m."""
     coverages: tuple[Interval, ...]
+    """Coverage and width at several levels."""
     reliability: Reliability
     stretches: Stretches
     independent: Array
+    """(n,) effective samples of the coverage."""
     coverage_low: Array
+    """(n,) lower end of the 95 % confidence interval of the coverage."""
     coverage_high: Array
+    """(n,) upper end of the 95 % confidence interval of the coverage."""
     in_training: bool
+    """Whether the version was trained on these samples: then the figures are too optimistic."""
     repeats_training: float | None
+    """Share of samples that repeat training motion; None if unknown."""
     period_s: float | None
+    """Period of the training motion, s; None if unknown."""
     warnings: tuple[str, ...]
+    """Other reasons why the figures are too optimistic."""
     judged: bool = False
+    """Whether the figures are those of the fit without these samples; the version was trained on them afterwards."""
 
     def rows(self) -> list[dict[str, Any]]:
-        """One dictionary a joint, as for `pandas.DataFrame(evaluation.rows())`."""
+        """Return one dictionary per joint, e.g. for `pandas.DataFrame(evaluation.rows())`."""
         figures = {name: getattr(self, name).tolist() for name in _FIGURES}
         return [
             {"joint": joint, **{name: values[at] for name, values in figures.items()}}
@@ -92,27 +112,27 @@ class Evaluation(Plain):
 
     @property
     def title(self) -> str:
-        """What was compared with what, and whether that flatters."""
+        """Title of the table: model, samples, and whether they are training data."""
         what = "held-out samples" if self.part == "held_out" else "samples"
-        unseen = ", which it was trained on: these figures flatter" if self.in_training else ""
-        unseen = ", as judged before it learnt them" if self.judged else unseen
-        return f"{self.model} version {self.version} on {self.samples_used} {what} of {self.dataset}{unseen}"
+        caveat = " (training data: figures are too optimistic)" if self.in_training else ""
+        caveat = ", evaluated before training on them" if self.judged else caveat
+        return f"{self.model} version {self.version} on {self.samples_used} {what} of {self.dataset}{caveat}"
 
     def __str__(self) -> str:
-        return "\n".join([text_table(self.title, self._columns()), *(f"careful: {each}" for each in self.warnings)])
+        return "\n".join([text_table(self.title, self._columns()), *(f"warning: {each}" for each in self.warnings)])
 
     def _repr_html_(self) -> str:
-        careful = (f"<p>careful: {escape(each)}</p>" for each in self.warnings)
-        return html_table(self.title, self._columns()) + "".join(careful)
+        warnings = (f"<p>warning: {escape(each)}</p>" for each in self.warnings)
+        return html_table(self.title, self._columns()) + "".join(warnings)
 
     def _columns(self) -> dict[str, list[str]]:
         heads = {
             "nMSE": (self.nmse, ".2e"),
             "RMSE N·m": (self.rmse, ".4f"),
-            f"coverage of {percent(self.level)}": (self.coverage, ".1%"),
-            "at least": (self.coverage_low, ".0%"),
-            "at most": (self.coverage_high, ".0%"),
-            "independent errors": (self.independent, ".0f"),
+            f"coverage ({percent(self.level)})": (self.coverage, ".1%"),
+            "95 % CI from": (self.coverage_low, ".0%"),
+            "to": (self.coverage_high, ".0%"),
+            "effective samples": (self.independent, ".0f"),
             "width N·m": (self.interval_width, ".3f"),
             "NLPD nats": (self.nlpd, ".3f"),
         }
@@ -125,7 +145,7 @@ _FIGURES = ("nmse", "rmse", "coverage", "coverage_low", "coverage_high", "indepe
 
 @dataclass(frozen=True, eq=False)
 class VersionFigures(Plain):
-    """Figures of one version, (n) each; see `Evaluation`."""
+    """Figures of one version, (n,) each; see `Evaluation`."""
 
     version: int
     revision: int
@@ -139,42 +159,50 @@ class VersionFigures(Plain):
 
 @dataclass(frozen=True, eq=False)
 class Difference(Plain):
-    """The second version's figure less the first's: (n), or () over all joints; NaN where it cannot be told.
-
-    standard_error: of the paired difference; half_width: half the width of its 95 % interval.
-    """
+    """Figure of the second version − figure of the first: (n,), or () over all joints; NaN if unknown."""
 
     difference: Array
     standard_error: Array
+    """Standard error of the paired difference."""
     half_width: Array
+    """Half the width of its 95 % confidence interval."""
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison(Plain):
-    """Two versions on one data set.
+    """Comparison of two versions on one data set; `print` shows its verdict.
 
-    blocks: stretches that standard errors stand on; differences: per joint by figure; nlpd, nmse: over all joints;
-    outcome and better: which version is better by its predictive density, None where none is; verdict: in words;
-    warnings: what makes the comparison unfair.
+    Example:
+        >>> print(client.compare("my-arm", "ds_0123456789abcdef", 1, 2))
     """
 
     model: str
     dataset: str
     joint_names: tuple[str, ...]
     samples: int
+    """Number of samples of the data set."""
     samples_used: int
+    """Number of samples compared."""
     blocks: int
+    """Number of blocks for the standard errors."""
     versions: tuple[VersionFigures, VersionFigures]
     differences: Mapping[str, Difference]
+    """Differences per joint, by figure."""
     nlpd: Difference
+    """Difference of the negative log predictive density over all joints."""
     nmse: Difference
+    """Difference of the nMSE over all joints."""
     outcome: Outcome
+    """Result by predictive density."""
     better: int | None
+    """Better version by predictive density, None if there is no difference."""
     verdict: str
+    """Result in words."""
     warnings: tuple[str, ...]
+    """Reasons why the comparison is unfair."""
 
     def __str__(self) -> str:
-        return "\n".join([self.verdict, *(f"careful: {warning}" for warning in self.warnings)])
+        return "\n".join([self.verdict, *(f"warning: {warning}" for warning in self.warnings)])
 
 
 read_evaluation = reading(Evaluation)

@@ -1,5 +1,4 @@
-"""Torques with their uncertainty: of queries, of recordings beside what was measured, and as a model is told them; and
-recordings thinned for a plot."""
+"""Predicted torques with uncertainty: of queries, of recordings and live; and recordings thinned for a plot."""
 
 from __future__ import annotations
 
@@ -18,8 +17,18 @@ from lipserve.results import Array, Plain, reading, shape_arrays
 def interval(
     mean: Array, std: Array, noise_std: Array, level: float, scale: Array | None = None
 ) -> tuple[Array, Array]:
-    """Ends of the central interval that a measurement lies in with probability `level`; std: of the function, noise_std
-    of a measurement around it, scale: (n) factor on its half. Raise ValueError unless level is between 0 and 1."""
+    """Return the ends of the central interval that contains a measurement with probability `level`.
+
+    Args:
+        mean: (…, n) predicted torque, N·m.
+        std: (…, n) standard deviation of the predicted torque.
+        noise_std: (n,) standard deviation of a measurement around it.
+        level: Probability.
+        scale: (n,) factor on the half width. Default: 1.
+
+    Raises:
+        ValueError: The level is not between 0 and 1.
+    """
     if not 0 < level < 1:
         raise ValueError(f"level is {level}, expected a probability between 0 and 1")
     half = NormalDist().inv_cdf((1 + level) / 2) * np.hypot(std, noise_std)
@@ -29,46 +38,68 @@ def interval(
 
 @dataclass(frozen=True, eq=False)
 class Component(Plain):
-    """A part of the dynamics at one query or a batch: numbers () or (N), vectors (…, n) or matrices (…, n, n).
+    """Component of the dynamics, such as gravity or the inertia matrix, at one or N motions.
 
-    mean; std: standard deviation of the function, of forward dynamics to first order.
+    Example:
+        >>> answer = client.predict("panda-sim", q, dq, ddq, components=["gravity"])
+        >>> answer.components["gravity"].mean
     """
 
     mean: Array
+    """() or (N,) for scalars, (…, n) for vectors, (…, n, n) for matrices."""
     std: Array
+    """Standard deviation, shaped as `mean`; for forward dynamics to first order."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction(Plain):
-    """Torques at one query, (n), or a batch, (N, n); N·m, of prismatic joints N.
+    """Predicted torques at one motion, (n,), or N motions, (N, n).
 
-    revision: online updates applied to the version; tau: mean; tau_std: standard deviation of the function, which grows
-    where the model knows little; noise_std: (n) of a measurement around the function; scale: (n) factor on the half
-    width of intervals that streams need at the moment, None of an earlier service; guaranteed: (n) share of
-    measurements that left-out blocks of the training guarantee for intervals of 95 %, None of the shipped model;
-    covariance: (…, n, n) (N·m)² of the function between joints, where asked for; components: by name, where asked for;
-    fallback: share of the fallback in each torque, shaped as `tau`, None if all are zero. Where it is 1, `tau` is
-    gravity, offset and friction only, or the training's mean: the training does not determine the torque there.
+    Example:
+        >>> answer = client.predict("panda-sim", [0.0] * 7, [0.0] * 7, [0.0] * 7)
+        >>> lower, upper = answer.interval(0.95)
     """
 
     model: str
     version: int
     revision: int
+    """Revision of the version: number of online updates."""
     joint_names: tuple[str, ...]
     torque_convention: str
     tau: Array
+    """(…, n) mean, N·m (prismatic: N)."""
     tau_std: Array
+    """(…, n) standard deviation of the predicted torque, without measurement noise. It grows away from the data."""
     noise_std: Array
+    """(n,) standard deviation of a measurement around the torque."""
     scale: Array | None = None
+    """(n,) factor on the half width of intervals, adapted to recent streams; None from older services."""
     guaranteed: Array | None = None
+    """(n,) guaranteed coverage of 95 % intervals, from left-out blocks of the training; None for the shipped model."""
     covariance: Array | None = None
+    """(…, n, n) covariance of the torque between joints, (N·m)², if requested."""
     components: Mapping[str, Component] | None = None
+    """Components by name, if requested."""
     fallback: Array | None = None
+    """(…, n) share of the fallback in each torque; None if all are zero.
+
+    At 1, the training data do not determine the torque: it is gravity, offset and friction only, or the mean of the
+    training data.
+    """
 
     def interval(self, level: float = 0.95) -> tuple[Array, Array]:
-        """Lower and upper end, shaped as `tau`, of the central interval that a *measurement* lies in with probability
-        `level`: uncertainty of the function and noise of the measurement together, times `scale`. That of the function
-        alone is narrower, and does not hold measurements.
+        """Return the ends of the central interval for a *measurement*.
+
+        The interval includes measurement noise: tau ± z · scale · √(tau_std² + noise_std²).
+
+        Args:
+            level: Probability that a measurement is inside.
+
+        Returns:
+            Lower and upper end, shaped as `tau`.
+
+        Raises:
+            ValueError: The level is not between 0 and 1.
         """
         return interval(self.tau, self.tau_std, self.noise_std, level, self.scale)
 
@@ -78,31 +109,40 @@ read_prediction = reading(Prediction)
 
 @dataclass(frozen=True, eq=False)
 class PreviewColumn(Plain):
-    """Points (K) of one quantity of one joint: rows, counted from 0; t: their times, s; values in `unit`."""
+    """K points of one quantity of one joint."""
 
     quantity: str
     joint: str
     unit: str
     rows: NDArray[np.int64]
+    """(K,) rows, counted from 0."""
     t: Array
+    """(K,) times, s."""
     values: Array
+    """(K,) values in `unit`."""
 
 
 @dataclass(frozen=True, eq=False)
 class Preview(Plain):
-    """Columns of a data set, thinned so that no extreme is lost. samples: rows of the data set; starts: first rows of
-    its episodes."""
+    """Columns of a data set, thinned for a plot with all extremes kept.
+
+    Example:
+        >>> column = client.preview("ds_0123456789abcdef").column("tau", "joint1")
+        >>> column.t, column.values
+    """
 
     samples: int
+    """Number of rows of the data set."""
     starts: NDArray[np.int64]
+    """First rows of the episodes."""
     columns: tuple[PreviewColumn, ...]
 
     def column(self, quantity: str, joint: str) -> PreviewColumn:
-        """One column; raise KeyError."""
+        """Return one column; raise KeyError if there is none."""
         for each in self.columns:
             if (each.quantity, each.joint) == (quantity, joint):
                 return each
-        raise KeyError(f"no column of {quantity} of {joint}")
+        raise KeyError(f"no column for {quantity} of {joint}")
 
 
 read_preview = reading(Preview)
@@ -110,14 +150,11 @@ read_preview = reading(Preview)
 
 @dataclass(frozen=True, eq=False)
 class Trace(Plain):
-    """Torques (K, n) at K rows of a data set, N·m (prismatic: N).
+    """Measured and predicted torques at K rows of a data set, N·m (prismatic: N).
 
-    samples: of the data set or the part; in_range: of these between start and stop; shown: K, evenly chosen where there
-    are more, so that peaks may be missing; rows: (K) counted from 0; t: (K) s; breaks: places in `rows` that lines are
-    not to be drawn across; tau: measured; mean: predicted; std: (K, n) of the function; noise_std: (n) of a
-    measurement; scale: (n) factor on the half width of intervals, None of an earlier service; offered: components that
-    may be asked for; components: by name, where asked for; in_training: whether the model was trained on these samples:
-    then it looks better than it is.
+    Example:
+        >>> trace = client.trace("panda-sim", "ds_0123456789abcdef")
+        >>> residual = trace.tau - trace.mean
     """
 
     model: str
@@ -125,22 +162,37 @@ class Trace(Plain):
     revision: int
     dataset: str
     part: str
+    """`all` or `held_out`."""
     joint_names: tuple[str, ...]
     torque_convention: str
     samples: int
+    """Number of samples of the data set or part."""
     in_range: int
+    """Number of samples between start and stop."""
     shown: int
+    """K. If there are more samples, they are chosen evenly, so peaks may be missing."""
     rows: NDArray[np.int64]
+    """(K,) rows, counted from 0."""
     t: Array
+    """(K,) times, s."""
     breaks: NDArray[np.int64]
+    """Indices in `rows` at which a plotted line must be interrupted."""
     tau: Array
+    """(K, n) measured torque."""
     mean: Array
+    """(K, n) predicted torque."""
     std: Array
+    """(K, n) standard deviation of the predicted torque."""
     noise_std: Array
+    """(n,) standard deviation of a measurement around it."""
     offered: tuple[str, ...]
+    """Names of components that can be requested."""
     components: Mapping[str, Component]
+    """Components by name, if requested."""
     in_training: bool
+    """Whether the model was trained on these samples: then it looks better than it is."""
     scale: Array | None = None
+    """(n,) factor on the half width of intervals; None from older services."""
 
     def __post_init__(self) -> None:
         shape = (len(self.rows), len(self.joint_names))
@@ -148,7 +200,7 @@ class Trace(Plain):
             shape_arrays(each, shape, *({"tau", "mean", "std"} & vars(each).keys()))
 
     def interval(self, level: float = 0.95) -> tuple[Array, Array]:
-        """Lower and upper end (K, n) of the interval that shall hold a share `level` of the *measurements*."""
+        """Return the ends, (K, n), of the central interval for *measurements*; see `Prediction.interval`."""
         return interval(self.mean, self.std, self.noise_std, level, self.scale)
 
 
@@ -157,27 +209,31 @@ read_trace = reading(Trace)
 
 @dataclass(frozen=True, eq=False)
 class LivePart(Plain):
-    """Rows of one stream that were judged since the last event, predicted by one revision before it learnt them.
-
-    rows: all that were judged; counts: what became of them, by code; worst: (n) largest |tau - mean| of all of them in
-    standard deviations of a measurement, NaN where none could be predicted; q: (n) positions of the newest row shown,
-    rad (m). Of the rows shown, K of them: time: (K) Unix seconds; tau: (K, n) measured; mean: predicted; std: of the
-    function, noise_std: (n) of a measurement around it, N·m; code: what became of each. NaN for what there is none of.
-    """
+    """New rows of one stream, predicted by one revision before it learns from them. Missing numbers are NaN."""
 
     stream_id: str
     version: int
     revision: int
     rows: int
+    """Number of rows since the last event; K of them are included."""
     counts: dict[str, int]
+    """Number of rows by code."""
     worst: Array
+    """(n,) largest |innovation| of all rows."""
     noise_std: Array
+    """(n,) standard deviation of a measurement around the predicted torque, N·m."""
     q: Array
+    """(n,) positions of the newest included row, rad (prismatic: m)."""
     time: Array
+    """(K,) Unix times, s."""
     tau: Array
+    """(K, n) measured torque, N·m."""
     mean: Array
+    """(K, n) predicted torque, N·m."""
     std: Array
+    """(K, n) standard deviation of the predicted torque, N·m."""
     code: tuple[str, ...]
+    """Code of each included row."""
 
     def __post_init__(self) -> None:
         shape_arrays(self, (len(self.time), len(self.noise_std)), "tau", "mean", "std")
@@ -186,20 +242,26 @@ class LivePart(Plain):
 
     @property
     def innovation(self) -> Array:
-        """(K, n) of tau - mean in standard deviations of a measurement."""
+        """(K, n) tau − mean, in predictive standard deviations including noise."""
         innovation: Array = (self.tau - self.mean) / np.hypot(self.std, self.noise_std)
         return innovation
 
 
 @dataclass(frozen=True, eq=False)
 class LiveRows:
-    """Rows that came."""
+    """Event of `Client.live` with new rows, in parts by stream and revision.
+
+    Example:
+        >>> for event in client.live("my-arm"):
+        ...     if isinstance(event, LiveRows):
+        ...         print([part.worst for part in event.parts])
+    """
 
     parts: tuple[LivePart, ...]
 
 
 Live = LiveRows | LiveStatus | LiveLost | None
-"""Rows, where the model stands (about once a second), how many events were lost; None for what a later release adds."""
+"""Rows, state of the model (about once a second), or number of lost events; None for events of later releases."""
 
 
 _read_rows = reading(LiveRows)

@@ -1,18 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A ROS 2 node that publishes the torque a learnt model expects for the measured motion, how sure it is of it, and that
-// teaches the model what was measured.
+// ROS 2 node that publishes the torque that a learnt model predicts for the measured motion, and its standard deviation.
+// The model can learn from the measured torques.
 //
 //   ros2 run lipserve_ros2 feedforward --ros-args -p model:=panda-sim -p joints:="[panda_joint1, …]" -p stream:=cell-3
 //
-// Subscribes joint_states (sensor_msgs/JointState: position, velocity, and effort, N·m, to teach) and, with
-// acceleration:=commanded, commands (trajectory_msgs/JointTrajectory, accelerations of its first point).
+// Subscribes to joint_states (sensor_msgs/JointState: position, velocity, and effort, N·m, to learn from) and, with
+// acceleration:=commanded, to commands (trajectory_msgs/JointTrajectory, accelerations of its first point).
 // Publishes ~/feedforward and ~/feedforward_std (sensor_msgs/JointState): effort is the torque and its standard
-// deviation, N·m; the stamp is that of the state. What is late, or cannot be had, is not published: a controller that
-// adds the torque has to look at its age, as at its deviation. No safety function.
+// deviation, N·m; the stamp is that of the state. Late or missing torques are not published: a controller that adds the
+// torque must check its age and its standard deviation. This is not a safety function.
 //
-// Callbacks hand rows over and return: they wait for nothing. A thread of the node's own asks for the newest row, and
-// then teaches all in their order.
+// Callbacks put rows into a queue and never wait. A separate thread queries the torque of the newest row, then sends all
+// rows in order to learn from.
 
 #ifndef LIPSERVE_ROS2_FEEDFORWARD_HPP
 #define LIPSERVE_ROS2_FEEDFORWARD_HPP
@@ -62,7 +62,7 @@ class Feedforward : public rclcpp::Node {
         last_dq_(joints_.size()),
         ddq_(joints_.size()) {
     if (joints_.empty() || model_.empty())
-      throw std::invalid_argument("the parameters model and joints are needed: joints as the model names them, in order");
+      throw std::invalid_argument("set the parameters model and joints: the model's joint names, in its order");
     tau_.name = std_.name = joints_;
     tau_publisher_ = create_publisher<JointState>("~/feedforward", rclcpp::SensorDataQoS());
     std_publisher_ = create_publisher<JointState>("~/feedforward_std", rclcpp::SensorDataQoS());
@@ -81,16 +81,16 @@ class Feedforward : public rclcpp::Node {
     thread_.join();
   }
 
-  /// States that could not be handed over, since the thread was behind by `rows`.
+  /// Return the number of states that were dropped because the queue of `rows` was full.
   std::uint64_t dropped() const { return dropped_.load(std::memory_order_relaxed); }
 
  private:
-  static constexpr double longest_step_s = 0.1;  // between two states whose velocities tell of an acceleration
+  static constexpr double longest_step_s = 0.1;  // max time between two states to derive an acceleration
 
   static std::string url_of(const std::string& host, std::int64_t port) {
     return host.compare(0, 7, "unix://") == 0 ? host : "http://" + host + ":" + std::to_string(port);
   }
-  /// A stream's sequences hold for good: each run of the node is a stream of its own.
+  /// Return a new stream_id for each run: the service remembers the sequences of a stream.
   static std::string run_of(const std::string& stream) {
     if (stream.empty()) return stream;
     timespec now{};
@@ -103,9 +103,9 @@ class Feedforward : public rclcpp::Node {
     return source == "commanded";
   }
 
-  // -- callbacks: nothing below waits ---------------------------------------------------------------------------------
+  // -- callbacks: they never wait -------------------------------------------------------------------------------------
 
-  /// Hand a state over. Those that lack a joint of the model, its velocity or its acceleration are not for it.
+  /// Queue a state. States without a joint of the model, its velocity or its acceleration are ignored.
   void take(const JointState& message) {
     if (!find(message.name) || farthest_ >= std::min(message.position.size(), message.velocity.size())) return;
     const std::int64_t stamp = nanoseconds(message.header.stamp);
@@ -129,7 +129,7 @@ class Feedforward : public rclcpp::Node {
     rows_.give();
   }
 
-  /// Keep the accelerations that are commanded now.
+  /// Store the commanded accelerations.
   void follow(const JointTrajectory& message) {
     if (message.points.empty() || !find(message.joint_names)) return;
     const auto& accelerations = message.points.front().accelerations;
@@ -138,7 +138,7 @@ class Feedforward : public rclcpp::Node {
     has_ddq_ = true;
   }
 
-  /// Find the joints of the model in a message; mostly they are where they were in the last one.
+  /// Find the joints of the model in a message; usually their places are those of the last message.
   bool find(const std::vector<std::string>& names) {
     farthest_ = 0;
     for (std::size_t k = 0; k < joints_.size(); ++k) {
@@ -150,7 +150,7 @@ class Feedforward : public rclcpp::Node {
     return true;
   }
 
-  /// Have an acceleration for a state: that commanded, or from the step of velocity, low-passed.
+  /// Update the acceleration of a state: the commanded one, or the low-pass filtered difference of velocities.
   bool accelerate(const std::vector<double>& velocity, std::int64_t stamp) {
     if (commanded_) return has_ddq_;
     const double step = static_cast<double>(stamp - last_stamp_) * 1e-9;
@@ -163,7 +163,7 @@ class Feedforward : public rclcpp::Node {
         ddq_[k] = has_ddq_ ? ddq_[k] + share * (raw - ddq_[k]) : raw;
       }
       last_dq_[k] = now;
-      if (!std::isfinite(now)) last_stamp_ = stamp = 0;  // begin again behind it
+      if (!std::isfinite(now)) last_stamp_ = stamp = 0;  // restart after this state
     }
     last_stamp_ = stamp;
     has_ddq_ = follows && stamp != 0;
@@ -174,14 +174,14 @@ class Feedforward : public rclcpp::Node {
     return std::int64_t{stamp.sec} * 1'000'000'000 + stamp.nanosec;
   }
 
-  // -- the thread that talks to the service ---------------------------------------------------------------------------
+  // -- thread that talks to the service -------------------------------------------------------------------------------
 
   void serve() {
     lipserve::Options options;
     options.model = model_.c_str();
     options.joints = static_cast<unsigned>(joints_.size());
     options.url = url_.c_str();
-    options.key = key_.empty() ? nullptr : key_.c_str();  // else LIPSERVE_API_KEY
+    options.key = key_.empty() ? nullptr : key_.c_str();  // null: LIPSERVE_API_KEY
     options.stream_id = stream_.empty() ? nullptr : stream_.c_str();
     lipserve::Client client(options);
     lipserve::Answer answer;
@@ -205,9 +205,10 @@ class Feedforward : public rclcpp::Node {
     if (!stream_.empty()) client.flush(Deadline::in(flush_s_));
     const lipserve::Learnt& learnt = client.learnt();
     RCLCPP_INFO(get_logger(),
-                "stream %s: taught %llu, learnt %llu, kept out %llu, refused %llu, not acknowledged %zu, dropped %llu",
-                stream_.empty() ? "none" : stream_.c_str(), static_cast<unsigned long long>(client.counters().taught), static_cast<unsigned long long>(learnt.accepted),
-                static_cast<unsigned long long>(learnt.rejected), static_cast<unsigned long long>(learnt.refused),
+                "stream %s: sent %llu, learnt %llu, rejected %llu, refused %llu, not acknowledged %zu, dropped %llu",
+                stream_.empty() ? "none" : stream_.c_str(), static_cast<unsigned long long>(client.counters().taught),
+                static_cast<unsigned long long>(learnt.accepted), static_cast<unsigned long long>(learnt.rejected),
+                static_cast<unsigned long long>(learnt.refused),
                 client.unsettled(), static_cast<unsigned long long>(dropped()));
   }
 
@@ -233,22 +234,22 @@ class Feedforward : public rclcpp::Node {
     std_publisher_->publish(std_);
   }
 
-  /// Whether the model has these joints in this order; looked at once a connection.
+  /// Return whether the model has these joints in this order; checked once per connection.
   bool knows_joints(const lipserve::Client& client) {
     if (client.counters().connections == checked_) return same_joints_;
     checked_ = client.counters().connections;
     same_joints_ = true;
     for (std::size_t k = 0; k < joints_.size(); ++k)
       same_joints_ = same_joints_ && joints_[k] == client.hello().joint_names[k];
-    if (!same_joints_) RCLCPP_ERROR(get_logger(), "the joints of the model have other names: nothing is published");
+    if (!same_joints_) RCLCPP_ERROR(get_logger(), "joint names differ from the model's: nothing is published");
     return same_joints_;
   }
 
-  /// Say when answers begin and end to come.
+  /// Log when answers start and stop.
   void note(const lipserve::Client& client, Status status) {
     if (status == last_) return;
     if (status == Status::ok)
-      RCLCPP_INFO(get_logger(), "%s answers", model_.c_str());
+      RCLCPP_INFO(get_logger(), "receiving answers of %s", model_.c_str());
     else
       RCLCPP_WARN(get_logger(), "no answer: %s", client.error().message);
     last_ = status;
@@ -261,17 +262,17 @@ class Feedforward : public rclcpp::Node {
   Rows rows_;
   std::atomic<bool> stopping_{false};
   std::atomic<std::uint64_t> dropped_{0};
-  // of the callbacks, which one group never runs at the same time
+  // used by the callbacks, which run one at a time in their callback group
   std::vector<std::size_t> places_;
   std::size_t farthest_ = 0;
   std::vector<double> last_dq_, ddq_;
   std::int64_t last_stamp_ = 0;
   bool has_ddq_ = false;
-  // of the thread
+  // used by the thread
   JointState tau_, std_;
   std::uint64_t checked_ = 0;
   bool same_joints_ = false;
-  Status last_ = Status::full;  // which no `ask` of the node returns
+  Status last_ = Status::full;  // a value that `ask` never returns here
   rclcpp::Publisher<JointState>::SharedPtr tau_publisher_, std_publisher_;
   rclcpp::Subscription<JointState>::SharedPtr states_;
   rclcpp::Subscription<JointTrajectory>::SharedPtr commands_;

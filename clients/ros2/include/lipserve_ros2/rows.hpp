@@ -13,7 +13,7 @@
 
 namespace lipserve_ros2 {
 
-/// One measured motion: q rad, dq rad/s, ddq rad/s² and, where `has_tau`, tau N·m, one number a joint each.
+/// One measured motion: q, rad; dq, rad/s; ddq, rad/s²; if `has_tau`, tau, N·m. One number per joint each.
 struct Row {
   std::int64_t stamp_ns = 0;
   bool has_tau = false;
@@ -22,7 +22,7 @@ struct Row {
   explicit Row(std::size_t joints) : q(joints), dq(joints), ddq(joints), tau(joints) {}
 };
 
-/// Hands rows from one thread to another. The one that gives never waits, allocates nothing and takes no lock.
+/// Queue of rows between two threads. The writing thread never waits, allocates or locks.
 class Rows {
  public:
   Rows(std::size_t capacity, std::size_t joints) : rows_(capacity, Row(joints)) { sem_init(&given_, 0, 0); }
@@ -30,7 +30,7 @@ class Rows {
   Rows(const Rows&) = delete;
   Rows& operator=(const Rows&) = delete;
 
-  /// The row to fill next; null where all are waiting to be taken. Follow it by `give`.
+  /// Return the row to fill next, or null if the queue is full. Call `give` afterwards.
   Row* next() {
     const std::size_t end = end_.load(std::memory_order_relaxed);
     return end - begin_.load(std::memory_order_acquire) < rows_.size() ? &rows_[end % rows_.size()] : nullptr;
@@ -41,7 +41,7 @@ class Rows {
   }
   void wake() { sem_post(&given_); }
 
-  /// Wait until something is given, but no longer than so many nanoseconds (below a second).
+  /// Wait until a row is given, at most the given nanoseconds (below a second).
   void wait(long nanoseconds) {
     timespec until{};
     clock_gettime(CLOCK_REALTIME, &until);
@@ -52,20 +52,20 @@ class Rows {
     while (sem_trywait(&given_) == 0) {
     }
   }
-  /// Rows that wait now.
+  /// Return the number of waiting rows.
   std::size_t waiting() const {
     return end_.load(std::memory_order_acquire) - begin_.load(std::memory_order_relaxed);
   }
-  /// One of them, the oldest first; it holds until it is dropped.
+  /// Return a waiting row, the oldest at place 0; it is valid until it is dropped.
   const Row& at(std::size_t place) const {
     return rows_[(begin_.load(std::memory_order_relaxed) + place) % rows_.size()];
   }
-  /// Let the oldest be filled again.
+  /// Remove the oldest rows.
   void drop(std::size_t count) { begin_.fetch_add(count, std::memory_order_release); }
 
  private:
   std::vector<Row> rows_;
-  std::atomic<std::size_t> begin_{0}, end_{0};  // counted up for good
+  std::atomic<std::size_t> begin_{0}, end_{0};  // only ever counted up
   sem_t given_;
 };
 

@@ -1,8 +1,8 @@
-// The service's API over fetch. Errors are ApiError with what the service said; 401 asks for a key and tries again.
+// Client of the service's API. Errors are ApiError; after a 401 it asks for a key and retries.
 
 import { askForKey, key } from "./keys.js";
 
-/** What the service refused, or "unreachable" where it does not answer. */
+/** Error of the API: HTTP status, error code, message and detail. Status 0: the service did not answer. */
 export class ApiError extends Error {
   constructor(status, code, message, detail = []) {
     super(message);
@@ -15,12 +15,12 @@ export const post = (path, body, signal) => send("POST", path, { body, signal })
 export const put = (path, body, signal) => send("PUT", path, { body, signal });
 export const del = (path, signal) => send("DELETE", path, { signal });
 
-/** A path with what was put in made safe: path`/v1/models/${name}`. */
+/** Return a path with its values percent-encoded: path`/v1/models/${name}`. */
 export function path(parts, ...values) {
   return parts.reduce((all, part, index) => all + encodeURIComponent(values[index - 1]) + part);
 }
 
-/** Items of a list, newest first, from as many pages as it takes, at most `limit`. */
+/** Return up to `limit` items of a list, newest first; read as many pages as needed. */
 export async function pages(address, limit = 200, params = {}, signal = undefined) {
   const found = [];
   let cursor = null;
@@ -32,7 +32,7 @@ export async function pages(address, limit = 200, params = {}, signal = undefine
   return found.slice(0, limit);
 }
 
-/** Server-sent events as {event, data}, until the answer ends or the signal aborts; throws ApiError where refused. */
+/** Yield server-sent events {event, data} until the response ends or the signal aborts; throw ApiError on an error status. */
 export async function* events(address, signal) {
   const answer = await request("GET", address, { signal, headers: { accept: "text/event-stream" } });
   const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
@@ -58,37 +58,37 @@ export async function* events(address, signal) {
   }
 }
 
-/** Upload a File, a recording unless `where` says else, and return what was made; onProgress is told the share sent. */
+/** Upload a File to `where` and return the created object. onProgress receives the share sent, 0 to 1. */
 export async function upload(file, params = {}, onProgress = () => {}, signal = undefined, where = "/v1/datasets") {
   const form = new FormData();
   form.append("file", file, file.name);
   for (;;) {
-    const answer = await sent(form, address(where, params), onProgress, signal);
-    if (answer.status === 401 && (await askForKey(message(answer.body)))) continue;
+    const answer = await sendForm(form, withQuery(where, params), onProgress, signal);
+    if (answer.status === 401 && (await askForKey(errorMessage(answer.body)))) continue;
     if (answer.status >= 200 && answer.status < 300) return answer.body;
-    throw refused(answer.status, answer.body);
+    throw apiError(answer.status, answer.body);
   }
 }
 
-// fetch cannot tell how much of an upload has left; XMLHttpRequest can
-function sent(form, url, onProgress, signal) {
+// fetch does not report the progress of an upload; XMLHttpRequest does
+function sendForm(form, url, onProgress, signal) {
   return new Promise((resolve, reject) => {
-    const asked = new XMLHttpRequest();
-    asked.open("POST", url);
-    for (const [name, value] of Object.entries(authorization())) asked.setRequestHeader(name, value);
-    asked.upload.onprogress = (event) => event.lengthComputable && onProgress(event.loaded / event.total);
-    asked.onload = () => resolve({ status: asked.status, body: parsed(asked.responseText) });
-    asked.onerror = () => reject(unreachable());
-    asked.onabort = () => reject(new DOMException("the upload was stopped", "AbortError"));
-    signal?.addEventListener("abort", () => asked.abort());
-    asked.send(form);
+    const sending = new XMLHttpRequest();
+    sending.open("POST", url);
+    for (const [name, value] of Object.entries(authorization())) sending.setRequestHeader(name, value);
+    sending.upload.onprogress = (event) => event.lengthComputable && onProgress(event.loaded / event.total);
+    sending.onload = () => resolve({ status: sending.status, body: parseJson(sending.responseText) });
+    sending.onerror = () => reject(unreachableError());
+    sending.onabort = () => reject(new DOMException("the upload was cancelled", "AbortError"));
+    signal?.addEventListener("abort", () => sending.abort());
+    sending.send(form);
   });
 }
 
 async function send(method, where, { params, body, signal }) {
   const headers = body === undefined ? {} : { "content-type": "application/json" };
   const content = body === undefined ? undefined : JSON.stringify(body);
-  const answer = await request(method, address(where, params), { signal, headers, body: content });
+  const answer = await request(method, withQuery(where, params), { signal, headers, body: content });
   return answer.status === 204 ? null : answer.json();
 }
 
@@ -99,16 +99,16 @@ async function request(method, url, { signal, headers = {}, body }) {
       answer = await fetch(url, { method, body, signal, headers: { ...headers, ...authorization() } });
     } catch (error) {
       if (error.name === "AbortError") throw error;
-      throw unreachable();
+      throw unreachableError();
     }
     if (answer.ok) return answer;
-    const said = parsed(await answer.text());
-    if (answer.status === 401 && (await askForKey(message(said)))) continue;
-    throw refused(answer.status, said);
+    const content = parseJson(await answer.text());
+    if (answer.status === 401 && (await askForKey(errorMessage(content)))) continue;
+    throw apiError(answer.status, content);
   }
 }
 
-function address(where, params = {}) {
+function withQuery(where, params = {}) {
   const given = Object.entries(params ?? {}).filter(([, value]) => value !== null && value !== undefined && value !== "");
   return given.length ? `${where}?${new URLSearchParams(given)}` : where;
 }
@@ -117,7 +117,7 @@ function authorization() {
   return key() ? { authorization: `Bearer ${key()}` } : {};
 }
 
-function parsed(text) {
+function parseJson(text) {
   try {
     return JSON.parse(text);
   } catch {
@@ -125,15 +125,15 @@ function parsed(text) {
   }
 }
 
-function message(body) {
+function errorMessage(body) {
   return body?.error?.message ?? "";
 }
 
-function refused(status, body) {
+function apiError(status, body) {
   const error = body?.error;
-  return new ApiError(status, error?.code ?? "unknown", error?.message ?? `the service answered ${status}`, error?.detail);
+  return new ApiError(status, error?.code ?? "unknown", error?.message ?? `The service answered with status ${status}.`, error?.detail);
 }
 
-function unreachable() {
-  return new ApiError(0, "unreachable", "the service does not answer: is it running, and is this machine connected to it?");
+function unreachableError() {
+  return new ApiError(0, "unreachable", "The service does not answer. Check that it is running and that this machine can reach it.");
 }

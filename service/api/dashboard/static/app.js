@@ -1,4 +1,4 @@
-// Which page is shown: the part of the address after #.
+// Router: shows the page that the part of the address after # names.
 
 import { replace } from "./dom.js";
 import { forgetKey, key } from "./keys.js";
@@ -23,11 +23,11 @@ async function show() {
   leave = new AbortController();
   const { signal } = leave;
   const [where, query = ""] = location.hash.slice(1).split("?");
-  const [page, params] = find(where);
-  mark(where);
-  title("");
+  const [page, params] = findRoute(where);
+  markSection(where);
+  setTitle("");
   if (page === null) {
-    replace(main, empty(`There is no page ${where}.`, link("Overview", "#/")));
+    replace(main, empty(`Page ${where} does not exist.`, link("Overview", "#/")));
     return;
   }
   const view = document.createElement("div");
@@ -36,7 +36,7 @@ async function show() {
     const module = await import(`./pages/${page}.js`);
     if (signal.aborted) return;
     replace(main, view);
-    await module.render(view, { ...params, query: new URLSearchParams(query) }, { signal, title });
+    await module.render(view, { ...params, query: new URLSearchParams(query) }, { signal, title: setTitle });
   } catch (error) {
     if (signal.aborted || error.name === "AbortError") return;
     if (!error.status && error.name !== "ApiError") console.error(error);
@@ -44,7 +44,7 @@ async function show() {
   }
 }
 
-function find(where) {
+function findRoute(where) {
   for (const [pattern, page] of ROUTES) {
     const found = pattern.exec(where);
     if (!found) continue;
@@ -54,11 +54,11 @@ function find(where) {
   return [null, {}];
 }
 
-function title(text) {
+function setTitle(text) {
   document.title = text ? `${text} · LIPServe` : "LIPServe";
 }
 
-function mark(where) {
+function markSection(where) {
   const section = where.split("/")[1] ?? "";
   const home = section === "train" ? "jobs" : section;
   for (const each of document.querySelectorAll("#nav a")) {
@@ -71,32 +71,32 @@ function mark(where) {
 function themeButton() {
   const themes = ["auto", "light", "dark"];
   const made = document.getElementById("theme");
-  const say = () => {
+  const update = () => {
     made.textContent = `Theme: ${document.documentElement.dataset.theme}`;
   };
   made.addEventListener("click", () => {
     const root = document.documentElement;
     root.dataset.theme = themes[(themes.indexOf(root.dataset.theme) + 1) % themes.length];
     localStorage.setItem("lipserve-theme", root.dataset.theme);
-    say();
+    update();
     document.dispatchEvent(new Event("themechange"));
   });
-  say();
+  update();
 }
 
 function keyButton() {
   const made = document.getElementById("key");
-  const say = () => {
+  const update = () => {
     made.hidden = !key();
     made.textContent = "Forget key";
   };
   made.addEventListener("click", () => {
     forgetKey();
-    say();
+    update();
     show();
   });
-  document.addEventListener("keychange", say);
-  say();
+  document.addEventListener("keychange", update);
+  update();
 }
 
 document.getElementById("skip").addEventListener("click", () => main.focus());

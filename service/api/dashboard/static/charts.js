@@ -1,53 +1,54 @@
-// Small charts that stand in cards and tables: bars per joint, a course of the last hour. Joints have their colours.
+// Small charts for cards and tables: a bar per joint, innovations of the last hour. Each joint has its colour.
 
 import { jointVar } from "./colours.js";
 import { h } from "./dom.js";
 import { nmse, number, percent } from "./format.js";
 
-const BEST = 1e-6; // nMSE at the bottom of its scale; 1, no better than the mean, is the top
-const NARROW = 0.8; // coverage at the bottom of its scale
-const PROMISED = 0.95;
-const LEAST = 0.04; // height of a bar that there is
+const MIN_NMSE = 1e-6; // bottom of the scale; its top is 1, the error of the mean torque
+const MIN_COVERAGE = 0.8; // bottom of the scale
+const NOMINAL_COVERAGE = 0.95;
+const MIN_BAR_HEIGHT = 0.04; // of the chart's height
 
 /**
- * nMSE of each joint as bars on a logarithmic scale. names: of the joints; values: null where not known; marks: a second value of each, drawn as a line.
+ * Return bars of the nMSE of each joint on a logarithmic scale. names: of the joints; values: null if unknown;
+ * marks: a second value of each joint, drawn as a line.
  */
 export function errorBars(names, values, { marks = null, what = "nMSE" } = {}) {
-  const share = (value) => Math.min(Math.max(1 - Math.log10(value) / Math.log10(BEST), LEAST), 1);
+  const share = (value) => Math.min(Math.max(1 - Math.log10(value) / Math.log10(MIN_NMSE), MIN_BAR_HEIGHT), 1);
   const columns = names.map((name, joint) => {
     const [value, mark] = [values?.[joint], marks?.[joint]];
-    return column(joint, known(value) ? [0, share(value)] : null, known(mark) ? share(mark) : null, `${name}: ${texts(value, mark, nmse)}`);
+    return column(joint, isKnown(value) ? [0, share(value)] : null, isKnown(mark) ? share(mark) : null, `${name}: ${barTitle(value, mark, nmse)}`);
   });
-  return bars("nmse", columns, `${what} by joint: ${listed(names, values ?? marks, nmse)}`, [[share(1e-4), ""], [share(1e-2), ""]]);
+  return bars("nmse", columns, `${what} by joint: ${describeValues(names, values ?? marks, nmse)}`, [[share(1e-4), ""], [share(1e-2), ""]]);
 }
 
-/** Coverage of the 95 % band of each joint: bars from what is promised, up where bands are wide, down where they are narrow. */
-export function coverageBars(names, values, { marks = null, what = "Inside the 95 % band" } = {}) {
-  const share = (value) => Math.min(Math.max((value - NARROW) / (1 - NARROW), 0), 1);
-  const promised = share(PROMISED);
+/** Return bars of the coverage of each joint: from 95 % upwards if its intervals are too wide, downwards if too narrow. */
+export function coverageBars(names, values, { marks = null, what = "Coverage of the 95 % interval" } = {}) {
+  const share = (value) => Math.min(Math.max((value - MIN_COVERAGE) / (1 - MIN_COVERAGE), 0), 1);
+  const nominal = share(NOMINAL_COVERAGE);
   const span = (value) => {
-    const ends = [share(value), promised].sort((a, b) => a - b);
-    return ends[1] - ends[0] < LEAST ? [promised - LEAST / 2, promised + LEAST / 2] : ends;
+    const ends = [share(value), nominal].sort((a, b) => a - b);
+    return ends[1] - ends[0] < MIN_BAR_HEIGHT ? [nominal - MIN_BAR_HEIGHT / 2, nominal + MIN_BAR_HEIGHT / 2] : ends;
   };
   const columns = names.map((name, joint) => {
     const [value, mark] = [values?.[joint], marks?.[joint]];
-    return column(joint, known(value) ? span(value) : null, known(mark) ? share(mark) : null, `${name}: ${texts(value, mark, percent)}`);
+    return column(joint, isKnown(value) ? span(value) : null, isKnown(mark) ? share(mark) : null, `${name}: ${barTitle(value, mark, percent)}`);
   });
-  return bars("coverage", columns, `${what} by joint: ${listed(names, values ?? marks, percent)}`, [[promised, "promised"]]);
+  return bars("coverage", columns, `${what} by joint: ${describeValues(names, values ?? marks, percent)}`, [[nominal, "nominal"]]);
 }
 
-/** Both of these charts, each below its name and the mean of the joints. shown, lately: {nmse, coverage}; lately may be null. */
-export function qualityCharts(names, shown, lately = null) {
+/** Return both charts, each below its name and the mean of the joints. shown, recent: {nmse, coverage}; recent may be null. */
+export function qualityCharts(names, shown, recent = null) {
   const chart = (label, value, made) => h("div", {}, h("div", { class: "chart-label" }, h("span", {}, label), h("strong", {}, value)), made);
   return [
-    chart("Error, nMSE", nmse(mean(shown.nmse)), errorBars(names, shown.nmse, { marks: lately?.nmse })),
-    chart("In the 95\u00a0% band", percent(mean(shown.coverage), 0), coverageBars(names, shown.coverage, { marks: lately?.coverage })),
+    chart("Error, nMSE", nmse(mean(shown.nmse)), errorBars(names, shown.nmse, { marks: recent?.nmse })),
+    chart("95\u00a0% coverage", percent(mean(shown.coverage), 0), coverageBars(names, shown.coverage, { marks: recent?.coverage })),
   ];
 }
 
 /**
- * How large innovations were along the last `seconds`, a line a joint; course: [{at, innovation}], oldest first; now: Unix s.
- * The dashed line is where errors are as large as the model says.
+ * Plot the innovations of the last `seconds`, one line per joint. course: [{at, innovation}], oldest first; now: Unix s;
+ * bucket: length of a point, s. The dashed line is at one standard deviation.
  */
 export function innovationCourse(names, course, seconds, now, bucket) {
   const most = Math.max(4, ...course.flatMap((point) => point.innovation));
@@ -64,7 +65,7 @@ export function innovationCourse(names, course, seconds, now, bucket) {
   });
   const worst = names.map((_name, joint) => Math.max(...course.map((point) => point.innovation[joint])));
   const joint = worst.indexOf(Math.max(...worst));
-  const label = `Innovation of the last hour in standard deviations; the largest, ${number(worst[joint], 2)}, of ${names[joint]}`;
+  const label = `Innovation of the last hour in standard deviations; largest: ${number(worst[joint], 2)} on ${names[joint]}`;
   return h(
     "svg",
     { class: "course", role: "img", "aria-label": label, viewBox: "0 0 100 40", preserveAspectRatio: "none" },
@@ -74,9 +75,9 @@ export function innovationCourse(names, course, seconds, now, bucket) {
   );
 }
 
-/** Mean of the joints that have a value; null where none has. */
+/** Return the mean of the known values; null if there are none. */
 export function mean(values) {
-  const there = (values ?? []).filter(known);
+  const there = (values ?? []).filter(isKnown);
   return there.length ? there.reduce((sum, each) => sum + each, 0) / there.length : null;
 }
 
@@ -95,15 +96,15 @@ function column(joint, span, mark, title) {
   return h("span", { title }, bar, line);
 }
 
-function texts(value, mark, format) {
-  if (!known(mark)) return format(value);
-  return known(value) ? `${format(value)} held out, ${format(mark)} lately` : `${format(mark)} lately`;
+function barTitle(value, mark, format) {
+  if (!isKnown(mark)) return format(value);
+  return isKnown(value) ? `${format(value)} held out, ${format(mark)} in the last hour` : `${format(mark)} in the last hour`;
 }
 
-function listed(names, values, format) {
+function describeValues(names, values, format) {
   return names.map((name, joint) => `${name} ${format(values?.[joint])}`).join(", ");
 }
 
-function known(value) {
+function isKnown(value) {
   return value !== null && value !== undefined && Number.isFinite(value);
 }

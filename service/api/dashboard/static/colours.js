@@ -1,36 +1,36 @@
-// Colours of the theme and of the joints. What HTML and SVG show follows the theme by itself; what draws on a canvas reads values.
+// Colours of the theme and of the joints. HTML and SVG follow the theme through CSS variables; plots need #rrggbb values.
 
-/** How many joints have a colour of their own; more begin again. */
+/** Number of joint colours; further joints repeat them. */
 export const JOINT_COLOURS = 8;
 const DARK = matchMedia("(prefers-color-scheme: dark)");
-const read = new Map();
+const cache = new Map();
 
-/** The colour of a joint as CSS, `var(--joint-3)`, for styles and SVG: it follows the theme. index: 0 for the first. */
+/** Return the CSS variable of a joint's colour, `var(--joint-3)`. index: 0 for the first joint. */
 export function jointVar(index) {
   return `var(--joint-${(index % JOINT_COLOURS) + 1})`;
 }
 
-/** The colour of a joint now, as #rrggbb, for plots: draw again on `themechange`. index: 0 for the first. */
+/** Return a joint's colour as #rrggbb, for plots; draw again on `themechange`. index: 0 for the first joint. */
 export function jointColour(index) {
   return css(`joint-${(index % JOINT_COLOURS) + 1}`);
 }
 
-/** A colour of the theme now, as #rrggbb, by the name of its CSS variable, with or without --; "" where there is none. */
+/** Return the current #rrggbb value of a CSS variable, named with or without --; "" if it does not exist. */
 export function css(name) {
   const variable = name.startsWith("--") ? name : `--${name}`;
   const place = `${document.documentElement.dataset.theme} ${DARK.matches} ${variable}`;
-  if (!read.has(place)) read.set(place, shown(variable));
-  return read.get(place);
+  if (!cache.has(place)) cache.set(place, computedColour(variable));
+  return cache.get(place);
 }
 
-/** A colour #rrggbb made translucent. */
-export function faint(colour, opacity) {
+/** Return a colour #rrggbb with an opacity. */
+export function withOpacity(colour, opacity) {
   const parts = [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
   return `rgba(${parts},${opacity})`;
 }
 
-// the variable's text names both themes, light-dark(…, …); the colour of an element is of the one that is shown
-function shown(variable) {
+// the variable is light-dark(…, …); only the computed colour of an element belongs to the current theme
+function computedColour(variable) {
   if (!getComputedStyle(document.documentElement).getPropertyValue(variable)) return "";
   const probe = document.createElement("span");
   probe.hidden = true;

@@ -1,18 +1,18 @@
-// Elements from plain calls. Text is always text: nothing from the service is ever parsed as HTML.
+// Creates and updates elements. Text is never parsed as HTML.
 
 const SVG = "http://www.w3.org/2000/svg";
 const SVG_TAGS = new Set(["svg", "path", "circle", "rect", "line", "polyline", "title", "g"]);
 const CONTROLS = new Set(["BUTTON", "INPUT", "SELECT", "TEXTAREA"]);
-const listening = new WeakSet();
+const withListeners = new WeakSet();
 
-/** An element: h("p", {class: "hint", onclick: f}, "text", h("b", {}, "more")). Children may be nested lists, null is left out. */
+/** Create an element: h("p", {class: "hint", onclick: f}, "text", h("b", {}, "more")). Children may be nested lists; null is skipped. */
 export function h(tag, props = {}, ...children) {
   const element = SVG_TAGS.has(tag) ? document.createElementNS(SVG, tag) : document.createElement(tag);
   for (const [name, value] of Object.entries(props ?? {})) {
     if (value === null || value === undefined || value === false) continue;
     if (name.startsWith("on") && typeof value === "function") {
       element.addEventListener(name.slice(2), value);
-      listening.add(element);
+      withListeners.add(element);
     } else if (name === "dataset") Object.assign(element.dataset, value);
     else if (name === "style") element.style.cssText = value;
     else if (name === "value" || name === "checked" || name === "selected") element[name] = value;
@@ -21,62 +21,62 @@ export function h(tag, props = {}, ...children) {
   return append(element, children);
 }
 
-/** Put these children in the place of all that an element has. */
+/** Replace all children of an element. */
 export function replace(element, ...children) {
   element.replaceChildren();
   return append(element, children);
 }
 
 /**
- * Bring what an element shows up to date without taking away what somebody has focused, scrolled, marked or begun to press.
- * What is there again stays the node that it was, and its texts and attributes are changed in place: a link where it
- * leads to the same place, a row or item where its `data-key` is the same. Only what has come or gone is put in or taken out.
- * What listens or is typed into is never made over: make such a control once, and give the same node again, as a child.
+ * Update the children of an element and keep the focus, the scroll position, the selection and a click in progress.
+ * A node that matches a new child is kept, and its texts and attributes are changed in place. Links match by their
+ * `href`, rows and items by their `data-key`. Only other nodes are inserted or removed.
+ * Controls and elements with listeners are never changed: create them once, and pass the same node again.
  */
 export function refresh(element, ...children) {
   const wanted = nodes(children);
   const given = new Set(wanted);
   const focused = element.contains(document.activeElement) ? document.activeElement : null;
-  const left = [...element.childNodes];
-  const stays = wanted.map((fresh) => {
-    const index = left.findIndex((old) => old === fresh || (!given.has(old) && alike(old, fresh)));
+  const remaining = [...element.childNodes];
+  const kept = wanted.map((fresh) => {
+    const index = remaining.findIndex((old) => old === fresh || (!given.has(old) && matches(old, fresh)));
     if (index < 0) return fresh;
-    const [old] = left.splice(index, 1);
-    if (old !== fresh) mend(old, fresh);
+    const [old] = remaining.splice(index, 1);
+    if (old !== fresh) update(old, fresh);
     return old;
   });
-  for (const old of left) old.remove();
+  for (const old of remaining) old.remove();
   let next = element.firstChild;
-  for (const node of stays) {
+  for (const node of kept) {
     if (node === next) next = next.nextSibling;
     else element.insertBefore(node, next);
   }
-  // a node that was moved has lost it
+  // moving a node removes its focus
   if (focused?.isConnected && focused !== document.activeElement) focused.focus({ preventScroll: true });
   return element;
 }
 
-function alike(old, fresh) {
+function matches(old, fresh) {
   if (old.nodeName !== fresh.nodeName) return false;
   if (old.nodeType === Node.TEXT_NODE) return true;
-  return !own(old) && !own(fresh) && key(old) === key(fresh);
+  return !isControl(old) && !isControl(fresh) && keyOf(old) === keyOf(fresh);
 }
 
-function own(element) {
-  return CONTROLS.has(element.nodeName) || listening.has(element);
+function isControl(element) {
+  return CONTROLS.has(element.nodeName) || withListeners.has(element);
 }
 
-function key(element) {
+function keyOf(element) {
   return element.dataset.key ?? element.getAttribute("href");
 }
 
-function mend(old, fresh) {
+function update(old, fresh) {
   if (old.nodeType === Node.TEXT_NODE) {
     if (old.data !== fresh.data) old.data = fresh.data;
     return;
   }
-  const readers = old.nodeName === "DETAILS" ? "open" : null; // who reads has opened it
-  for (const { name } of [...old.attributes]) if (!fresh.hasAttribute(name) && name !== readers) old.removeAttribute(name);
+  const kept = old.nodeName === "DETAILS" ? "open" : null; // the reader opened it
+  for (const { name } of [...old.attributes]) if (!fresh.hasAttribute(name) && name !== kept) old.removeAttribute(name);
   for (const { name, value } of fresh.attributes) if (old.getAttribute(name) !== value) old.setAttribute(name, value);
   refresh(old, ...fresh.childNodes);
 }

@@ -1,26 +1,26 @@
-// The API key: asked for where the service wants one, kept until the tab is closed, sent with every request.
+// The API key: requested when the service requires one, kept until the tab is closed, sent with every request.
 
 import { h } from "./dom.js";
 
-const PLACE = "lipserve-key";
-let asking = null;
+const STORAGE_KEY = "lipserve-key";
+let pending = null;
 
-/** The key that requests carry, null where none is needed so far. */
+/** Return the current key; null if there is none. */
 export function key() {
-  return sessionStorage.getItem(PLACE);
+  return sessionStorage.getItem(STORAGE_KEY);
 }
 
-/** Ask for a key; true once one is given. Requests that fail meanwhile wait for the same dialog. */
+/** Ask for a key and return whether one was entered. Requests that fail meanwhile wait for the same dialog. */
 export function askForKey(reason) {
-  asking ??= dialog(reason).finally(() => {
-    asking = null;
+  pending ??= dialog(reason).finally(() => {
+    pending = null;
   });
-  return asking;
+  return pending;
 }
 
 /** Forget the key. */
 export function forgetKey() {
-  sessionStorage.removeItem(PLACE);
+  sessionStorage.removeItem(STORAGE_KEY);
 }
 
 function dialog(reason) {
@@ -38,10 +38,10 @@ function dialog(reason) {
       "form",
       { method: "dialog" },
       h("h2", {}, "API key"),
-      h("p", { id: "key-reason" }, reason || "This service asks for an API key."),
+      h("p", { id: "key-reason" }, reason || "This service requires an API key."),
       h("div", { class: "field" }, h("label", { for: "key-input" }, "Key"), input),
-      h("p", { class: "hint" }, "Make one on the service's machine: ", h("code", {}, "lipserve keys create --name me --scope admin")),
-      h("p", { class: "hint" }, "It is kept until this tab is closed."),
+      h("p", { class: "hint" }, "Create one on the service's machine: ", h("code", {}, "lipserve keys create --name me --scope admin")),
+      h("p", { class: "hint" }, "The key is kept until you close this tab."),
       h(
         "div",
         { class: "actions" },
@@ -54,7 +54,7 @@ function dialog(reason) {
     box.addEventListener("close", () => {
       const given = box.returnValue === "use" ? input.value.trim() : "";
       box.remove();
-      if (given) sessionStorage.setItem(PLACE, given);
+      if (given) sessionStorage.setItem(STORAGE_KEY, given);
       document.dispatchEvent(new Event("keychange"));
       resolve(given !== "");
     });

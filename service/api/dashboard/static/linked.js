@@ -1,16 +1,18 @@
-// Plots over one x axis: one cursor through all of them, one zoom, marks, and a stretch that is chosen by dragging.
+// Plots that share a linear x axis: their cursor, zoom, marks, and a range selected by dragging.
 
 import { h, replace } from "./dom.js";
 import { plotly } from "./plots.js";
 
-const LEAST = 4; // px, below which a drag was a click
-const FULL = 80; // % of a plot's width, beyond which a mark's word stands before it
+const MIN_DRAG_PX = 4; // a shorter drag is a click
+const LATE_MARK_PERCENT = 80; // of the plot's width; the label of a later mark is drawn on its left
 
 /**
- * Plots that belong together. moved(x): the cursor was moved to x; chosen([from, to]): a stretch was dragged, null: a
- * click took it away. zooms: they zoom together; stays: the cursor stays where the pointer left, else moved(null). All numbers are those of the x axis, which is linear and the same in each plot.
+ * Plots with a common cursor. All numbers are values of the x axis.
+ * moved(x): called when the pointer moves the cursor; null if it left and `stays` is false.
+ * chosen([from, to]): called when a range was dragged; null if a click removed it.
+ * zooms: zoom all plots together. stays: keep the cursor if the pointer leaves.
  */
-export class Linked {
+export class LinkedPlots {
   #plots = new Map();
   #zooms;
   #stays;
@@ -24,7 +26,7 @@ export class Linked {
     Object.assign(this, { moved, chosen });
   }
 
-  /** Take a plot in, once it is drawn. */
+  /** Add a plot that has been drawn. */
   add(element) {
     if (this.#plots.has(element)) return;
     const cursor = h("div", { class: "cursor", hidden: true }), stretch = h("div", { class: "stretch", hidden: true }), marks = h("div", {});
@@ -34,60 +36,60 @@ export class Linked {
     element.classList.add("linking");
     element.append(layer);
     element.addEventListener("pointermove", (event) => this.#follow(element, event));
-    if (!this.#stays) element.addEventListener("pointerleave", () => this.#go(null));
+    if (!this.#stays) element.addEventListener("pointerleave", () => this.#moveCursor(null));
     this.#drag(element, layer);
-    element.on("plotly_afterplot", () => this.#place(element, parts));
+    element.on("plotly_afterplot", () => this.#layOut(element, parts));
     if (this.#zooms) element.on("plotly_relayout", (change) => this.#zoom(element, change));
     layer.classList.toggle("dragging", this.#dragging);
-    this.#place(element, parts);
+    this.#layOut(element, parts);
   }
 
-  /** Put the cursor at x in all plots; null: nowhere. */
+  /** Show the cursor at x in all plots; null hides it. */
   point(x) {
     this.#at = x;
-    for (const [element, { cursor }] of this.#plots) stand(cursor, element, x, x);
+    for (const [element, { cursor }] of this.#plots) placeBetween(cursor, element, x, x);
   }
 
-  /** Shade a stretch [from, to] in all plots; null: none. */
+  /** Shade a range [from, to] in all plots; null removes it. */
   shade(stretch) {
     this.#stretch = stretch;
-    for (const [element, { stretch: shown }] of this.#plots) stand(shown, element, ...(stretch ?? [null, null]));
+    for (const [element, { stretch: shown }] of this.#plots) placeBetween(shown, element, ...(stretch ?? [null, null]));
   }
 
-  /** Mark places in all plots by a line with a word: [{x, word, kind}], kind as of a badge. */
+  /** Draw labelled lines in all plots: [{x, word, kind}]; kind as in `badge`. */
   mark(marks) {
     this.#marks = marks;
-    for (const [element, parts] of this.#plots) this.#flag(element, parts);
+    for (const [element, parts] of this.#plots) this.#drawMarks(element, parts);
   }
 
-  /** Whether dragging chooses a stretch, rather than what the plots do by themselves. */
+  /** Set whether dragging selects a range instead of zooming. */
   drag(chooses) {
     this.#dragging = chooses;
     for (const { layer } of this.#plots.values()) layer.classList.toggle("dragging", chooses);
   }
 
-  /** See all of the x axis again, in all plots. */
+  /** Show the whole x axis in all plots. */
   async reset() {
     const Plotly = await plotly();
     for (const element of this.#plots.keys()) Plotly.relayout(element, { "xaxis.autorange": true });
   }
 
-  #place(element, { layer, cursor, stretch, marks }) {
+  #layOut(element, { layer, cursor, stretch, marks }) {
     const area = element.querySelector(".nsewdrag")?.getBoundingClientRect();
     if (!area) return;
     const outer = element.getBoundingClientRect();
     const [left, top] = [area.left - outer.left, area.top - outer.top];
     layer.style.cssText = `left: ${left}px; top: ${top}px; width: ${area.width}px; height: ${area.height}px`;
-    stand(cursor, element, this.#at, this.#at);
-    stand(stretch, element, ...(this.#stretch ?? [null, null]));
-    this.#flag(element, { marks });
+    placeBetween(cursor, element, this.#at, this.#at);
+    placeBetween(stretch, element, ...(this.#stretch ?? [null, null]));
+    this.#drawMarks(element, { marks });
   }
 
-  #flag(element, { marks }) {
+  #drawMarks(element, { marks }) {
     const made = this.#marks.map(({ x, word, kind }) => {
       const mark = h("div", { class: `mark ${kind}`, "data-word": word });
-      stand(mark, element, x, x);
-      mark.classList.toggle("late", parseFloat(mark.style.left) > FULL);
+      placeBetween(mark, element, x, x);
+      mark.classList.toggle("late", parseFloat(mark.style.left) > LATE_MARK_PERCENT);
       return mark;
     });
     replace(marks, made);
@@ -95,11 +97,11 @@ export class Linked {
 
   #follow(element, event) {
     if (event.pointerType === "touch" && !this.#dragging) return; // a finger scrolls
-    const x = place(element, this.#plots.get(element).layer, event);
-    if (x !== null || !this.#stays) this.#go(x);
+    const x = xUnderPointer(element, this.#plots.get(element).layer, event);
+    if (x !== null || !this.#stays) this.#moveCursor(x);
   }
 
-  #go(x) {
+  #moveCursor(x) {
     if (x === this.#at) return;
     this.point(x);
     this.moved(x);
@@ -109,8 +111,8 @@ export class Linked {
     let from = null, began = 0;
     const end = (event) => {
       if (from === null) return;
-      const to = place(element, layer, event, true);
-      const far = Math.abs(event.clientX - began) >= LEAST;
+      const to = xUnderPointer(element, layer, event, true);
+      const far = Math.abs(event.clientX - began) >= MIN_DRAG_PX;
       const stretch = far ? [Math.min(from, to), Math.max(from, to)] : null;
       from = null;
       this.shade(stretch);
@@ -118,12 +120,12 @@ export class Linked {
     };
     layer.addEventListener("pointerdown", (event) => {
       layer.setPointerCapture(event.pointerId);
-      [from, began] = [place(element, layer, event, true), event.clientX];
+      [from, began] = [xUnderPointer(element, layer, event, true), event.clientX];
       event.preventDefault();
     });
     layer.addEventListener("pointermove", (event) => {
       if (from === null) return;
-      const to = place(element, layer, event, true);
+      const to = xUnderPointer(element, layer, event, true);
       this.shade([Math.min(from, to), Math.max(from, to)]);
     });
     layer.addEventListener("pointerup", end);
@@ -143,8 +145,8 @@ export class Linked {
   }
 }
 
-/** Put what belongs to a layer between two places of the x axis, or on one; away where there is none. */
-function stand(part, element, from, to) {
+/** Place an element of a layer between two x values, or at one; hide it if there is none. */
+function placeBetween(part, element, from, to) {
   const [low, high] = element.layout?.xaxis?.range ?? [0, 0];
   const share = (x) => (100 * (x - low)) / (high - low);
   const away = from === null || !(high > low) || to < low || from > high;
@@ -154,8 +156,8 @@ function stand(part, element, from, to) {
   if (from !== to) part.style.width = `${Math.min(share(to), 100) - Math.max(share(from), 0)}%`;
 }
 
-/** Where on the x axis a pointer is; null beside the axes, unless the nearest place will do. */
-function place(element, layer, event, nearest = false) {
+/** Return the x value under a pointer; outside the axes null, or the nearest value if `nearest`. */
+function xUnderPointer(element, layer, event, nearest = false) {
   const area = layer.getBoundingClientRect();
   const share = (event.clientX - area.left) / area.width;
   if (!nearest && (!(share >= 0 && share <= 1) || event.clientY < area.top || event.clientY > area.bottom)) return null;

@@ -1,12 +1,12 @@
-// Plots by Plotly, whose JavaScript is loaded in two parts, each when it first has something to draw. Colours follow the page's theme.
+// Plots by Plotly in the colours of the theme. Each of its two bundles is loaded when it is first needed.
 
-import { css, faint, jointColour } from "./colours.js";
+import { css, withOpacity, jointColour } from "./colours.js";
 import { h } from "./dom.js";
 
 const SPATIAL = new Set(["scatter3d", "mesh3d"]);
 const loading = new Map();
 
-/** Plotly, once it is there: its part that draws plots with two axes, or with "gl3d" scenes in 3-D. */
+/** Load a bundle of Plotly and return it: "cartesian" for plots with two axes, "gl3d" for 3-D scenes. */
 export function plotly(bundle = "cartesian") {
   if (!loading.has(bundle)) loading.set(bundle, load(bundle));
   return loading.get(bundle);
@@ -15,18 +15,18 @@ export function plotly(bundle = "cartesian") {
 function load(bundle) {
   return new Promise((resolve, reject) => {
     const script = h("script", { src: `/dashboard/plotly/${bundle}.js` });
-    script.onload = () => resolve(window.Plotly); // each part by itself: one replaces the other there
+    script.onload = () => resolve(window.Plotly); // each bundle replaces the other in window.Plotly
     script.onerror = () => {
       loading.delete(bundle);
-      reject(new Error("Plotly's JavaScript could not be loaded from the service: where it runs, pip install plotly"));
+      reject(new Error("Plotly could not be loaded from the service. Run `pip install plotly` on the service's machine."));
     };
     document.head.append(script);
   });
 }
 
 /**
- * Draw traces into an element and keep them in the page's colours.
- * layout: Plotly's, and `title`, `x`, `y` (texts of the axes), `height`; label: what it shows, for screen readers.
+ * Draw traces into an element and keep them in the colours of the theme.
+ * layout: Plotly's layout, with `title`, `x` and `y` (axis titles) and `height`; label: description for screen readers.
  * Returns {element, react(traces, layout), extend(update, indices, most)}.
  */
 export async function plot(element, traces, layout = {}, { label = "", signal = null } = {}) {
@@ -35,8 +35,8 @@ export async function plot(element, traces, layout = {}, { label = "", signal = 
   element.setAttribute("role", "img");
   element.setAttribute("aria-label", label || layout.title || "plot");
   let last = [traces, layout];
-  const draw = () => Plotly.react(element, painted(last[0]), themed(last[1]), CONFIG);
-  await Plotly.newPlot(element, painted(traces), themed(layout), CONFIG);
+  const draw = () => Plotly.react(element, withColours(last[0]), withTheme(last[1]), CONFIG);
+  await Plotly.newPlot(element, withColours(traces), withTheme(layout), CONFIG);
   const again = () => (element.isConnected ? draw() : document.removeEventListener("themechange", again));
   document.addEventListener("themechange", again);
   signal?.addEventListener("abort", () => {
@@ -53,12 +53,12 @@ export async function plot(element, traces, layout = {}, { label = "", signal = 
   };
 }
 
-/** A line. colour: a number of `colours`, or a name of a CSS variable such as "measured". */
+/** Return a line. colour: the index of a joint, or the name of a CSS variable such as "measured". */
 export function line(x, y, name, colour, extra = {}) {
   return { x, y, name, mode: "lines", type: "scatter", colour, line: { width: 1.5 }, hoverlabel: { namelength: -1 }, ...extra };
 }
 
-/** The area between two curves, one entry of the legend. */
+/** Return the area between two curves, with one entry in the legend. */
 export function band(x, lower, upper, name, colour) {
   const edge = { x, mode: "lines", type: "scatter", colour, hoverinfo: "skip", legendgroup: name, line: { width: 0 } };
   return [
@@ -67,42 +67,42 @@ export function band(x, lower, upper, name, colour) {
   ];
 }
 
-/** Colours of n joints, in the page's theme. */
+/** Return the colours of n joints in the current theme. */
 export function colours(n) {
   return Array.from({ length: n }, (_, index) => jointColour(index));
 }
 
-// without its bar of buttons: they cannot be reached by keys in what is a picture, and one would send the plot to another host
+// without Plotly's mode bar: its buttons cannot be reached by keyboard, and one sends the plot to another host
 const CONFIG = { responsive: true, displayModeBar: false };
 
-/** A text that Plotly shows as it is: it takes some HTML for markup, and names of joints are anybody's. */
-export function literal(text) {
+/** Escape text for Plotly, which interprets some HTML: joint names come from users. */
+export function escapeMarkup(text) {
   return String(text).replaceAll("&", "&amp;").replaceAll("<", "&lt;");
 }
 
-function painted(traces) {
+function withColours(traces) {
   return traces.flat().map(({ colour, filled, ...given }) => {
     const trace = { ...given };
-    if (trace.name !== undefined) trace.name = literal(trace.name);
-    if (trace.text !== undefined) trace.text = Array.isArray(trace.text) ? trace.text.map(literal) : literal(trace.text);
+    if (trace.name !== undefined) trace.name = escapeMarkup(trace.name);
+    if (trace.text !== undefined) trace.text = Array.isArray(trace.text) ? trace.text.map(escapeMarkup) : escapeMarkup(trace.text);
     if (colour === undefined) return trace;
     const found = typeof colour === "number" ? jointColour(colour) : css(colour) || colour;
     const made = { ...trace, line: { color: found, ...trace.line } };
     if (trace.marker || trace.mode?.includes("markers")) made.marker = { color: found, ...trace.marker };
-    if (filled) made.fillcolor = faint(found, 0.22);
+    if (filled) made.fillcolor = withOpacity(found, 0.22);
     return made;
   });
 }
 
-function themed({ title = "", x = "", y = "", height = 300, ...rest }) {
+function withTheme({ title = "", x = "", y = "", height = 300, ...rest }) {
   const axis = { gridcolor: css("line"), zerolinecolor: css("line-strong"), linecolor: css("line-strong"), automargin: true };
-  const own = (name, text) => ({ ...axis, ...rest[name], title: { text: literal(text), standoff: 8, ...rest[name]?.title } });
+  const own = (name, text) => ({ ...axis, ...rest[name], title: { text: escapeMarkup(text), standoff: 8, ...rest[name]?.title } });
   return {
     margin: { l: 56, r: 16, t: title ? 40 : 16, b: 44 },
     legend: { orientation: "h", y: -0.22, yanchor: "top" },
     hovermode: "x unified",
     ...rest,
-    title: title ? { text: literal(title), x: 0, xanchor: "left", font: { size: 15 } } : undefined,
+    title: title ? { text: escapeMarkup(title), x: 0, xanchor: "left", font: { size: 15 } } : undefined,
     height,
     autosize: true,
     paper_bgcolor: "rgba(0,0,0,0)",

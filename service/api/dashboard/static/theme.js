@@ -1,4 +1,4 @@
-// Light or dark before anything is drawn; no module, as those run too late and the page would flash.
+// Sets the theme before the first paint. Not a module: modules run later, and the page would flash.
 "use strict";
 (() => {
   const root = document.documentElement;

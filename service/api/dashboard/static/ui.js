@@ -1,23 +1,23 @@
-// The pieces that pages are made of.
+// Building blocks of the pages.
 
 import { ApiError } from "./api.js";
 import { h, refresh } from "./dom.js";
 
 let names = 0;
 
-/** The page's heading with what can be done beside it. */
+/** The page's heading with its actions. */
 export function heading(text, ...actions) {
   return h("div", { class: "heading" }, h("h1", {}, text), actions.length ? h("div", { class: "actions" }, actions) : null);
 }
 
-/** A part of a page with a title of its own. */
+/** A section of a page with a title. */
 export function card(title, ...children) {
   return h("section", { class: "card", "aria-label": title }, h("h2", {}, title), children);
 }
 
 /**
- * A table; columns: [{label, cell: row => node or text, numeric}]. It scrolls by itself where it is too wide.
- * key(row): what tells rows apart where the table is refreshed and rows come, go or move.
+ * A table that scrolls horizontally if it is too wide. columns: [{label, cell: row => node or text, numeric}];
+ * key(row): identity of a row, needed if rows change.
  */
 export function table(columns, rows, { caption, key } = {}) {
   const kind = (column) => (column.numeric ? { class: "numeric" } : {});
@@ -32,26 +32,26 @@ export function table(columns, rows, { caption, key } = {}) {
       h("tbody", {}, rows.map((row) => h("tr", key ? { "data-key": key(row) } : {}, columns.map((column) => h("td", kind(column), column.cell(row)))))),
     ),
   );
-  // outside of what scrolls, so that it can be read whole on a phone
+  // outside the scrolling region, so that a phone shows all of it
   return caption ? h("div", {}, h("p", { class: "caption", "aria-hidden": "true" }, caption), made) : made;
 }
 
-/** Pairs of a name and what belongs to it: [[name, node or text], …]. */
+/** A list of names and values: [[name, node or text], …]. */
 export function facts(pairs) {
   return h("dl", { class: "facts" }, pairs.map(([name, what]) => h("div", {}, h("dt", {}, name), h("dd", {}, what))));
 }
 
-/** An explanation that is there for who asks for it; first: what everybody is to see of it. */
-export function explained(text, first = "") {
-  return h("details", { class: "hint" }, h("summary", {}, first, "How to read it"), h("p", {}, text));
+/** An explanation that the reader can open; first: text that is always visible. */
+export function explanation(text, first = "") {
+  return h("details", { class: "hint" }, h("summary", {}, first, "How to read this"), h("p", {}, text));
 }
 
-/** What a page shows where there is nothing yet, and what to do about it. */
+/** The empty state of a page: a text and actions. */
 export function empty(text, ...actions) {
   return h("div", { class: "empty" }, h("p", {}, text), actions.length ? h("div", { class: "actions" }, actions) : null);
 }
 
-/** An error in the service's own words, with field, value and what was expected where it says so. */
+/** An error with the service's message and its table of fields, values and expectations. */
 export function errorBox(error, retry) {
   const detail = error instanceof ApiError ? error.detail : [];
   return h(
@@ -66,29 +66,29 @@ export function errorBox(error, retry) {
             { label: "expected", cell: (item) => text(item.expected) },
           ],
           detail,
-          { caption: "What was wrong" },
+          { caption: "Details" },
         )
       : null,
-    retry ? h("div", { class: "actions" }, button("Try again", retry)) : null,
+    retry ? h("div", { class: "actions" }, button("Retry", retry)) : null,
   );
 }
 
-/** A word about a state, told apart by its sign too. */
+/** A badge for a state, with a symbol so that colour is not the only cue. */
 export function badge(state, kind = KINDS[state] ?? "plain") {
   return h("span", { class: `badge ${kind}` }, `${SIGNS[kind]} ${state}`);
 }
 
-/** Something is on its way. */
+/** A loading indicator. */
 export function loading(what = "Loading") {
   return h("p", { class: "loading", role: "status" }, `${what}…`);
 }
 
-/** How much of something is done, 0 to 1. */
+/** A progress bar; fraction: 0 to 1. */
 export function progress(fraction, label) {
   return h("progress", { max: "1", value: String(fraction), "aria-label": label }, `${Math.round(100 * fraction)} %`);
 }
 
-/** An input with its label and a hint. */
+/** An input with its label and hint. */
 export function field(label, input, hint) {
   input.id ||= `field-${(names += 1)}`;
   const about = hint ? h("span", { class: "hint", id: `${input.id}-hint` }, hint) : null;
@@ -98,21 +98,21 @@ export function field(label, input, hint) {
   return h("div", { class: "field" }, named, input, about);
 }
 
-/** A list to choose one of: [[value, label], …] or texts. */
+/** A select of [[value, label], …] or of texts. */
 export function select(options, chosen, onchange) {
   const made = h("select", { onchange: (event) => onchange?.(event.target.value) });
-  return offer(made, options, chosen);
+  return updateSelect(made, options, chosen);
 }
 
-/** Bring the options of such a list up to date, and which one is chosen, while it stays where it is. */
-export function offer(made, options, chosen) {
+/** Update the options and the value of a select in place. */
+export function updateSelect(made, options, chosen) {
   const pairs = options.map((option) => (Array.isArray(option) ? option : [option, option]));
   refresh(made, pairs.map(([value, label]) => h("option", { value }, label)));
   if (made.value !== chosen && pairs.some(([value]) => value === chosen)) made.value = chosen;
   return made;
 }
 
-/** A button; while what it started runs, it cannot be pressed again. What goes wrong is shown as a notice. */
+/** A button that is disabled while its action runs. An error is shown as a notice. */
 export function button(label, onclick, { kind = "" } = {}) {
   const made = h("button", { type: "button", class: kind }, label);
   made.addEventListener("click", async () => {
@@ -133,8 +133,8 @@ export function link(label, hash, kind = "") {
   return h("a", { href: hash, class: kind }, label);
 }
 
-/** Ask before something that cannot be undone, or that robots notice; true where it is to be done. */
-export function confirm(question, label = "Go on", kind = "danger") {
+/** Ask for confirmation before an action that cannot be undone or that affects robots; return whether to proceed. */
+export function confirm(question, label = "Continue", kind = "danger") {
   return new Promise((resolve) => {
     const box = h(
       "dialog",
@@ -160,14 +160,14 @@ export function confirm(question, label = "Go on", kind = "danger") {
   });
 }
 
-/** Say something in a corner of the page; kind: good, bad or plain. Bad news stays until it is closed. */
+/** Show a notice in a corner of the page; kind: good, bad or plain. A bad one stays until it is closed. */
 export function notice(text, kind = "good") {
   const made = h("div", { class: `notice ${kind}` }, h("span", {}, text), h("button", { type: "button", "aria-label": "Close", onclick: () => made.remove() }, "×"));
   document.getElementById("notices").append(made);
   if (kind !== "bad") setTimeout(() => made.remove(), 6000);
 }
 
-/** Tabs: [[name, label], …]; show(name) is called for the first, or `chosen`, and whenever another is chosen. */
+/** Tabs [[name, label], …]. show(name) is called for `chosen` at once, and for each tab that is selected later. */
 export function tabs(options, show, chosen = options[0]?.[0]) {
   const made = options.map(([name, label]) =>
     h("button", { type: "button", role: "tab", onclick: () => choose(name), dataset: { name } }, label),
@@ -187,7 +187,7 @@ export function tabs(options, show, chosen = options[0]?.[0]) {
       const here = tab.dataset.name === name;
       tab.setAttribute("aria-selected", String(here));
       tab.tabIndex = here ? 0 : -1;
-      if (here) requestAnimationFrame(() => bring(list, tab));
+      if (here) requestAnimationFrame(() => scrollToTab(list, tab));
     }
     show(name);
   }
@@ -195,14 +195,14 @@ export function tabs(options, show, chosen = options[0]?.[0]) {
   return list;
 }
 
-/** Scroll a row of tabs so that one of them is seen, and nothing else. */
-function bring(list, tab) {
+/** Scroll a tab into view without scrolling the page. */
+function scrollToTab(list, tab) {
   const [all, one] = [list.getBoundingClientRect(), tab.getBoundingClientRect()];
   list.scrollLeft += Math.min(one.left - all.left, 0) + Math.max(one.right - all.right, 0);
 }
 
-/** Do something now and every so many seconds while the page is seen, one at a time, until the signal aborts. */
-export async function every(seconds, work, signal) {
+/** Run `work` now and again after each pause of `seconds`, while the page is visible, until the signal aborts. */
+export async function repeat(seconds, work, signal) {
   while (!signal.aborted) {
     if (!document.hidden) await work();
     await new Promise((resolve) => {
@@ -213,17 +213,17 @@ export async function every(seconds, work, signal) {
 }
 
 const KINDS = {
-  ok: "good", alive: "good", ready: "good", succeeded: "good", serving: "good", well: "good", learnt: "good",
+  ok: "good", alive: "good", ready: "good", succeeded: "good", serving: "good", learnt: "good",
   running: "busy", queued: "busy", reconnecting: "busy",
-  warning: "warn", poorly: "warn", held: "warn", cancelled: "plain",
-  failed: "bad", error: "bad", "not ready": "bad", "not determined": "bad",
+  warning: "warn", paused: "warn", cancelled: "plain",
+  failed: "bad", error: "bad", "not ready": "bad",
 };
 const SIGNS = { good: "✓", busy: "◌", warn: "!", bad: "✕", plain: "·" };
 
 function title(error) {
-  if (!(error instanceof ApiError)) return "Something went wrong in this page.";
-  const titles = { 0: "No answer.", 401: "A key is needed.", 403: "Not allowed.", 404: "Not there.", 507: "No room." };
-  return titles[error.status] ?? "The service refused it.";
+  if (!(error instanceof ApiError)) return "This page failed.";
+  const titles = { 0: "No connection.", 401: "API key required.", 403: "Not allowed.", 404: "Not found.", 507: "Disk full." };
+  return titles[error.status] ?? "Request rejected.";
 }
 
 function text(value) {

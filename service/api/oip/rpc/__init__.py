@@ -1,5 +1,4 @@
-"""The Open Inference Protocol over gRPC: its messages, its methods, and who listens. Needs the extra `grpc`, which is
-imported where a service listens for it."""
+"""The Open Inference Protocol over gRPC. Its modules need the extra `grpc`."""
 
 import socket
 
@@ -8,11 +7,11 @@ from service.foundation.settings import Settings
 
 
 class PortError(OSError):
-    """Nothing can listen at the port; the message says why."""
+    """The gRPC port cannot be opened."""
 
 
 def check_installed(settings: Settings) -> bool:
-    """Whether the service shall listen for gRPC; raise MissingExtraError."""
+    """Return whether gRPC is enabled; raise MissingExtraError if it is, but not installed."""
     if settings.grpc_port is None:
         return False
     extras.check_extra("grpc", "LIPSERVE_GRPC_PORT is set")
@@ -20,16 +19,16 @@ def check_installed(settings: Settings) -> bool:
 
 
 def check_port(settings: Settings) -> None:
-    """Look before the service starts whether its port for gRPC is free; raise PortError."""
+    """Check that the gRPC port is free; raise PortError."""
     if not settings.grpc_port:
         return
     family = socket.AF_INET6 if ":" in settings.host else socket.AF_INET
     try:
         socket.create_server((settings.host, settings.grpc_port), family=family).close()
     except OSError as error:
-        raise taken(settings, error.strerror or str(error)) from error
+        raise port_error(settings, error.strerror or str(error)) from error
 
 
-def taken(settings: Settings, reason: str) -> PortError:
-    """The error of a port at which nothing can listen."""
-    return PortError(f"LIPSERVE_GRPC_PORT is {settings.grpc_port}, expected a port that is free: {reason}")
+def port_error(settings: Settings, reason: str) -> PortError:
+    """Return the error for a port that cannot be opened."""
+    return PortError(f"LIPSERVE_GRPC_PORT is {settings.grpc_port}, expected a free port: {reason}")

@@ -1,7 +1,7 @@
-"""Messages of the protocol's gRPC service: what its published definition says, as classes of protobuf.
+"""Messages of the protocol's gRPC service, as protobuf classes built from its published definition.
 
-They are made when this is imported, in a pool of their own: no code is generated, no other package is needed, and a
-client's copy of the same definition, as Triton's, may be in the same process.
+The classes are built at import in a descriptor pool of their own. No generated code or further package is needed, and
+another copy of the definition, such as that of Triton's client, may be in the same process.
 """
 
 from __future__ import annotations
@@ -91,8 +91,7 @@ message InferTensorContents
   repeated double fp64_contents = 7
   repeated bytes bytes_contents = 8
 """
-"""The definition in short: `parameters` is a `map<string, InferParameter>`, `one` a member of `oneof
-parameter_choice`."""
+"""The definition. `parameters` stands for a `map<string, InferParameter>`, `one` for `oneof parameter_choice`."""
 _FIELD = re.compile(r"  (?:(?P<label>repeated|one) )?(?:(?P<type>[\w.]+) )?(?P<name>\w+) = (?P<number>\d+)")
 _SCALARS = ("bool", "int32", "int64", "uint32", "uint64", "float", "double", "string", "bytes")
 
@@ -116,7 +115,7 @@ def _file() -> FileDescriptorProto:
 def _add_field(
     message: DescriptorProto, path: str, label: str | None, kind: str | None, name: str, number: int
 ) -> None:
-    if kind is None:  # a map: protobuf knows it as a list of entries
+    if kind is None:  # a map, which protobuf represents as a list of entries
         entry = message.nested_type.add(name="ParametersEntry")
         entry.options.map_entry = True
         _add_field(entry, path, None, "string", "key", 1)
@@ -139,5 +138,5 @@ POOL.Add(_file())
 
 
 def message(name: str) -> Any:
-    """The class of a message by its name, as `ModelInferRequest`."""
+    """Return the class of a message by its name, such as `ModelInferRequest`."""
     return GetMessageClass(POOL.FindMessageTypeByName(f"{PACKAGE}.{name}"))

@@ -1,4 +1,4 @@
-"""Listens for gRPC in the service's own event loop, and hands calls to the application as requests."""
+"""Serves gRPC in the event loop of the service, and passes calls to the application as requests."""
 
 from __future__ import annotations
 
@@ -15,8 +15,9 @@ import grpc
 from starlette.types import ASGIApp, Message, Scope
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
+from service.api.errors import UNEXPECTED_ERROR
 from service.api.limits.requests import MAX_REQUESTS, PATIENCE
-from service.api.oip.rpc import taken
+from service.api.oip.rpc import port_error
 from service.api.oip.rpc.definition import SERVICE
 from service.api.oip.rpc.messages import PROTOBUF
 from service.api.oip.rpc.methods import CALL, METHODS
@@ -40,17 +41,19 @@ _CODES = {
     503: grpc.StatusCode.UNAVAILABLE,
     507: grpc.StatusCode.RESOURCE_EXHAUSTED,
 }
-"""What stands for a status of HTTP; INTERNAL for all others."""
+"""gRPC codes of HTTP statuses; INTERNAL for all others."""
 _TRAILING = frozenset({b"x-request-id", b"retry-after", b"www-authenticate"})
-"""Headers that a call's trailing metadata have, too."""
+"""Headers that are copied to the trailing metadata of a call."""
 ERROR_CODE = "lipserve-error-code"
-"""Trailing metadata with the code of an error, as `invalid_request`."""
+"""Key of the trailing metadata with the code of an error, such as `invalid_request`."""
 
 
 @asynccontextmanager
 async def listening(app: ASGIApp, settings: Settings, stopping: StopState) -> AsyncIterator[int]:
-    """Take calls while the context lasts, and give the port. Where the service stops, no more are taken, and those
-    begun have the time that requests have. Raise PortError."""
+    """Serve calls while the context is open and yield the port; raise PortError.
+
+    When the service stops, new calls are rejected, and running calls have as much time to end as HTTP requests.
+    """
     handlers = {
         path.rpartition("/")[2]: grpc.stream_unary_rpc_method_handler(partial(_answer, _proxied(app, settings), path))
         for path in METHODS
@@ -61,7 +64,7 @@ async def listening(app: ASGIApp, settings: Settings, stopping: StopState) -> As
     try:
         port = server.add_insecure_port(f"{host}:{settings.grpc_port}")
     except RuntimeError as error:
-        raise taken(settings, str(error)) from error
+        raise port_error(settings, str(error)) from error
     await server.start()
     logger.info("gRPC on %s:%d", host, port)
     stop = asyncio.create_task(_stop(server, stopping))
@@ -78,9 +81,9 @@ async def _stop(server: grpc.aio.Server, stopping: StopState) -> None:
 
 
 def _options(settings: Settings) -> list[tuple[str, int]]:
-    """The limits that requests over HTTP have, where gRPC itself knows them."""
+    """Return the limits of HTTP requests as options of gRPC, as far as there are such options."""
     return [
-        ("grpc.so_reuseport", 0),  # else a second service would take half of the calls
+        ("grpc.so_reuseport", 0),  # else a second service at the port would get half of the calls
         ("grpc.max_receive_message_length", settings.max_request_bytes),
         ("grpc.max_send_message_length", -1),
         ("grpc.max_metadata_size", PATIENCE.header_bytes),
@@ -89,20 +92,19 @@ def _options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.max_allowed_incoming_connections", settings.max_connections),
         ("grpc.server_handshake_timeout_ms", int(PATIENCE.header_s * 1000)),
         ("grpc.max_connection_idle_ms", int(settings.stream_idle_s * 1000)),
-        ("grpc.keepalive_time_ms", int(PATIENCE.answer_s * 1000)),  # who has gone without a word
-        ("grpc.compression_enabled_algorithms_bitset", 1),  # none: messages are taken uncompressed
+        ("grpc.keepalive_time_ms", int(PATIENCE.answer_s * 1000)),  # detects vanished clients
+        ("grpc.compression_enabled_algorithms_bitset", 1),  # only uncompressed messages
     ]
 
 
 def _proxied(app: ASGIApp, settings: Settings) -> ASGIApp:
-    """The application as behind the reverse proxies that are trusted to say who asks."""
+    """Wrap the application so that trusted reverse proxies can give the client's address."""
     made: Any = ProxyHeadersMiddleware(app, trusted_hosts=settings.trusted_proxies)  # type: ignore[arg-type]
     return made  # type: ignore[no-any-return]
 
 
 async def _answer(app: ASGIApp, path: str, _: Any, context: Any) -> bytes:
-    """Answer a call as the application answers a request. The message is read when the application asks for it, under
-    its limits."""
+    """Answer a call through the application, which reads the message under the limits of its middleware."""
     status, headers, parts = 500, list[tuple[bytes, bytes]](), list[bytes]()
 
     async def receive() -> Message:
@@ -127,13 +129,13 @@ async def _answer(app: ASGIApp, path: str, _: Any, context: Any) -> bytes:
         return b"".join(parts)
     code, words = _error(b"".join(parts))
     await context.abort(_CODES.get(status, grpc.StatusCode.INTERNAL), words, (*trailing, (ERROR_CODE, code)))
-    raise AssertionError("abort has raised")
+    raise AssertionError("context.abort did not raise")
 
 
 def _error(body: bytes) -> tuple[str, str]:
-    """Code and words of an error that the application has answered."""
+    """Return code and message of an error response."""
     error = json.loads(body)["error"] if body else {}
-    return error.get("code", "internal_error"), error.get("message", "an unexpected error; the service's log says more")
+    return error.get("code", "internal_error"), error.get("message", UNEXPECTED_ERROR)
 
 
 def _scope(path: str, context: Any) -> Scope:
@@ -156,14 +158,14 @@ def _scope(path: str, context: Any) -> Scope:
 
 
 def _headers(metadata: Iterable[tuple[str, str | bytes]]) -> Iterator[tuple[bytes, bytes]]:
-    """A call's metadata as headers, besides the binary ones."""
+    """Yield the text metadata of a call as headers."""
     for name, value in metadata:
         if isinstance(value, str):
             yield name.lower().encode("latin-1"), value.encode("latin-1", "replace")
 
 
 def _client(peer: str) -> tuple[str, int] | None:
-    """Address and port of a peer, as `ipv4:127.0.0.1:50000` or `ipv6:%5B::1%5D:50000`."""
+    """Return address and port of a peer such as `ipv4:127.0.0.1:50000` or `ipv6:%5B::1%5D:50000`."""
     kind, _, address = unquote(peer).partition(":")
     host, _, port = address.rpartition(":")
     return (host.strip("[]"), int(port)) if kind in ("ipv4", "ipv6") and port.isdigit() else None

@@ -1,4 +1,4 @@
-"""An inference request over gRPC, its numbers raw or typed; and the message of its answer."""
+"""Decodes inference requests over gRPC, with raw or typed numbers, and encodes their answers."""
 
 from __future__ import annotations
 
@@ -17,68 +17,72 @@ from service.foundation.errors import invalid_request
 
 PROTOBUF = b"application/grpc"
 InferRequest, InferResponse = message("ModelInferRequest"), message("ModelInferResponse")
-MOST = 100
-"""Inputs, outputs and axes that are looked at: more than any right request has, so one with more is refused for them.
-A message of the largest size may have millions, each of which takes more memory than it has bytes."""
+MAX_ITEMS = 100
+"""Max inputs, outputs and axes that are read. No valid request has as many; later checks reject one that has.
+
+A message of the max size may have millions of them, which need more memory than the message itself.
+"""
 _FIELDS = {"FP64": "fp64_contents", "FP32": "fp32_contents"}
 
 
 def decode(kind: Any, data: bytes) -> Any:
-    """Read a message; raise InvalidRequestError."""
+    """Decode a message; raise InvalidRequestError."""
     try:
         return kind.FromString(data)
     except DecodeError as error:
-        expected = f"one of {kind.DESCRIPTOR.full_name}"
-        raise invalid_request("the message", f"not protobuf that can be read: {error}", expected) from error
+        expected = kind.DESCRIPTOR.full_name
+        sentence = f"The message is not a valid {expected}: {error}"
+        raise invalid_request("the message", f"not valid protobuf: {error}", expected, sentence) from error
 
 
 def encode(answer: Any) -> Reply:
-    """The answer that a message is."""
+    """Return the reply with a message."""
     return Reply(answer.SerializeToString(), PROTOBUF)
 
 
 class Message:
-    """A request; its answer is raw where it is, and typed where it is."""
+    """An inference request. Its answer has raw numbers if the request has, else typed numbers."""
 
     def __init__(self, sent: Any) -> None:
-        """sent: an InferRequest. Raise InvalidRequestError for a shape that is none."""
+        """Read an InferRequest; raise InvalidRequestError for a negative shape."""
         self._sent, self._raw = sent, len(sent.raw_input_contents) > 0
         self.request = schema.InferRequest(
-            [_input(place, tensor) for place, tensor in enumerate(sent.inputs[:MOST])],
-            [schema.InferOutput(each.name, _output_parameters(each.parameters)) for each in sent.outputs[:MOST]]
+            [_input(place, tensor) for place, tensor in enumerate(sent.inputs[:MAX_ITEMS])],
+            [schema.InferOutput(each.name, _output_parameters(each.parameters)) for each in sent.outputs[:MAX_ITEMS]]
             or None,
         )
 
     def check(self) -> None:
-        """Look that all numbers are raw, or all typed; raise InvalidRequestError."""
+        """Check that the numbers are all raw or all typed; raise InvalidRequestError."""
         if not self._raw:
             return
         given, needed = len(self._sent.raw_input_contents), len(self._sent.inputs)
         if given != needed:
-            raise invalid_request("raw_input_contents", f"{given} of them", f"one of each of the {needed} inputs")
+            message = f"`raw_input_contents` has {given} entries, expected one for each of the {needed} inputs."
+            raise invalid_request("raw_input_contents", f"{given} entries", f"{needed} entries", message)
         for tensor in self._sent.inputs:
             if tensor.HasField("contents"):
-                expected = f"the numbers of {tensor.name} in one of them"
-                raise invalid_request(f"{tensor.name}.contents", "given, and raw_input_contents too", expected)
+                field = f"{tensor.name}.contents"
+                message = f"Both `{field}` and `raw_input_contents` are given. Use one of them for all inputs."
+                raise invalid_request(field, "given, and raw_input_contents too", "one of the two", message)
 
     def numbers(self, place: int, dtype: np.dtype[np.floating]) -> NDArray[np.floating]:
-        """Numbers of an input, flat; raise InvalidRequestError where they are not those of its shape."""
+        """Return the numbers of an input, flat; raise InvalidRequestError if their count does not match the shape."""
         tensor = self._sent.inputs[place]
         count = prod(tensor.shape)
         if self._raw:
             data: bytes = self._sent.raw_input_contents[place]
             if len(data) != count * dtype.itemsize:
-                expected = (
-                    f"{count * dtype.itemsize} bytes for {tensor.name}: "
-                    f"the shape {list(tensor.shape)} of {tensor.datatype}"
-                )
+                shape = f"shape {list(tensor.shape)} of {tensor.datatype}"
+                expected = f"{count * dtype.itemsize} bytes for {tensor.name} with {shape}"
                 raise invalid_request(f"raw_input_contents[{place}]", f"{len(data)} bytes", expected)
             return np.frombuffer(data, dtype)
         field = _FIELDS[tensor.datatype]
         values = np.array(getattr(tensor.contents, field), dtype)
         if values.size != count:
-            expected = f"{count} numbers, as the shape {list(tensor.shape)} has"
-            raise invalid_request(f"{tensor.name}.contents.{field}", f"{values.size} numbers", expected)
+            path, expected = f"{tensor.name}.contents.{field}", f"{count} for shape {list(tensor.shape)}"
+            message = f"`{path}` has {values.size} numbers, expected {expected}."
+            raise invalid_request(path, f"{values.size} numbers", expected, message)
         return values
 
     def encode(self, header: Header, answers: list[Answer]) -> Reply:
@@ -96,7 +100,7 @@ class Message:
 
 
 def _input(place: int, tensor: Any) -> schema.InferInput:
-    shape = list(tensor.shape[:MOST])
+    shape = list(tensor.shape[:MAX_ITEMS])
     for axis, size in enumerate(shape):
         if size < 0:
             raise invalid_request(f"inputs[{place}].shape[{axis}]", size, "a whole number of at least 0")
@@ -112,5 +116,5 @@ def _output_parameters(given: Any) -> schema.OutputParameters:
 
 
 def _text(given: Any, name: str) -> str | None:
-    """A parameter that is understood; others are ignored."""
+    """Return a text parameter, None if it is not given."""
     return str(given[name].string_param) if name in given else None

@@ -1,5 +1,7 @@
-"""Methods of the gRPC service. Each is a route of the application at the path that gRPC gives it, so that a call
-passes all that a request passes; no request over HTTP reaches it."""
+"""Methods of the gRPC service, as routes of the application.
+
+A call goes through the same middleware as an HTTP request. HTTP requests do not reach these routes.
+"""
 
 from __future__ import annotations
 
@@ -22,13 +24,13 @@ from service.api.routes import health
 from service.foundation.errors import NotReadyError, invalid_request
 
 CALL = "lipserve.call"
-"""Key in the ASGI scope of a call, which the listener sets; no request has it."""
+"""Key that marks the ASGI scope of a gRPC call. HTTP requests do not have it."""
 
 Answerer = Callable[[State, Scope, bytes], Awaitable[Reply]]
 
 
 class Method(NamedTuple):
-    """path: as gRPC has it, and as metrics and logs name the route."""
+    """A method; `path` is its gRPC path, which metrics and logs use as the route."""
 
     path: str
     answer: Answerer
@@ -36,22 +38,22 @@ class Method(NamedTuple):
 
 
 class Methods(BaseRoute):
-    """The route of all methods; path: none of its own."""
+    """The route of all methods. It has no path of its own."""
 
     path = ""
 
     @property
     def calls(self) -> dict[str, Rule]:
-        """What each method needs, by its path."""
+        """The access rule of every method, by path."""
         return {path: method.rule for path, method in METHODS.items()}
 
     def matches(self, scope: Scope) -> tuple[Match, Scope]:
-        """Whether a scope is that of a call of one of the methods."""
+        """Match the scope of a gRPC call to one of the methods."""
         method = METHODS.get(scope["path"]) if CALL in scope else None
         return (Match.NONE, {}) if method is None else (Match.FULL, {"route": method, "path_params": {}})
 
     async def handle(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answer a call; an error is raised."""
+        """Answer a call; raise ServiceError."""
         sent = await receive()
         reply = await scope["route"].answer(scope["app"].state, scope, sent["body"])
         await send({"type": "http.response.start", "status": 200, "headers": reply.headers()})
@@ -108,10 +110,10 @@ async def _model_infer(state: State, scope: Scope, body: bytes) -> Reply:
 
 
 def _model(scope: Scope, sent: Any, name: str, version: str) -> tuple[str, str | None]:
-    """The model and version that a message names, which metrics tell calls apart by; raise InvalidRequestError."""
+    """Return the model and version that a message names, and store the model for metrics; raise InvalidRequestError."""
     model: str = getattr(sent, name)
     if not model:
-        raise invalid_request(name, "missing", "the name of a model")
+        raise invalid_request(name, "missing", "the name of a model", f"`{name}` is required.")
     scope["path_params"]["model"] = model
     return model, getattr(sent, version) or None
 

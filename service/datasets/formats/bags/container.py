@@ -1,7 +1,7 @@
-"""What every kind of bag is read as: channels, and their messages in the order of their recording.
+"""The interface of all bag readers: channels, and their messages in the order of their recording.
 
-The bags are read by us, front to back, for three reasons: a recording that was cut off is read as far as it goes;
-nothing is unpacked beyond a limit; and no code is generated out of message definitions, which come with the upload.
+The service has its own readers, for three reasons. An incomplete recording is read up to where it was cut off. Nothing
+is unpacked beyond a limit. No code is generated from message definitions, which come with the upload.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ from typing import NamedTuple
 
 import pyarrow as pa
 
-from service.foundation.errors import InvalidDataError, TooLargeError, invalid_data
+from service.datasets.formats.table import unreadable
+from service.foundation.errors import InvalidDataError, TooLargeError
 from service.foundation.settings import Settings
 
 Data = bytes | memoryview
 MAX_PART_BYTES = 64 * 1024 * 1024
-"""Largest chunk or message of a bag, once unpacked."""
+"""Max size of a chunk or message of a bag after unpacking."""
 
 
 class Channel(NamedTuple):
-    """One topic of one type.
-
-    type: `package/Name`; encoding: of its messages, `cdr` or `ros1` or what is not read here; definition: of the type,
-    as text, None where the bag does not hold it.
-    """
+    """One topic of one type."""
 
     topic: str
     type: str
+    """`package/Name`."""
     encoding: str
+    """Of its messages: `cdr`, `ros1`, or one that cannot be read."""
     definition: str | None
+    """Definition of the type as text; None if the bag does not hold it."""
 
 
 class Bag(ABC):
-    """A bag in one file. facts: what was noticed on the way, complete once it was read through."""
+    """A bag in one file. facts: sentences for the report, complete after the bag is read."""
 
     def __init__(self, path: Path, settings: Settings) -> None:
         self.path, self.settings = path, settings
@@ -44,53 +44,53 @@ class Bag(ABC):
 
     @abstractmethod
     def channels(self) -> dict[Channel, int]:
-        """Number of messages of every channel that has any; raise InvalidDataError."""
+        """Return the number of messages of every channel that has any; raise InvalidDataError."""
 
     @abstractmethod
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
-        """Time of reception in ns and data of every message of a channel's topic and type."""
+        """Yield the reception time in ns and the data of every message of a channel's topic and type."""
 
-    def unpacking(self) -> Unpacking:
-        """What one pass through the bag may unpack."""
-        return Unpacking(MAX_PART_BYTES, self.settings.max_unpacked_bytes)
+    def unpacker(self) -> Unpacker:
+        """Return an unpacker with the limits of one pass through the bag."""
+        return Unpacker(MAX_PART_BYTES, self.settings.max_unpacked_bytes)
 
 
 class ScannedBag(Bag):
-    """A bag that is read from front to back; `scan` says how."""
+    """A bag that is read from front to back by `scan`."""
 
     @abstractmethod
     def scan(self) -> Iterator[tuple[Channel, int, Data]]:
-        """Channel, time of reception in ns and data of every message."""
+        """Yield the channel, the reception time in ns and the data of every message."""
 
-    def tell(self, fact: str) -> None:
-        """Note a fact, once: a bag is read several times."""
+    def add_fact(self, fact: str) -> None:
+        """Add a fact once, although the bag is read several times."""
         if fact not in self.facts:
             self.facts.append(fact)
 
     def channels(self) -> dict[Channel, int]:
-        """Number of messages of every channel that has any."""
+        """Return the number of messages of every channel that has any."""
         counts: dict[Channel, int] = {}
         for channel, _, _ in self.scan():
             counts[channel] = counts.get(channel, 0) + 1
         return counts
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
-        """Time of reception in ns and data of every message of a channel's topic and type."""
-        unpacking = self.unpacking()
+        """Yield the reception time in ns and the data of every message of a channel's topic and type."""
+        unpacker = self.unpacker()
         for other, time, data in self.scan():
             if other.topic == channel.topic and other.type == channel.type:
-                yield time, unpacking.message(bytes(data)) if other.encoding == "cdr" else bytes(data)
+                yield time, unpacker.message(bytes(data)) if other.encoding == "cdr" else bytes(data)
 
 
 class JoinedBags(Bag):
-    """The files that one recording was split into, one after the other; path: of the archive that they were in."""
+    """The files of a split recording in order; path: of the archive that holds them."""
 
     def __init__(self, path: Path, bags: list[Bag], settings: Settings) -> None:
         super().__init__(path, settings)
         self.bags = bags
 
     def channels(self) -> dict[Channel, int]:
-        """Number of messages of every channel of all files."""
+        """Return the number of messages of every channel of all files."""
         counts: dict[Channel, int] = {}
         for bag in self.bags:
             for channel, count in bag.channels().items():
@@ -99,41 +99,42 @@ class JoinedBags(Bag):
         return counts
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
-        """Time of reception in ns and data of every message of a channel's topic and type."""
+        """Yield the reception time in ns and the data of every message of a channel's topic and type."""
         for bag in self.bags:
             yield from bag.messages(channel)
 
 
 def type_name(name: str) -> str:
-    """A message type as ROS 1 writes it: `package/Name`, whether or not `msg` stands between."""
+    """Return a message type as ROS 1 writes it, `package/Name`, from either form."""
     return name.replace("/msg/", "/")
 
 
-def damaged(what: str, offset: int | None = None) -> InvalidDataError:
-    """Error for a bag that cannot be read on."""
-    return invalid_data("file", what if offset is None else f"damaged at byte {offset}: {what}", "a complete bag")
+def damaged(reason: str, offset: int | None = None) -> InvalidDataError:
+    """Return the error for a bag that cannot be read further."""
+    reason = reason if offset is None else f"damaged at byte {offset}: {reason}"
+    return unreadable("file", reason, "a complete bag")
 
 
-class Unpacking:
-    """Decompression that never yields more than was declared, nor more than the limits in all.
+class Unpacker:
+    """Decompression that never yields more bytes than declared, nor more than its limits.
 
-    most_at_once: bytes of one chunk or message; most: bytes of one pass through a bag.
+    max_part: bytes of one chunk or message; max_total: bytes of one pass through a bag.
     """
 
-    def __init__(self, most_at_once: int, most: int) -> None:
-        self.most_at_once, self.most, self.taken = most_at_once, most, 0
+    def __init__(self, max_part: int, max_total: int) -> None:
+        self.max_part, self.max_total, self.total = max_part, max_total, 0
 
-    def take(self, size: int) -> None:
-        """Count bytes that are about to be unpacked; raise TooLargeError."""
-        if size > self.most_at_once:
-            raise TooLargeError(f"the bag has a part of {size} bytes, expected at most {self.most_at_once}")
-        self.taken += size
-        if self.taken > self.most:
-            raise TooLargeError(f"the bag unpacks to more than {self.most} bytes")
+    def count(self, size: int) -> None:
+        """Count bytes that will be unpacked; raise TooLargeError."""
+        if size > self.max_part:
+            raise TooLargeError(f"The bag has a part of {size} bytes, expected at most {self.max_part}")
+        self.total += size
+        if self.total > self.max_total:
+            raise TooLargeError(f"The bag unpacks to more than {self.max_total} bytes")
 
     def unpack(self, data: Data, compression: str, size: int) -> Data:
-        """Decompress `data` into exactly `size` bytes; raise ValueError or OSError where it is damaged."""
-        self.take(size)
+        """Decompress `data` into exactly `size` bytes; raise ValueError or OSError if it is damaged."""
+        self.count(size)
         if compression in ("", "none"):
             unpacked = data
         elif compression == "bz2":
@@ -141,19 +142,19 @@ class Unpacking:
         elif compression in ("lz4", "zstd"):
             unpacked = pa.decompress(data, decompressed_size=size, codec=compression, asbytes=True) if size else b""
         else:
-            raise ValueError(f"compressed by {compression!r}, expected zstd, lz4, bz2 or none")
+            raise ValueError(f"unknown compression {compression!r}, expected zstd, lz4, bz2 or none")
         if len(unpacked) != size:
-            raise ValueError(f"a part of {len(unpacked)} bytes, {size} declared")
+            raise ValueError(f"a part has {len(unpacked)} bytes, but {size} are declared")
         return unpacked
 
     def message(self, data: bytes) -> bytes:
-        """A message, which rosbag2 may have compressed by itself."""
-        if not data.startswith(b"\x28\xb5\x2f\xfd"):  # rosbag2 compressed it by zstd; no CDR message begins so
+        """Return a message, decompressed if rosbag2 has compressed it."""
+        if not data.startswith(b"\x28\xb5\x2f\xfd"):  # the start of zstd data; no CDR message starts like this
             return data
         try:
             with pa.CompressedInputStream(pa.BufferReader(data), "zstd") as stream:
-                unpacked: bytes = stream.read(self.most_at_once + 1)
+                unpacked: bytes = stream.read(self.max_part + 1)
         except OSError as error:
             raise damaged(str(error)) from None
-        self.take(len(unpacked))
+        self.count(len(unpacked))
         return unpacked

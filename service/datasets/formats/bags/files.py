@@ -1,6 +1,8 @@
-"""The files that bags are: rosbag 2.0 of ROS 1 (http://wiki.ros.org/Bags/Format/2.0), MCAP (https://mcap.dev/spec), and
-the sqlite3 of rosbag2. Neither an index nor a metadata.yaml is needed, so that a recording which was cut off is read
-too."""
+"""Reading bag files: rosbag 2.0 of ROS 1, MCAP, and the sqlite3 files of rosbag2.
+
+Specifications: http://wiki.ros.org/Bags/Format/2.0 and https://mcap.dev/spec. The readers need neither an index nor a
+metadata.yaml, so they also read incomplete recordings.
+"""
 
 from __future__ import annotations
 
@@ -19,38 +21,39 @@ from service.datasets.formats.bags.container import (
     Channel,
     Data,
     ScannedBag,
-    Unpacking,
+    Unpacker,
     damaged,
     type_name,
 )
 
+_CUT_OFF = "the file ends within a record at byte {}; its recording is read up to there"
 ROSBAG1_MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, CHUNK, CONNECTION = 0x02, 0x03, 0x05, 0x07
 _U32, _TIME = Struct("<I"), Struct("<II")
 
 
 class Rosbag1(ScannedBag):
-    """A bag of ROS 1; raise InvalidDataError where it is none."""
+    """A ROS 1 bag; raise InvalidDataError if the file is not one."""
 
     def scan(self) -> Iterator[tuple[Channel, int, Data]]:
-        """Channel, time of reception in ns and data of every message, up to where the file was cut off."""
+        """Yield the channel, reception time in ns and data of every message, up to where the file was cut off."""
         channels: dict[int, Channel] = {}
-        unpacking = self.unpacking()
+        unpacker = self.unpacker()
         with self.path.open("rb") as file:
             if file.read(len(ROSBAG1_MAGIC)) != ROSBAG1_MAGIC:
-                raise damaged("no rosbag of version 2.0")
-            for offset, header, data in self._records(file, unpacking):
+                raise damaged("not a rosbag of version 2.0")
+            for offset, header, data in self._records(file, unpacker):
                 try:
                     if header["op"] == bytes((CHUNK,)):
-                        yield from _chunk(header, data, channels, unpacking)
+                        yield from _chunk(header, data, channels, unpacker)
                     else:
                         yield from _record(header, data, channels)
                 except KeyError as error:
-                    raise damaged(f"a record without {error}", offset) from None
+                    raise damaged(f"a record has no field {error}", offset) from None
                 except (struct.error, ValueError, OSError) as error:
                     raise damaged(str(error), offset) from None
 
-    def _records(self, file: BinaryIO, unpacking: Unpacking) -> Iterator[tuple[int, dict[str, bytes], memoryview]]:
+    def _records(self, file: BinaryIO, unpacker: Unpacker) -> Iterator[tuple[int, dict[str, bytes], memoryview]]:
         end = os.fstat(file.fileno()).st_size
         while (offset := file.tell()) < end:
             try:
@@ -62,18 +65,18 @@ class Rosbag1(ScannedBag):
                 if size > end - file.tell():
                     raise EOFError
             except (EOFError, struct.error):
-                return self.tell(f"the file ends within a record, at byte {offset}: its recording is read up to there")
+                return self.add_fact(_CUT_OFF.format(offset))
             except ValueError as error:
                 raise damaged(str(error), offset) from None
             kind = header.get("op", b"")
             if kind == bytes((BAG_HEADER,)):
                 if header.get("encryptor"):
-                    raise damaged("encrypted")
+                    raise damaged("it is encrypted")
                 if not any(header.get("index_pos", b"")):
-                    self.tell("the bag has no index: its recording was cut off, and is read as far as it goes")
+                    self.add_fact("the bag has no index: its recording was cut off and is read as far as possible")
             if kind in (bytes((MESSAGE,)), bytes((CHUNK,)), bytes((CONNECTION,))):
-                if kind != bytes((CHUNK,)) or size > unpacking.most_at_once:
-                    unpacking.take(size)
+                if kind != bytes((CHUNK,)) or size > unpacker.max_part:
+                    unpacker.count(size)
                 yield offset, header, memoryview(file.read(size))
             else:
                 file.seek(size, os.SEEK_CUR)
@@ -81,10 +84,10 @@ class Rosbag1(ScannedBag):
 
 
 def _chunk(
-    header: dict[str, bytes], data: memoryview, channels: dict[int, Channel], unpacking: Unpacking
+    header: dict[str, bytes], data: memoryview, channels: dict[int, Channel], unpacker: Unpacker
 ) -> Iterator[tuple[Channel, int, Data]]:
     (size,) = _U32.unpack(header["size"])
-    unpacked = memoryview(unpacking.unpack(data, header["compression"].decode(), size))
+    unpacked = memoryview(unpacker.unpack(data, header["compression"].decode(), size))
     at = 0
     while at < size:
         inner, at = _sized(unpacked, at)
@@ -99,7 +102,7 @@ def _record(
     if kind == MESSAGE:
         (number,) = _U32.unpack(header["conn"])
         if number not in channels:
-            raise ValueError(f"a message of connection {number}, which is not declared before it")
+            raise ValueError(f"a message has connection {number}, which is not declared before it")
         seconds, nanoseconds = _TIME.unpack(header["time"])
         yield channels[number], seconds * 1_000_000_000 + nanoseconds, data
     elif kind == CONNECTION:
@@ -113,7 +116,7 @@ def _sized(content: memoryview, at: int) -> tuple[memoryview, int]:
     (length,) = _U32.unpack_from(content, at)
     at += 4
     if length > len(content) - at:
-        raise ValueError(f"a record of {length} bytes in a chunk, {len(content) - at} there")
+        raise ValueError(f"a record in a chunk declares {length} bytes, but {len(content) - at} remain")
     return content[at : at + length], at + length
 
 
@@ -124,7 +127,7 @@ def _header(content: memoryview) -> dict[str, bytes]:
         field, at = _sized(content, at)
         name, separator, value = bytes(field).partition(b"=")
         if not separator:
-            raise ValueError("a header's field without a value")
+            raise ValueError("a header field has no value")
         fields[name.decode("ascii")] = value
     return fields
 
@@ -136,37 +139,37 @@ _U16, _U64 = Struct("<H"), Struct("<Q")
 
 
 class Mcap(ScannedBag):
-    """An MCAP file; raise InvalidDataError where it is none."""
+    """An MCAP file; raise InvalidDataError if the file is not one."""
 
     def scan(self) -> Iterator[tuple[Channel, int, Data]]:
-        """Channel, time of reception in ns and data of every message, up to where the file was cut off."""
+        """Yield the channel, reception time in ns and data of every message, up to where the file was cut off."""
         schemas: dict[int, tuple[str, str | None]] = {}
         channels: dict[int, Channel] = {}
-        unpacking = self.unpacking()
+        unpacker = self.unpacker()
         with self.path.open("rb") as file:
             if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
-                raise damaged("no MCAP file")
-            for kind, offset, content in self._records(file, unpacking):
+                raise damaged("not an MCAP file")
+            for kind, offset, content in self._records(file, unpacker):
                 try:
-                    yield from _mcap_record(kind, content, schemas, channels, unpacking)
+                    yield from _mcap_record(kind, content, schemas, channels, unpacker)
                 except (struct.error, ValueError, OSError, KeyError) as error:
                     raise damaged(str(error), offset) from None
 
-    def _records(self, file: BinaryIO, unpacking: Unpacking) -> Iterator[tuple[int, int, memoryview]]:
+    def _records(self, file: BinaryIO, unpacker: Unpacker) -> Iterator[tuple[int, int, memoryview]]:
         end = os.fstat(file.fileno()).st_size
         while True:
             offset = file.tell()
             head = file.read(_HEAD.size)
             if len(head) < _HEAD.size:
-                return self.tell("the file has no end: its recording was cut off, and is read as far as it goes")
+                return self.add_fact("the file has no end: its recording was cut off and is read as far as possible")
             kind, length = _HEAD.unpack(head)
             if kind in (FOOTER, DATA_END):
                 return None
             if length > end - file.tell():
-                return self.tell(f"the file ends within a record, at byte {offset}: its recording is read up to there")
+                return self.add_fact(_CUT_OFF.format(offset))
             if kind in (SCHEMA, CHANNEL, MCAP_MESSAGE, MCAP_CHUNK):
-                if kind != MCAP_CHUNK or length > unpacking.most_at_once:  # a chunk counts once unpacked
-                    unpacking.take(length)
+                if kind != MCAP_CHUNK or length > unpacker.max_part:  # a chunk is counted when it is unpacked
+                    unpacker.count(length)
                 yield kind, offset, memoryview(file.read(length))
             else:
                 file.seek(length, os.SEEK_CUR)
@@ -177,14 +180,14 @@ def _mcap_record(
     content: memoryview,
     schemas: dict[int, tuple[str, str | None]],
     channels: dict[int, Channel],
-    unpacking: Unpacking,
+    unpacker: Unpacker,
 ) -> Iterator[tuple[Channel, int, Data]]:
     if kind == MCAP_MESSAGE:
         number, _, time, _ = _MESSAGE_HEAD.unpack_from(content)
         if number not in channels:
-            raise ValueError(f"a message of channel {number}, which is not declared before it")
+            raise ValueError(f"a message has channel {number}, which is not declared before it")
         if time >= 1 << 63:
-            raise ValueError(f"a message of {time} ns after 1970")
+            raise ValueError(f"a message has the time {time} ns, which is too large")
         yield channels[number], time, content[_MESSAGE_HEAD.size :]
     elif kind == SCHEMA:
         (number,) = _U16.unpack_from(content)
@@ -203,40 +206,38 @@ def _mcap_record(
         compression, at = _mcap_text(content, _CHUNK_HEAD.size)
         (packed,) = _U64.unpack_from(content, at)
         if packed > len(content) - at - 8:
-            raise ValueError(f"a chunk of {packed} bytes declared, {len(content) - at - 8} there")
-        unpacked = memoryview(unpacking.unpack(content[at + 8 : at + 8 + packed], compression, size))
+            raise ValueError(f"a chunk declares {packed} bytes, but {len(content) - at - 8} remain")
+        unpacked = memoryview(unpacker.unpack(content[at + 8 : at + 8 + packed], compression, size))
         if checksum and zlib.crc32(unpacked) != checksum:
-            raise ValueError("a chunk's checksum does not agree")
+            raise ValueError("the checksum of a chunk does not match")
         at = 0
         while at < size:
             inner, length = _HEAD.unpack_from(unpacked, at)
             at += _HEAD.size
             if length > size - at or inner == MCAP_CHUNK:
-                raise ValueError(f"a record of {length} bytes in a chunk, {size - at} there")
+                raise ValueError(f"a record in a chunk declares {length} bytes, but {size - at} remain")
             if inner in (SCHEMA, CHANNEL, MCAP_MESSAGE):
-                yield from _mcap_record(inner, unpacked[at : at + length], schemas, channels, unpacking)
+                yield from _mcap_record(inner, unpacked[at : at + length], schemas, channels, unpacker)
             at += length
 
 
 def _mcap_text(content: memoryview, at: int) -> tuple[str, int]:
     (length,) = _U32.unpack_from(content, at)
     if length > len(content) - at - 4:
-        raise ValueError(f"a text of {length} bytes, {len(content) - at - 4} there")
+        raise ValueError(f"a text declares {length} bytes, but {len(content) - at - 4} remain")
     return str(content[at + 4 : at + 4 + length], "utf-8"), at + 4 + length
 
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
-
-
 SQLITE_ERRORS = (sqlite3.Error, UnicodeDecodeError)
-"""What sqlite3 raises of a damaged file: its own messages may quote bytes that are no text."""
+"""Errors of sqlite3 for a damaged file; its messages may quote bytes that are not text."""
 
 
 class SqliteBag(Bag):
-    """One sqlite3 file of a rosbag2; raise InvalidDataError where it is none."""
+    """A sqlite3 file of a rosbag2; raise InvalidDataError if the file is not one."""
 
     def channels(self) -> dict[Channel, int]:
-        """Number of messages of every channel that has any."""
+        """Return the number of messages of every channel that has any."""
         try:
             with closing(self._connect()) as database:
                 definitions = _definitions(database)
@@ -253,8 +254,8 @@ class SqliteBag(Bag):
         return counts
 
     def messages(self, channel: Channel) -> Iterator[tuple[int, bytes]]:
-        """Time of reception in ns and data of every message of a channel's topic and type."""
-        unpacking = self.unpacking()
+        """Yield the reception time in ns and the data of every message of a channel's topic and type."""
+        unpacker = self.unpacker()
         try:
             with closing(self._connect()) as database:
                 rows = database.execute(
@@ -264,13 +265,13 @@ class SqliteBag(Bag):
                 )
                 for time, data in rows:
                     if not isinstance(time, int) or not isinstance(data, bytes):
-                        raise damaged("a message without a time or without data")
-                    yield time, unpacking.message(data)
+                        raise damaged("a message has no time or no data")
+                    yield time, unpacker.message(data)
         except SQLITE_ERRORS as error:
             raise damaged(str(error)) from None
 
     def _connect(self) -> sqlite3.Connection:
-        # immutable: no journal beside the file is looked for, and nothing is locked
+        # immutable=1: sqlite3 looks for no journal and locks nothing
         database = sqlite3.connect(f"{self.path.resolve().as_uri()}?mode=ro&immutable=1", uri=True)
         try:
             database.text_factory = _text
@@ -279,7 +280,7 @@ class SqliteBag(Bag):
             database.execute("PRAGMA cell_size_check = ON")
             for table in ("messages", "topics"):
                 if not _has_table(database, table):
-                    raise damaged(f"a database without a table {table!r}")
+                    raise damaged(f"the database has no table {table!r}")
         except BaseException:
             database.close()
             raise
@@ -287,7 +288,7 @@ class SqliteBag(Bag):
 
 
 def _has_table(database: sqlite3.Connection, name: str) -> bool:
-    """Whether there is a plain table: a view or a virtual one would run what the file says."""
+    """Return whether there is a plain table; a view or a virtual table could run SQL from the file."""
     query = "SELECT 1 FROM sqlite_master WHERE name = ? AND type = 'table' AND sql LIKE 'CREATE TABLE%'"
     return database.execute(query, (name,)).fetchone() is not None
 
@@ -297,7 +298,7 @@ def _text(raw: bytes) -> str:
 
 
 def _definitions(database: sqlite3.Connection) -> dict[str, str]:
-    """Definitions of types, as bags hold them since ROS 2 Iron."""
+    """Return the definitions by type; bags hold them since ROS 2 Iron."""
     if not _has_table(database, "message_definitions"):
         return {}
     rows = database.execute(

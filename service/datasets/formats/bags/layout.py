@@ -1,5 +1,7 @@
-"""Messages in bytes: their definitions as text (http://wiki.ros.org/msg), and where by these the fields of a message
-lie, in CDR (ROS 2) or in the form of ROS 1."""
+"""Parsing message definitions, and finding the fields of a message in its bytes, in CDR (ROS 2) or ROS 1 encoding.
+
+Definitions: http://wiki.ros.org/msg.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +11,8 @@ from struct import Struct
 
 from service.datasets.formats.bags.container import type_name
 
-MAX_CHARACTERS = 256 * 1024
-CDR_HEADER = 4
+MAX_DEFINITION_CHARS = 256 * 1024
+CDR_HEADER_BYTES = 4
 SEQUENCE = -1
 SIZES = {
     **dict.fromkeys(("bool", "byte", "char", "int8", "uint8"), 1),
@@ -18,7 +20,7 @@ SIZES = {
     **dict.fromkeys(("int32", "uint32", "float32"), 4),
     **dict.fromkeys(("int64", "uint64", "float64"), 8),
 }
-"""Bytes of the numbers that fields consist of."""
+"""Size in bytes by type of number."""
 _LINE = re.compile(
     r"\s*(?P<type>[A-Za-z][\w/]*)(?:<=\d+)?(?:\[(?P<bound><=)?(?P<count>\d*)\])?\s+(?P<name>[A-Za-z]\w*)(?P<rest>.*)"
 )
@@ -26,29 +28,28 @@ _LINE = re.compile(
 
 @dataclass(frozen=True)
 class Field:
-    """One field.
-
-    type: of SIZES, `string`, `time`, `duration` or of a message; count: None of one, SEQUENCE, or fixed.
-    """
+    """A field of a message."""
 
     name: str
     type: str
+    """One of SIZES, `string`, `time`, `duration`, or a message type."""
     count: int | None
+    """None for a single value, SEQUENCE, or the length of an array."""
 
 
 Types = dict[str, tuple[Field, ...]]
-"""Fields of messages by type."""
+"""Fields by message type."""
 
 
-def parse(text: str, root: str) -> Types:
-    """Fields of the type `root` and of those that follow it in `text`; raise ValueError."""
-    if len(text) > MAX_CHARACTERS:
-        raise ValueError(f"a definition of {len(text)} characters, expected at most {MAX_CHARACTERS}")
+def parse_definition(text: str, root: str) -> Types:
+    """Parse the definition of the type `root` and of the types after it in `text`; raise ValueError."""
+    if len(text) > MAX_DEFINITION_CHARS:
+        raise ValueError(f"it has {len(text)} characters, expected at most {MAX_DEFINITION_CHARS}")
     types: Types = {}
     name, fields = root, list[Field]()
     for number, line in enumerate([*text.splitlines(), "MSG: end/End"]):
         if line.startswith("MSG:"):
-            if number or fields:  # rosbags and others write the first type's name too
+            if number or fields:  # some writers also name the first type
                 types[name] = tuple(fields)
             name, fields = type_name(line[4:].strip()), []
         elif field := _field(line, name):
@@ -62,7 +63,7 @@ def _field(line: str, owner: str) -> Field | None:
         return None
     match = _LINE.match(line)
     if match is None:
-        raise ValueError(f"{line[:80]!r} in the definition of {owner}")
+        raise ValueError(f"{line[:80]!r} is not a field of {owner}")
     if match["rest"].lstrip().startswith("="):  # a constant
         return None
     count = None
@@ -78,7 +79,7 @@ def _field(line: str, owner: str) -> Field | None:
     return Field(match["name"], kind, count)
 
 
-# the beginning of what franka_ros2 publishes: the fields that follow differ between its releases
+# the start of franka_ros2's message; later fields differ between its releases
 _DEFINITIONS = """std_msgs/Header header
 CollisionIndicators collision_indicators
 sensor_msgs/JointState measured_joint_state
@@ -112,75 +113,77 @@ uint32 nanosec
 """
 
 
-def well_known(encoding: str) -> Types:
-    """Types whose definition need not be in the bag: rosbag2 stores none before ROS 2 Iron."""
-    types = parse(_DEFINITIONS, "franka_msgs/FrankaRobotState")
+def known_types(encoding: str) -> Types:
+    """Return the types that need no definition in the bag; rosbag2 stores none before ROS 2 Iron."""
+    types = parse_definition(_DEFINITIONS, "franka_msgs/FrankaRobotState")
     if encoding != "ros1":
         return types
     joint_state = "sensor_msgs/JointState"
-    return {joint_state: types[joint_state]} | parse("uint32 seq\ntime stamp\nstring frame_id", "std_msgs/Header")
+    return {joint_state: types[joint_state]} | parse_definition(
+        "uint32 seq\ntime stamp\nstring frame_id", "std_msgs/Header"
+    )
 
 
 @dataclass
 class Layout:
-    """Of messages of one length that agree in all texts and lengths of sequences.
-
-    numbers: first byte, count and type of numbers by the path of their field, `header.stamp` for example; texts by
-    path; fixed: the bytes in which such messages agree, (first byte, bytes); big_endian: of the numbers; fields: how
-    many there are.
-    """
+    """Layout of all messages that have the same size, texts and lengths of sequences."""
 
     length: int
+    """Size of a message in bytes."""
     big_endian: bool = False
     numbers: dict[str, tuple[int, int, str]] = field(default_factory=dict)
+    """First byte, count and type of numbers by the path of their field, such as `header.stamp`."""
     texts: dict[str, list[str]] = field(default_factory=dict)
+    """Texts by the path of their field."""
     fixed: list[tuple[int, bytes]] = field(default_factory=list)
+    """Bytes that are equal in all these messages: (first byte, bytes)."""
     fields: int = 0
+    """Number of fields."""
 
     def fits(self, data: bytes) -> bool:
-        """Whether a message has this layout."""
+        """Return whether a message has this layout."""
         return len(data) == self.length and all(data.startswith(known, at) for at, known in self.fixed)
 
 
-def lay_out(data: bytes, types: Types, root: str, last: str, encoding: str) -> Layout:
-    """Layout of a message of type `root` up to its field `last`; raise ValueError where the bytes do not agree."""
+def find_layout(data: bytes, types: Types, root: str, last: str, encoding: str) -> Layout:
+    """Return the layout of a message of type `root` up to its field `last`; raise ValueError if it does not fit."""
     layout = Layout(len(data))
     if encoding == "cdr":
-        if len(data) < CDR_HEADER or data[0] != 0 or data[1] > 1:
-            raise ValueError("no plain CDR")
+        if len(data) < CDR_HEADER_BYTES or data[0] != 0 or data[1] > 1:
+            raise ValueError("it is not plain CDR")
         layout.big_endian = data[1] == 0
         layout.fixed.append((0, data[:2]))
-    walk = _Walk(data, types, layout, encoding == "cdr")
-    walk.message(root, "", 0, last)
-    left = len(data) - walk.at
-    if types[root][-1].name == last and left > (3 if encoding == "cdr" else 0):  # some writers fill CDR up
-        raise ValueError(f"{left} bytes too many")
+    finder = _LayoutFinder(data, types, layout, encoding == "cdr")
+    finder.message(root, "", 0, last)
+    left = len(data) - finder.at
+    if types[root][-1].name == last and left > (3 if encoding == "cdr" else 0):  # some writers pad CDR
+        raise ValueError(f"it has {left} bytes too many")
     layout.fixed = _merged(layout.fixed)
     return layout
 
 
-class _Walk:
+class _LayoutFinder:
     def __init__(self, data: bytes, types: Types, layout: Layout, cdr: bool) -> None:
         self.data, self.types, self.layout, self.cdr = data, types, layout, cdr
-        self.at = CDR_HEADER if cdr else 0
+        self.at = CDR_HEADER_BYTES if cdr else 0
         self.length = Struct(">I" if layout.big_endian else "<I")
 
     def message(self, name: str, path: str, depth: int, last: str | None = None) -> None:
         if name not in self.types:
-            raise ValueError(f"type {name} without a definition")
+            raise ValueError(f"type {name} has no definition")
         if depth > 32:
-            raise ValueError(f"type {name} nested {depth} deep")
+            raise ValueError(f"type {name} is nested {depth} levels deep")
         for each in self.types[name]:
             self.field(each.type, each.count, f"{path}.{each.name}" if path else each.name, depth)
             if each.name == last:
                 return
         if last is not None:
-            raise ValueError(f"type {name} without {last}")
+            raise ValueError(f"type {name} has no field {last}")
 
     def count(self) -> None:
         self.layout.fields += 1
         if self.layout.fields > 2000:
-            raise ValueError("more than 2000 fields")
+            raise ValueError("it has more than 2000 fields")
 
     def field(self, kind: str, count: int | None, path: str, depth: int) -> None:
         self.count()
@@ -199,20 +202,20 @@ class _Walk:
                 self.layout.numbers[path] = (self.at, 1, kind)
             self.skip(8 * (1 if count is None else count))
         elif count is None:
-            self.one(kind, path, depth)
+            self.element(kind, path, depth)
         else:
-            # an element takes a byte at least, but for messages without fields
+            # every element takes at least a byte, except messages without fields
             if count > len(self.data):
-                raise ValueError(f"{path} of {count} elements declared in {len(self.data)} bytes")
+                raise ValueError(f"{path} declares {count} elements in {len(self.data)} bytes")
             for index in range(count):
-                self.one(kind, path if kind == "string" else f"{path}[{index}]", depth)
+                self.element(kind, path if kind == "string" else f"{path}[{index}]", depth)
 
-    def one(self, kind: str, path: str, depth: int) -> None:
+    def element(self, kind: str, path: str, depth: int) -> None:
         self.count()
         if kind == "string":
             self.layout.texts.setdefault(path, []).append(self.text())
         elif kind == "wstring":
-            raise ValueError(f"{path} is a wstring, which is not read")
+            raise ValueError(f"{path} is a wstring, which is not supported")
         else:
             self.message(kind, path, depth + 1)
 
@@ -234,11 +237,13 @@ class _Walk:
 
     def align(self, size: int) -> None:
         if self.cdr:
-            self.at += -(self.at - CDR_HEADER) % size
+            self.at += -(self.at - CDR_HEADER_BYTES) % size
 
     def skip(self, size: int) -> None:
         if size > len(self.data) - self.at:
-            raise ValueError(f"{size} bytes declared at byte {self.at}, {max(len(self.data) - self.at, 0)} there")
+            raise ValueError(
+                f"{size} bytes are declared at byte {self.at}, but {max(len(self.data) - self.at, 0)} remain"
+            )
         self.at += size
 
 

@@ -57,8 +57,8 @@ def _upgrade(connection: sa.Connection, prior: str | None) -> None:
     known = {script.revision for script in ScriptDirectory.from_config(config).walk_revisions()}
     if prior is not None and prior not in known:
         raise DatabaseVersionError(
-            f"the database has revision {prior!r}, expected at most {HEAD!r}: a later release of LIPServe has used it; "
-            "start that one, or set LIPSERVE_HOME, or LIPSERVE_DATABASE_URL, to another"
+            f"the database has revision {prior!r}, expected at most {HEAD!r}: a later release of LIPServe has used it. "
+            "Start that release, or set LIPSERVE_HOME or LIPSERVE_DATABASE_URL to another database"
         )
     if prior == FIRST:
         _check_contents(connection)

@@ -1,14 +1,14 @@
-// One data set: what to do about it, and tabs of what its signals and its report show.
+// One data set: recommendations, and tabs with its signals and its report.
 
 import { del, get, path } from "../api.js";
 import { h, replace } from "../dom.js";
 import { button, confirm, errorBox, heading, link, notice, tabs } from "../ui.js";
 import { excitationTab, frictionTab, preparationTab, timingTab } from "./data/figures.js";
-import { motion } from "./data/motion.js";
-import { about, toDo } from "./data/report.js";
-import { rowsOf } from "./data/stretch.js";
+import { signals } from "./data/signals.js";
+import { recommendations, summary } from "./data/report.js";
+import { rowsOf } from "./data/hold_out.js";
 
-/** Each tab: its name in the address, its label, and what it shows. */
+/** Tabs: name in the address, label, contents. */
 const TABS = [
   ["signals", "Signals", () => null],
   ["timing", "Timing", timingTab],
@@ -17,12 +17,12 @@ const TABS = [
   ["preparation", "Preparation", preparationTab],
 ];
 
-/** The page `#/data/{id}`; `?tab=timing` chooses a tab, `?hold_out=300-450` rows to hold out. */
+/** The page `#/data/{id}`; `?tab=timing` selects a tab, `?hold_out=300-450` the rows to hold out. */
 export async function render(view, { id, query }, { signal, title }) {
   const dataset = await get(path`/v1/datasets/${id}`, {}, signal);
   title(dataset.name);
   const state = { tab: TABS.some(([tab]) => tab === query.get("tab")) ? query.get("tab") : TABS[0][0], rows: rowsOf(query.get("hold_out")) };
-  const train = link("Train on it", "", "primary");
+  const train = link("Train on this recording", "", "primary");
   const remember = () => {
     const held = state.rows ? { hold_out: state.rows.join("-") } : {};
     const seen = new URLSearchParams({ ...(state.tab === TABS[0][0] ? {} : { tab: state.tab }), ...held }).toString();
@@ -35,12 +35,12 @@ export async function render(view, { id, query }, { signal, title }) {
   };
 
   const panel = h("div", { role: "tabpanel" });
-  let left = new AbortController();
-  signal.addEventListener("abort", () => left.abort());
+  let shownTab = new AbortController();
+  signal.addEventListener("abort", () => shownTab.abort());
   const show = async (tab) => {
-    left.abort();
-    left = new AbortController();
-    const mine = left.signal;
+    shownTab.abort();
+    shownTab = new AbortController();
+    const mine = shownTab.signal;
     state.tab = tab;
     remember();
     const [, label, figures] = TABS.find(([each]) => each === tab);
@@ -48,7 +48,7 @@ export async function render(view, { id, query }, { signal, title }) {
     panel.setAttribute("aria-label", label);
     replace(panel, h("div", { dataset: { tab } }, plots, figures(dataset)));
     try {
-      if (plots) await motion(plots, dataset, { rows: state.rows, choose, signal: mine });
+      if (plots) await signals(plots, dataset, { rows: state.rows, choose, signal: mine });
     } catch (error) {
       if (mine.aborted || error.name === "AbortError") return;
       if (error.name !== "ApiError") console.error(error);
@@ -56,15 +56,15 @@ export async function render(view, { id, query }, { signal, title }) {
     }
   };
   const remove = button("Delete", async () => {
-    const question = `Delete “${dataset.name}” (${dataset.id})? Its samples will be gone. Models trained on it stay, but can no longer be judged on it.`;
+    const question = `Delete “${dataset.name}” (${dataset.id})? Its samples are deleted. Models trained on it remain, but can no longer be evaluated on it.`;
     if (!(await confirm(question, "Delete"))) return;
     await del(path`/v1/datasets/${id}`);
-    notice(`${dataset.name} is deleted.`);
+    notice(`${dataset.name} deleted.`);
     location.hash = "#/data";
   }, { kind: "danger" });
   const list = h("div", {});
-  replace(view, heading(dataset.name, train, remove), about(dataset), toDo(dataset), list, panel);
+  replace(view, heading(dataset.name, train, remove), summary(dataset), recommendations(dataset), list, panel);
   const bar = tabs(TABS.map(([tab, label]) => [tab, label]), show, state.tab);
-  bar.setAttribute("aria-label", `What is known of ${dataset.name}`);
+  bar.setAttribute("aria-label", `Report of ${dataset.name}`);
   replace(list, bar);
 }

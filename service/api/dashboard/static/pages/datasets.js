@@ -1,4 +1,4 @@
-// All data sets, and uploading more.
+// All data sets, and the upload.
 
 import { get } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
@@ -13,23 +13,23 @@ export async function render(view, params, { signal, title }) {
   const list = h("div", {});
   const found = [];
   let cursor = null;
-  const more = button("Show older ones", () => load(cursor));
+  const more = button("Show older", () => load(cursor));
 
   const load = async (after = null) => {
     const page = await get("/v1/datasets", { cursor: after }, signal);
     if (after === null) found.length = 0;
     found.push(...page.items);
     cursor = page.next_cursor;
-    refresh(list, found.length ? listed(found) : nothing(), cursor ? more : null);
+    refresh(list, found.length ? datasetTable(found) : emptyState(), cursor ? more : null);
   };
   const { element, fillRobots } = uploader({ onUploaded: () => load(), signal });
   await load();
   replace(view, heading("Data sets", found.length ? link("Train a model", "#/train", "primary") : null), element, card("Recordings", list));
-  // uploads work without them
-  robots(signal).then(fillRobots, (error) => error.name === "AbortError" || notice(`robots: ${error.message}`, "bad"));
+  // uploads work without the list of robots
+  robots(signal).then(fillRobots, (error) => error.name === "AbortError" || notice(`The robots could not be loaded: ${error.message}`, "bad"));
 }
 
-function listed(datasets) {
+function datasetTable(datasets) {
   return table(
     [
       { label: "Name", cell: (row) => link(row.name, `#/data/${row.id}`) },
@@ -49,13 +49,13 @@ function listed(datasets) {
 
 function findings(report) {
   if (report.warnings.length) return badge(counted(report.warnings.length, "warning"), "warn");
-  return report.advice.length ? badge(counted(report.advice.length, "hint"), "plain") : badge("nothing found", "good");
+  return report.advice.length ? badge(counted(report.advice.length, "recommendation"), "plain") : badge("no issues", "good");
 }
 
-function nothing() {
+function emptyState() {
   return empty(
     [
-      "There are no recordings yet. Upload one above, or make one by simulation: ",
+      "No recordings yet. Upload one above, or simulate one: ",
       h("code", {}, "lipserve simulate panda panda.csv"),
     ],
   );

@@ -2,10 +2,10 @@
 
 import { get } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
-import { ago, percent, seconds, when } from "../format.js";
+import { ago, percent, seconds, sentence, when } from "../format.js";
 import { listing } from "../tables.js";
-import { badge, button, card, empty, every, heading, link, progress } from "../ui.js";
-import { ACTIVE, left, stage } from "./job/words.js";
+import { badge, button, card, empty, heading, link, progress, repeat } from "../ui.js";
+import { ACTIVE, remaining, stage } from "./job/words.js";
 import { QUALITY_HINT, qualityColumns } from "./quality.js";
 
 /** The page `#/jobs`. */
@@ -28,10 +28,10 @@ export async function render(view, params, { signal, title }) {
     const ids = new Set(newest.map((job) => job.id));
     const jobs = [...newest, ...older.filter((job) => !ids.has(job.id))];
     if (jobs.length) table.show(jobs);
-    refresh(list, jobs.length ? [table.element, hint] : nothing(), cursor ? more : null);
+    refresh(list, jobs.length ? [table.element, hint] : emptyState(), cursor ? more : null);
   };
   let newest = [];
-  const more = button("Show older ones", async () => {
+  const more = button("Show older", async () => {
     const page = await get("/v1/jobs", { cursor }, signal);
     older = [...older, ...page.items];
     cursor = page.next_cursor;
@@ -41,7 +41,7 @@ export async function render(view, params, { signal, title }) {
     const page = await get("/v1/jobs", {}, signal);
     if (!older.length) cursor = page.next_cursor;
     newest = page.items;
-    const now = JSON.stringify([newest, Math.floor(Date.now() / 30_000)]); // “2 min ago” grows old too
+    const now = JSON.stringify([newest, Math.floor(Date.now() / 30_000)]); // also redraw for texts such as “2 min ago”
     if (now !== seen) draw(newest);
     seen = now;
   };
@@ -49,7 +49,7 @@ export async function render(view, params, { signal, title }) {
   await load();
   let read = Date.now();
   replace(view, heading("Training", link("Train a model", "#/train", "primary")), stale, card("Jobs", list));
-  every(
+  repeat(
     2,
     async () => {
       try {
@@ -59,7 +59,7 @@ export async function render(view, params, { signal, title }) {
       } catch (error) {
         if (error.name === "AbortError") return;
         stale.hidden = false;
-        stale.textContent = `What is shown is as of ${when(read / 1000)}: ${error.message} Trying again.`;
+        stale.textContent = `Last update: ${when(read / 1000)}. ${sentence(error.message)} Retrying.`;
       }
     },
     signal,
@@ -74,22 +74,22 @@ const COLUMNS = [
     cell: (job) => (job.state === "succeeded" ? column.cell(job) : "–"),
   })),
   { label: "Result", value: (job) => job.version, cell: (job) => (job.version === null ? "–" : link(`version ${job.version}`, `#/models/${job.model}?version=${job.version}`)) },
-  { label: "Progress", cell: far },
+  { label: "Progress", cell: progressCell },
   { label: "Estimator", value: (job) => job.estimator, cell: (job) => job.estimator },
   { label: "Recordings", numeric: true, value: (job) => job.datasets.length, cell: (job) => job.datasets.length },
   { label: "Queued", value: (job) => job.created_at, first: "descending", cell: (job) => h("time", { datetime: job.created_at, title: when(job.created_at) }, ago(job.created_at)) },
 ];
 
-function far(job) {
+function progressCell(job) {
   if (job.state === "failed") return job.error?.message ?? "failed";
   if (!ACTIVE.has(job.state)) {
     const took = job.progress.elapsed_s ? `took ${seconds(job.progress.elapsed_s)}` : "";
-    return [took, job.refresh ? "refresh of a model that learns" : ""].filter(Boolean).join(", ");
+    return [took, job.refresh ? "automatic retraining" : ""].filter(Boolean).join(", ");
   }
   const done = job.progress.fraction;
-  return [`${percent(done, 0)}, ${stage(job)}`, left(job) ? `, ${left(job)} left` : "", progress(done, `Progress of ${job.model}`)];
+  return [`${percent(done, 0)}, ${stage(job)}`, remaining(job) ? `, ${remaining(job)} left` : "", progress(done, `Progress of ${job.model}`)];
 }
 
-function nothing() {
-  return empty("Nothing has been trained yet. Upload a recording, then train a model on it.", link("Upload data", "#/data"), link("Train a model", "#/train", "primary"));
+function emptyState() {
+  return empty("No training jobs yet. Upload a recording, then train a model on it.", link("Upload data", "#/data"), link("Train a model", "#/train", "primary"));
 }

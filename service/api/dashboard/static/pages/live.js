@@ -1,49 +1,49 @@
-// The live page: which robots stream now, and of one model what streams measure and what was predicted, as it comes.
+// Live page: list of streaming robots, or live plots and online learning of one model.
 
 import { pages } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
-import { count, counted } from "../format.js";
-import { Linked } from "../linked.js";
+import { count, counted, sentence } from "../format.js";
+import { LinkedPlots } from "../linked.js";
 import { plotly } from "../plots.js";
-import { card, heading, offer, select } from "../ui.js";
+import { card, heading, select, updateSelect } from "../ui.js";
 import { alarmMarks, alarms } from "./live/alarms.js";
-import { carriedCard, externalCard } from "./live/carried.js";
+import { payloadCard, externalCard } from "./live/payload.js";
 import { follow } from "./live/connection.js";
 import { innovation } from "./live/innovation.js";
-import { moving } from "./live/moving.js";
-import { quiet } from "./live/quiet.js";
+import { liveArm } from "./live/arm.js";
+import { noStreamHint } from "./live/no_stream.js";
 import { address, robots } from "./live/robots.js";
 import { Rows } from "./live/rows.js";
-import { learningFacts, qualityCard, vitals } from "./live/standing.js";
+import { latencyLine, learningFacts, qualityCard } from "./live/status.js";
 import { switches } from "./live/switches.js";
 import { toolbar } from "./live/toolbar.js";
 import { torque } from "./live/torque.js";
 
 const DRAW_MS = 300;
-const MOST_MODELS = 500;
-const STALE_S = 3;
-const BREATH = 3; // times as long as drawing takes, nothing is drawn
-const LONGEST_BREATH_MS = 1500;
+const MAX_MODELS = 500;
+const STALE_AFTER_S = 3;
+const PAUSE_FACTOR = 3; // pause after drawing, relative to its duration
+const MAX_PAUSE_MS = 1500;
 
-/** The page `#/live`, where robots are listed, and `#/live/{name}`; `?window=120&joint=joint4` chooses what is seen. */
+/** The pages `#/live`, a list of robots, and `#/live/{name}`; `?window=120&joint=joint4` sets the view. */
 export async function render(view, { name, query }, { signal, title }) {
   title(name ? `${name} live` : "Live");
   if (!name) return robots(view, signal);
-  const models = (await pages("/v1/models", MOST_MODELS, {}, signal)).map((model) => model.name);
-  await followed(view, name, models, query, signal);
+  const models = (await pages("/v1/models", MAX_MODELS, {}, signal)).map((model) => model.name);
+  await followModel(view, name, models, query, signal);
 }
 
-/** Follow one model until the page is left; throws what the service refuses for good. */
-async function followed(view, name, models, query, signal) {
+/** Follow a model until the page is left; throw permanent errors of the service. */
+async function followModel(view, name, models, query, signal) {
   const learning = switches(name, signal);
   const page = parts(name, models, learning.element);
   const seen = { rows: null, status: null, connection: null, pausedAt: null, drawn: 0, drawAt: 0, lost: 0 };
   const choice = { window: 30, joint: null, cursor: null };
-  const stream = streamChoice(seen);
+  const stream = streamSelect(seen);
   let plots = null, drawing = false;
-  plotly(); // is needed as soon as rows come
+  plotly(); // load it before the first rows arrive
 
-  const again = () => {
+  const redraw = () => {
     seen.drawn = -1;
     seen.drawAt = 0;
   };
@@ -53,53 +53,53 @@ async function followed(view, name, models, query, signal) {
     tools?.point(x);
     plots?.torque.point();
   };
-  const linked = new Linked({ moved: point, stays: false });
+  const linked = new LinkedPlots({ moved: point, stays: false });
   let tools = null;
 
   const begin = (status) => {
     const { joint_names: joints, joint_types: types } = status;
     if (seen.rows?.joints.join() === joints.join()) return;
     seen.rows = new Rows(joints);
-    tools = toolbar(name, joints, choice, query, { changed: again, point });
+    tools = toolbar(name, joints, choice, query, { changed: redraw, point });
     replace(page.tools, tools.element);
     const pick = (joint) => tools.pick(joint);
     plots = {
       torque: torque(page.torque, joints, types, choice, linked, { pick, signal }),
       innovation: innovation(page.innovation, joints, choice, linked, signal),
-      arm: moving(page.arm, name, () => seen.rows.pose(), signal),
+      arm: liveArm(page.arm, name, () => seen.rows.pose(), signal),
     };
-    again();
+    redraw();
   };
-  const hear = (event, data) => {
+  const onEvent = (event, data) => {
     if (event === "lost") seen.lost += data.events;
-    if (event === "rows") data.parts.forEach((part) => seen.rows?.take(part));
+    if (event === "rows") data.parts.forEach((part) => seen.rows?.add(part));
     if (event !== "status") return;
     begin(data);
     seen.status = data;
-    data.novel.forEach((said) => seen.rows.mark(said));
-    learning.look(data);
-    tell();
+    data.novel.forEach((rows) => seen.rows.mark(rows));
+    learning.update(data);
+    update();
   };
-  const tell = () => {
-    said(page, seen, name);
+  const update = () => {
+    showState(page, seen, name);
     if (!seen.status) return;
-    page.standing.hidden = false;
-    refresh(page.carried, carriedCard(seen.status));
+    page.status.hidden = false;
+    refresh(page.payload, payloadCard(seen.status));
     refresh(page.learning, learningFacts(seen.status));
     refresh(page.quality, qualityCard(seen.status));
-    refresh(page.vitals, vitals(seen.status));
+    refresh(page.latency, latencyLine(seen.status));
     alarms(page, seen.status, name, signal);
     const names = seen.rows.streams();
-    refresh(page.streams, names.length < 2 ? null : offer(stream, names, seen.rows.chosen));
+    refresh(page.streams, names.length < 2 ? null : updateSelect(stream, names, seen.rows.chosen));
   };
   const draw = async () => {
-    if (!seen.rows?.came || drawing || seen.pausedAt !== null || document.hidden || seen.drawn === seen.rows.version) return;
+    if (!seen.rows?.received || drawing || seen.pausedAt !== null || document.hidden || seen.drawn === seen.rows.version) return;
     if (Date.now() < seen.drawAt) return;
     drawing = true;
     seen.drawn = seen.rows.version;
     const began = Date.now();
     try {
-      page.plots.hidden = false; // a plot takes its width from a place that is seen
+      page.plots.hidden = false; // a plot takes its width from its visible place
       const shown = seen.rows.shown(choice.window);
       const joint = await plots.torque.draw(shown);
       linked.mark(alarmMarks(seen.status.alarms, seen.rows.chosen, seen.rows.newest()));
@@ -108,33 +108,33 @@ async function followed(view, name, models, query, signal) {
       await plots.innovation.draw(shown, seen.status, joint);
     } finally {
       drawing = false;
-      // on a slow machine less often: the page stays usable
-      if (seen.drawn !== -1) seen.drawAt = Date.now() + Math.min(BREATH * (Date.now() - began), LONGEST_BREATH_MS);
+      // draw less often on a slow machine, so that the page stays responsive
+      if (seen.drawn !== -1) seen.drawAt = Date.now() + Math.min(PAUSE_FACTOR * (Date.now() - began), MAX_PAUSE_MS);
     }
   };
   page.pause.addEventListener("click", () => {
     seen.pausedAt = seen.pausedAt === null ? Date.now() : null;
-    page.pause.textContent = seen.pausedAt === null ? "Pause plots" : "Go on";
-    tell();
+    page.pause.textContent = seen.pausedAt === null ? "Pause plots" : "Resume plots";
+    update();
   });
 
   replace(view, page.all);
-  tell();
-  const timers = [setInterval(draw, DRAW_MS), setInterval(() => said(page, seen, name), 1000)];
-  document.addEventListener("themechange", again);
+  update();
+  const timers = [setInterval(draw, DRAW_MS), setInterval(() => showState(page, seen, name), 1000)];
+  document.addEventListener("themechange", redraw);
   signal.addEventListener("abort", () => {
     timers.forEach(clearInterval);
-    document.removeEventListener("themechange", again);
+    document.removeEventListener("themechange", redraw);
   });
-  await follow(name, signal, hear, (connection) => {
+  await follow(name, signal, onEvent, (connection) => {
     seen.connection = connection;
-    tell();
+    update();
   });
 }
 
-/** The places of the page. */
+/** Create the parts of the page. */
 function parts(name, models, learning) {
-  const places = ["about", "quiet", "held", "carried", "external", "learning", "quality", "vitals", "alarms", "tools", "torque", "arm", "innovation"];
+  const places = ["about", "hint", "decision", "payload", "external", "learning", "quality", "latency", "alarms", "tools", "torque", "arm", "innovation"];
   const page = Object.fromEntries(places.map((each) => [each, h("div")]));
   page.state = h("p", { role: "status", class: "actions" });
   page.about.className = "hint";
@@ -144,46 +144,46 @@ function parts(name, models, learning) {
   choice.setAttribute("aria-label", "Model to follow");
   choice.style.width = "auto";
   page.plots = h("div", { hidden: true }, page.tools, page.torque, page.innovation);
-  const stage = h("div", { class: "stage" }, page.plots, h("div", { class: "aside" }, page.arm, page.carried, page.external));
-  page.standing = h("div", { class: "grid wide", hidden: true }, card("Learning", learning, page.learning), page.quality);
-  const top = h("div", { class: "now" }, h("div", {}, page.state, page.about), page.vitals);
-  page.all = [heading(`${name} live`, choice, page.streams, page.pause), top, page.held, page.quiet, stage, page.standing, page.alarms];
+  const stage = h("div", { class: "stage" }, page.plots, h("div", { class: "aside" }, page.arm, page.payload, page.external));
+  page.status = h("div", { class: "grid wide", hidden: true }, card("Learning", learning, page.learning), page.quality);
+  const top = h("div", { class: "now" }, h("div", {}, page.state, page.about), page.latency);
+  page.all = [heading(`${name} live`, choice, page.streams, page.pause), top, page.decision, page.hint, stage, page.status, page.alarms];
   return page;
 }
 
-/** Say how old what is shown is, and how much of it. */
-function said(page, seen, name) {
+/** Show the state of the connection and the age of the data. */
+function showState(page, seen, name) {
   const { rows, status, connection } = seen;
   const age = rows?.age() ?? null;
   const lost = connection?.state === "lost";
   const words = [];
   if (!connection) words.push(["busy", "◌ connecting"]);
-  else if (lost) words.push(["bad", `✕ connection lost: ${connection.why}. What is shown is old. Trying again`]);
-  else if (!rows?.came) words.push(["plain", "· connected, no rows yet"]);
-  else if (age > STALE_S) words.push(["warn", "! no new rows: what is shown is old"]);
+  else if (lost) words.push(["bad", `✕ connection lost. ${sentence(connection.why)} Data is outdated. Retrying`]);
+  else if (!rows?.received) words.push(["plain", "· connected, no rows yet"]);
+  else if (age > STALE_AFTER_S) words.push(["warn", "! no new rows, data is outdated"]);
   else words.push(["good", "✓ live"]);
-  if (seen.pausedAt !== null) words.push(["warn", "! plots paused, rows still come"]);
+  if (seen.pausedAt !== null) words.push(["warn", "! plots paused, still receiving rows"]);
   refresh(page.state, ...words.map(([kind, text]) => h("span", { class: `badge ${kind}`, style: "white-space: normal" }, text)));
-  page.pause.hidden = !rows?.came;
-  page.plots.classList.toggle("old", lost || age > STALE_S);
-  refresh(page.quiet, rows?.came || lost ? null : quiet(name, status));
-  refresh(page.about, rows?.came ? about(seen, age) : null);
+  page.pause.hidden = !rows?.received;
+  page.plots.classList.toggle("old", lost || age > STALE_AFTER_S);
+  refresh(page.hint, rows?.received || lost ? null : noStreamHint(name, status));
+  refresh(page.about, rows?.received ? streamFacts(seen, age) : null);
 }
 
-function about({ rows, lost, pausedAt }, age) {
+function streamFacts({ rows, lost, pausedAt }, age) {
   const rate = rows.rate();
   const texts = [
     `Stream ${rows.chosen}. `,
-    age > STALE_S ? `The newest row came ${Math.round(age)} s ago. ` : null,
-    rate ? `${counted(Math.round(rate.came), "row")} come in each second. This page shows ${count(Math.round(rate.shown))} of them, those kept out of learning first. ` : null,
-    pausedAt === null ? null : `Plots are paused since ${new Date(pausedAt).toLocaleTimeString("en-GB")}. `,
-    lost ? `This page was too slow and missed ${counted(lost, "event")}. ` : null,
+    age > STALE_AFTER_S ? `Last row ${Math.round(age)} s ago. ` : null,
+    rate ? `Receiving ${counted(Math.round(rate.received), "row")} per second, ${count(Math.round(rate.shown))} of them shown; rejected rows take precedence. ` : null,
+    pausedAt === null ? null : `Plots paused since ${new Date(pausedAt).toLocaleTimeString("en-GB")}. `,
+    lost ? `${counted(lost, "event")} skipped because this page was too slow. ` : null,
   ];
   return h("p", {}, texts);
 }
 
-/** A choice of streams, where there are several. */
-function streamChoice(seen) {
+/** Create the select of the stream. */
+function streamSelect(seen) {
   const made = select([], null, (name) => {
     seen.rows.choose(name);
     seen.drawn = -1;

@@ -1,51 +1,51 @@
-// One model: how well it predicts, what it has learnt, its versions, and a form to ask it.
+// One model: accuracy, parameters, versions, online learning, and a form for predictions.
 
 import { get, pages, path, put } from "../api.js";
 import { h, refresh, replace } from "../dom.js";
 import { when } from "../format.js";
 import { badge, button, errorBox, heading, link, loading, notice, tabs } from "../ui.js";
-import { warned } from "./data/prose.js";
+import { warningBanner } from "./data/prose.js";
 import { accuracy } from "./model/accuracy.js";
 import { arm } from "./model/arm.js";
-import { ask } from "./model/ask.js";
+import { predictForm } from "./model/predict.js";
 import { chooser, firstChoice } from "./model/choice.js";
 import { learning } from "./model/learning.js";
 import { lineage } from "./model/lineage.js";
 import { parts } from "./model/parts.js";
-import { mayAnswer, promoted } from "./model/promotion.js";
+import { promotionCheck, promotionNote } from "./model/promotion.js";
 import { confirmServing } from "./model/serving.js";
 import { versions } from "./model/versions.js";
 
-/** Each tab: its name in the address, its label, what shows it, and what of the choice above the tabs it goes by. */
+/** Tabs: name in the address, label, function that draws it, selects above the tabs that it uses. */
 const TABS = [
   ["accuracy", "Accuracy", accuracy, { data: true, version: true }],
-  ["parts", "Parts and friction", parts, { data: true, version: true }],
+  ["parts", "Components and friction", parts, { data: true, version: true }],
   ["arm", "Arm", arm, { version: true }],
   ["versions", "Versions", versions, {}],
   ["lineage", "Lineage", lineage, { version: true }],
-  ["ask", "Ask", ask, { version: true }],
+  ["ask", "Predict", predictForm, { version: true }],
   ["learning", "Learning", learning, {}],
 ];
 
-/** The page `#/models/{name}`; `?version=2&dataset=ID&part=held_out&tab=versions` chooses beforehand. */
+/** The page `#/models/{name}`; `?version=2&dataset=ID&part=held_out&tab=versions` sets the selects and the tab. */
 export async function render(view, { name, query }, { signal, title }) {
   title(name);
   const where = path`/v1/models/${name}`;
   const [model, datasets] = await Promise.all([get(where, {}, signal), pages("/v1/datasets", 200, {}, signal)]);
-  const asked = Number(query.get("version"));
-  const number = model.versions.some((each) => each.version === asked) ? asked : shownFirst(model);
+  const requested = Number(query.get("version"));
+  const number = model.versions.some((each) => each.version === requested) ? requested : defaultVersion(model);
   const version = await get(`${where}/versions/${number}`, {}, signal);
   const state = { name, where, model, version, datasets, ...firstChoice(version, datasets, query) };
   state.tab = TABS.some(([tab]) => tab === query.get("tab")) ? query.get("tab") : "accuracy";
 
   const choice = h("div", { class: "grid" }), panel = h("div", { role: "tabpanel" });
-  let left = new AbortController();
-  signal.addEventListener("abort", () => left.abort());
+  let shownTab = new AbortController();
+  signal.addEventListener("abort", () => shownTab.abort());
 
   const show = async () => {
-    left.abort();
-    left = new AbortController();
-    const mine = left.signal;
+    shownTab.abort();
+    shownTab = new AbortController();
+    const mine = shownTab.signal;
     const [tab, label, draw, needs] = TABS.find(([each]) => each === state.tab);
     remember(state);
     updateTop();
@@ -61,7 +61,7 @@ export async function render(view, { name, query }, { signal, title }) {
       replace(inner, errorBox(error, show));
     }
   };
-  /** Look at another version. */
+  /** Show another version. */
   const select = async (chosen, tab = state.tab) => {
     replace(panel, loading());
     state.version = await get(`${where}/versions/${chosen}`, {}, signal);
@@ -69,10 +69,10 @@ export async function render(view, { name, query }, { signal, title }) {
     if (tab !== state.tab) list.querySelector(`[data-name="${tab}"]`).click();
     else await show();
   };
-  /** Read the model again, after something about it was changed here. */
+  /** Read the model again after a change. */
   const reload = async () => {
     state.model = await get(where, {}, signal);
-    if (!state.model.versions.some((each) => each.version === state.version.version)) await select(shownFirst(state.model));
+    if (!state.model.versions.some((each) => each.version === state.version.version)) await select(defaultVersion(state.model));
     else await show();
   };
 
@@ -86,19 +86,19 @@ export async function render(view, { name, query }, { signal, title }) {
   replace(view, top, choice, list, panel);
 }
 
-/** The version that a page shows where none is named. */
-function shownFirst(model) {
+/** Return the version that is shown by default. */
+function defaultVersion(model) {
   return model.serving_version ?? model.latest_version;
 }
 
-/** What stands above all tabs: what can be done, and what is looked at. Returns its element, and what brings it up to date. */
+/** Create the header with actions and the shown version. Returns its element and a function that updates it. */
 function header(state, reload) {
   const { name, where } = state;
   const promote = button("", async () => {
     const shown = state.version.version;
     if (!(await confirmServing(name, state.version, state.model.serving_version))) return;
     await put(`${where}/aliases/serving`, { version: shown });
-    notice(`Version ${shown} of ${name} answers from now on.`);
+    notice(`Version ${shown} of ${name} is now serving.`);
     await reload();
   }, { kind: "primary" });
   const actions = h("div", { class: "actions" }), about = h("div", {});
@@ -109,18 +109,18 @@ function header(state, reload) {
     const shown = version.version;
     const names = Object.entries(aliases).map(([alias, number]) => `${alias} → ${number}`);
     promote.textContent = `Serve version ${shown}`;
-    const { word, kind, why } = mayAnswer(version);
-    promote.title = `${why}.`;
+    const { word, kind, why } = promotionCheck(version);
+    promote.title = why;
     refresh(actions, shown === serving ? badge("serving") : [badge(word, kind), promote], follow, train);
-    const other = serving === null ? "no version answers" : `version ${serving} answers`;
-    const answers = shown === serving ? `Version ${shown} answers` : `You look at version ${shown}, ${other}`;
-    refresh(about, h("p", { class: "muted" }, [answers, version.estimator, `made ${when(version.created_at)}`, ...names].join(" · ")), shown === serving || promoted(version)?.matches(".banner") ? promoted(version) : h("p", { class: "hint" }, `${why}.`), warned(version.warnings));
+    const other = serving === null ? "no version is serving" : `version ${serving} is serving`;
+    const answers = shown === serving ? `Version ${shown} is serving` : `Viewing version ${shown} · ${other}`;
+    refresh(about, h("p", { class: "muted" }, [answers, version.estimator, `created ${when(version.created_at)}`, ...names].join(" · ")), shown === serving || promotionNote(version)?.matches(".banner") ? promotionNote(version) : h("p", { class: "hint" }, why), warningBanner(version.warnings));
   };
   return [h("div", {}, heading(name, actions), about), update];
 }
 
-/** The address names what is looked at, so that it can be shared; nothing is loaded for it. */
+/** Keep the selection in the address, so that it can be shared; do not navigate. */
 function remember({ name, version, dataset, part, tab }) {
-  const said = new URLSearchParams({ version: version.version, ...(dataset ? { dataset } : {}), ...(part === "all" ? {} : { part }), tab });
-  history.replaceState(null, "", `#/models/${encodeURIComponent(name)}?${said}`);
+  const search = new URLSearchParams({ version: version.version, ...(dataset ? { dataset } : {}), ...(part === "all" ? {} : { part }), tab });
+  history.replaceState(null, "", `#/models/${encodeURIComponent(name)}?${search}`);
 }

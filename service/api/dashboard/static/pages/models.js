@@ -1,4 +1,4 @@
-// All models: which version answers, how good it is, where to look at it.
+// All models: their serving version and its quality.
 
 import { pages } from "../api.js";
 import { h, replace } from "../dom.js";
@@ -7,25 +7,25 @@ import { listing } from "../tables.js";
 import { card, empty, heading, link } from "../ui.js";
 import { QUALITY_HINT, qualityColumns } from "./quality.js";
 
-const MOST = 500;
+const MAX_MODELS = 500;
 
 /** The page `#/models`. */
 export async function render(view, _params, { signal, title }) {
   title("Models");
-  const models = await pages("/v1/models", MOST, {}, signal);
+  const models = await pages("/v1/models", MAX_MODELS, {}, signal);
   const train = link("Train a model", "#/train", "primary");
   if (!models.length) {
-    const said = "There is no model yet. Upload a recording of your robot, then train a model on it: this takes minutes.";
-    replace(view, heading("Models"), empty(said, link("Upload a recording", "#/data", "primary"), link("Train a model", "#/train")));
+    const hint = "No models yet. Upload a recording of your robot, then train a model on it. This takes minutes.";
+    replace(view, heading("Models"), empty(hint, link("Upload a recording", "#/data", "primary"), link("Train a model", "#/train")));
     return;
   }
   const serving = (model) => model.versions.find((each) => each.version === model.serving_version);
   const columns = [
     { label: "Model", value: (model) => model.name, cell: (model) => link(model.name, address(model.name)) },
     ...qualityColumns((model) => ({ quality: serving(model)?.quality, joints: null })),
-    { label: "Answers", value: (model) => model.serving_version, cell: (model) => link(model.serving_version === null ? "none yet" : `version ${model.serving_version}`, `${address(model.name)}?tab=versions`) },
+    { label: "Serving version", value: (model) => model.serving_version, cell: (model) => link(model.serving_version === null ? "none" : `version ${model.serving_version}`, `${address(model.name)}?tab=versions`) },
     { label: "Estimator", value: (model) => serving(model)?.estimator, cell: (model) => serving(model)?.estimator ?? "–" },
-    { label: "Made", value: (model) => serving(model)?.created_at, first: "descending", cell: (model) => (serving(model) ? time(serving(model).created_at) : "–") },
+    { label: "Created", value: (model) => serving(model)?.created_at, first: "descending", cell: (model) => (serving(model) ? time(serving(model).created_at) : "–") },
     { label: "Versions", numeric: true, value: (model) => model.versions.length, first: "descending", cell: (model) => count(model.versions.length) },
     { label: "Aliases", cell: (model) => aliases(model.aliases) },
     { label: "Live", cell: (model) => h("a", { href: `#/live/${encodeURIComponent(model.name)}`, "aria-label": `Follow ${model.name} live` }, "follow") },
@@ -40,7 +40,7 @@ export async function render(view, _params, { signal, title }) {
   replace(
     view,
     heading("Models", train),
-    card("All models", list.element, h("p", { class: "hint" }, QUALITY_HINT), models.length === MOST ? h("p", { class: "hint" }, `The newest ${MOST} are shown.`) : null),
+    card("All models", list.element, h("p", { class: "hint" }, QUALITY_HINT), models.length === MAX_MODELS ? h("p", { class: "hint" }, `Showing the newest ${MAX_MODELS} models.`) : null),
   );
 }
 

@@ -1,4 +1,4 @@
-// Overview: every robot at a glance, what trains now, whether the service is well, and what to do first.
+// Overview: models, training jobs, health of the service, first steps.
 
 import { get } from "../api.js";
 import { h, replace } from "../dom.js";
@@ -9,8 +9,8 @@ import { jobBoard } from "./overview/jobs.js";
 import { robots } from "./overview/robots.js";
 import { steps } from "./overview/steps.js";
 
-const OFTEN_S = 2;
-const MODELS = 24;
+const PERIOD_S = 2;
+const MAX_MODELS = 24;
 
 /** The page `#/`. */
 export async function render(view, _params, { signal, title }) {
@@ -28,22 +28,22 @@ export async function render(view, _params, { signal, title }) {
   const waiting = loading();
   places.robots.append(waiting);
   const show = robots(places.robots);
-  const seen = { data: null, models: null, jobs: null };
-  const tell = () => {
-    if (seen.data !== null && seen.models && seen.jobs) steps(places.steps, seen);
+  const found = { data: null, models: null, jobs: null };
+  const showSteps = () => {
+    if (found.data !== null && found.models && found.jobs) steps(places.steps, found);
   };
-  health(places.health, OFTEN_S, signal);
-  follow(OFTEN_S, places.stale, signal, async (until) => {
-    seen.jobs = (await get("/v1/jobs", {}, until)).items;
-    jobBoard(places.jobs, seen.jobs);
-    tell();
+  health(places.health, PERIOD_S, signal);
+  follow(PERIOD_S, places.stale, signal, async (until) => {
+    found.jobs = (await get("/v1/jobs", {}, until)).items;
+    jobBoard(places.jobs, found.jobs);
+    showSteps();
   });
-  follow(OFTEN_S, places.stale, signal, async (until) => {
-    const page = await get("/v1/overview", { limit: MODELS }, until);
-    seen.models = page.items;
-    if (!seen.data) seen.data = (await get("/v1/datasets", { limit: 1 }, until)).items.length > 0;
+  follow(PERIOD_S, places.stale, signal, async (until) => {
+    const page = await get("/v1/overview", { limit: MAX_MODELS }, until);
+    found.models = page.items;
+    if (!found.data) found.data = (await get("/v1/datasets", { limit: 1 }, until)).items.length > 0;
     waiting.remove();
     show(page);
-    tell();
+    showSteps();
   });
 }

@@ -1,22 +1,22 @@
-// The form that starts a training job.
+// Form that starts a training job.
 
 import { pages, post } from "../api.js";
 import { h, replace } from "../dom.js";
 import { card, errorBox, field, heading, notice, select } from "../ui.js";
 import { robotSelect, robots } from "./data/robots.js";
 import { advancedOptions } from "./train/advanced.js";
-import { rowsOf } from "./data/stretch.js";
+import { rowsOf } from "./data/hold_out.js";
 import { datasetChoice } from "./train/choice.js";
 import { ESTIMATORS, estimatorChoice } from "./train/estimators.js";
 import { holdoutChoice } from "./train/holdout.js";
 
 const PROMOTION = [
-  ["", "as the service’s settings say"],
-  ["ask", "only if it does well on what was held out"],
-  ["always", "in any case"],
+  ["", "default of the service"],
+  ["ask", "only if it passes the held-out check"],
+  ["always", "always"],
 ];
 
-/** The page `#/train`; `?datasets=ID,ID&model=NAME` chooses beforehand, `&hold_out=300-450` rows of the one data set. */
+/** The page `#/train`; `?datasets=ID,ID&model=NAME` fills the form, `&hold_out=300-450` holds out rows of a single data set. */
 export async function render(view, { query }, { signal, title }) {
   title("Train a model");
   const [datasets, models] = await Promise.all([
@@ -25,26 +25,26 @@ export async function render(view, { query }, { signal, title }) {
   ]);
   const known = new Map(models.map((each) => [each.name, each]));
   const robot = robotSelect({ none: "none: learn the joint axes from the torque", withUrdf: true });
-  const withRobot = h("div", {}, field("Robot", robot.select, "Optional. Learning then begins at the robot’s URDF; joints are matched by name."), robot.note, robot.add);
-  const offerRobot = (taken) => {
-    withRobot.hidden = !taken;
-    robot.select.disabled = !taken;
+  const withRobot = h("div", {}, field("Robot", robot.select, "Optional. Training then starts from the robot’s URDF; joints are matched by name."), robot.note, robot.add);
+  const enableRobot = (usesRobot) => {
+    withRobot.hidden = !usesRobot;
+    robot.select.disabled = !usesRobot;
   };
   let estimator = ESTIMATORS[0][0];
-  const estimators = estimatorChoice((name, taken) => {
+  const estimators = estimatorChoice((name, usesRobot) => {
     estimator = name;
-    offerRobot(taken);
+    enableRobot(usesRobot);
   });
-  offerRobot(ESTIMATORS[0][2]);
-  const tellRobot = () => estimators.robot(robot.select.value ? robot.select.selectedOptions[0].textContent : "");
-  robot.select.addEventListener("change", tellRobot);
+  enableRobot(ESTIMATORS[0][2]);
+  const showRobot = () => estimators.robot(robot.select.value ? robot.select.selectedOptions[0].textContent : "");
+  robot.select.addEventListener("change", showRobot);
 
   const { element: nameField, input: model } = modelName(known, query.get("model"));
   const preselected = (query.get("datasets") ?? "").split(",");
   const choice = datasetChoice(datasets, preselected, (picked) => {
-    const said = new Set(picked.map((each) => each.report.robot));
-    if (said.size === 1 && !robot.select.value) robot.choose([...said][0]);
-    tellRobot();
+    const names = new Set(picked.map((each) => each.report.robot));
+    if (names.size === 1 && !robot.select.value) robot.choose([...names][0]);
+    showRobot();
   });
   const rows = preselected.length === 1 ? rowsOf(query.get("hold_out")) : null;
   const holdout = holdoutChoice(rows && { [preselected[0]]: [rows] });
@@ -87,7 +87,7 @@ export async function render(view, { query }, { signal, title }) {
     { onsubmit: submit },
     card("Recordings", choice.element),
     card("Model", nameField, estimators.element, withRobot),
-    card("How it is judged", holdout.element, field("May the new version answer?", promotion, "It does well if its 95\u00a0% bands hold at least 90\u00a0% on every joint, and it is no worse than the version that answers now.")),
+    card("Evaluation", holdout.element, field("Start serving the new version", promotion, "The held-out check requires a 95\u00a0% coverage of at least 90\u00a0% on every joint, and predictions no worse than those of the serving version.")),
     card("Options", h("p", { class: "hint" }, "The defaults suit most recordings."), advanced.element),
     problems,
     h("div", { class: "actions" }, start),
@@ -98,9 +98,9 @@ export async function render(view, { query }, { signal, title }) {
     (found) => {
       robot.fill(found);
       choice.changed?.();
-      tellRobot();
+      showRobot();
     },
-    (error) => error.name === "AbortError" || notice(`robots: ${error.message}`, "bad"),
+    (error) => error.name === "AbortError" || notice(`The robots could not be loaded: ${error.message}`, "bad"),
   );
 }
 
@@ -111,7 +111,7 @@ function modelName(known, given) {
     value: given ?? "",
     required: true,
     pattern: "[a-z0-9][a-z0-9._\\-]{0,63}",
-    title: "Lower-case letters, digits, dots, underscores and hyphens; 64 at most",
+    title: "Lower-case letters, digits, dots, underscores and hyphens; max 64",
     placeholder: "my-arm",
     autocomplete: "off",
     autocapitalize: "none",
@@ -119,15 +119,15 @@ function modelName(known, given) {
     list: "models-known",
   });
   const about = h("p", { class: "hint", role: "status" });
-  const say = () => {
+  const describe = () => {
     const model = known.get(input.value.trim());
     const has = model?.latest_version === 1 ? "version 1" : `versions up to ${model?.latest_version}`;
     about.textContent = model
-      ? `${model.name} has ${has}. The new version answers if it does well on what is held out; else it waits as candidate.`
+      ? `${model.name} has ${has}. The new version serves if it passes the held-out check. Otherwise it becomes a candidate.`
       : "";
   };
-  input.addEventListener("input", say);
-  say();
+  input.addEventListener("input", describe);
+  describe();
   const list = h("datalist", { id: "models-known" }, [...known.keys()].map((name) => h("option", { value: name })));
-  return { input, element: [field("Name of the model", input, "Lower-case letters, digits, dots, underscores and hyphens."), about, list] };
+  return { input, element: [field("Model name", input, "Lower-case letters, digits, dots, underscores and hyphens."), about, list] };
 }

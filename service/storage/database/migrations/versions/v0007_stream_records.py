@@ -1,5 +1,4 @@
-"""What is known of a stream has one place: its row, and no longer what its last batch and events said of it. Models
-have a clock of their own."""
+"""Keep the record of a stream in its row, instead of its last batch and events; add a clock to each model."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Each model of before has a row that names the version that serves, its newest where none was promoted, and that
-version learns."""
+"""Give each model a row that names its serving version, the newest if none was promoted; that version learns."""
 
 from __future__ import annotations
 

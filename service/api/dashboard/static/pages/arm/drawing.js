@@ -1,30 +1,30 @@
-// The arm that a version has learnt, drawn in 3-D at a posture: links, joint axes, masses, and how sure it is of them.
+// 3-D drawing of a learnt arm: links, joint axes, masses and their uncertainties.
 
-import { css, faint, jointColour } from "../../colours.js";
+import { css, withOpacity, jointColour } from "../../colours.js";
 import { shortNames } from "../../format.js";
-import { literal, plot } from "../../plots.js";
-import { add, centres, frames, scaled, times, upright } from "./kinematics.js";
+import { escapeMarkup, plot } from "../../plots.js";
+import { add, frames, gravityAlignment, massCentres, scaled, times } from "./kinematics.js";
 
-const AXIS = 0.12; // half an axis' length, of the arm's size
-const ROUND = 24; // corners of a disc
+const AXIS = 0.12; // half-length of an axis, relative to the size of the arm
+const ROUND = 24; // vertices of a disc
 const MARGIN = 0.15;
-const EYE = { x: 1.1, y: -1.1, z: 0.5 }; // far enough to see all of the arm
-const THICK = 20; // px, of a joint that is pointed out
-const SMALLEST = 7, LARGEST = 24; // of a mass, px
+const EYE = { x: 1.1, y: -1.1, z: 0.5 }; // far enough to show the whole arm
+const HIGHLIGHT_PX = 20; // width of the highlighted axis
+const MIN_MASS_PX = 7, MAX_MASS_PX = 24;
 
-/** What both pages say beside the drawing. */
-export const CANNOT = "Torque cannot tell an arm from its mirror image, nor where a frame lies along its axis.";
-export const LEGEND = "Coloured: joint axes. Grey: links. Balls: masses at their centres. Discs show one standard deviation of an axis’ place, thin lines one of its direction, both from the joint before. Pale discs, hollow balls: torque does not tell.";
+/** Notes beside the drawing. */
+export const AMBIGUITY_NOTE = "Torque does not distinguish an arm from its mirror image, and does not determine the position of a frame along its axis.";
+export const LEGEND = "Coloured lines: joint axes. Grey lines: links. Balls: centres of mass. Discs and thin lines: standard deviation of the position and direction of an axis, relative to the previous joint. Pale discs and hollow balls: unidentifiable.";
 
-/** Whether the browser can draw in 3-D. */
+/** Return whether the browser supports 3-D drawing. */
 export function drawable() {
   return document.createElement("canvas").getContext("webgl") !== null;
 }
 
-/** Draw the arm of a version into an element; at(q) is where to begin. Returns {draw(q, joint)}, which moves it; joint: whose axis is thick. */
+/** Draw the arm of a version at positions q into an element. Returns {draw(q, joint)}, which moves it; joint: highlighted axis. */
 export async function drawing(element, { joint_names: names, parameters, training_range: range }, q, { height = 460, legend = true, signal }) {
   const arm = new Arm(names, parameters, range);
-  const label = `The arm in 3-D, ${names.length} joints from base to tip: ${arm.names.join(", ")}. The tables hold the same numbers.`;
+  const label = `The arm in 3-D, ${names.length} joints from base to tip: ${arm.names.join(", ")}. The tables contain the same values.`;
   let last = q;
   const layout = (shown) => arm.layout(shown, height, legend);
   const first = arm.at(last);
@@ -45,7 +45,7 @@ class Arm {
   constructor(names, { geometry, inertia }, range) {
     const short = shortNames(names);
     const masses = inertia.bodies.map((body) => body.plausible.mass);
-    Object.assign(this, { geometry, bodies: inertia.bodies, masses, centres: centres(inertia), up: upright(geometry.gravity) });
+    Object.assign(this, { geometry, bodies: inertia.bodies, masses, centres: massCentres(inertia), up: gravityAlignment(geometry.gravity) });
     this.names = geometry.order.map((joint) => short[joint]);
     const slide = ({ type }, place) => (type === "prismatic" ? Math.max(...["min", "max"].map((end) => Math.abs(range.q[end][geometry.order[place]]))) : 0);
     const steps = geometry.joints.map((joint, place) => Math.hypot(...joint.translation) + slide(joint, place));
@@ -54,7 +54,7 @@ class Arm {
     this.thick = null;
   }
 
-  /** Points of all that is drawn, with gravity downwards. */
+  /** Return all points of the drawing, with gravity downwards. */
   at(q) {
     const turned = frames(this.geometry, q).map(({ rotation, origin, axis }) => ({
       origin: times(this.up, origin),
@@ -80,14 +80,14 @@ class Arm {
       path(links, { name: "links", line: { color: css("muted"), width: 7 }, hoverinfo: "skip" }),
       path(arms, { name: "to the masses", line: { color: css("line-strong"), width: 2 }, hoverinfo: "skip", connectgaps: false }),
       ...turned.map(({ origin, axis }, place) => path([add(origin, scaled(axis, -half)), add(origin, scaled(axis, half))], {
-        name: this.names[place], line: { color: jointColour(place), width: order[place] === this.thick ? THICK : 9 }, hovertemplate: `${literal(this.names[place])}, ${this.geometry.joints[place].type}<extra></extra>`,
+        name: this.names[place], line: { color: jointColour(place), width: order[place] === this.thick ? HIGHLIGHT_PX : 9 }, hovertemplate: `${escapeMarkup(this.names[place])}, ${this.geometry.joints[place].type}<extra></extra>`,
       })),
       {
         ...points(masses), type: "scatter3d", mode: "markers", name: "masses", showlegend: false,
-        text: order.map((joint, place) => `${this.names[place]} moves ${this.masses[joint].toPrecision(3)} kg${open(joint) ? ", which torque does not tell" : ""}`),
+        text: order.map((joint, place) => `${this.names[place]} moves ${this.masses[joint].toPrecision(3)} kg${open(joint) ? " (unidentifiable)" : ""}`),
         hovertemplate: "%{text}<extra></extra>",
         marker: {
-          size: balls.map((mass) => Math.max(LARGEST * Math.cbrt(mass / most), SMALLEST)),
+          size: balls.map((mass) => Math.max(MAX_MASS_PX * Math.cbrt(mass / most), MIN_MASS_PX)),
           symbol: order.map((joint) => (open(joint) ? "circle-open" : "circle")), color: css("accent"), opacity: 0.7, line: { width: 0 },
         },
       },
@@ -96,12 +96,12 @@ class Arm {
     ];
   }
 
-  /** height: px; legend: false leaves out what names joints and metres, where there is little room. */
+  /** Return the layout. height: px; legend: false hides the joint names and axis labels of a small drawing. */
   layout({ turned }, height, legend) {
     const span = [0, 1, 2].map((k) => this.reach[1][k] - this.reach[0][k]);
     const room = Math.max(MARGIN * Math.max(...span), AXIS * this.size);
     const sides = span.map((each) => each + 2 * room), longest = Math.max(...sides);
-    const [x, y, z] = sides.map((each) => each / longest); // as long as they are, within a cube that the camera sees all of
+    const [x, y, z] = sides.map((each) => each / longest); // true proportions, within the cube that the camera shows
     const axis = (k) => ({
       range: [this.reach[0][k] - room, this.reach[1][k] + room], title: { text: legend ? "xyz"[k] + " m" : "" }, showticklabels: legend, color: css("muted"), gridcolor: css("line"),
       zerolinecolor: css("line-strong"), showbackground: false, showspikes: false, nticks: 5,
@@ -112,21 +112,21 @@ class Arm {
     };
   }
 
-  /** Axes turned by one standard deviation either way. */
+  /** Return the axes rotated by plus and minus one standard deviation. */
   #pointing(turned, half) {
     const ends = turned.flatMap(({ origin, out }, place) => {
       const { axis, across, turn_std: std } = this.geometry.joints[place];
       return std.flatMap((angle, k) => [-1, 1].flatMap((side) => {
-        // a turn about one of the two vectors moves the axis along the other
+        // a rotation about one of the two vectors moves the axis along the other
         const moved = add(axis, scaled(cross(across[k], axis), side * Math.tan(Math.min(angle, 1.2))));
         const end = out(scaled(moved, half / Math.hypot(...moved)));
         return [add(origin, scaled(end, -1)), add(origin, end), null];
       }));
     });
-    return path(ends, { name: "± std of the axes", showlegend: false, line: { color: faint(css("text"), 0.3), width: 2 }, hoverinfo: "skip", connectgaps: false });
+    return path(ends, { name: "± std of the axes", showlegend: false, line: { color: withOpacity(css("text"), 0.3), width: 2 }, hoverinfo: "skip", connectgaps: false });
   }
 
-  /** Discs of one standard deviation across the axes: of all that torque tells, or of the others. */
+  /** Return discs of one standard deviation of the position across the axes; pale: those of the unidentifiable axes. */
   #discs(turned, pale) {
     const corners = [], triangles = [];
     turned.forEach(({ origin, out }, place) => {
@@ -142,7 +142,7 @@ class Arm {
     });
     const [i, j, k] = [0, 1, 2].map((corner) => triangles.map((each) => each[corner]));
     return {
-      ...points(corners), i, j, k, type: "mesh3d", name: "± std of the places", showlegend: false, hoverinfo: "skip", color: css("novel"), opacity: pale ? 0.12 : 0.45, flatshading: true,
+      ...points(corners), i, j, k, type: "mesh3d", name: "± std of the positions", showlegend: false, hoverinfo: "skip", color: css("novel"), opacity: pale ? 0.12 : 0.45, flatshading: true,
       lighting: { ambient: 1, diffuse: 0, specular: 0 },
     };
   }

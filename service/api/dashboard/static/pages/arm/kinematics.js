@@ -1,6 +1,6 @@
-// Where the joints and masses of an arm are at a posture. Matrices are lists of rows; joints run from base to tip.
+// Forward kinematics of an arm. Matrices are lists of rows; joints are ordered from base to tip.
 
-/** Frames of all joints at positions q (of the data's joints), in the base's frame: [{rotation, origin, axis}, …]. */
+/** Return the frames of all joints in the base frame at positions q (in the order of the data): [{rotation, origin, axis}, …]. */
 export function frames({ order, joints }, q) {
   let [rotation, origin] = [[[1, 0, 0], [0, 1, 0], [0, 0, 1]], [0, 0, 0]];
   return joints.map((joint, place) => {
@@ -13,18 +13,18 @@ export function frames({ order, joints }, q) {
   });
 }
 
-/** Centres of mass of the bodies in their joints' frames, m, by the data's joints: first moment over mass. */
-export function centres(inertia) {
+/** Return the centres of mass of the bodies in their joint frames, m, in the order of the data: first moment / mass. */
+export function massCentres(inertia) {
   return inertia.bodies.map(({ plausible: { mass, first_moment: moment } }) => moment.map((each) => each / mass));
 }
 
-/** Positions in the middle of the training range, by the data's joints. */
-export function middle({ q: { min, max } }) {
+/** Return the positions in the middle of the training range, in the order of the data. */
+export function midRange({ q: { min, max } }) {
   return min.map((low, joint) => (low + max[joint]) / 2);
 }
 
-/** The shortest turn after which gravity points down the z axis; none where gravity is not known. */
-export function upright(gravity) {
+/** Return the shortest rotation that aligns gravity with −z; the identity if gravity is unknown. */
+export function gravityAlignment(gravity) {
   const length = Math.hypot(...gravity);
   if (!length) return turn([0, 0, 1], 0);
   const [x, y, z] = gravity.map((each) => each / length);
@@ -33,7 +33,7 @@ export function upright(gravity) {
   return turn([-y / sine, x / sine, 0], Math.atan2(sine, -z)); // about gravity × (0, 0, −1)
 }
 
-/** Rotation by an angle, rad, about a unit vector: Rodrigues' formula. */
+/** Return the rotation by an angle, rad, about a unit vector (Rodrigues' formula). */
 export function turn([x, y, z], angle) {
   const [sin, cos] = [Math.sin(angle), Math.cos(angle)], rest = 1 - cos;
   return [
@@ -51,7 +51,7 @@ export function scaled(a, factor) {
   return a.map((each) => each * factor);
 }
 
-/** A matrix times a vector. */
+/** Multiply a matrix by a vector. */
 export function times(matrix, vector) {
   return matrix.map((row) => row[0] * vector[0] + row[1] * vector[1] + row[2] * vector[2]);
 }

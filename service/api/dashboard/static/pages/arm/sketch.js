@@ -1,22 +1,22 @@
-// The arm that a version has learnt, drawn small: links, joint axes in their joints' colours, masses. The arm's page has all of it.
+// Small drawing of a learnt arm: links, coloured joint axes, masses.
 
 import { jointVar } from "../../colours.js";
 import { h } from "../../dom.js";
-import { add, frames, scaled, times, upright } from "./kinematics.js";
+import { add, frames, gravityAlignment, scaled, times } from "./kinematics.js";
 
 const AZIMUTH = -0.9, ELEVATION = 0.3; // of the eye, rad
-const AXIS = 0.075, PLATE = 0.16, BALL = 0.085; // half an axis, radius of the plate, largest ball: of the arm's size
+const AXIS = 0.075, PLATE = 0.16, BALL = 0.085; // half-length of an axis, radius of the plate, largest ball: relative to the size of the arm
 const ROOM = 0.06;
 const GLIDE_MS = 1800;
-const STILL = matchMedia("(prefers-reduced-motion: reduce)");
+const REDUCED_MOTION = matchMedia("(prefers-reduced-motion: reduce)");
 
 /**
- * An arm as the overview of models has it, {gravity, joints}, at positions q of the model's joints. label: for screen readers.
- * Returns {element, pose(q), glide(q)}: pose moves it at once, glide takes a moment unless the reader wants no motion.
+ * Draw an arm {gravity, joints} of `/v1/overview` at positions q. label: for screen readers.
+ * Returns {element, pose(q), glide(q)}: `pose` moves the arm at once, `glide` with an animation unless reduced motion is set.
  */
 export function sketch(arm, q, label) {
   const geometry = { order: arm.joints.map((each) => each.joint), joints: arm.joints };
-  const up = upright(arm.gravity);
+  const up = gravityAlignment(arm.gravity);
   const size = Math.max(arm.joints.reduce((sum, each) => sum + Math.hypot(...each.translation), 0), 0.05);
   const most = Math.max(...arm.joints.map((each) => each.mass));
   const stroke = (factor) => String(factor * size);
@@ -35,22 +35,22 @@ export function sketch(arm, q, label) {
       origin: times(up, origin), axis: times(up, axis), out: (vector) => times(up, times(rotation, vector)),
     }));
     const centres = turned.map(({ origin, out }, place) => add(origin, out(arm.joints[place].centre)));
-    const chain = [[0, 0, 0], ...turned.map((each) => each.origin), centres.at(-1)].map(flat);
+    const chain = [[0, 0, 0], ...turned.map((each) => each.origin), centres.at(-1)].map(project);
     back.setAttribute("d", path(chain));
     links.setAttribute("d", path(chain));
-    plate.setAttribute("d", `${path(circle(PLATE * size).map(flat))}Z`);
-    centres.map(flat).forEach(([x, y], place) => {
+    plate.setAttribute("d", `${path(circle(PLATE * size).map(project))}Z`);
+    centres.map(project).forEach(([x, y], place) => {
       masses[place].setAttribute("cx", x);
       masses[place].setAttribute("cy", y);
     });
     const half = AXIS * size;
     turned.forEach(({ origin, axis }, place) => {
-      axes[place].setAttribute("d", path([-half, half].map((length) => flat(add(origin, scaled(axis, length))))));
+      axes[place].setAttribute("d", path([-half, half].map((length) => project(add(origin, scaled(axis, length))))));
     });
-    frameOf([...chain, ...centres.map(flat), ...circle(PLATE * size).map(flat)]);
+    fitView([...chain, ...centres.map(project), ...circle(PLATE * size).map(project)]);
   };
-  // what has been seen stays in view, so that an arm that moves does not change its size
-  const frameOf = (points) => {
+  // the view only grows, so that a moving arm does not change its size
+  const fitView = (points) => {
     for (const point of points) {
       seen.low = seen.low.map((low, k) => Math.min(low, point[k]));
       seen.high = seen.high.map((high, k) => Math.max(high, point[k]));
@@ -62,7 +62,7 @@ export function sketch(arm, q, label) {
   };
   const glide = (positions) => {
     cancelAnimationFrame(frame);
-    if (STILL.matches || !element.isConnected) return void pose(positions);
+    if (REDUCED_MOTION.matches || !element.isConnected) return void pose(positions);
     const from = shown;
     const began = performance.now();
     const step = (now) => {
@@ -76,7 +76,7 @@ export function sketch(arm, q, label) {
   return { element, pose, glide };
 }
 
-/** Joints in a row, for estimators that know no arm. */
+/** Draw joints in a row, for estimators that do not learn an arm. */
 export function chain(n, label) {
   const spot = (joint) => [12 + (76 * joint) / Math.max(n - 1, 1), 50 - 16 * Math.sin((2.4 * joint) / Math.max(n - 1, 1))];
   const spots = Array.from({ length: n }, (_, joint) => spot(joint));
@@ -88,8 +88,8 @@ export function chain(n, label) {
   );
 }
 
-/** Where the eye sees a point: right, and down. */
-function flat([x, y, z]) {
+/** Project a point: right, and down. */
+function project([x, y, z]) {
   const across = Math.cos(AZIMUTH) * x + Math.sin(AZIMUTH) * y;
   const away = -Math.sin(AZIMUTH) * x + Math.cos(AZIMUTH) * y;
   return [across, -(Math.cos(ELEVATION) * z + Math.sin(ELEVATION) * away)];

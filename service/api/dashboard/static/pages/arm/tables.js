@@ -1,13 +1,13 @@
-// The arm that a version has learnt in numbers: where its joints lie, what they carry, and what torque does not tell.
+// Tables of a learnt arm: joint axes, masses, friction, and unidentifiable parameters.
 
 import { h } from "../../dom.js";
 import { number, shortNames } from "../../format.js";
 import { table } from "../../ui.js";
-import { centres, frames } from "./kinematics.js";
+import { frames, massCentres } from "./kinematics.js";
 
 const DEGREES = 180 / Math.PI;
 
-/** Joints from base to tip, with all positions at zero, in the base's frame. */
+/** Return a table of the joints from base to tip, in the base frame, with all positions at zero. */
 export function jointTable({ joint_names: names, parameters: { geometry } }) {
   const short = shortNames(names);
   const zero = frames(geometry, names.map(() => 0));
@@ -16,21 +16,21 @@ export function jointTable({ joint_names: names, parameters: { geometry } }) {
     { label: "Joint", cell: (place) => short[geometry.order[place]] },
     { label: "Type", cell: (place) => geometry.joints[place].type },
     { label: "Axis", numeric: true, cell: (place) => vector(zero[place].axis) },
-    { label: "Place, m", numeric: true, cell: (place) => vector(zero[place].origin) },
+    { label: "Position, m", numeric: true, cell: (place) => vector(zero[place].origin) },
     { label: "± turn, °", numeric: true, cell: (place) => stds(geometry.joints[place].turn_std, DEGREES) },
     { label: "± shift, mm", numeric: true, cell: (place) => stds(geometry.joints[place].shift_std, 1000) },
-    { label: "Torque does not tell", cell: (place) => geometry.joints[place].undetermined.join(", ") || "–" },
+    { label: "Unidentifiable", cell: (place) => geometry.joints[place].undetermined.join(", ") || "–" },
   ];
-  return table(columns, geometry.joints.map((_joint, place) => place), { caption: "Joint axes from base to tip, in the base’s frame, all positions at zero; ±: one standard deviation in two directions across the axis" });
+  return table(columns, geometry.joints.map((_joint, place) => place), { caption: "Joint axes from base to tip, in the base frame, with all positions at zero; ±: one standard deviation in two directions across the axis" });
 }
 
-/** What the joints carry: masses with their centres, rotors and friction, base to tip. */
+/** Return a table of masses, centres of mass, rotors and friction, from base to tip. */
 export function massTable({ joint_names: names, joint_types: types, parameters }) {
   const { geometry, inertia, rotor, friction } = parameters;
-  const centre = centres(inertia);
+  const centre = massCentres(inertia);
   const short = shortNames(names);
   const pair = ({ mean, std }, joint) => `${number(mean[joint])} ± ${number(std[joint], 2)}`;
-  const sliding = types.includes("prismatic") ? "; of sliding joints kg, N·s/m and N" : "";
+  const sliding = types.includes("prismatic") ? "; prismatic joints: kg, N·s/m and N" : "";
   const columns = [
     { label: "Joint", cell: (joint) => short[joint] },
     { label: "Mass, kg", numeric: true, cell: (joint) => `${number(inertia.bodies[joint].plausible.mass)} ± ${number(inertia.bodies[joint].std.mass, 2)}` },
@@ -39,10 +39,10 @@ export function massTable({ joint_names: names, joint_types: types, parameters }
     ...(rotor ? [{ label: "Rotor, kg·m²", numeric: true, cell: (joint) => pair(rotor, joint) }] : []),
     { label: "Viscous, N·m·s", numeric: true, cell: (joint) => pair(friction.viscous, joint) },
     { label: "Coulomb, N·m", numeric: true, cell: (joint) => pair(friction.coulomb, joint) },
-    ...(friction.stribeck ? [{ label: "Slow, N·m", numeric: true, cell: (joint) => pair(friction.stribeck, joint) }] : []),
-    { label: "Torque does not tell", cell: (joint) => (inertia.bodies[joint].undetermined ?? []).map((each) => each.replace("_", " ")).join(", ") || "–" },
+    ...(friction.stribeck ? [{ label: "Stribeck, N·m", numeric: true, cell: (joint) => pair(friction.stribeck, joint) }] : []),
+    { label: "Unidentifiable", cell: (joint) => (inertia.bodies[joint].undetermined ?? []).map((each) => each.replace("_", " ")).join(", ") || "–" },
   ];
-  return h("div", { class: "dense" }, table(columns, geometry.order, { caption: `What the joints carry, in the joints’ own frames, and their friction; slow: what it is more at low speed; ±: one standard deviation${sliding}` }));
+  return h("div", { class: "dense" }, table(columns, geometry.order, { caption: `Bodies in their joint frames, and friction; ±: one standard deviation${sliding}` }));
 }
 
 // of first moment over mass, to first order

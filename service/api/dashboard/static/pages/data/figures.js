@@ -1,4 +1,4 @@
-// What was found in a data set, tab by tab: figures joint by joint.
+// Tabs of a data set's report: figures of each joint.
 
 import { jointVar } from "../../colours.js";
 import { h } from "../../dom.js";
@@ -6,17 +6,17 @@ import { count, number, percent, seconds, shortNames } from "../../format.js";
 import { badge, card, facts, table } from "../../ui.js";
 import { prose, sentences } from "./prose.js";
 
-/** Rate, jitter and gaps, and how far the torque lags behind the motion. */
+/** Rate, jitter, gaps, and the lag of the torque. */
 export function timingTab({ report, joint_names: joints }) {
   return h("div", { class: "grid wide" }, timing(report), lag(report.lag, joints));
 }
 
-/** How far joints were moved, against what they can do. */
+/** Motion of the joints, compared with their limits. */
 export function excitationTab({ report, joint_names: joints }) {
   return [motion(report.excitation, joints), limits(report.limits, joints), ranges(report, joints)];
 }
 
-/** How well friction can be told, the torque against that of the robot's URDF, and how far it can be trusted. */
+/** Identifiability of friction, torque compared with the robot's URDF, noise and saturation. */
 export function frictionTab({ report, joint_names: joints }) {
   return [
     friction(report.excitation, joints),
@@ -24,13 +24,13 @@ export function frictionTab({ report, joint_names: joints }) {
   ];
 }
 
-/** What the columns were taken as, and every step that changed the data. */
+/** How the columns were read, and every preparation step. */
 export function preparationTab({ report }) {
   return preparation(report);
 }
 
-/** A column with the joints' names in their colours. */
-function short(joints) {
+/** Return a column of joint names in their colours. */
+function jointColumn(joints) {
   const names = shortNames(joints);
   const cell = ({ joint }) => {
     const index = joints.indexOf(joint);
@@ -39,24 +39,27 @@ function short(joints) {
   return { label: "Joint", cell };
 }
 
-/** A share as text on a bar. */
+/** Return a share as text on a bar. */
 function bar(share, text = percent(share, 0)) {
   return share === null ? "–" : h("span", { class: "share", style: `--of: ${Math.max(0, Math.min(share, 1))}` }, text);
 }
 
+/** Labels and kinds of badges by the verdict of the report. */
+const IDENTIFIABILITY = { well: ["identifiable", "good"], poorly: ["weak", "warn"], "not determined": ["unidentifiable", "bad"] };
+
 function motion(found, joints) {
   const whole = found.whole;
   return card(
-    "How the joints were moved",
+    "Joint motion",
     table(
       [
-        short(joints),
-        { label: "Range visited", cell: (row) => bar(row.visited) },
+        jointColumn(joints),
+        { label: "Range covered", cell: (row) => bar(row.visited) },
         { label: "Span, rad or m", numeric: true, cell: (row) => number(row.span) },
         { label: "Reversals", numeric: true, cell: (row) => count(row.reversals) },
-        { label: "Still", numeric: true, cell: (row) => percent(row.still, 0) },
-        { label: "Forwards / backwards", numeric: true, cell: (row) => `${percent(row.forwards, 0)} / ${percent(row.backwards, 0)}` },
-        { label: "Most collinear", numeric: true, cell: (row) => `${row.collinear_term} ${percent(row.collinear, 0)}` },
+        { label: "At rest", numeric: true, cell: (row) => percent(row.still, 0) },
+        { label: "Forward / backward", numeric: true, cell: (row) => `${percent(row.forwards, 0)} / ${percent(row.backwards, 0)}` },
+        { label: "Most collinear term", numeric: true, cell: (row) => `${row.collinear_term} ${percent(row.collinear, 0)}` },
       ],
       found.joints,
     ),
@@ -64,14 +67,14 @@ function motion(found, joints) {
       ? h(
           "p",
           {},
-          `Rigid bodies: ${whole.rank} of ${whole.parameters} base parameters are excited enough. `,
-          `Weakest: the body that ${whole.weakest_body} moves, with ${percent(whole.weakest)} of what random motion gives.`,
+          `${whole.rank} of ${whole.parameters} rigid-body base parameters are sufficiently excited. `,
+          `The weakest is excited at ${percent(whole.weakest)} of the level of random motion; it belongs to the body that ${whole.weakest_body} moves.`,
         )
-      : h("p", { class: "hint" }, "Rigid bodies are judged only if the upload names a robot with a URDF."),
+      : h("p", { class: "hint" }, "To check the excitation of the rigid bodies, upload the recording with a robot that has a URDF."),
     found.motion_dimensions == null
       ? null
-      : h("p", {}, `The joints move like ${number(found.motion_dimensions, 2)} independent ones of ${found.joints.length}, and all stand still in ${percent(found.standstill, 0)} of the samples.`),
-    h("details", {}, h("summary", {}, "The same in words"), h("p", {}, prose(found.text))),
+      : h("p", {}, `The motion has ${number(found.motion_dimensions, 2)} independent dimensions of ${found.joints.length}. All joints are at rest in ${percent(found.standstill, 0)} of the samples.`),
+    h("details", {}, h("summary", {}, "Description"), h("p", {}, prose(found.text))),
   );
 }
 
@@ -79,20 +82,20 @@ function friction(found, joints) {
   const weight = (name) => (row) => {
     const { verdict, std, value, implausible } = row[name];
     const figure = value == null ? "" : ` ${number(value, 2)}`;
-    return [implausible ? badge("implausible", "bad") : badge(verdict), figure, std === null ? "" : ` ±\u00a0${number(std, 2)}`];
+    return [implausible ? badge("implausible", "bad") : badge(...IDENTIFIABILITY[verdict]), figure, std === null ? "" : ` ±\u00a0${number(std, 2)}`];
   };
   const beside = found.friction_beside === "rigid bodies" ? "the robot’s rigid bodies" : "any smooth function of the motion";
   return card(
-    "Can friction be told?",
+    "Identifiability of friction",
     table(
       [
-        short(joints),
+        jointColumn(joints),
         { label: "Viscous friction", cell: weight("viscous") },
         { label: "Coulomb friction", cell: weight("coulomb") },
         { label: "Constant torque", cell: weight("offset") },
       ],
       found.joints,
-      { caption: `Told apart from ${beside}; ±: one standard deviation` },
+      { caption: `Separated from ${beside}; ±: one standard deviation` },
     ),
   );
 }
@@ -101,16 +104,16 @@ function againstRobot(found, joints) {
   if (!found) return null;
   const times = (part) => (row) => (row[part] === null ? "–" : `${number(row[part], 3)} ± ${number(row[`${part}_std`], 2)}`);
   return card(
-    `Torque against that of ${found.robot}`,
+    `Torque compared with the URDF of ${found.robot}`,
     table(
       [
-        short(joints),
-        { label: "Gravity, times", numeric: true, cell: times("gravity") },
-        { label: "Inertia, times", numeric: true, cell: times("inertia") },
+        jointColumn(joints),
+        { label: "Gravity, ratio", numeric: true, cell: times("gravity") },
+        { label: "Inertia, ratio", numeric: true, cell: times("inertia") },
         { label: "Explained with friction", cell: (row) => bar(row.explained) },
       ],
       found.joints,
-      { caption: "1: as the robot’s URDF has it. Rotors, which it lacks, make inertia larger, loads both" },
+      { caption: "1: equal to the URDF. Rotor inertia, which the URDF omits, increases inertia; a payload increases both. Explained: share of the variance" },
     ),
   );
 }
@@ -118,19 +121,19 @@ function againstRobot(found, joints) {
 function limits(rows, joints) {
   if (!rows.some((row) => [row.range_used, row.speed_used, row.torque_used].some((share) => share !== null))) return null;
   const used = (share, beyond) => (row) => {
-    return row[beyond] > 0 ? badge(`${percent(row[share], 0)}, beyond in ${percent(row[beyond], 2)}`, "bad") : bar(row[share]);
+    return row[beyond] > 0 ? badge(`${percent(row[share], 0)}, limit exceeded in ${percent(row[beyond], 2)}`, "bad") : bar(row[share]);
   };
   return card(
-    "Against the robot's limits",
+    "Use of the robot's limits",
     table(
       [
-        short(joints),
+        jointColumn(joints),
         { label: "Range used", cell: used("range_used", "beyond_range") },
-        { label: "Speed, of limit", cell: used("speed_used", "beyond_speed") },
-        { label: "Torque, of limit", cell: used("torque_used", "beyond_torque") },
+        { label: "Speed used", cell: used("speed_used", "beyond_speed") },
+        { label: "Torque used", cell: used("torque_used", "beyond_torque") },
       ],
       rows,
-      { caption: "Outside what is used here, a model has to extrapolate" },
+      { caption: "A model extrapolates beyond the used range; 100 % is the limit" },
     ),
   );
 }
@@ -141,14 +144,14 @@ function ranges(report, joints) {
     "Ranges",
     table(
       [
-        short(joints),
+        jointColumn(joints),
         { label: "q, rad or m", numeric: true, cell: between("q") },
         { label: "dq, per s", numeric: true, cell: between("dq") },
         { label: "ddq, per s²", numeric: true, cell: between("ddq") },
         { label: "tau, N·m or N", numeric: true, cell: between("tau") },
       ],
       joints.map((joint, index) => ({ joint, index })),
-      { caption: "Smallest and largest value" },
+      { caption: "Minimum … maximum" },
     ),
   );
 }
@@ -158,14 +161,14 @@ function noise(report, joints) {
     "Noise",
     table(
       [
-        short(joints),
+        jointColumn(joints),
         { label: "Torque, N·m", numeric: true, cell: (row) => (row.smoothed ? "smoothed" : number(row.torque, 2)) },
-        { label: "of its spread", numeric: true, cell: (row) => percent(row.torque_share) },
+        { label: "of its std", numeric: true, cell: (row) => percent(row.torque_share) },
         { label: "Velocity, per s", numeric: true, cell: (row) => number(row.velocity, 2) },
-        { label: "of its spread", numeric: true, cell: (row) => percent(row.velocity_share) },
+        { label: "of its std", numeric: true, cell: (row) => percent(row.velocity_share) },
       ],
       report.noise,
-      { caption: "Standard deviation of white noise, as recorded" },
+      { caption: "Standard deviation of the white noise as recorded" },
     ),
   );
 }
@@ -179,16 +182,16 @@ function lag(rows, joints) {
     known.length
       ? table(
           [
-            { label: "Joint", cell: (row) => (row.joint === null ? "all together" : short(joints).cell(row)) },
+            { label: "Joint", cell: (row) => (row.joint === null ? "all joints" : jointColumn(joints).cell(row)) },
             { label: "Lag, ms", numeric: true, cell: (row) => `${number(1e3 * row.seconds, 2)} ± ${number(1e3 * row.std_s, 2)}` },
-            { label: "Costs, of variance", numeric: true, cell: (row) => percent(row.cost, 2) },
+            { label: "Error caused, of variance", numeric: true, cell: (row) => percent(row.cost, 2) },
           ],
           known,
-          { caption: "Negative: the torque comes first; ± one standard deviation" },
+          { caption: "Negative: the torque precedes the motion; ±: one standard deviation" },
         )
       : null,
     [...why].map(([reason, who]) =>
-      h("p", {}, `Cannot be told for ${who.map((row) => row.joint ?? "all joints together").join(", ")}: `, reason),
+      h("p", {}, `Lag unknown for ${who.map((row) => row.joint ?? "all joints").join(", ")}: `, reason),
     ),
   );
 }
@@ -198,21 +201,21 @@ function timing(report) {
   return card(
     "Timing",
     facts([
-      ["Rate as uploaded", found.rate_hz === null ? "not known" : `${number(found.rate_hz, 4)} Hz`],
-      ["Jitter, 50 / 99 % of steps", `${percent(found.jitter_p50)} / ${percent(found.jitter_p99)}`],
-      ["Largest jitter", percent(found.jitter_max)],
+      ["Rate as uploaded", found.rate_hz === null ? "unknown" : `${number(found.rate_hz, 4)} Hz`],
+      ["Jitter, 50th / 99th percentile", `${percent(found.jitter_p50)} / ${percent(found.jitter_p99)}`],
+      ["Max jitter", percent(found.jitter_max)],
       ["Gaps", count(report.gaps)],
-      ["Repeated stamps left out", count(found.repeated_stamps)],
-      ["Rows left out, value missing", count(found.missing_rows)],
+      ["Rows dropped, repeated time", count(found.repeated_stamps)],
+      ["Rows dropped, missing value", count(found.missing_rows)],
     ]),
     found.gaps.length
       ? table(
           [
-            { label: "After t, s", numeric: true, cell: (row) => number(row.t, 6) },
-            { label: "Lasts", numeric: true, cell: (row) => seconds(row.seconds) },
+            { label: "Starts at, s", numeric: true, cell: (row) => number(row.t, 6) },
+            { label: "Duration", numeric: true, cell: (row) => seconds(row.seconds) },
           ],
           found.gaps,
-          { caption: "The longest gaps, at most 20" },
+          { caption: "Longest gaps (max 20)" },
         )
       : null,
   );
@@ -220,28 +223,28 @@ function timing(report) {
 
 function saturation(rows, joints) {
   return card(
-    "Signs of saturation",
+    "Possible saturation",
     table(
       [
-        short(joints),
-        { label: "At its extremes", numeric: true, cell: (row) => percent(row.at_largest, 2) },
-        { label: "Flat while moving", numeric: true, cell: (row) => (row.flat > 0 ? badge(percent(row.flat, 2), "warn") : percent(row.flat, 2)) },
-        { label: "At the robot's limit", numeric: true, cell: (row) => (row.at_limit > 0 ? badge(percent(row.at_limit, 2), "warn") : percent(row.at_limit, 2)) },
+        jointColumn(joints),
+        { label: "At extremes", numeric: true, cell: (row) => percent(row.at_largest, 2) },
+        { label: "Constant in motion", numeric: true, cell: (row) => (row.flat > 0 ? badge(percent(row.flat, 2), "warn") : percent(row.flat, 2)) },
+        { label: "At torque limit", numeric: true, cell: (row) => (row.at_limit > 0 ? badge(percent(row.at_limit, 2), "warn") : percent(row.at_limit, 2)) },
       ],
       rows,
-      { caption: "Share of samples whose torque may have been cut off" },
+      { caption: "Share of samples whose torque may be clipped" },
     ),
   );
 }
 
 function preparation(report) {
   const figures = { source: report.source, recipe: report.recipe, steps: report.steps };
-  const steps = report.preparation.length ? sentences(report.preparation) : h("p", {}, "Nothing was changed.");
+  const steps = report.preparation.length ? sentences(report.preparation) : h("p", {}, "No changes.");
   return card(
-    "How it was read and prepared",
+    "Reading",
     report.reading.length ? sentences(report.reading) : null,
     h("h3", {}, "Preparation"),
     steps,
-    h("details", {}, h("summary", {}, "Everything, in figures"), h("pre", {}, h("code", {}, JSON.stringify(figures, null, 2)))),
+    h("details", {}, h("summary", {}, "All settings as JSON"), h("pre", {}, h("code", {}, JSON.stringify(figures, null, 2)))),
   );
 }

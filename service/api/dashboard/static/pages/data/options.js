@@ -1,4 +1,4 @@
-// How an uploaded file is to be read and prepared: a form that turns into the query of the upload.
+// Form with the options for reading and preparing a file; its values are the query of the upload.
 
 import { h } from "../../dom.js";
 import { field } from "../../ui.js";
@@ -13,57 +13,57 @@ const QUANTITIES = [
   ["episode", "episode", []],
 ];
 
-/** The form. Returns {element, values(), fillRobots(robots)}; values: query of the upload. */
+/** Create the form. Returns {element, values(), fillRobots(robots)}; values(): query of the upload. */
 export function uploadOptions() {
   const inputs = {
-    effort: select("effort", [["", "as the robot or the file says"], ...pairs(EFFORTS, ["measured", "commanded", "current"])]),
-    torque_constants: text("torque_constants", "0.11, 0.11, 0.08"),
-    torque_factors: text("torque_factors", "1, 1, -1"),
+    effort: select("effort", [["", "default of the robot or the file"], ...pairs(EFFORTS, ["measured", "commanded", "current"])]),
+    torque_constants: textInput("torque_constants", "0.11, 0.11, 0.08"),
+    torque_factors: textInput("torque_factors", "1, 1, -1"),
     torque_convention: select("torque_convention", [
-      ["", "as the effort implies"],
+      ["", "derived from the effort"],
       ["gravity_included", "gravity included"],
       ["gravity_compensated", "gravity compensated"],
     ]),
-    joint_names: text("joint_names", "shoulder, elbow, wrist"),
-    joints: text("joints", "all"),
-    drop_joints: text("drop_joints", "gripper"),
-    topic: text("topic", "/joint_states"),
-    delimiter: select("delimiter", [["", "found out"], [",", "comma"], [";", "semicolon"], ["\t", "tab"], [" ", "space"]]),
+    joint_names: textInput("joint_names", "shoulder, elbow, wrist"),
+    joints: textInput("joints", "all"),
+    drop_joints: textInput("drop_joints", "gripper"),
+    topic: textInput("topic", "/joint_states"),
+    delimiter: select("delimiter", [["", "auto-detect"], [",", "comma"], [";", "semicolon"], ["\t", "tab"], [" ", "space"]]),
     filtering: select("filtering", [
-      ["", "if something is derived (default)"],
+      ["", "only if signals are derived (default)"],
       ["always", "always"],
       ["never", "never"],
     ]),
-    cutoff: amount("cutoff", "4", "0.01", "1000"),
-    form: select("form", [["", "without delay (default)"], ["causal", "causal, as a live stream could be"]]),
-    rate: amount("rate", "as recorded", "0.01", "1000000"),
-    gap: amount("gap", "1.5", "1.01", "1000000"),
-    trim: amount("trim", "the filter’s edges", "0", "1000000"),
+    cutoff: numberInput("cutoff", "4", "0.01", "1000"),
+    form: select("form", [["", "zero-phase (default)"], ["causal", "causal, as in a live stream"]]),
+    rate: numberInput("rate", "as recorded", "0.01", "1000000"),
+    gap: numberInput("gap", "1.5", "1.01", "1000000"),
+    trim: numberInput("trim", "edges of the filter", "0", "1000000"),
   };
-  let expected; // effort of the robot that was chosen
+  let expected; // effort of the chosen robot
   const robot = robotSelect({
-    none: "not said",
+    none: "unspecified",
     onchange: (profile) => {
       expected = profile?.effort;
       showConstants();
     },
   });
   const columns = {}, units = {};
-  const rows = QUANTITIES.map(([name, said, known]) => {
-    columns[name] = text(`columns-${name}`, name === "q" ? "{joint}/position" : "found out", `Columns of ${said}`);
+  const rows = QUANTITIES.map(([name, label, known]) => {
+    columns[name] = textInput(`columns-${name}`, name === "q" ? "{joint}/position" : "auto-detect", `Columns of ${label}`);
     const list = `units-of-${name}`;
-    units[name] = text(`units-${name}`, known[0] ?? "", `Unit of ${said}`);
+    units[name] = textInput(`units-${name}`, known[0] ?? "", `Unit of ${label}`);
     if (known.length) units[name].setAttribute("list", list);
     return h(
       "tr",
       {},
-      h("th", { scope: "row" }, h("code", {}, name), ` ${said}`),
+      h("th", { scope: "row" }, h("code", {}, name), ` ${label}`),
       h("td", {}, columns[name]),
       h("td", {}, known.length ? units[name] : "–", known.length ? h("datalist", { id: list }, ...known.map(option)) : ""),
     );
   });
 
-  const constants = field("Torque constants, N·m/A", inputs.torque_constants, "Of joints 1 to n, separated by commas.");
+  const constants = field("Torque constants, N·m/A", inputs.torque_constants, "One for each joint, separated by commas.");
   const showConstants = () => {
     const current = (inputs.effort.value || expected) === "current";
     constants.hidden = !current && !inputs.torque_constants.value;
@@ -74,40 +74,40 @@ export function uploadOptions() {
   const element = h(
     "details",
     { class: "options" },
-    h("summary", {}, "How to read it: robot, units, columns, joints, effort, preparation"),
-    h("p", { class: "hint" }, "Leave these empty to let the service find out. If it cannot be sure, it refuses the file and says what to add."),
+    h("summary", {}, "Import options: robot, units, columns, joints, effort, preparation"),
+    h("p", { class: "hint" }, "Leave fields empty to auto-detect them. If that is ambiguous, the upload is rejected with a message that names the missing option."),
     h("div", { class: "grid" },
-      field("Robot", robot.select, "Its limits, joint order and the meaning of its effort."),
-      field("What the torque column holds", inputs.effort, "A wrong answer here teaches a wrong torque."),
+      field("Robot", robot.select, "Provides limits, joint order and the meaning of the effort."),
+      field("Meaning of the torque column", inputs.effort, "With a wrong choice, the model learns a wrong torque."),
       constants,
-      field("Torque factors", inputs.torque_factors, "By which the torques of joints 1 to n are multiplied: −1 where the sign is opposite."),
+      field("Torque factors", inputs.torque_factors, "One for each joint; they multiply the torque. Use −1 to reverse the sign."),
     ),
     robot.note,
     robot.add,
     h("h3", {}, "Columns and units"),
     h("div", { class: "scroll" }, h("table", {},
-      h("caption", {}, "What the file calls its columns: a name, a pattern with {joint}, or names separated by commas"),
+      h("caption", {}, "Column names of the file: a name, a pattern with {joint}, or names separated by commas"),
       h("thead", {}, h("tr", {}, ...["Quantity", "Columns", "Unit"].map((label) => h("th", { scope: "col" }, label)))),
       h("tbody", {}, ...rows),
     )),
     h("h3", {}, "Joints"),
     h("div", { class: "grid" },
-      field("Names of joints 1 to n", inputs.joint_names, "Separated by commas, where the file has only numbers."),
-      field("Joints to keep, in this order", inputs.joints, "Separated by commas; all by default."),
-      field("Joints to leave out", inputs.drop_joints, "Grippers, and joints that are locked."),
+      field("Joint names", inputs.joint_names, "Required if the file numbers its joints. Separate them with commas."),
+      field("Joints to keep, in this order", inputs.joints, "Separate them with commas. Default: all."),
+      field("Joints to drop", inputs.drop_joints, "For example grippers and locked joints."),
     ),
     h("h3", {}, "Preparation"),
-    h("p", { class: "hint" }, "Missing velocity and acceleration are derived with a low-pass and central differences. The report lists every step."),
+    h("p", { class: "hint" }, "Missing velocity and acceleration are derived with a low-pass filter and central differences. The report lists every step."),
     h("div", { class: "grid" },
-      field("Low-pass the signals", inputs.filtering),
-      field("Cut-off, Hz", inputs.cutoff),
-      field("Form of the filter", inputs.form),
-      field("Rate of the samples, Hz", inputs.rate),
-      field("Steps longer than so many usual ones are gaps", inputs.gap),
-      field("Cut off at both ends, s", inputs.trim),
+      field("Low-pass filter", inputs.filtering),
+      field("Cutoff frequency, Hz", inputs.cutoff),
+      field("Filter type", inputs.form),
+      field("Resampling rate, Hz", inputs.rate),
+      field("Min gap, in usual time steps", inputs.gap),
+      field("Trim at both ends, s", inputs.trim),
       field("Torque convention", inputs.torque_convention),
-      field("Topic", inputs.topic, "Of a bag, where several could be read."),
-      field("Delimiter", inputs.delimiter, "Of a CSV."),
+      field("Topic", inputs.topic, "Required for a bag with several candidates."),
+      field("Delimiter", inputs.delimiter, "For CSV files."),
     ),
   );
 
@@ -124,20 +124,20 @@ export function uploadOptions() {
   };
 }
 
-/** Options with one more that the service proposed. */
+/** Add an option that the service proposed. */
 export function withOption(values, option, value) {
   if (option === "drop_joints") return { ...values, drop_joints: [values.drop_joints, value].filter(Boolean).join(",") };
   return { ...values, [option]: JSON.stringify({ ...JSON.parse(values[option] ?? "{}"), ...value }) };
 }
 
-/** Options as a reader sees them: robot: ur5, units: q deg. */
-export function inWords(values) {
+/** Describe options: robot: ur5, units: q deg. */
+export function describeOptions(values) {
   return Object.entries(values)
     .map(([name, value]) => `${name.replaceAll("_", " ")}: ${value.replace(/[{}"[\]]/g, "").replaceAll(":", " ")}`)
     .join("; ");
 }
 
-/** What was typed, as JSON by quantity; nothing where nothing was typed. */
+/** Return the entered values as JSON by quantity; an empty text if there are none. */
 function json(inputs, meaning) {
   const given = Object.entries(inputs).map(([name, input]) => [name, input.value.trim()]).filter(([, value]) => value);
   return given.length ? JSON.stringify(Object.fromEntries(given.map(([name, value]) => [name, meaning(value)]))) : "";
@@ -148,20 +148,20 @@ function names(value) {
   return parts.length > 1 ? parts : parts[0];
 }
 
-function text(name, placeholder, label) {
+function textInput(name, placeholder, label) {
   const input = h("input", { type: "text", name, placeholder, autocomplete: "off", spellcheck: "false" });
   if (!label) return input;
   input.setAttribute("aria-label", label);
-  input.style.minWidth = "8rem"; // in a table, which scrolls where there is no room
+  input.style.minWidth = "8rem"; // the table scrolls if it is too narrow
   return input;
 }
 
-function amount(name, placeholder, min, max) {
+function numberInput(name, placeholder, min, max) {
   return h("input", { type: "number", name, placeholder, min, max, step: "any" });
 }
 
 function select(name, options) {
-  return h("select", { name }, ...options.map(([value, said]) => h("option", { value }, said)));
+  return h("select", { name }, ...options.map(([value, label]) => h("option", { value }, label)));
 }
 
 function pairs(known, names) {

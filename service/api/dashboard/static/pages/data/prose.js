@@ -1,18 +1,18 @@
-// Sentences of the service, whose `code` stands between backticks.
+// Sentences from the service. They mark code with backticks.
 
 import { h } from "../../dom.js";
 
-/** The parts of a sentence: texts, and code where it stands between backticks. */
+/** Split a sentence into texts and code. */
 export function prose(text) {
   return text.split("`").map((part, index) => (index % 2 ? h("code", {}, part) : part));
 }
 
-/** What to be careful with, in a frame; nothing where there is nothing. */
-export function warned(texts) {
+/** Return a banner with warnings; null if there are none. */
+export function warningBanner(texts) {
   return texts.length ? h("section", { class: "banner", "aria-label": "Warnings" }, h("strong", {}, "Warnings"), sentences(texts)) : null;
 }
 
-/** Sentences as a list. */
+/** Return a list of sentences. */
 export function sentences(texts) {
   return h("ul", {}, texts.map((text) => h("li", {}, prose(text))));
 }

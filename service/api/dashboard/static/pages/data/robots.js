@@ -1,4 +1,4 @@
-// Choosing a robot: known by name, or an uploaded URDF. Shared by the upload and the training form.
+// Select for a robot: a known one or an uploaded URDF. Used for uploads and training.
 
 import { get, pages } from "../../api.js";
 import { h, replace } from "../../dom.js";
@@ -6,15 +6,15 @@ import { counted } from "../../format.js";
 import { prose } from "./prose.js";
 import { urdfButton } from "./urdf.js";
 
-/** What the effort of a robot's recordings may be. */
+/** Meanings of the effort of a recording. */
 export const EFFORTS = {
   measured: "measured torque, gravity included",
   commanded: "commanded torque, added to gravity compensation",
-  current: "motor current, which needs torque constants",
-  unknown: "not known for this robot: say what it is",
+  current: "motor current (requires torque constants)",
+  unknown: "unknown for this robot: choose its meaning",
 };
 
-/** Profiles and uploaded URDFs, as {profiles, uploaded}. */
+/** Read the robots, as {profiles, uploaded}. */
 export async function robots(signal) {
   const [known, uploaded] = await Promise.all([
     get("/v1/robots/profiles", {}, signal),
@@ -24,9 +24,9 @@ export async function robots(signal) {
 }
 
 /**
- * A select of robots and a line that says what the chosen one means.
- * withUrdf: offer only those that a model with rigid bodies can be made of; onchange(profile): undefined for a URDF.
- * Returns {select, note, add, fill(robots), choose(name)}: `fill` keeps what is chosen, `add` uploads a URDF and chooses it.
+ * Create a select of robots and a line that describes the chosen one.
+ * withUrdf: list only robots with a URDF; onchange(profile): undefined for an uploaded URDF.
+ * Returns {select, note, add, fill(robots), choose(name)}. `fill` keeps the choice; `add` uploads a URDF and chooses it.
  */
 export function robotSelect({ none, withUrdf = false, onchange = () => {} }) {
   const select = h("select", { name: "robot" }, h("option", { value: "" }, none));
@@ -34,12 +34,12 @@ export function robotSelect({ none, withUrdf = false, onchange = () => {} }) {
   let profiles = new Map();
   let last = { profiles: [], uploaded: [] };
 
-  const say = () => {
+  const update = () => {
     const profile = profiles.get(select.value);
-    replace(note, profile ? prose(described(profile, withUrdf)) : "");
+    replace(note, profile ? prose(describeProfile(profile, withUrdf)) : "");
     onchange(profile);
   };
-  select.addEventListener("change", say);
+  select.addEventListener("change", update);
 
   const fill = (found) => {
     last = found;
@@ -58,7 +58,7 @@ export function robotSelect({ none, withUrdf = false, onchange = () => {} }) {
   const choose = (name) => {
     select.value = name;
     if (select.selectedIndex < 0) select.value = "";
-    say();
+    update();
   };
   const add = urdfButton((robot) => {
     fill({ ...last, uploaded: [robot, ...last.uploaded.filter((each) => each.id !== robot.id)] });
@@ -72,7 +72,7 @@ function group(label, options) {
   return h("optgroup", { label }, ...options.map(([value, text]) => h("option", { value }, text)));
 }
 
-function described(profile, withUrdf) {
+function describeProfile(profile, withUrdf) {
   const joints = `${counted(profile.joints.length, "joint")}: ${profile.joints.map((each) => each.name).join(", ")}.`;
   return withUrdf ? joints : `${joints} Its effort: ${EFFORTS[profile.effort]}. ${profile.effort_note}`;
 }

@@ -1,38 +1,38 @@
-// Uploading recordings: by a button or by dropping them on the page, one after the other.
+// Upload of recordings, one after the other, chosen by a button or dropped on the page.
 
-import { lacking } from "../../abilities.js";
+import { missingExtraHint } from "../../extras.js";
 import { upload } from "../../api.js";
 import { h, replace } from "../../dom.js";
-import { bytes, counted } from "../../format.js";
+import { bytes, counted, sentence } from "../../format.js";
 import { button, card, field, link, notice, progress } from "../../ui.js";
-import { inWords, uploadOptions, withOption } from "./options.js";
-import { refusal } from "./refusal.js";
+import { describeOptions, uploadOptions, withOption } from "./options.js";
+import { uploadError } from "./upload_error.js";
 
-const ENDINGS = ".csv,.tsv,.txt,.npz,.parquet,.pq,.ndjson,.jsonl,.json,.db3,.bag,.mcap,.zip";
+const EXTENSIONS = ".csv,.tsv,.txt,.npz,.parquet,.pq,.ndjson,.jsonl,.json,.db3,.bag,.mcap,.zip";
 
-/** The card to upload with. onUploaded(dataset) is called for each. Returns {element, fillRobots(robots)}. */
+/** Create the upload card. onUploaded(dataset) is called after each upload. Returns {element, fillRobots(robots)}. */
 export function uploader({ onUploaded, signal }) {
   const options = uploadOptions();
   const name = h("input", { type: "text", name: "name", maxlength: "200", autocomplete: "off" });
-  const named = field("Name", name, "What people will call it; the file’s name if empty.");
-  const input = h("input", { type: "file", multiple: true, accept: ENDINGS, "aria-label": "Recordings to upload", hidden: true });
+  const named = field("Name", name, "Default: the name of the file.");
+  const input = h("input", { type: "file", multiple: true, accept: EXTENSIONS, "aria-label": "Recordings to upload", hidden: true });
   const choose = button("Choose files", () => input.click());
   const zone = h(
     "div",
     { class: "empty" },
-    h("p", {}, "Drop recordings anywhere on this page, or choose them here."),
+    h("p", {}, "Drop recordings anywhere on this page, or choose files."),
     h("div", { class: "actions" }, choose, input),
-    h("p", { class: "hint" }, "CSV, Parquet, NPZ, JSON, rosbag1, rosbag2, MCAP, LeRobot (zip). At least times, positions and torques."),
-    lacking("ingest"),
+    h("p", { class: "hint" }, "CSV, Parquet, NPZ, JSON, rosbag1, rosbag2, MCAP, LeRobot (zip). Required columns: time, position and torque."),
+    missingExtraHint("ingest"),
   );
   const ready = h("div", { hidden: true });
   const as = h("p", { class: "hint" });
-  // options outlive an upload: who sends the next file shall see what it will be read as
-  const say = () => {
+  // options are kept after an upload: show how the next file will be read
+  const describe = () => {
     const values = options.values();
-    as.textContent = Object.keys(values).length ? `It is read as set below: ${inWords(values)}.` : "The service finds out what it holds. Set the options below to tell it.";
+    as.textContent = Object.keys(values).length ? `Import options: ${describeOptions(values)}.` : "The contents are detected automatically. To override this, set the import options below.";
   };
-  options.element.addEventListener("change", say);
+  options.element.addEventListener("change", describe);
   const outcomes = h("div", {});
   let chosen = [];
   let sending = Promise.resolve();
@@ -41,7 +41,7 @@ export function uploader({ onUploaded, signal }) {
     chosen = [...files];
     ready.hidden = chosen.length === 0;
     named.hidden = chosen.length !== 1;
-    const start = button(chosen.length === 1 ? "Upload" : `Upload ${chosen.length} recordings`, go, { kind: "primary" });
+    const start = button(chosen.length === 1 ? "Upload" : `Upload ${chosen.length} recordings`, startUploads, { kind: "primary" });
     replace(
       ready,
       h("ul", {}, chosen.map((file) => h("li", {}, `${file.name}, ${bytes(file.size)}`))),
@@ -49,33 +49,33 @@ export function uploader({ onUploaded, signal }) {
       as,
       h("div", { class: "actions" }, start, button("Clear", () => pick([]))),
     );
-    say();
+    describe();
     if (chosen.length) start.focus();
   };
-  const go = () => {
+  const startUploads = () => {
     const title = chosen.length === 1 ? name.value.trim() : "";
     for (const file of chosen) enqueue(file, title);
     name.value = input.value = "";
     pick([]);
   };
-  // proposals: options that the user took from the service's refusals of this file
+  // proposals: options from error messages that the user accepted for this file
   const enqueue = (file, title, proposals = [], place = h("div", {})) => {
     if (!place.isConnected) outcomes.prepend(place);
-    replace(place, h("p", { class: "muted" }, `${file.name} waits for the upload before it.`));
+    replace(place, h("p", { class: "muted" }, `${file.name} is queued.`));
     sending = sending.then(() => send(file, title, proposals, place));
   };
   const send = async (file, title, proposals, place) => {
     const stop = new AbortController();
     const bar = progress(0, `Upload of ${file.name}`);
-    const said = h("p", { role: "status" }, `Sending ${file.name}…`);
-    const stopping = h("div", { class: "actions" }, button("Stop", () => stop.abort()));
-    replace(place, said, bar, stopping);
+    const status = h("p", { role: "status" }, `Uploading ${file.name}…`);
+    const stopping = h("div", { class: "actions" }, button("Cancel", () => stop.abort()));
+    replace(place, status, bar, stopping);
     const sent = (share) => {
       if (share < 1) bar.value = share;
       else {
-        bar.removeAttribute("value"); // how long reading takes, nobody knows
-        said.textContent = `${file.name} is sent; the service reads, checks and prepares it…`;
-        stopping.remove(); // from here on the service may have stored it
+        bar.removeAttribute("value"); // the duration of the import is unknown
+        status.textContent = `${file.name} is uploaded. Importing…`;
+        stopping.remove(); // the service may have stored it already
       }
     };
     const values = proposals.reduce((all, each) => withOption(all, ...each), options.values());
@@ -84,16 +84,16 @@ export function uploader({ onUploaded, signal }) {
       dataset = await upload(file, { ...values, name: title }, sent, stop.signal);
     } catch (error) {
       if (stop.signal.aborted) {
-        replace(place, h("p", { class: "muted" }, `${file.name} was stopped before all of it was sent.`));
+        replace(place, h("p", { class: "muted" }, `Upload of ${file.name} cancelled.`));
         return;
       }
       const accept = (option, value) => enqueue(file, title, [...proposals, [option, value]], place);
-      replace(place, refusal(file.name, error, accept, () => enqueue(file, title, proposals, place)));
-      if (signal.aborted) notice(`${file.name} was not taken: ${error.message}`, "bad");
+      replace(place, uploadError(file.name, error, accept, () => enqueue(file, title, proposals, place)));
+      if (signal.aborted) notice(`${file.name} could not be imported: ${error.message}`, "bad");
       return;
     }
-    replace(place, taken(dataset));
-    if (signal.aborted) notice(`${file.name} is uploaded.`);
+    replace(place, uploadSummary(dataset));
+    if (signal.aborted) notice(`${file.name} uploaded.`);
     else await Promise.resolve(onUploaded(dataset)).catch((error) => notice(error.message, "bad"));
   };
 
@@ -109,18 +109,18 @@ export function uploader({ onUploaded, signal }) {
   return { element: card("Upload a recording", zone, ready, outcomes, options.element), fillRobots: options.fillRobots };
 }
 
-function taken(dataset) {
+function uploadSummary(dataset) {
   const { report } = dataset;
-  const found = [some(report.warnings, "warning"), some(report.advice, "hint")].filter(Boolean);
+  const found = [countIfAny(report.warnings, "warning"), countIfAny(report.advice, "recommendation")].filter(Boolean);
   return h(
     "div",
     { class: "banner", role: "status", style: "border-color: var(--good); background: var(--good-bg); color: var(--good)" },
     h("p", {}, `✓ ${dataset.name}: ${counted(report.rows, "sample")} of ${counted(dataset.joint_names.length, "joint")}`, found.length ? `, ${found.join(" and ")}.` : "."),
-    report.reading.length ? h("p", { class: "hint" }, report.reading.join(". "), ".") : null,
-    h("div", { class: "actions" }, link("Read its report", `#/data/${dataset.id}`), link("Train on it", `#/train?datasets=${dataset.id}`)),
+    report.reading.length ? h("p", { class: "hint" }, report.reading.map(sentence).join(" ")) : null,
+    h("div", { class: "actions" }, link("View report", `#/data/${dataset.id}`), link("Train on this recording", `#/train?datasets=${dataset.id}`)),
   );
 }
 
-function some(texts, what) {
+function countIfAny(texts, what) {
   return texts.length ? counted(texts.length, what) : "";
 }

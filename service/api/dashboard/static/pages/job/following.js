@@ -1,13 +1,13 @@
-// Following a job: its events as long as the connection holds, and again when it is back.
+// Follows a job by its events; reconnects after a lost connection.
 
 import { events, get, path } from "../../api.js";
 import { ACTIVE } from "./words.js";
 
-const PAUSE_S = 2;
+const RETRY_AFTER_S = 2;
 
 /**
- * Tell every change of a job until it has ended or the signal aborts.
- * onJob(job): each news; onTrouble(text): why there is none for now.
+ * Report every change of a job until it ends or the signal aborts.
+ * onJob(job): called for each change; onTrouble(text): called with the reason if there are no updates.
  */
 export async function follow(id, { onJob, onTrouble, signal }) {
   let active = true;
@@ -17,19 +17,19 @@ export async function follow(id, { onJob, onTrouble, signal }) {
         active = ACTIVE.has(data.state);
         onJob(data);
       }
-      if (active) onTrouble("The service ended the connection.");
+      if (active) onTrouble("The service closed the connection.");
     } catch (error) {
       if (signal.aborted) return;
       if (error.status === 404) throw error;
-      onTrouble(error.status ? error.message : "The connection to the service is lost.");
-      // too many follow already, or a proxy lets no events through: asking now and then still works
-      if (error.status) active = await asked(id, onJob, signal, active);
+      onTrouble(error.status ? error.message : "Connection to the service lost.");
+      // if there are too many followers or a proxy blocks events, polling still works
+      if (error.status) active = await poll(id, onJob, signal, active);
     }
     if (active) await pause(signal);
   }
 }
 
-async function asked(id, onJob, signal, before) {
+async function poll(id, onJob, signal, before) {
   try {
     const job = await get(path`/v1/jobs/${id}`, {}, signal);
     onJob(job);
@@ -41,7 +41,7 @@ async function asked(id, onJob, signal, before) {
 
 function pause(signal) {
   return new Promise((resolve) => {
-    const timer = setTimeout(resolve, 1000 * PAUSE_S);
+    const timer = setTimeout(resolve, 1000 * RETRY_AFTER_S);
     signal.addEventListener("abort", () => (clearTimeout(timer), resolve()), { once: true });
   });
 }

@@ -1,12 +1,12 @@
-// The objective of a fit against its iterations, as far as this page has seen it.
+// Plot of the objective of a fit over its iterations, from the updates that this page received.
 
 import { line, plot } from "../../plots.js";
 
-/** Points by job, kept while the page is open: who leaves a job and comes back sees the curve go on. */
+/** Points by job, kept while the dashboard is open, so that the curve continues after a return to the job. */
 const seen = new Map();
-const MOST_JOBS = 20;
+const MAX_JOBS = 20;
 
-/** Draws as jobs are given to it; an interrupted job that starts again gets a curve of its own. */
+/** Plot of a job's objective. Each attempt of a restarted job has its own curve. */
 export class Objective {
   #place;
   #signal;
@@ -19,19 +19,19 @@ export class Objective {
     this.#signal = signal;
   }
 
-  /** Iterations that are in the curve. */
+  /** Return the number of iterations in the plot. */
   static points(id) {
     return [...(seen.get(id)?.values() ?? [])].reduce((sum, { x }) => sum + x.length, 0);
   }
 
-  /** The first iteration that is in the curve, null where there is none. */
+  /** Return the first iteration in the plot; null if there is none. */
   static first(id) {
     const [curve] = seen.get(id)?.values() ?? [];
     return curve?.x[0] ?? null;
   }
 
-  /** Take a job as it is now; true where a point came with it. */
-  take(job) {
+  /** Add the progress of a job; return whether it has a new point. */
+  add(job) {
     const { objective, iteration, estimator } = job.progress;
     if (objective === null || objective === undefined || !iteration) return false;
     const curves = curvesOf(job.id);
@@ -44,7 +44,7 @@ export class Objective {
     return true;
   }
 
-  /** Draw what is known. On a slow machine news come faster than they can be drawn: only the last is drawn then. */
+  /** Draw the plot. If updates arrive faster than they can be drawn, only the last one is drawn. */
   async draw(job) {
     this.#next = job;
     if (this.#drawing) return;
@@ -63,7 +63,7 @@ export class Objective {
   async #draw(job) {
     const all = [...curvesOf(job.id).values()];
     if (this.#signal.aborted || !all.length) return;
-    // objectives of different estimators cannot be compared: the one at work is shown, or the last one
+    // objectives of different estimators are not comparable: show the current estimator, or the last one
     const { estimator } = all.find((each) => each.estimator === job.progress.estimator) ?? all.at(-1);
     const curves = all.filter((each) => each.estimator === estimator);
     const name = estimator ? `objective of ${estimator}` : "objective";
@@ -90,7 +90,7 @@ export class Objective {
 
 function curvesOf(id) {
   if (!seen.has(id)) {
-    if (seen.size >= MOST_JOBS) seen.delete(seen.keys().next().value);
+    if (seen.size >= MAX_JOBS) seen.delete(seen.keys().next().value);
     seen.set(id, new Map());
   }
   return seen.get(id);

@@ -1,4 +1,4 @@
-// What a job is doing, in words.
+// Texts about jobs: stages, remaining time, held-out parts.
 
 import { seconds } from "../../format.js";
 
@@ -6,43 +6,43 @@ import { seconds } from "../../format.js";
 export const ACTIVE = new Set(["queued", "running"]);
 
 const STAGES = {
-  waiting: "waiting for its turn",
+  waiting: "queued",
   loading: "loading the data",
-  geometry: "searching for the joint axes",
+  geometry: "fitting the joint axes",
   hyperparameters: "fitting hyperparameters",
   posterior: "computing the posterior",
-  statistics: "summing up all rows",
+  statistics: "computing statistics of all rows",
   evaluating: "evaluating on the held-out part",
-  all_rows: "training on all rows, held out or not",
+  all_rows: "training on all rows",
   saving: "saving the version",
   done: "done",
 };
 
-/** The stage of a job's work. */
+/** Describe the current stage of a job. */
 export function stage({ progress: at }) {
-  if (at.stage === "hyperparameters" && !at.iteration) return "choosing where to start the fit";
+  if (at.stage === "hyperparameters" && !at.iteration) return "choosing the start of the fit";
   const doing = STAGES[at.stage] ?? at.stage;
   return at.estimator ? `${at.estimator}: ${doing}` : doing;
 }
 
-/** What is left of its time, empty where that is not known. */
-export function left({ progress: at }) {
-  return at.remaining_s === null ? "" : `at most about ${seconds(Math.ceil(at.remaining_s))}`;
+/** Describe the remaining time of a job; an empty text if it is unknown. */
+export function remaining({ progress: at }) {
+  return at.remaining_s === null ? "" : `up to ${seconds(Math.ceil(at.remaining_s))}`;
 }
 
-/** Of figures of a version that has learnt what was held out: which fit they are of. */
-export const JUDGED = "Judged on held-out rows; the version was then trained on all rows.";
+/** Note on the figures of a version that was trained on the held-out rows in the end. */
+export const HELD_OUT_NOTE = "Evaluated on held-out rows. The version was then trained on all rows.";
 
-/** What was held out, in a sentence. */
+/** Describe the held-out part. */
 export function heldOut(holdout) {
   if (!holdout) return "nothing";
   const share = `${Math.round(100 * holdout.share)}\u00a0%`;
-  const guard = holdout.guard_s === null ? "" : `, with a guard of ${holdout.guard_s} s`;
+  const guard = holdout.guard_s === null ? "" : `, guard of ${holdout.guard_s} s`;
   const what = {
     last: `the last ${share} of each data set`,
-    auto: `${share}: the last part, unless it repeats the rest`,
-    episodes: `${share}, in whole episodes chosen by seed ${holdout.seed}`,
-    blocks: `${share}, in some of ${holdout.blocks} blocks chosen by seed ${holdout.seed}`,
+    auto: `${share}: the last part, or another one if that repeats earlier motion`,
+    episodes: `${share}: whole episodes, seed ${holdout.seed}`,
+    blocks: `${share}: some of ${holdout.blocks} blocks, seed ${holdout.seed}`,
   };
-  return `${what[holdout.kind]}${guard}${holdout.only ? ", and never learnt" : ""}`;
+  return `${what[holdout.kind]}${guard}${holdout.only ? ", never trained on" : ""}`;
 }

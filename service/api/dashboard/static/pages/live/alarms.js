@@ -1,56 +1,56 @@
-// What the model's owner should know, and the decision that learning waits for.
+// Alarms, and the decision after a change of the robot.
 
 import { path, post } from "../../api.js";
 import { h, refresh, replace } from "../../dom.js";
-import { counted, when } from "../../format.js";
+import { counted, sentence, when } from "../../format.js";
 import { badge, button, confirm, field, notice } from "../../ui.js";
 
-const WORDS = {
-  adapt: "Choose this if the robot has a payload or a new tool: it is learnt anew, and what was learnt before counts less.",
-  ignore: "Choose this if the robot is the same as before. If it has changed, going on ruins what the model knows.",
+const CONFIRMATIONS = {
+  adapt: "Choose this if the robot has a payload or a new tool. The model learns the change, and earlier data counts less.",
+  ignore: "Choose this if the robot has not changed. If it has, learning damages the model.",
 };
 
-/** Show alarms, and buttons where learning is held; the buttons stay while they are needed. */
+/** Show the alarms, and the decision while learning is paused by a change. */
 export function alarms(page, status, name, signal) {
   const key = status.held ? String(status.held.at) : "";
-  if ((page.held.dataset.key ?? "") !== key) {
-    page.held.dataset.key = key;
-    replace(page.held, status.held ? decision(status, name, signal) : null);
+  if ((page.decision.dataset.key ?? "") !== key) {
+    page.decision.dataset.key = key;
+    replace(page.decision, status.held ? decisionBanner(status, name, signal) : null);
   }
-  refresh(page.alarms, status.alarms.length ? list(status.alarms) : null);
+  refresh(page.alarms, status.alarms.length ? alarmList(status.alarms) : null);
 }
 
-const MARKS = { promotion: "good", payload: "good", change: "bad" };
+const MARK_KINDS = { promotion: "good", payload: "good", change: "bad" };
 
-/** Alarms of a stream as marks of the plots' time axis, whose zero is the newest row's time, Unix seconds: where it began, by the rows' own clock, if that is known. */
+/** Return the alarms of a stream as marks on the time axis, at their start if that is known. newest: time of the newest row, Unix s, the zero of the axis. */
 export function alarmMarks(found, stream, newest) {
   const own = found.filter(({ evidence }) => (evidence.stream_id ?? stream) === stream);
-  return own.map(({ at, kind, evidence }) => ({ x: (evidence.at ?? Date.parse(at) / 1000) - newest, word: kind, kind: MARKS[kind] ?? "warn" }));
+  return own.map(({ at, kind, evidence }) => ({ x: (evidence.at ?? Date.parse(at) / 1000) - newest, word: kind, kind: MARK_KINDS[kind] ?? "warn" }));
 }
 
-function decision({ held, alarms }, name, signal) {
+function decisionBanner({ held, alarms }, name, signal) {
   const replay = h("input", { type: "checkbox" });
   const decide = (choice) => async () => {
-    if (!(await confirm(WORDS[choice], choice === "adapt" ? "Adapt" : "Go on as before", choice === "adapt" ? "primary" : "danger"))) return;
+    if (!(await confirm(CONFIRMATIONS[choice], choice === "adapt" ? "Adapt" : "Resume learning", choice === "adapt" ? "primary" : "danger"))) return;
     const done = await post(path`/v1/models/${name}/learning/change`, { decision: choice, replay: replay.checked }, signal);
-    notice(`Learning goes on${done.rows ? `, with ${counted(done.rows, "row")} that had been kept out` : ""}.`);
+    notice(`Learning has resumed${done.rows ? `, with ${counted(done.rows, "rejected row")}` : ""}.`);
   };
-  const said = alarms.find((alarm) => alarm.kind === "change")?.message;
+  const message = alarms.find((alarm) => alarm.kind === "change")?.message;
   return h(
     "section",
     { class: "banner", "aria-label": "Decision" },
-    h("h2", {}, "Learning waits for you"),
-    h("p", {}, said ? `${said[0].toUpperCase()}${said.slice(1)}. ` : "The robot seems to have changed. ", held.at === null ? null : `It began on ${when(held.at)}. `, "Until you decide, the model answers with what it knew before. Its torque may be wrong."),
-    field("Also learn the rows kept out since", replay),
-    h("div", { class: "actions" }, button("Adapt to the changed robot", decide("adapt"), { kind: "primary" }), button("Nothing has changed, go on", decide("ignore"))),
+    h("h2", {}, "Learning is paused"),
+    h("p", {}, message ? `${sentence(message)} ` : "The robot may have changed. ", held.at === null ? null : `Start of the change: ${when(held.at)}. `, "Until you decide, the model serves its earlier state, and its torque may be wrong."),
+    field("Also learn the rows rejected since then", replay),
+    h("div", { class: "actions" }, button("Adapt to the change", decide("adapt"), { kind: "primary" }), button("No change, resume learning", decide("ignore"))),
   );
 }
 
-function list(items) {
+function alarmList(items) {
   return h(
     "section",
     { class: "card", "aria-label": "Alarms" },
-    h("h2", {}, "Newest alarms"),
+    h("h2", {}, "Recent alarms"),
     h("ul", {}, items.map((alarm) => h("li", {}, badge(alarm.kind, { promotion: "good", payload: "plain" }[alarm.kind] ?? "warn"), ` ${when(alarm.at)}: ${alarm.message}`))),
   );
 }

@@ -1,49 +1,49 @@
-// Follows a model's live events, and again after the connection was lost, until the page is left.
+// Follows the live events of a model; reconnects until the page is left.
 
 import { ApiError, events, path } from "../../api.js";
 
-const SILENT_MS = 6000; // a status comes every second
-const LONGEST_S = 10;
-const FINAL = [400, 401, 403, 404, 422];
+const TIMEOUT_MS = 6000; // a status arrives every second
+const MAX_WAIT_S = 10;
+const PERMANENT = [400, 401, 403, 404, 422];
 
 /**
- * Tell hear(event, data) of every event, and tell({state, why}) whenever that changes: "following" or "lost".
- * Throws ApiError where asking again would not help.
+ * Call onEvent(event, data) for every event, and onState({state, why}) if the state changes: "following" or "lost".
+ * Throw an ApiError if a retry cannot succeed.
  */
-export async function follow(name, signal, hear, tell) {
+export async function follow(name, signal, onEvent, onState) {
   let wait = 1;
   while (!signal.aborted) {
-    const why = await attempt(name, signal, hear, () => {
+    const why = await attempt(name, signal, onEvent, () => {
       wait = 1;
-      tell({ state: "following" });
+      onState({ state: "following" });
     });
     if (signal.aborted) return;
-    tell({ state: "lost", why });
+    onState({ state: "lost", why });
     await pause(wait, signal);
-    wait = Math.min(2 * wait, LONGEST_S);
+    wait = Math.min(2 * wait, MAX_WAIT_S);
   }
 }
 
-/** Follow until it ends; returns why. */
-async function attempt(name, signal, hear, begun) {
+/** Follow the events until the connection ends; return the reason. */
+async function attempt(name, signal, onEvent, onStart) {
   const one = new AbortController();
   const stop = () => one.abort();
-  let heard = null;
-  const watch = setInterval(() => heard !== null && Date.now() - heard > SILENT_MS && stop(), 1000);
+  let receivedAt = null;
+  const watch = setInterval(() => receivedAt !== null && Date.now() - receivedAt > TIMEOUT_MS && stop(), 1000);
   signal.addEventListener("abort", stop);
   try {
     for await (const { event, data } of events(path`/v1/models/${name}/live`, one.signal)) {
-      if (heard === null) begun();
-      heard = Date.now();
-      hear(event, data);
+      if (receivedAt === null) onStart();
+      receivedAt = Date.now();
+      onEvent(event, data);
     }
-    return "the service ended it";
+    return "closed by the service";
   } catch (error) {
     if (signal.aborted) return "";
-    if (error instanceof ApiError && FINAL.includes(error.status)) throw error;
+    if (error instanceof ApiError && PERMANENT.includes(error.status)) throw error;
     if (error instanceof ApiError) return error.message;
-    if (one.signal.aborted) return `nothing was heard for ${SILENT_MS / 1000} s`;
-    if (error instanceof TypeError && heard !== null) return "it broke off";
+    if (one.signal.aborted) return `no data for ${TIMEOUT_MS / 1000} s`;
+    if (error instanceof TypeError && receivedAt !== null) return "interrupted";
     throw error;
   } finally {
     clearInterval(watch);

@@ -1,36 +1,36 @@
-// How far every row was from its prediction, in standard deviations, with marks of what was kept out and what is novel.
+// Plot of the innovation in standard deviations, with marks of rejected and novel rows.
 
 import { css } from "../../colours.js";
 import { h, replace } from "../../dom.js";
 import { shortNames } from "../../format.js";
 import { line, plot } from "../../plots.js";
-import { card, explained } from "../../ui.js";
+import { card, explanation } from "../../ui.js";
 import { CODES, NOVEL } from "./codes.js";
-import { score } from "./scores.js";
-import { broken, HALF_WIDTH, span, thin } from "./torque.js";
+import { innovationOf } from "./scores.js";
+import { withGaps, HALF_WIDTH, span, thin } from "./torque.js";
 
 const HEIGHT = 300;
-const LEAST = 4;
-const MOST = 12;
-const MOST_MARKS = 150; // of a kind
+const MIN_RANGE_STD = 4;
+const MAX_RANGE_STD = 12;
+const MAX_MARKS = 150; // of each kind
 
-/** The plot in a place; draw(rows, status). view: {window, joint}: the joint whose line is thick, null: none. */
+/** Create the plot. view: {window}. Returns {draw(rows, status, joint)}; joint: highlighted joint. */
 export function innovation(place, joints, view, linked, signal) {
   const short = shortNames(joints);
   const element = h("div", { style: `height: ${HEIGHT}px` });
-  const hint = `Measured minus predicted torque, in standard deviations of a measurement. 95 % of the rows should lie between the dotted lines at ± ${HALF_WIDTH}. Symbols mark rows kept out of learning, and motion beyond what this version was trained on. A symbol stands at the joint with the largest error. Values beyond ± ${MOST} are drawn at ± ${MOST}.`;
-  replace(place, card("Innovation", element, explained(hint)));
+  const hint = `Measured − predicted torque, in standard deviations of a measurement. 95 % of the rows should lie between the dotted lines at ± ${HALF_WIDTH}. Symbols mark rejected rows and rows outside the training data, at the joint with the largest innovation. Values beyond ± ${MAX_RANGE_STD} are drawn at ± ${MAX_RANGE_STD}.`;
+  replace(place, card("Innovation", element, explanation(hint)));
   let made = null;
   return {
     async draw(rows, status, shown) {
       if (signal.aborted) return;
-      const worst = rows.map(farthest);
-      const top = Math.min(MOST, Math.max(LEAST, 1.1 * worst.reduce((most, z) => Math.max(most, Math.abs(z)), 0)));
+      const worst = rows.map(largestInnovation);
+      const top = Math.min(MAX_RANGE_STD, Math.max(MIN_RANGE_STD, 1.1 * worst.reduce((most, z) => Math.max(most, Math.abs(z)), 0)));
       const clip = (z) => (z === null ? null : Math.max(-top, Math.min(top, z)));
       const thinned = thin(rows);
-      const x = broken(thinned, (row) => row.x);
+      const x = withGaps(thinned, (row) => row.x);
       const curves = joints.map((_name, joint) =>
-        line(x, broken(thinned, (row) => clip(score(row, joint))), short[joint], joint, { line: { width: joint === shown ? 2.2 : 0.8 }, showlegend: false }),
+        line(x, withGaps(thinned, (row) => clip(innovationOf(row, joint))), short[joint], joint, { line: { width: joint === shown ? 2.2 : 0.8 }, showlegend: false }),
       );
       const traces = [...curves, ...marks(rows, worst, clip)];
       const range = [-span(rows, view.window), 0];
@@ -38,11 +38,11 @@ export function innovation(place, joints, view, linked, signal) {
         y: "σ", height: HEIGHT, margin: { l: 52, r: 8, t: 8, b: 40 }, hovermode: false, dragmode: false,
         xaxis: { range, zeroline: false, ticksuffix: " s", automargin: false },
         yaxis: { range: [-1.05 * top, 1.05 * top], automargin: false },
-        showlegend: true, // of marks: the joints' colours are named above
+        showlegend: true, // for the marks only: the plots above name the joint colours
         legend: { orientation: "h", y: -0.16, yanchor: "top", itemclick: false, itemdoubleclick: false },
         shapes: limits(status.contact_threshold, top),
       };
-      const label = `Innovation of all joints over the last ${-range[0]} seconds, with marks of rows that were kept out of learning`;
+      const label = `Innovation of all joints over the last ${-range[0]} seconds, with marks of rejected rows`;
       element.setAttribute("aria-label", label);
       if (made) await made.react(traces, layout);
       else {
@@ -53,10 +53,10 @@ export function innovation(place, joints, view, linked, signal) {
   };
 }
 
-/** The innovation of the joint that was farthest off; 0 where nothing was predicted. */
-function farthest(row) {
+/** Return the largest innovation of a row; 0 if nothing was predicted. */
+function largestInnovation(row) {
   return row.tau.reduce((most, _tau, joint) => {
-    const z = score(row, joint);
+    const z = innovationOf(row, joint);
     return z !== null && Math.abs(z) > Math.abs(most) ? z : most;
   }, 0);
 }
@@ -74,13 +74,13 @@ function marks(rows, worst, clip) {
     if (row.novel) add(NOVEL, row, worst[index]);
   });
   return [...kinds].map(([kind, data]) => ({
-    ...few(data), mode: "markers", type: "scatter", name: kind.words, colour: kind.colour,
+    ...limitMarks(data), mode: "markers", type: "scatter", name: kind.words, colour: kind.colour,
     marker: kind.lasting ? { symbol: kind.symbol, size: 4, opacity: 0.6 } : { symbol: kind.symbol, size: 8 },
   }));
 }
 
-function few(data) {
-  const step = Math.ceil(data.x.length / MOST_MARKS);
+function limitMarks(data) {
+  const step = Math.ceil(data.x.length / MAX_MARKS);
   return Object.fromEntries(Object.entries(data).map(([name, values]) => [name, values.filter((_value, index) => index % step === 0)]));
 }
 

@@ -2,26 +2,26 @@
 
 export const WINDOWS_S = [10, 30, 120];
 const KEPT_S = Math.max(...WINDOWS_S);
-const GAP_S = 1; // lines do not cross it
+const GAP_S = 1; // lines have a gap there
 const RATE_S = 5;
-const SILENT_S = 3;
-const MOST_STREAMS = 50;
+const SILENT_AFTER_S = 3;
+const MAX_STREAMS = 50;
 
-/** Rows that came; `version` grows with every change, `chosen` is the stream that is shown. */
+/** Received rows. `version` increases with every change; `chosen` is the shown stream. */
 export class Rows {
   #streams = new Map();
   #picked = false;
 
   constructor(joints) {
-    Object.assign(this, { joints, version: 0, came: 0, chosen: null });
+    Object.assign(this, { joints, version: 0, received: 0, chosen: null });
   }
 
-  /** Take a part of a `rows` event. */
-  take(part) {
+  /** Add a part of a `rows` event. */
+  add(part) {
     const at = performance.now() / 1000;
     const stream = this.#stream(part.stream_id);
     part.time.forEach((time, index) => {
-      // a row whose time is in doubt has no place in a plot over time; it is counted
+      // a row with an unreliable time is counted, but not drawn
       if (time === null || part.code[index] === "time_jump") return;
       const std = part.std[index].map((std, joint) => (std === null ? null : Math.hypot(std, part.noise_std[joint])));
       stream.rows.push({ time, tau: part.tau[index], mean: part.mean[index], std, code: part.code[index], novel: false });
@@ -33,12 +33,12 @@ export class Rows {
     stream.rate = stream.rate.filter((each) => each.time > newest - RATE_S);
     stream.heard = at;
     if (part.q.length && !part.q.includes(null)) stream.q = part.q;
-    this.came += part.rows;
+    this.received += part.rows;
     this.version += 1;
-    if (this.chosen === null || (!this.#picked && this.age() > SILENT_S)) this.chosen = part.stream_id;
+    if (this.chosen === null || (!this.#picked && this.age() > SILENT_AFTER_S)) this.chosen = part.stream_id;
   }
 
-  /** Mark rows that lie beyond what the version's basis covers, as a status says some time later. */
+  /** Mark rows outside the basis of the version, which a later status reports. */
   mark({ stream_id, times }) {
     const novel = new Set(times);
     for (const row of this.#streams.get(stream_id)?.rows ?? []) row.novel ||= novel.has(row.time);
@@ -54,32 +54,32 @@ export class Rows {
     return [...this.#streams.keys()].sort();
   }
 
-  /** Seconds since rows of the chosen stream came, by this browser's clock; null: none did. */
+  /** Return the seconds since the last rows of the chosen stream, by the browser's clock; null if there are none. */
   age() {
     const stream = this.#streams.get(this.chosen);
     return stream ? performance.now() / 1000 - stream.heard : null;
   }
 
-  /** Positions of the chosen stream's newest row that is shown, null where none is known. */
+  /** Return the newest positions of the chosen stream; null if unknown. */
   pose() {
     return this.#streams.get(this.chosen)?.q ?? null;
   }
 
-  /** Event time of the chosen stream's newest row, Unix seconds; null: there is none. */
+  /** Return the event time of the newest row of the chosen stream, Unix s; null if there is none. */
   newest() {
     return this.#streams.get(this.chosen)?.rows.at(-1)?.time ?? null;
   }
 
-  /** Rows a second of the robot's own time that came and that were shown lately; null: not known yet. */
+  /** Return the recent rates of received and shown rows per second of event time; null if unknown. */
   rate() {
     const parts = this.#streams.get(this.chosen)?.rate ?? [];
     const seconds = parts.length ? parts.at(-1).time - parts[0].time : 0;
     if (seconds < 1) return null;
     const sum = (name) => parts.slice(1).reduce((all, each) => all + each[name], 0) / seconds;
-    return { came: sum("rows"), shown: sum("shown") };
+    return { received: sum("rows"), shown: sum("shown") };
   }
 
-  /** Rows of the last so many seconds, `x` seconds after the newest one (so never positive), `cut` where the line does not go on. */
+  /** Return the rows of the last `seconds`. x: time relative to the newest row, s; cut: whether a gap precedes the row. */
   shown(seconds) {
     const all = this.#streams.get(this.chosen)?.rows ?? [];
     const newest = all.at(-1)?.time ?? 0;
@@ -93,7 +93,7 @@ export class Rows {
 
   #stream(name) {
     if (!this.#streams.has(name)) {
-      if (this.#streams.size >= MOST_STREAMS) this.#streams.delete(this.streams().find((each) => each !== this.chosen));
+      if (this.#streams.size >= MAX_STREAMS) this.#streams.delete(this.streams().find((each) => each !== this.chosen));
       this.#streams.set(name, { rows: [], rate: [], heard: 0, q: null });
     }
     return this.#streams.get(name);

@@ -1,4 +1,4 @@
-// What of the live plots is seen: how much time, which joint large, and a cursor that keys can move.
+// Controls of the live plots: time window, large joint, and a cursor for the keyboard.
 
 import { h } from "../../dom.js";
 import { field, select } from "../../ui.js";
@@ -7,16 +7,16 @@ import { WINDOWS_S } from "./rows.js";
 const LARGEST = "largest innovation";
 
 /**
- * The bar. choice: {window, joint, cursor}, changed here and kept in the address, from whose query it begins.
- * changed(): it is to be drawn again; point(x): the cursor was moved, null: away. Returns {element, pick(joint), point(x)}.
+ * Create the controls. choice: {window, joint, cursor}, updated here and stored in the query of the address.
+ * changed(): called to redraw; point(x): called when the cursor moves, null if it is removed. Returns {element, pick(joint), point(x)}.
  */
 export function toolbar(name, joints, choice, query, { changed, point }) {
   if (WINDOWS_S.includes(Number(query.get("window")))) choice.window = Number(query.get("window"));
   if (joints.includes(query.get("joint"))) choice.joint = joints.indexOf(query.get("joint"));
   const remember = () => {
     const kept = { ...(choice.window === 30 ? {} : { window: choice.window }), ...(choice.joint === null ? {} : { joint: joints[choice.joint] }) };
-    const said = new URLSearchParams(kept).toString();
-    history.replaceState(null, "", `#/live/${encodeURIComponent(name)}${said && `?${said}`}`);
+    const search = new URLSearchParams(kept).toString();
+    history.replaceState(null, "", `#/live/${encodeURIComponent(name)}${search && `?${search}`}`);
     slider.min = String(-choice.window);
     changed();
   };
@@ -41,8 +41,8 @@ export function toolbar(name, joints, choice, query, { changed, point }) {
   const element = h(
     "div",
     { class: "grid thirds" },
-    field("Time shown", windows),
-    field("Shown large", large),
+    field("Time window", windows),
+    field("Large plot", large),
     h("div", { class: "field" }, h("span", { class: "row", "aria-hidden": "true" }, h("b", {}, "Cursor"), at), slider),
   );
   return { element, pick, point: show };

@@ -1,21 +1,21 @@
-// Measured and predicted torque: one joint large, all of them small beside each other, with the 95 % interval of a measurement.
+// Plots of the measured and predicted torque with 95 % intervals: one large plot, and a small one for each joint.
 
 import { jointVar } from "../../colours.js";
 import { h, replace } from "../../dom.js";
 import { number, shortNames, torqueUnit } from "../../format.js";
 import { line, plot } from "../../plots.js";
 import { card } from "../../ui.js";
-import { lately, largest } from "./scores.js";
+import { recentInnovations, largestJoint } from "./scores.js";
 
 export const HALF_WIDTH = 1.96;
-const MOST_DRAWN = 300;
+const MAX_POINTS = 300;
 const SMALL = { height: 110, margin: { l: 34, r: 4, t: 4, b: 16 }, most: 120 };
-const LARGE = { height: 320, margin: { l: 52, r: 8, t: 8, b: 28 }, most: MOST_DRAWN };
-const FULL = 8; // standard deviations that fill a joint's bar
+const LARGE = { height: 320, margin: { l: 52, r: 8, t: 8, b: 28 }, most: MAX_POINTS };
+const FULL_BAR_STD = 8; // innovation that fills the bar of a joint
 
 /**
- * Plots in a place. view: what the page shows, {window, joint, cursor}: joint null is the one with the largest innovation
- * of late; pick(joint): a joint was chosen. Returns {draw(rows), point(): show values at the cursor}.
+ * Create the plots. view: {window, joint, cursor}; joint null: the one with the largest recent innovation;
+ * pick(joint): called when a joint is selected. Returns {draw(rows), point()}; point() shows the values at the cursor.
  */
 export function torque(place, joints, types, view, linked, { pick, signal }) {
   const short = shortNames(joints);
@@ -37,7 +37,7 @@ export function torque(place, joints, types, view, linked, { pick, signal }) {
     card(
       "Torque",
       large.element,
-      h("p", { class: "hint" }, swatch("border-top: 3px solid var(--measured)"), "measured  ", swatch("border-top: 3px solid var(--predicted)"), "predicted before it was learnt  ", swatch("height: 0.8em; background: var(--predicted); opacity: 0.3"), "95 % of measurements are expected here: ± 1.96 √(std² + noise²)  ", h("b", { "aria-hidden": "true", style: "color: var(--contact)" }, "× "), "kept out of learning (at the edge: far off)"),
+      h("p", { class: "hint" }, swatch("border-top: 3px solid var(--measured)"), "measured  ", swatch("border-top: 3px solid var(--predicted)"), "predicted before learning  ", swatch("height: 0.8em; background: var(--predicted); opacity: 0.3"), "95 % interval of measurements: ± 1.96 √(std² + noise²)  ", h("b", { "aria-hidden": "true", style: "color: var(--contact)" }, "× "), "rejected (at the edge: outside the plot)"),
       h("div", { class: "multiples" }, made.map((each) => each.element)),
     ),
   );
@@ -45,8 +45,8 @@ export function torque(place, joints, types, view, linked, { pick, signal }) {
   let shown = null, chosen = false, last = [];
   const draw = async (each, joint, range, label) => {
     const rows = thin(last, each.size.most);
-    const reach = reached(rows, joint);
-    const traces = [...curves(rows, joint), keptOut(last, joint, reach)];
+    const reach = axisRange(rows, joint);
+    const traces = [...curves(rows, joint), rejectedMarks(last, joint, reach)];
     const small = each.size === SMALL;
     const layout = {
       y: small ? "" : torqueUnit(types[joint]),
@@ -72,18 +72,18 @@ export function torque(place, joints, types, view, linked, { pick, signal }) {
     point,
     async draw(rows) {
       last = rows;
-      const scores = lately(rows, joints);
-      shown = view.joint ?? largest(scores, chosen ? null : shown);
+      const scores = recentInnovations(rows, joints);
+      shown = view.joint ?? largestJoint(scores, chosen ? null : shown);
       chosen = view.joint !== null;
       large.title.textContent = short[shown];
       large.element.style.setProperty("--own", jointVar(shown));
-      why.textContent = view.joint === null ? `largest innovation of the last seconds: ${number(scores[shown], 2)} σ` : "chosen by you";
+      why.textContent = view.joint === null ? `largest recent innovation: ${number(scores[shown], 2)} σ` : "selected";
       for (const each of made) {
         each.score = scores[each.joint];
         each.element.classList.toggle("largest", each.joint === shown);
         each.button.setAttribute("aria-pressed", String(view.joint === each.joint));
-        each.element.style.setProperty("--of", String(Math.min(scores[each.joint] / FULL, 1)));
-        each.element.classList.toggle("far", scores[each.joint] > FULL);
+        each.element.style.setProperty("--of", String(Math.min(scores[each.joint] / FULL_BAR_STD, 1)));
+        each.element.classList.toggle("far", scores[each.joint] > FULL_BAR_STD);
       }
       point();
       const range = [-span(rows, view.window), 0];
@@ -95,7 +95,7 @@ export function torque(place, joints, types, view, linked, { pick, signal }) {
   };
 }
 
-/** What a joint's plot stands in: a head with its name and its value, and a place that has its size before it is drawn. */
+/** Create the frame of a plot: a head with name and value, and a place of fixed size. */
 function figure(title, size, kind) {
   const value = h("span", { class: "value" });
   const head = h("div", { class: "head" }, title, value);
@@ -103,13 +103,13 @@ function figure(title, size, kind) {
   return { title, value, head, size, plot: place, seen: false, made: null, element: h("div", { class: `trace ${kind}` }, head, place) };
 }
 
-/** Seconds of a window that the x axis shows: while there are only a few, they are not squeezed into its end. */
+/** Return the seconds of a window that the x axis shows: fewer while there are only a few rows. */
 export function span(rows, window) {
   const there = rows.length ? -rows[0].x : 0;
   return [2, 5, 10, 30, 60, window].find((each) => each >= there && each <= window) ?? window;
 }
 
-/** The row nearest to a place of the x axis; null: there is none. */
+/** Return the row nearest to x; null if there are none. */
 export function closest(rows, x) {
   return rows.reduce((best, row) => (best === null || Math.abs(row.x - x) < Math.abs(best.x - x) ? row : best), null);
 }
@@ -119,29 +119,29 @@ function values({ tau, mean }, joint, unit) {
   return unit ? `measured ${measured}, predicted ${predicted} ${unit}` : `${measured} | ${predicted}`;
 }
 
-/** Few enough rows for a line; the first after a gap stays, and those that were kept out. */
-export function thin(rows, most = MOST_DRAWN) {
+/** Thin rows for a line; keep the first row after a gap and the rejected rows. */
+export function thin(rows, most = MAX_POINTS) {
   const step = Math.ceil(rows.length / most);
-  return step < 2 ? rows : rows.filter((row, index) => row.cut || index % step === 0 || odd(row));
+  return step < 2 ? rows : rows.filter((row, index) => row.cut || index % step === 0 || isRejected(row));
 }
 
-/** Numbers with a hole before every row that does not go on from the one before. */
-export function broken(rows, value) {
+/** Return values with a null before each row that follows a gap. */
+export function withGaps(rows, value) {
   return rows.flatMap((row) => (row.cut ? [null, value(row)] : [value(row)]));
 }
 
 function curves(rows, joint) {
-  const x = broken(rows, (row) => row.x);
-  // a torque beyond all limits would leave nothing to see of the others
-  const measured = broken(rows, (row) => (row.code === "limit" ? null : row.tau[joint]));
+  const x = withGaps(rows, (row) => row.x);
+  // a torque beyond the limits would compress all other values
+  const measured = withGaps(rows, (row) => (row.code === "limit" ? null : row.tau[joint]));
   return [
     ribbon(rows.filter((row) => row.mean[joint] !== null), joint),
-    line(x, broken(rows, (row) => row.mean[joint]), "predicted", "predicted"),
+    line(x, withGaps(rows, (row) => row.mean[joint]), "predicted", "predicted"),
     line(x, measured, "measured", "measured", { line: { width: 1.2 } }),
   ];
 }
 
-// one closed shape for each unbroken piece: an area between two curves would bridge the gaps
+// a closed shape for each piece: an area between two curves would bridge the gaps
 function ribbon(rows, joint) {
   const pieces = [];
   for (const row of rows) {
@@ -157,28 +157,28 @@ function ribbon(rows, joint) {
   };
 }
 
-function keptOut(rows, joint, [low, high]) {
-  const kept = rows.filter(odd);
+function rejectedMarks(rows, joint, [low, high]) {
+  const kept = rows.filter(isRejected);
   return {
     x: kept.map((row) => row.x), y: kept.map((row) => Math.max(low, Math.min(high, row.tau[joint]))), mode: "markers", type: "scatter",
-    colour: "contact", marker: { symbol: "x", size: 6 }, name: "kept out", hoverinfo: "skip",
+    colour: "contact", marker: { symbol: "x", size: 6 }, name: "rejected", hoverinfo: "skip",
   };
 }
 
-// what is worth a mark and must not make the others too small to see; a robot at rest, changed or with a payload goes on for long
-function odd(row) {
+// rows to mark; the listed codes are usual, or last too long to mark every row
+function isRejected(row) {
   return !["learnt", "stationary", "limit", "change", "payload", "paused"].includes(row.code);
 }
 
-/** What the axis shows: all usual rows and their interval, and of those that were kept out as much again on either side. */
-function reached(rows, joint) {
+/** Return the range of the axis: all usual rows with their intervals; rejected rows extend it by its size at most. */
+function axisRange(rows, joint) {
   const all = [Infinity, -Infinity];
   const usual = [Infinity, -Infinity];
   const widen = (range, y) => y !== null && ([range[0], range[1]] = [Math.min(range[0], y), Math.max(range[1], y)]);
   for (const row of rows) {
     if (row.code === "limit") continue;
     widen(all, row.tau[joint]);
-    if (odd(row)) continue;
+    if (isRejected(row)) continue;
     widen(usual, row.tau[joint]);
     if (row.mean[joint] !== null) [-1, 1].forEach((side) => widen(usual, row.mean[joint] + side * HALF_WIDTH * row.std[joint]));
   }

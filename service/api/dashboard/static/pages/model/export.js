@@ -1,4 +1,4 @@
-// A version as an archive or as C, and its arm as a URDF: fetched with the key where one is needed and handed to the browser as a file.
+// Downloads of a version: archive, C code, URDF. They are fetched with the API key and saved as files.
 
 import { ApiError } from "../../api.js";
 import { h } from "../../dom.js";
@@ -9,12 +9,12 @@ export function exportVersion(name, version) {
   return save(name, version, "export", "tar");
 }
 
-/** Save the arm that a version has learnt as a URDF. */
+/** Save the learnt arm of a version as a URDF. */
 export function saveUrdf(name, version) {
   return save(name, version, "urdf", "urdf");
 }
 
-/** Save a version as C99, in an archive of two files. */
+/** Save a version as C99: an archive of two files. */
 export function saveC(name, version) {
   return save(name, version, "export", "tar", "&format=c");
 }
@@ -23,8 +23,8 @@ async function save(name, version, what, ending, more = "") {
   const headers = key() ? { authorization: `Bearer ${key()}` } : {};
   const answer = await fetch(`/v1/models/${encodeURIComponent(name)}/${what}?version=${version}${more}`, { headers });
   if (!answer.ok) {
-    const said = (await answer.json()).error;
-    throw new ApiError(answer.status, said.code, said.message, said.detail);
+    const error = (await answer.json()).error;
+    throw new ApiError(answer.status, error.code, error.message, error.detail);
   }
   const address = URL.createObjectURL(await answer.blob());
   const file = /filename="?([^";]+)"?/.exec(answer.headers.get("content-disposition") ?? "")?.[1];

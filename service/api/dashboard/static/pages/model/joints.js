@@ -1,9 +1,9 @@
-// Small plots, one a joint, that zoom together; where not every row is shown, zooming fetches the rows between.
+// Small plots of a trace, one for each joint, with a common zoom. If rows are skipped, zooming loads them.
 
 import { jointVar } from "../../colours.js";
 import { h, replace } from "../../dom.js";
 import { count, shortNames, torqueUnit } from "../../format.js";
-import { Linked } from "../../linked.js";
+import { LinkedPlots } from "../../linked.js";
 import { plot, plotly } from "../../plots.js";
 import { button, errorBox, field, select } from "../../ui.js";
 import { axis } from "./curves.js";
@@ -11,26 +11,26 @@ import { axis } from "./curves.js";
 const ALL = "all joints";
 
 /**
- * Draw a trace joint by joint into an element.
- * fetch(start, stop): a trace of these rows, (0, null) all; views: {label: (trace, joint, x) => traces}, one is shown at
- * a time; about: {label: a sentence on it}; unit: of the y axis.
+ * Draw a trace into an element, one plot for each joint.
+ * first: trace of all rows; fetch(start, stop): read the trace of some rows, (0, null) for all;
+ * views: {label: (trace, joint, x) => traces}, of which one is shown; about: {label: explanation}.
  */
-export async function joints(element, { first, fetch, views, about, signal }) {
+export async function jointPlots(element, { first, fetch, views, about, signal }) {
   const names = shortNames(first.joint_names);
   const labels = Object.keys(views);
   const shown = { trace: first, joint: ALL, view: labels[0] };
   const plots = new Map();
-  let asked = 0, painting = false;
+  let requests = 0, isDrawing = false;
   const places = first.joint_names.map(() => h("div", {}));
-  const linked = new Linked({ stays: false });
-  const grid = h("div", { class: "grid" }, places), said = h("span", {}), note = h("span", {}), key = h("p", { class: "actions" });
+  const linked = new LinkedPlots({ stays: false });
+  const grid = h("div", { class: "grid" }, places), rowsNote = h("span", {}), note = h("span", {}), key = h("p", { class: "actions" });
   const problem = h("div", {});
   const start = h("input", { type: "number", min: "0", step: "1" }), stop = h("input", { type: "number", min: "1", step: "1" });
 
   const draw = async () => {
     const { trace } = shown;
     const { x, suffix } = axis(trace);
-    painting = true;
+    isDrawing = true;
     for (const [joint, place] of places.entries()) {
       place.hidden = shown.joint !== ALL && shown.joint !== first.joint_names[joint];
       if (place.hidden) continue;
@@ -39,7 +39,7 @@ export async function joints(element, { first, fetch, views, about, signal }) {
         y: torqueUnit(trace.joint_types?.[joint]),
         height: shown.joint === ALL ? 210 : 420,
         margin: { l: 52, r: 8, t: 32, b: 26 },
-        showlegend: false, // one key above all plots takes less room than a legend in each
+        showlegend: false, // there is one legend above all plots
         xaxis: { autorange: true, ticksuffix: suffix, automargin: false },
         hovermode: "x unified",
       };
@@ -56,18 +56,18 @@ export async function joints(element, { first, fetch, views, about, signal }) {
       }
       if (signal.aborted) return;
     }
-    painting = false;
+    isDrawing = false;
     start.value = String(trace.rows[0]);
     stop.value = String(trace.rows.at(-1));
-    replace(said, sentence(trace), " ", whole() ? null : button("Show all rows", () => go(0, null)));
+    replace(rowsNote, shownRows(trace), " ", isWhole() ? null : button("Show all rows", () => showRows(0, null)));
     replace(note, about[shown.view]);
   };
-  const whole = () => shown.trace.in_range === first.in_range;
-  const go = async (from, to) => {
-    const mine = (asked += 1);
+  const isWhole = () => shown.trace.in_range === first.in_range;
+  const showRows = async (from, to) => {
+    const mine = (requests += 1);
     try {
       const trace = from === 0 && to === null ? first : await fetch(from, to);
-      if (mine !== asked || signal.aborted) return;
+      if (mine !== requests || signal.aborted) return;
       shown.trace = trace;
       replace(problem);
       await draw();
@@ -76,16 +76,16 @@ export async function joints(element, { first, fetch, views, about, signal }) {
     }
   };
   const zoomed = (change) => {
-    if (painting) return;
+    if (isDrawing) return;
     if (change["xaxis.autorange"]) {
-      if (!whole()) go(0, null);
+      if (!isWhole()) showRows(0, null);
       return;
     }
     if (!("xaxis.range[0]" in change)) return;
     const { x } = axis(shown.trace);
     const [low, high] = [change["xaxis.range[0]"], change["xaxis.range[1]"]];
     const within = shown.trace.rows.filter((_row, index) => x[index] >= low && x[index] <= high);
-    if (within.length > 1) go(within[0], within.at(-1) + 1);
+    if (within.length > 1) showRows(within[0], within.at(-1) + 1);
   };
 
   const form = h(
@@ -94,11 +94,11 @@ export async function joints(element, { first, fetch, views, about, signal }) {
       class: "actions",
       onsubmit: (event) => {
         event.preventDefault();
-        go(Math.max(0, Number(start.value)), Number(stop.value) + 1);
+        showRows(Math.max(0, Number(start.value)), Number(stop.value) + 1);
       },
     },
     field("From row", start),
-    field("to row", stop),
+    field("To row", stop),
     h("button", { type: "submit" }, "Show these rows"),
   );
   replace(
@@ -109,17 +109,17 @@ export async function joints(element, { first, fetch, views, about, signal }) {
       field("Joint", select([ALL, ...first.joint_names], ALL, (joint) => { shown.joint = joint; draw(); })),
       labels.length > 1 ? field("Show", select(labels, shown.view, (view) => { shown.view = view; draw(); })) : null,
     ),
-    h("p", { class: "hint" }, note, " ", said),
+    h("p", { class: "hint" }, note, " ", rowsNote),
     key,
     problem,
     grid,
-    h("details", {}, h("summary", {}, "Choose the rows to show"), h("p", { class: "hint" }, "Dragging over a plot does the same."), form),
+    h("details", {}, h("summary", {}, "Select rows"), h("p", { class: "hint" }, "Dragging over a plot does the same."), form),
   );
   await plotly();
   await draw();
 }
 
-/** What each line and band of a plot is, in its colour and form. */
+/** Return the legend of the lines and areas. */
 function legend(traces) {
   const named = traces.filter((trace) => trace.showlegend !== false);
   return named.map(({ name, colour, filled, opacity = 1 }) => {
@@ -129,8 +129,8 @@ function legend(traces) {
   });
 }
 
-function sentence(trace) {
+function shownRows(trace) {
   const part = trace.in_range === trace.samples ? "" : ` (rows ${count(trace.rows[0])} to ${count(trace.rows.at(-1))})`;
-  if (trace.shown === trace.in_range) return `All ${count(trace.in_range)} samples${part} are drawn.`;
-  return `${count(trace.shown)} of ${count(trace.in_range)} samples${part} are drawn, evenly chosen, so short peaks may be missing. Drag over part of a plot to see every sample.`;
+  if (trace.shown === trace.in_range) return `Showing all ${count(trace.in_range)} samples${part}.`;
+  return `Showing ${count(trace.shown)} of ${count(trace.in_range)} samples${part}, evenly spaced; short peaks may be missing. Drag over a plot to zoom in on every sample.`;
 }

@@ -1,24 +1,22 @@
-// Whether a version may answer, and why: judged by what its training held out.
+// Result of a version's promotion check on held-out rows.
 
 import { h } from "../../dom.js";
+import { sentence } from "../../format.js";
 
-/** What came of a version's judgement; nothing of one that was refreshed or came with LIPServe. */
-export function promoted({ version, promotion }) {
+/** Return a note on the promotion of a version; null if it was retrained automatically or shipped with LIPServe. */
+export function promotionNote({ version, promotion }) {
   if (!promotion) return null;
-  if (promotion.passed) return h("p", { class: "hint" }, `It answers by itself: ${promotion.reason}.`);
-  const doubt = promotion.passed === null ? "is not known to do well" : "did not do well";
-  const what = promotion.answers ? `Version ${version} answered, though it ${doubt} on what was held out` : `Version ${version} waits as candidate and did not answer by itself`;
-  return h("div", { class: "banner", role: "note" }, h("strong", {}, `${what}: `), `${promotion.reason}.`);
+  const reason = sentence(promotion.reason);
+  if (promotion.passed) return h("p", { class: "hint" }, `Held-out check passed. ${reason}`);
+  const check = promotion.passed === null ? "the held-out check was inconclusive" : "it failed the held-out check";
+  const state = promotion.answers ? `Version ${version} was promoted, although ${check}.` : `Version ${version} is a candidate: ${check}.`;
+  return h("div", { class: "banner", role: "note" }, h("strong", {}, state), ` ${reason}`);
 }
 
-/** Whether a version should be let answer, beside the button that does it: {word, kind, why}. */
-export function mayAnswer({ promotion }) {
-  if (!promotion) return { word: "not judged", kind: "plain", why: "It was refreshed or came with LIPServe. Compare it on a recording first" };
+/** Return label and kind of a badge for the promotion check of a version, and its reason: {word, kind, why}. */
+export function promotionCheck({ promotion }) {
+  if (!promotion) return { word: "not evaluated", kind: "plain", why: "Retrained automatically or shipped with LIPServe. Compare it on a recording first." };
   const { passed, reason } = promotion;
-  if (passed === null) return { word: "not judged", kind: "plain", why: capital(reason) };
-  return passed ? { word: "may answer", kind: "good", why: capital(reason) } : { word: "should not answer", kind: "warn", why: capital(reason) };
-}
-
-function capital(text) {
-  return `${text.slice(0, 1).toUpperCase()}${text.slice(1)}`;
+  if (passed === null) return { word: "inconclusive", kind: "plain", why: sentence(reason) };
+  return passed ? { word: "passed", kind: "good", why: sentence(reason) } : { word: "failed", kind: "warn", why: sentence(reason) };
 }

@@ -1,38 +1,38 @@
-// How `auto` has chosen a version's estimator: a small table, shown with the version and with the job that made it.
+// How `auto` selected the estimator of a version; shown with the version and its job.
 
 import { h } from "../../dom.js";
-import { counted, number, percent, scientific } from "../../format.js";
+import { counted, number, percent, scientific, sentence } from "../../format.js";
 import { card, table } from "../../ui.js";
 
-/** The card of a choice; null where the estimator was named. */
+/** Return the card; null if the estimator was not selected by `auto`. */
 export function selectionCard({ selection }) {
   if (!selection) return null;
   const { held_out: held, table: rows } = selection;
   const failed = rows.filter((each) => each.error);
   return card(
-    "How the estimator was chosen",
-    h("p", {}, h("strong", {}, selection.chosen), `: ${selection.reason}.`),
-    held.repeats ? h("p", { class: "banner" }, "The held-out motion repeats the training motion: all figures flatter, except those at the edge.") : null,
-    held.blocks ? judged(selection, held) : null,
+    "Selection of the estimator",
+    h("p", {}, h("strong", {}, selection.chosen), `: ${sentence(selection.reason)}`),
+    held.repeats ? h("p", { class: "banner" }, "The held-out motion repeats the training motion, so all figures are optimistic except those at the edge.") : null,
+    held.blocks ? comparisonTable(selection, held) : null,
     failed.map((each) => h("p", { class: "hint" }, `${each.estimator} could not be trained: ${each.error}`)),
-    held.blocks ? h("p", { class: "hint" }, "A higher log density means better predictions and truer uncertainty. The first estimator is chosen unless a later one has a higher log density beyond chance and no larger error, also at the edge of the data. The chosen estimator was then trained on the held-out samples, too.") : null,
+    held.blocks ? h("p", { class: "hint" }, "A higher log density means better predictions and more accurate uncertainty. The first estimator is selected unless a later one has a significantly higher log density and no larger error, also at the edge of the data. The selected estimator was then trained on all samples.") : null,
   );
 }
 
-function judged({ chosen, table: rows }, held) {
-  const stretches = counted(held.blocks, "stretch", "stretches");
+function comparisonTable({ chosen, table: rows }, held) {
+  const segments = counted(held.blocks, "held-out segment");
   const columns = [
     { label: "Estimator", cell: (row) => (row.estimator === chosen ? h("strong", {}, row.estimator) : row.estimator) },
-    { label: "Log density, nats a sample", numeric: true, cell: (row) => shown(row.log_density, number) },
-    { label: "Less than the best", numeric: true, cell: (row) => less(row) },
-    { label: "nMSE, mean of the joints", numeric: true, cell: (row) => shown(mean(row.nmse), scientific) },
+    { label: "Log density, nats per sample", numeric: true, cell: (row) => shown(row.log_density, number) },
+    { label: "Difference from the best", numeric: true, cell: (row) => differenceText(row) },
+    { label: "nMSE, mean over joints", numeric: true, cell: (row) => shown(mean(row.nmse), scientific) },
     { label: "nMSE at the edge", numeric: true, cell: (row) => shown(mean(row.edge_nmse), scientific) },
-    { label: "Within the 95 % band", numeric: true, cell: (row) => shown(mean(row.coverage), percent) },
+    { label: "95 % coverage", numeric: true, cell: (row) => shown(mean(row.coverage), percent) },
   ];
-  return table(columns, rows, { caption: `Judged on ${stretches} held out (${counted(held.rows, "sample")}), ${held.edge_blocks} at the edge of the data` });
+  return table(columns, rows, { caption: `Evaluated on ${segments} (${counted(held.rows, "sample")}), ${held.edge_blocks} of them at the edge of the data` });
 }
 
-function less({ difference, standard_error: error }) {
+function differenceText({ difference, standard_error: error }) {
   if (difference === null) return "–";
   return error === null ? number(-difference || 0) : `${number(-difference)} ± ${number(error, 2)}`;
 }

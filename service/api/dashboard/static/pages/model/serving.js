@@ -1,13 +1,13 @@
-// Moving what answers: always asked first, as robots may be listening.
+// Confirmation before another version serves: connected robots are affected.
 
 import { confirm } from "../../ui.js";
-import { mayAnswer } from "./promotion.js";
+import { promotionCheck } from "./promotion.js";
 
-/** Ask whether a version, as the API shows it, shall answer; true where it shall. */
+/** Ask whether a version should serve; return the decision. */
 export function confirmServing(name, version, serving) {
-  const { word, why } = mayAnswer(version);
+  const { word, why } = promotionCheck(version);
   return confirm(
-    `Serve version ${version.version} of ${name}${serving === null ? "" : ` instead of version ${serving}`}? It answers every query that names no version. You can undo this under “Versions”. Judged: ${word}. ${why}.`,
+    `Serve version ${version.version} of ${name}${serving === null ? "" : ` instead of version ${serving}`}? It will answer every query that names no version. To undo this, roll back the alias “serving”. Held-out check: ${word}. ${why}`,
     `Serve version ${version.version}`,
     "primary",
   );

@@ -1,4 +1,4 @@
-// Versions and aliases: which one answers, moving that, taking a move back, deleting, comparing two.
+// Versions and aliases: serve, roll back, export, delete, compare.
 
 import { del, get, path, post, put } from "../../api.js";
 import { h, replace } from "../../dom.js";
@@ -8,37 +8,37 @@ import { badge, button, card, confirm, field, loading, notice, select, table } f
 import { QUALITY_HINT, qualityColumns } from "../quality.js";
 import { compareForm } from "./compare.js";
 import { exportVersion } from "./export.js";
-import { mayAnswer } from "./promotion.js";
+import { promotionCheck } from "./promotion.js";
 import { confirmServing } from "./serving.js";
 
-/** The tab of versions. */
-export async function versions(view, state, { signal, reload, select: look }) {
+/** Draw the tab. */
+export async function versions(view, state, { signal, reload, select: viewVersion }) {
   replace(view, loading());
   const { items: aliases } = await get(`${state.where}/aliases`, {}, signal);
   replace(
     view,
-    card("Versions", versionTable(state, aliases, reload, look)),
+    card("Versions", versionTable(state, aliases, reload, viewVersion)),
     card("Aliases", aliasTable(state, aliases, reload), aliasForm(state, reload)),
     state.model.versions.length > 1 ? card("Compare versions", compareForm(state, signal)) : null,
   );
 }
 
-function versionTable({ name, where, model, version }, aliases, reload, look) {
+function versionTable({ name, where, model, version }, aliases, reload, viewVersion) {
   const serving = model.serving_version;
   const named = (number) => aliases.filter((each) => each.version === number && each.alias !== "serving").map((each) => each.alias);
   const actions = (each) => {
     const number = each.version;
-    const made = [button("Show", () => look(number, "accuracy"))];
+    const made = [button("View", () => viewVersion(number, "accuracy"))];
     if (number !== serving) made.push(button("Serve", async () => {
       if (!(await confirmServing(name, each, serving))) return;
       await put(`${where}/aliases/serving`, { version: number });
-      await done(reload, `Version ${number} of ${name} answers from now on.`);
+      await reloadAndNotify(reload, `Version ${number} of ${name} is now serving.`);
     }, { kind: "primary" }));
     made.push(button("Export", () => exportVersion(name, number)));
     if (number !== serving && !named(number).length) made.push(button("Delete", async () => {
       if (!(await confirm(`Delete version ${number} of ${name}? This cannot be undone.`, `Delete version ${number}`))) return;
       await del(`${where}/versions/${number}`);
-      await done(reload, `Version ${number} is deleted.`);
+      await reloadAndNotify(reload, `Version ${number} deleted.`);
     }, { kind: "danger" }));
     for (const press of made) press.setAttribute("aria-label", `${press.textContent}: version ${number}`);
     return h("div", { class: "actions" }, made);
@@ -53,42 +53,42 @@ function versionTable({ name, where, model, version }, aliases, reload, look) {
         each.version === serving ? badge("serving") : null,
         " ",
         named(each.version).map((alias) => [badge(alias, "plain"), " "]),
-        each.version === version.version ? h("span", { class: "muted" }, "shown here") : null,
+        each.version === version.version ? h("span", { class: "muted" }, "viewing") : null,
       ],
     },
     ...qualityColumns((each) => ({ quality: each.quality, joints: version.joint_names })),
-    { label: "May it answer?", value: (each) => mayAnswer(each).word, cell: judged },
+    { label: "Held-out check", value: (each) => promotionCheck(each).word, cell: checkCell },
     { label: "Estimator", value: (each) => each.estimator, cell: (each) => each.estimator },
-    { label: "Made", value: (each) => each.created_at, first: "descending", cell: (each) => h("time", { datetime: each.created_at, title: when(each.created_at) }, ago(each.created_at)) },
+    { label: "Created", value: (each) => each.created_at, first: "descending", cell: (each) => h("time", { datetime: each.created_at, title: when(each.created_at) }, ago(each.created_at)) },
     { label: "Actions", cell: actions },
   ];
   const list = listing(columns, {
     caption: "Versions, newest first",
     what: ["version", "versions"],
     key: (each) => each.version,
-    words: (each) => [`version ${each.version}`, each.estimator, mayAnswer(each).word, ...named(each.version)].join(" "),
-    fewest: 4,
+    words: (each) => [`version ${each.version}`, each.estimator, promotionCheck(each).word, ...named(each.version)].join(" "),
+    minRows: 4,
   });
   list.show([...model.versions].reverse());
   return [list.element, h("p", { class: "hint" }, QUALITY_HINT)];
 }
 
-function judged(version) {
-  const { word, kind, why } = mayAnswer(version);
-  return h("details", { class: "why" }, h("summary", {}, badge(word, kind)), h("p", { class: "hint" }, `${why}.`));
+function checkCell(version) {
+  const { word, kind, why } = promotionCheck(version);
+  return h("details", { class: "why" }, h("summary", {}, badge(word, kind)), h("p", { class: "hint" }, why));
 }
 
 function aliasTable({ name, where }, aliases, reload) {
   const back = (each) => button("Roll back", async () => {
-    const what = each.alias === "serving" ? `Version ${each.previous} of ${name} will answer again instead of version ${each.version}.` : `${each.alias} will be version ${each.previous} again.`;
-    if (!(await confirm(`Undo the last move of “${each.alias}”? ${what}`, `Back to version ${each.previous}`, "primary"))) return;
+    const what = each.alias === "serving" ? `Version ${each.previous} of ${name} will serve instead of version ${each.version}.` : `It will point to version ${each.previous} again.`;
+    if (!(await confirm(`Roll back the alias “${each.alias}”? ${what}`, `Roll back to version ${each.previous}`, "primary"))) return;
     const now = await post(`${where}/aliases/${encodeURIComponent(each.alias)}/rollback`, {});
-    await done(reload, `${each.alias} is version ${now.version} again.`);
+    await reloadAndNotify(reload, `${each.alias} → version ${now.version}`);
   });
   const remove = (each) => button("Remove", async () => {
-    if (!(await confirm(`Remove the alias “${each.alias}”? Queries that name it will be refused. Version ${each.version} stays.`, "Remove it"))) return;
+    if (!(await confirm(`Remove the alias “${each.alias}”? Queries that name it will fail. Version ${each.version} is kept.`, "Remove alias"))) return;
     await del(path`/v1/models/${name}/aliases/${each.alias}`);
-    await done(reload, `The alias ${each.alias} is removed.`);
+    await reloadAndNotify(reload, `Alias ${each.alias} removed.`);
   }, { kind: "danger" });
   const named = (made, each) => {
     made.setAttribute("aria-label", `${made.textContent}: ${each.alias}`);
@@ -100,10 +100,10 @@ function aliasTable({ name, where }, aliases, reload) {
       label: "Actions",
       cell: (each) => h("div", { class: "actions" }, each.previous === null ? null : named(back(each), each), each.alias === "serving" ? null : named(remove(each), each)),
     },
-    { label: "Before", cell: (each) => (each.previous === null ? "–" : `version ${each.previous}`) },
-    { label: "Since", cell: (each) => when(each.changed_at) },
+    { label: "Previous", cell: (each) => (each.previous === null ? "–" : `version ${each.previous}`) },
+    { label: "Changed", cell: (each) => when(each.changed_at) },
   ];
-  return table(columns, aliases, { caption: "“serving” answers queries that name no version; other aliases answer queries that name them" });
+  return table(columns, aliases, { caption: "“serving” is used for queries that name no version; other aliases for queries that name them" });
 }
 
 function aliasForm({ where, model, name }, reload) {
@@ -114,22 +114,22 @@ function aliasForm({ where, model, name }, reload) {
     const chosen = alias.value.trim(), number = Number(version.value);
     if (chosen === "serving" && !(await confirmServing(name, model.versions.find((each) => each.version === number), model.serving_version))) return;
     await put(`${where}/aliases/${encodeURIComponent(chosen)}`, { version: number });
-    await done(reload, `${chosen} is version ${number} now.`);
+    await reloadAndNotify(reload, `${chosen} → version ${number}`);
   });
   return h(
     "details",
     {},
-    h("summary", {}, "Make or move an alias"),
+    h("summary", {}, "Create or move an alias"),
     h("div", { class: "grid" }, field("Alias", alias, "A lower-case letter, then lower-case letters, digits, dots and hyphens."), field("Points to", version)),
     set,
   );
 }
 
-/** Say that something was done once the page shows it: what is pressed then is no longer of before. */
-async function done(reload, text) {
+/** Reload the page, then show a notice, so that no button of the old state can be pressed. */
+async function reloadAndNotify(reload, text) {
   try {
     await reload();
   } finally {
-    notice(text); // it was, even where the page cannot be read again
+    notice(text); // the action succeeded even if the reload failed
   }
 }

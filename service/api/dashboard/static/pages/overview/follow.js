@@ -1,14 +1,14 @@
-// Looks at something again and again. What cannot be looked at any more is still shown, and said to be old.
+// Periodic updates. After an error the last state stays visible and is marked as outdated.
 
 import { h, refresh } from "../../dom.js";
 import { when } from "../../format.js";
-import { errorBox, every } from "../../ui.js";
+import { errorBox, repeat } from "../../ui.js";
 
-const told = new WeakMap();
+const lastContents = new WeakMap();
 
 /**
- * Do `look(signal)` every so many seconds until the signal aborts. Where it fails, `place` says so, and since when what
- * is shown is old. Where a key is missing or not enough, it stops: it would ask for one again and again.
+ * Run `look(signal)` every `seconds` until the signal aborts. `place` shows an error and the time of the last update.
+ * If the key is missing or insufficient, stop: the dialog would open again and again.
  */
 export function follow(seconds, place, signal, look) {
   const own = new AbortController();
@@ -16,7 +16,7 @@ export function follow(seconds, place, signal, look) {
   const note = h("div");
   let last = null;
   place.append(note);
-  return every(
+  return repeat(
     seconds,
     async () => {
       try {
@@ -32,12 +32,12 @@ export function follow(seconds, place, signal, look) {
         };
         if (closed) own.abort();
         if (error.name !== "ApiError") console.error(error);
-        // beside a second one that says the same it would only take room
+        // another update already shows this error
         if (!closed && place.querySelector(".error") && !note.firstChild) return;
         refresh(
           note,
           errorBox(error, closed ? again : null),
-          last ? h("p", { class: "hint" }, `What is shown below is as of ${when(last.toISOString())}.`) : null,
+          last ? h("p", { class: "hint" }, `Last update: ${when(last.toISOString())}.`) : null,
         );
       }
     },
@@ -45,10 +45,10 @@ export function follow(seconds, place, signal, look) {
   );
 }
 
-/** Show something only where it is not what was shown last: nobody loses the focus or a selection to a repetition. */
+/** Return whether contents differ from those of the last call, so that unchanged ones keep focus and selection. */
 export function changed(place, what) {
   const text = JSON.stringify(what);
-  if (told.get(place) === text) return false;
-  told.set(place, text);
+  if (lastContents.get(place) === text) return false;
+  lastContents.set(place, text);
   return true;
 }

@@ -1,14 +1,14 @@
-// Health: one line while all is well; what is not well is listed. /health/ready tells it without a key.
+// Health of the service in one line, and its failed checks. /health/ready needs no key.
 
 import { get } from "../../api.js";
 import { h, refresh, replace } from "../../dom.js";
 import { when } from "../../format.js";
-import { badge, every } from "../../ui.js";
+import { badge, repeat } from "../../ui.js";
 import { changed } from "./follow.js";
 
-/** Keep the line up to date until the signal aborts. */
+/** Update the health until the signal aborts. */
 export function health(place, seconds, signal) {
-  const state = h("span", { role: "status" }, badge("asking", "plain"));
+  const state = h("span", { role: "status" }, badge("checking", "plain"));
   const since = h("span", { class: "hint" });
   const wrong = h("ul", { class: "parts" }), all = h("ul", { class: "parts" });
   const version = h("span", { class: "muted" });
@@ -19,7 +19,7 @@ export function health(place, seconds, signal) {
       { class: "health", "aria-labelledby": "health" },
       h("div", { class: "row" }, h("h2", { id: "health" }, "Health"), state, version, since),
       wrong,
-      h("details", {}, h("summary", {}, "All parts"), all),
+      h("details", {}, h("summary", {}, "All checks"), all),
     ),
   );
   let answered = null;
@@ -29,14 +29,14 @@ export function health(place, seconds, signal) {
     refresh(wrong, checks.filter((check) => check.state !== "ok").map(part));
     refresh(all, checks.map(part));
   };
-  return every(
+  return repeat(
     seconds,
     async () => {
       try {
         const ready = await get("/health/ready", {}, signal);
         version.textContent = `LIPServe ${ready.version}`;
-        const warned = ready.checks.some((check) => check.state !== "ok");
-        show(warned ? "ready, with warnings" : "ready", warned ? "warn" : "good", ready.checks);
+        const warningBanner = ready.checks.some((check) => check.state !== "ok");
+        show(warningBanner ? "ready, with warnings" : "ready", warningBanner ? "warn" : "good", ready.checks);
         answered = new Date();
         since.textContent = "";
       } catch (error) {
@@ -47,8 +47,8 @@ export function health(place, seconds, signal) {
           answered = new Date();
           since.textContent = "";
         } else {
-          show("no answer", "bad", [{ name: "service", state: "failed", message: error.message }]);
-          since.textContent = answered ? `last answer ${when(answered.toISOString())}` : "";
+          show("no connection", "bad", [{ name: "service", state: "failed", message: error.message }]);
+          since.textContent = answered ? `last response ${when(answered.toISOString())}` : "";
         }
       }
     },

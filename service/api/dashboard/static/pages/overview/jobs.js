@@ -1,16 +1,16 @@
-// Jobs that run or wait, with their progress; the last ones that ended where none does.
+// Queued and running jobs with their progress, and the last finished ones.
 
 import { mean } from "../../charts.js";
 import { h, refresh } from "../../dom.js";
 import { ago, nmse, percent, seconds } from "../../format.js";
 import { badge, card, link, progress } from "../../ui.js";
 
-const ENDED = 3;
+const MAX_FINISHED = 3;
 
-/** Show what the page of jobs tells. */
+/** Show the jobs. */
 export function jobBoard(place, jobs) {
   const active = jobs.filter((job) => job.state === "running" || job.state === "queued");
-  const shown = [...active, ...jobs.filter((job) => !active.includes(job)).slice(0, ENDED)];
+  const shown = [...active, ...jobs.filter((job) => !active.includes(job)).slice(0, MAX_FINISHED)];
   const list = h("ul", { class: "rows" }, shown.map(row));
   refresh(place, shown.length ? card("Training", list, h("p", {}, link("All jobs", "#/jobs"))) : null);
 }
@@ -19,19 +19,19 @@ function row(job) {
   return h(
     "li",
     { "data-key": job.id },
-    h("div", { class: "row" }, badge(job.state), link(`${job.model}, ${job.estimator}`, `#/jobs/${job.id}`), h("span", { class: "muted" }, said(job))),
+    h("div", { class: "row" }, badge(job.state), link(`${job.model}, ${job.estimator}`, `#/jobs/${job.id}`), h("span", { class: "muted" }, status(job))),
     job.state === "running" ? progress(job.progress.fraction, `Progress of ${job.model}`) : null,
   );
 }
 
-function said(job) {
+function status(job) {
   const { stage, remaining_s: left } = job.progress;
-  if (job.state === "queued") return `waiting, queued ${ago(job.created_at)}`;
-  if (job.state === "running") return left ? `${stage}, at most about ${seconds(left)} left` : stage;
-  if (job.state === "succeeded") return `made version ${job.version}${judged(job)}, ${ago(job.finished_at)}`;
+  if (job.state === "queued") return `queued ${ago(job.created_at)}`;
+  if (job.state === "running") return left ? `${stage}, up to ${seconds(left)} left` : stage;
+  if (job.state === "succeeded") return `version ${job.version}${qualityText(job)}, ${ago(job.finished_at)}`;
   return `${job.error?.message ?? ""} ${ago(job.finished_at)}`.trim();
 }
 
-function judged({ quality }) {
-  return quality ? `: nMSE ${nmse(mean(quality.nmse))}, ${percent(mean(quality.coverage), 0)} in the 95\u00a0% band` : "";
+function qualityText({ quality }) {
+  return quality ? `: nMSE ${nmse(mean(quality.nmse))}, 95\u00a0% coverage ${percent(mean(quality.coverage), 0)}` : "";
 }

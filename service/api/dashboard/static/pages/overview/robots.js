@@ -1,4 +1,4 @@
-// A card for each model: the arm that it has learnt, whether it is live, how well it predicts, and what needs somebody.
+// A card for each model: its arm, its stream, its quality, and what requires attention.
 
 import { innovationCourse, qualityCharts } from "../../charts.js";
 import { h, refresh } from "../../dom.js";
@@ -7,10 +7,10 @@ import { badge, link } from "../../ui.js";
 import { chain, sketch } from "../arm/sketch.js";
 
 const NEW_MS = 86_400_000;
-const BUCKETS = 60; // of the course of the last hour
+const BUCKETS = 60; // points of the last hour
 const NEWS = { promotion: "promotion", payload: "payload" };
 
-/** Cards that are brought up to date: returns show(page of the overview of models). */
+/** Create the cards. Returns show(page of `/v1/overview`), which updates them. */
 export function robots(place) {
   const cards = new Map();
   const list = h("ul", { class: "robots" });
@@ -41,8 +41,8 @@ function isLive({ idle_s: idle }, live) {
 function robotCard(first) {
   const address = encodeURIComponent(first.name);
   const state = h("span", {}), about = h("p", { class: "hint" }), charts = h("div", { class: "charts" });
-  const lately = h("div", { class: "robot-course" }), news = h("div", { class: "robot-news" });
-  const figure = h("a", { class: "robot-arm", href: `#/models/${address}?tab=arm`, "aria-label": `The arm of ${first.name}` });
+  const lastHour = h("div", { class: "robot-course" }), news = h("div", { class: "robot-news" });
+  const figure = h("a", { class: "robot-arm", href: `#/models/${address}?tab=arm`, "aria-label": `Arm of ${first.name}` });
   const body = h("div", { class: "robot-body" }, figure, charts);
   const element = h(
     "li",
@@ -50,50 +50,50 @@ function robotCard(first) {
     h("div", { class: "robot-head" }, h("h2", {}, link(first.name, `#/models/${address}`)), state),
     about,
     body,
-    lately,
+    lastHour,
     news,
-    h("div", { class: "actions robot-foot" }, h("a", { href: `#/live/${address}`, "aria-label": `Follow live: ${first.name}` }, "Follow live"), h("a", { href: `#/train?model=${address}`, "aria-label": `Train again: ${first.name}` }, "Train again")),
+    h("div", { class: "actions robot-foot" }, h("a", { href: `#/live/${address}`, "aria-label": `Follow live: ${first.name}` }, "Follow live"), h("a", { href: `#/train?model=${address}`, "aria-label": `Retrain: ${first.name}` }, "Retrain")),
   );
   let drawn = null, arm = null, posture = null;
   const update = (model, live) => {
     const names = shortNames(model.joint_names);
-    refresh(state, standing(model, live));
-    refresh(about, model.serving_version === null ? "No version answers: all wait as candidates." : `Version ${model.serving_version}, ${model.estimator}, made ${ago(model.created_at)}.`, model.candidate ? ` Version ${model.candidate} waits.` : "");
+    refresh(state, streamState(model, live));
+    refresh(about, model.serving_version === null ? "No version is serving; all are candidates." : `Version ${model.serving_version}, ${model.estimator}, created ${ago(model.created_at)}.`, model.candidate ? ` Version ${model.candidate} is a candidate.` : "");
     if (drawn !== model.serving_version) {
       drawn = model.serving_version;
       posture = JSON.stringify(model.position);
-      arm = model.arm && sketch(model.arm, model.position, `The arm that ${model.name} has learnt, ${names.length} joints`);
-      const unknown = [chain(names.length, `${names.length} joints`), h("span", { class: "hint" }, `${model.estimator} learns no arm`)];
+      arm = model.arm && sketch(model.arm, model.position, `Learnt arm of ${model.name}, ${names.length} joints`);
+      const unknown = [chain(names.length, `${names.length} joints`), h("span", { class: "hint" }, `${model.estimator} does not learn an arm`)];
       figure.replaceChildren(...(arm ? [arm.element] : unknown));
-      if (arm) figure.setAttribute("aria-label", `The arm of ${first.name}`);
-      else figure.removeAttribute("aria-label"); // its text names it
+      if (arm) figure.setAttribute("aria-label", `Arm of ${first.name}`);
+      else figure.removeAttribute("aria-label"); // its text is its name
     } else if (posture !== JSON.stringify(model.position)) {
       posture = JSON.stringify(model.position);
       arm?.glide(model.position);
     }
     body.classList.toggle("unjudged", !model.quality && !model.recent?.rows);
-    refresh(charts, quality(model, names));
-    refresh(lately, course(model, names));
-    refresh(news, items(model, address));
+    refresh(charts, qualityParts(model, names));
+    refresh(lastHour, recentInnovation(model, names));
+    refresh(news, newsItems(model, address));
   };
   return { element, update };
 }
 
-function standing(model, live) {
-  if (model.held) return badge("held");
-  if (model.failure) return badge("does not learn", "bad");
+function streamState(model, live) {
+  if (model.held) return badge("paused");
+  if (model.failure) return badge("learning failed", "bad");
   if (isLive(model, live)) return h("span", { class: "badge good live" }, "live");
-  return h("span", { class: "hint" }, model.idle_s === null ? "no stream yet" : `quiet for ${seconds(Math.round(model.idle_s))}`);
+  return h("span", { class: "hint" }, model.idle_s === null ? "no stream yet" : `idle for ${seconds(Math.round(model.idle_s))}`);
 }
 
-function quality({ quality: judged, recent }, names) {
-  const lately = recent?.rows ? recent : null;
-  if (!judged && !lately) return h("p", { class: "hint" }, "Not judged yet: nothing was held out of its training, and no stream has come.");
-  const note = judged && lately ? "Bars: judged on held-out rows. Lines: last hour." : judged ? "Judged on held-out rows." : "In the last hour.";
-  return [qualityCharts(names, judged ?? lately, judged ? lately : null), h("p", { class: "hint" }, note)];
+function qualityParts({ quality: judged, recent }, names) {
+  const lastHour = recent?.rows ? recent : null;
+  if (!judged && !lastHour) return h("p", { class: "hint" }, "Not evaluated: no rows were held out, and no stream was received.");
+  const note = judged && lastHour ? "Bars: held-out rows. Lines: last hour." : judged ? "On held-out rows." : "In the last hour.";
+  return [qualityCharts(names, judged ?? lastHour, judged ? lastHour : null), h("p", { class: "hint" }, note)];
 }
 
-function course({ recent }, names) {
+function recentInnovation({ recent }, names) {
   if (!recent?.course.length) return null;
   const now = Date.now() / 1000;
   return [
@@ -102,16 +102,16 @@ function course({ recent }, names) {
   ];
 }
 
-function items(model, address) {
+function newsItems(model, address) {
   const found = [];
-  if (model.held) found.push([badge("held"), " The robot seems to have changed, and learning waits. ", link("Decide", `#/live/${address}`)]);
-  if (model.failure) found.push([badge("error"), ` It does not learn: ${model.failure}`]);
+  if (model.held) found.push([badge("paused"), " The robot may have changed. Learning is paused until you decide. ", link("Decide", `#/live/${address}`)]);
+  if (model.failure) found.push([badge("error"), ` Learning failed: ${model.failure}`]);
   for (const { stream_id: stream, mass } of model.payloads ?? []) {
-    if (mass) found.push([badge("payload", "plain"), ` ${stream} carries ${kilograms(mass)}.`]);
+    if (mass) found.push([badge("payload", "plain"), ` ${stream}: payload ${kilograms(mass)}.`]);
   }
   const { alarm } = model;
-  const told = alarm?.kind === "payload" && found.length > 0; // by what the arm carries
-  if (alarm && !told && !model.held && Date.now() - new Date(alarm.at).getTime() < NEW_MS) {
+  const isShown = alarm?.kind === "payload" && found.length > 0; // the payload is shown already
+  if (alarm && !isShown && !model.held && Date.now() - new Date(alarm.at).getTime() < NEW_MS) {
     found.push([badge(NEWS[alarm.kind] ?? "warning", NEWS[alarm.kind] ? "plain" : "warn"), ` ${alarm.message} `, h("span", { class: "muted" }, ago(alarm.at))]);
   }
   return found.map((each) => h("p", {}, each));

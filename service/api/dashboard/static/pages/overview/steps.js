@@ -1,4 +1,4 @@
-// What to do first on a service that has not been used yet; gone once all of it is done.
+// First steps on a new service; hidden once they are done.
 
 import { h, refresh } from "../../dom.js";
 import { badge, card, link } from "../../ui.js";
@@ -6,7 +6,7 @@ import { changed } from "./follow.js";
 
 const SHIPPED = "panda-sim";
 
-/** Show the way from nothing to a model, and how far one has come. */
+/** Show the steps from a recording to a model, and which are done. */
 export function steps(place, { data, models, jobs }) {
   const done = { data, trained: jobs.some((job) => job.state === "succeeded") || models.some((model) => model.name !== SHIPPED) };
   if (!changed(place, [done, models[0]?.name])) return;
@@ -21,10 +21,10 @@ export function steps(place, { data, models, jobs }) {
         { class: "steps" },
         step(done.data, link("Upload a recording", "#/data"), " of your robot: positions, velocities and torques. No robot at hand? Simulate one:", command("lipserve simulate panda panda.csv")),
         step(done.trained, link("Train a model", "#/train"), " on it: the defaults suit most recordings."),
-        step(false, "Judge it on motion that it was not trained on, then stream to it."),
+        step(false, "Evaluate it on motion that it was not trained on, then stream to it."),
       ),
       shipped
-        ? h("p", { class: "hint" }, "Or look around first: ", link("panda-sim", "#/models/panda-sim"), " is a simulated Panda that comes with LIPServe.")
+        ? h("p", { class: "hint" }, "Or explore first: ", link("panda-sim", "#/models/panda-sim"), " is a simulated Panda that comes with LIPServe.")
         : null,
     ),
   );

@@ -1,36 +1,36 @@
-// Options of the fit, as the service's own description of its API lists them: names, defaults, limits, explanations.
+// Options of the fit, from the service's OpenAPI description: names, defaults, limits, explanations.
 
 import { get } from "../../api.js";
 import { h, replace } from "../../dom.js";
 import { errorBox, field, loading } from "../../ui.js";
 
-/** The part of the form, read from the service when it is opened. Returns {element, values()}: what was changed. */
+/** Create this part of the form; it is loaded when it is opened. Returns {element, jointTypes(), values()}; values(): changed options. */
 export function advancedOptions(signal) {
   const place = h("div", {});
   const inputs = new Map();
-  let asked = false;
+  let loaded = false;
   const load = async () => {
     replace(place, loading());
     try {
       const { components } = await get("/openapi.json", {}, signal);
       const options = Object.entries(components.schemas.Options.properties);
-      replace(place, h("div", { class: "grid" }, options.map(([name, schema]) => one(inputs, name, schema))));
+      replace(place, h("div", { class: "grid" }, options.map(([name, schema]) => optionField(inputs, name, schema))));
     } catch (error) {
       if (error.name !== "AbortError") replace(place, errorBox(error, load));
     }
   };
   const opened = (event) => {
-    if (!event.target.open || asked) return;
-    asked = true;
+    if (!event.target.open || loaded) return;
+    loaded = true;
     load();
   };
-  const types = h("input", { type: "text", name: "joint_types", placeholder: "as the robot says, else revolute", autocomplete: "off" });
+  const types = h("input", { type: "text", name: "joint_types", placeholder: "those of the robot, else revolute", autocomplete: "off" });
   return {
     element: h(
       "details",
       { ontoggle: opened },
       h("summary", {}, "Advanced options"),
-      field("Joint types", types, "revolute or prismatic, one a joint, separated by commas."),
+      field("Joint types", types, "revolute or prismatic for each joint, separated by commas."),
       place,
     ),
     jointTypes: () => types.value.split(",").map((each) => each.trim()).filter(Boolean),
@@ -38,7 +38,7 @@ export function advancedOptions(signal) {
   };
 }
 
-function one(inputs, name, schema) {
+function optionField(inputs, name, schema) {
   const label = name.replaceAll("_", " ");
   const called = { name: `options.${name}` };
   const hint = [schema.description, `Default: ${schema.default}.`].filter(Boolean).join(". ").replaceAll("`", "");

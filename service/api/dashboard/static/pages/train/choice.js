@@ -1,14 +1,14 @@
-// Choosing the recordings to train on: those that fit together.
+// Selection of the recordings to train on; all must have the same joints and torque convention.
 
 import { h } from "../../dom.js";
 import { ago, count, counted, seconds, when } from "../../format.js";
 import { listing } from "../../tables.js";
 import { empty, link } from "../../ui.js";
 
-/** Checkboxes of data sets. Returns {element, chosen()}; onchange(chosen data sets) after every change. */
+/** Create checkboxes of data sets. onchange(chosen data sets) is called after every change. Returns {element, chosen(), changed()}. */
 export function datasetChoice(datasets, preselected, onchange) {
   if (!datasets.length) {
-    const none = empty("There is nothing to train on yet.", link("Upload a recording", "#/data", "primary"));
+    const none = empty("No recordings yet.", link("Upload a recording", "#/data", "primary"));
     return { element: none, chosen: () => [] };
   }
   const known = new Set(preselected);
@@ -22,15 +22,15 @@ export function datasetChoice(datasets, preselected, onchange) {
   const chosen = () => datasets.filter((each) => boxes.get(each).checked);
   const changed = () => {
     const picked = chosen();
-    let apart = 0;
+    let incompatible = 0;
     for (const [each, box] of boxes) {
-      const fits = !picked.length || alike(each, picked[0]);
+      const fits = !picked.length || isCompatible(each, picked[0]);
       box.disabled = !fits && !box.checked;
-      apart += fits ? 0 : 1;
+      incompatible += fits ? 0 : 1;
     }
     const rows = picked.reduce((sum, each) => sum + each.report.rows, 0);
-    const others = apart ? ` ${counted(apart, "recording")} cannot be added: other joints, or another torque convention.` : "";
-    note.textContent = picked.length ? `${picked.length} chosen, ${counted(rows, "sample")}.${others}` : "None chosen yet.";
+    const others = incompatible ? ` ${counted(incompatible, "recording")} cannot be added: different joints or torque convention.` : "";
+    note.textContent = picked.length ? `${picked.length} selected, ${counted(rows, "sample")}.${others}` : "No recording selected.";
     onchange(picked);
   };
   const list = listing(
@@ -49,7 +49,7 @@ export function datasetChoice(datasets, preselected, onchange) {
       what: ["recording", "recordings"],
       key: (row) => row.id,
       words: (row) => [row.name, row.report.robot, row.id, ...row.joint_names].join(" "),
-      fewest: 4,
+      minRows: 4,
     },
   );
   list.show(datasets);
@@ -57,6 +57,6 @@ export function datasetChoice(datasets, preselected, onchange) {
   return { element, chosen, changed };
 }
 
-function alike(one, other) {
+function isCompatible(one, other) {
   return one.torque_convention === other.torque_convention && one.joint_names.join("\n") === other.joint_names.join("\n");
 }

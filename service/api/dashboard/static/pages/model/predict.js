@@ -1,4 +1,4 @@
-// A form for one query: type a motion, read the torque with what it may be off by.
+// Form for one prediction: torque of a state, with its interval.
 
 import { post } from "../../api.js";
 import { h, replace } from "../../dom.js";
@@ -8,8 +8,8 @@ import { Z95 } from "./curves.js";
 
 const QUANTITIES = [["q", "q, rad"], ["dq", "dq, rad/s"], ["ddq", "ddq, rad/s²"]];
 
-/** The tab that asks a version. */
-export async function ask(view, { where, version }, { signal }) {
+/** Draw the tab. */
+export async function predictForm(view, { where, version }, { signal }) {
   const { joint_names: names, training_range: range } = version;
   const short = shortNames(names);
   const middle = (joint) => Number((0.5 * (range.q.min[joint] + range.q.max[joint])).toFixed(3));
@@ -35,14 +35,14 @@ export async function ask(view, { where, version }, { signal }) {
   replace(
     view,
     card(
-      "Ask for a torque",
-      h("form", { onsubmit: submit }, table(columns, names.map((_name, joint) => joint), { caption: "A motion in SI units (sliding joints: m). The form starts at rest, in the middle of the trained range." }), h("button", { type: "submit", class: "primary" }, "Ask")),
+      "Predict a torque",
+      h("form", { onsubmit: submit }, table(columns, names.map((_name, joint) => joint), { caption: "State in SI units (prismatic joints: m). Initial values: at rest, in the middle of the training range." }), h("button", { type: "submit", class: "primary" }, "Predict")),
       answer,
     ),
   );
 }
 
-/** A number to as many decimals as the two leading digits of its standard deviation have. */
+/** Format a number with the decimals of the two leading digits of its standard deviation. */
 function fixed(value, std) {
   const decimals = std > 0 ? Math.min(8, Math.max(0, 1 - Math.floor(Math.log10(std)))) : 4;
   return value.toFixed(decimals);
@@ -59,13 +59,13 @@ function shown(found, motion, { training_range: range }) {
     numeric("tau, N·m", (joint) => fixed(found.tau[joint], found.tau_std[joint])),
     numeric("tau_std", (joint) => number(found.tau_std[joint], 2)),
     numeric("noise_std", (joint) => number(found.noise_std[joint], 2)),
-    numeric("95 % of measurements", (joint) => `${fixed(found.tau[joint], total[joint])} ± ${fixed(Z95 * total[joint], total[joint])}`),
-    { label: "Trained there?", cell: (joint) => (outside(joint).length ? badge(`${outside(joint).join(", ")} outside`, "warn") : badge("within", "good")) },
+    numeric("95 % interval of measurements", (joint) => `${fixed(found.tau[joint], total[joint])} ± ${fixed(Z95 * total[joint], total[joint])}`),
+    { label: "Training range", cell: (joint) => (outside(joint).length ? badge(`${outside(joint).join(", ")} outside`, "warn") : badge("within", "good")) },
   ];
   const revision = found.revision ? `, revision ${found.revision}` : "";
   return [
-    beyond ? h("div", { class: "banner", role: "note" }, "Part of this motion lies outside what the version was trained on. It guesses there: its interval grows, but not always enough. Do not send this torque to a robot unchecked.") : null,
+    beyond ? h("div", { class: "banner", role: "note" }, "This state is partly outside the training range. The version extrapolates: its interval grows, but not always enough. Do not send this torque to a robot without a check.") : null,
     table(columns, found.joint_names.map((_name, joint) => joint), { caption: `Version ${found.version}${revision} of ${found.model}, ${found.torque_convention.replace("_", " ")}` }),
-    h("p", { class: "hint" }, "“Within” means that each value alone was seen in training, not all of them together."),
+    h("p", { class: "hint" }, "“Within” refers to each value alone, not to their combination."),
   ];
 }

@@ -1,4 +1,4 @@
-// What all joints do at the cursor: a table that is the key of the plots' colours too, and a slider to move the cursor by keys.
+// Table of the values at the cursor, which is also the legend of the plots. A slider moves the cursor by keyboard.
 
 import { jointVar } from "../../colours.js";
 import { h } from "../../dom.js";
@@ -7,13 +7,14 @@ import { count, number } from "../../format.js";
 const QUANTITIES = ["q", "dq", "ddq", "tau"];
 
 /**
- * The table. pointed(x): the slider was moved. Returns {element, show(x), against(axis, orderly), only(joint)}: x of the
- * plots' axis, null: none; joint: the only one that is drawn, null: all are.
+ * Create the table. pointed(x): called when the slider moves. Returns {element, show(x), setAxis(axis, rising), only(joint)}.
+ * x: value of the plots' axis, null for none; rising: whether this axis never decreases; joint: the only visible one,
+ * null for all.
  */
-export function reading(preview, names, types, pointed) {
+export function valuesTable(preview, names, types, pointed) {
   const columns = new Map(preview.columns.map((each) => [`${each.quantity} ${each.joint}`, each]));
   const joints = [...new Set(preview.columns.map((each) => each.joint))];
-  const state = { axis: "t", orderly: true };
+  const state = { axis: "t", rising: true };
   const cells = joints.map(() => Object.fromEntries(QUANTITIES.map((name) => [name, h("td", { class: "numeric" }, "–")])));
   const rows = joints.map((_joint, index) =>
     h("tr", {}, h("th", { scope: "row" }, h("span", { class: "joint", style: `--own: ${jointVar(index)}` }, names[index])), QUANTITIES.map((name) => cells[index][name])),
@@ -35,14 +36,14 @@ export function reading(preview, names, types, pointed) {
         h("tbody", {}, rows),
       ),
     ),
-    types?.includes("prismatic") ? h("p", { class: "hint" }, "Of sliding joints in m and N.") : null,
+    types?.includes("prismatic") ? h("p", { class: "hint" }, "Prismatic joints: m and N.") : null,
   );
 
   function show(x) {
-    const known = x !== null && state.orderly;
-    at.textContent = known ? said(x) : "Values at the cursor";
+    const known = x !== null && state.rising;
+    at.textContent = known ? describeCursor(x) : "Values at the cursor";
     if (known && document.activeElement !== slider) slider.value = String(x);
-    if (known) slider.setAttribute("aria-valuetext", said(x));
+    if (known) slider.setAttribute("aria-valuetext", describeCursor(x));
     joints.forEach((joint, index) => {
       for (const name of QUANTITIES) {
         const column = columns.get(`${name} ${joint}`);
@@ -51,16 +52,16 @@ export function reading(preview, names, types, pointed) {
       }
     });
   }
-  const said = (x) => (state.axis === "t" ? `At ${number(x, 5)} s` : `At sample ${count(x)}`);
+  const describeCursor = (x) => (state.axis === "t" ? `At ${number(x, 5)} s` : `At sample ${count(x)}`);
   return {
     element,
     show,
-    against(axis, orderly) {
-      Object.assign(state, { axis, orderly });
+    setAxis(axis, rising) {
+      Object.assign(state, { axis, rising });
       const all = preview.columns[0][axis];
-      [slider.min, slider.max, slider.disabled] = [String(all[0]), String(all.at(-1)), !orderly];
+      [slider.min, slider.max, slider.disabled] = [String(all[0]), String(all.at(-1)), !rising];
       slider.value = slider.min;
-      show(orderly ? all[0] : null);
+      show(rising ? all[0] : null);
     },
     only(joint) {
       rows.forEach((row, index) => (row.hidden = joint !== null && joint !== index));
@@ -68,7 +69,7 @@ export function reading(preview, names, types, pointed) {
   };
 }
 
-/** Place of the number nearest to x in rising ones. */
+/** Return the index of the number nearest to x in an ascending list. */
 export function nearest(rising, x) {
   let [low, high] = [0, rising.length - 1];
   while (high - low > 1) {

@@ -1,0 +1,111 @@
+"""Sentences for people about a model: warnings about a version, and reasons of its acceptance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+MAX_LISTED_JOINTS = 8
+"""Max joints named in a sentence."""
+
+
+def list_joints(items: Sequence[str], separator: str = ", ") -> str:
+    """Return the items as one list, cut after MAX_LISTED_JOINTS."""
+    return separator.join([*items[:MAX_LISTED_JOINTS], "…"] if len(items) > MAX_LISTED_JOINTS else items)
+
+
+def list_with_and(items: Sequence[str]) -> str:
+    """Return the items as one list with "and" before the last."""
+    return " and ".join(", ".join(items).rsplit(", ", 1))
+
+
+def describe_failed_fit(error: str) -> str:
+    """Return the warning that the final fit failed."""
+    return f"The final fit, on all rows, failed ({error}). The model has not learnt the held-out rows."
+
+
+def describe_dependent_motion(dimensions: float, joints: int) -> str:
+    """Return the warning that joints moved together, in fewer independent dimensions than there are joints."""
+    return (
+        f"The joints moved together: {joints} joints moved like {dimensions:.1f} independent ones. Errors on other "
+        "motions may be larger than tau_std states. Record motion in which each joint moves independently."
+    )
+
+
+def describe_search_limit(seconds: float) -> str:
+    """Return the warning that the search for the geometry ended early."""
+    return (
+        f"The search for the geometry stopped at its time limit of {seconds:g} s (`search_seconds`). A longer search "
+        "may find a better geometry."
+    )
+
+
+def describe_unmodelled_torque(has_correction: bool) -> str:
+    """Return the warning that rigid bodies do not explain the torque. has_correction: whether a kernel helps them."""
+    text = "The error of the rigid bodies is larger than the sensor noise: the torque has other causes, too."
+    return text if has_correction else f"{text} Compare with rigid-body+lip-chain."
+
+
+def describe_unidentifiable(parameters: Mapping[str, Sequence[str]], calibrated: bool) -> str:
+    """Return the warning about unidentifiable parameters, by joint. calibrated: whether there is a prior arm."""
+    values = "keep the values of the URDF or the base" if calibrated else "are guesses"
+    listed = list_joints([f"{joint}: {', '.join(each)}" for joint, each in parameters.items()], "; ")
+    count = sum(map(len, parameters.values()))
+    return f"{count} geometry parameters are not identifiable from this recording. They {values} ({listed})."
+
+
+def describe_fallback(joints: Sequence[str], factor: float) -> str:
+    """Return the warning about joints that fall back at `factor` times the range and speed of the recording."""
+    listed = list_with_and([*joints[:MAX_LISTED_JOINTS], "…"] if len(joints) > MAX_LISTED_JOINTS else joints)
+    return (
+        f"At {factor:g} times the recorded range and speed, the torque of {listed} falls back to gravity and friction, "
+        "as far as the recording identifies them. Record wider and faster motion to extend the model."
+    )
+
+
+def describe_alternatives(probabilities: Sequence[float], motion: str, difference: str, joint: str) -> str:
+    """Return the warning about several arms. motion: would distinguish them, by a `difference` in torque at `joint`."""
+    count = {2: "Two", 3: "Three", 4: "Four"}.get(len(probabilities), str(len(probabilities)))
+    percent = list_with_and([f"{each:.0%}" for each in probabilities])
+    return (
+        f"{count} arms explain the recording about equally well (probabilities {percent}); tau_std includes their "
+        f"difference. To distinguish them, record motion in which {motion}: at twice that, they differ by "
+        f"{difference} in {joint}."
+    )
+
+
+NO_SIGNAL = "the held-out torque is not larger than its noise, so the error cannot be judged"
+
+
+def describe_error_against(joints: str) -> str:
+    """Return that a model is no better than the mean torque on some joints."""
+    return f"the error is not below that of the mean torque: {joints}"
+
+
+def describe_error_unknown(joints: str) -> str:
+    """Return that it is unknown whether a model is better than the mean torque on some joints."""
+    return f"too few samples are held out to compare the error with that of the mean torque: {joints}"
+
+
+def describe_error(share: float) -> str:
+    """Return the error of an accepted model. share: of the variance of the torque."""
+    return f"the error is at most {share:.2g} of the torque's variance"
+
+
+def describe_joint_error(share: float, samples: float) -> str:
+    """Return the error of one joint. samples: effective ones."""
+    return f"{share:.2g} of the variance ({samples:.0f} effective samples)"
+
+
+def describe_coverage_against(least: float, joints: str) -> str:
+    """Return that intervals are too narrow on some joints."""
+    return f"coverage of the 95 % intervals is below {100 * least:.0f} %: {joints}"
+
+
+def describe_coverage(least: float) -> str:
+    """Return the coverage of an accepted model."""
+    return f"coverage of the 95 % intervals is at least {100 * least:.0f} % on every joint, within sampling error"
+
+
+def describe_joint_coverage(share: float, high: float, samples: float) -> str:
+    """Return the coverage of one joint. high: upper end of its confidence interval; samples: effective ones."""
+    return f"{100 * share:.0f} % (at most {100 * high:.0f} %, {samples:.0f} effective samples)"

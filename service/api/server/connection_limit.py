@@ -1,0 +1,113 @@
+"""The limit on open connections: a new connection replaces the one that has been idle longest.
+
+A client can open idle connections without an API key, so they must not block new ones. A client at its own limit
+replaces its own connections.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from typing import Any, Protocol
+
+from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
+
+from service.api.limits.requests import network_of
+from service.foundation.settings import Settings
+
+
+class LimitedConnection(Protocol):
+    """A connection that can be closed to make room."""
+
+    peer: str | None
+    """The client's address or network; None if it does not identify the client, as behind a proxy."""
+
+    def drop(self) -> None:
+        """Close at once, without finishing an answer."""
+        ...
+
+
+class ConnectionLimit:
+    """The connections of one server, in the order in which they are closed. For the event loop.
+
+    First come connections without any request, then idle ones after an answer, then those whose clients do not read
+    their answer; the oldest of each kind first. A connection that is being answered is never closed.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.most, self.most_of_one = settings.max_connections, settings.max_connections_per_client
+        self._trusted: Any = ProxyHeadersMiddleware(_nothing, settings.trusted_proxies).trusted_hosts
+        self._fresh: dict[LimitedConnection, None] = {}
+        self._rested: dict[LimitedConnection, None] = {}
+        self._unread: dict[LimitedConnection, None] = {}
+        self._leaving: set[LimitedConnection] = set()
+
+    def find_peer(self, client: tuple[str, int] | None) -> str | None:
+        """Return the address or network of a client; None for a local socket or a trusted proxy."""
+        if client is None or client[0] in self._trusted:
+            return None
+        return network_of(client[0])
+
+    def admit(self, connection: LimitedConnection, present: Collection[Any]) -> tuple[int, str]:
+        """Make room for a new connection; `present` are all connections, including this one.
+
+        Return by how many connections a limit is exceeded, 0 if there is room now, and the reason.
+        """
+        self._fresh[connection] = None
+        beyond, why = self._beyond_own(connection, present)
+        if beyond <= 0 or self._shed(connection, connection.peer):
+            beyond = len(present) - len(self._leaving) - self.most
+            why = f"Too many connections: at most {self.most} (LIPSERVE_MAX_CONNECTIONS)."
+            if beyond <= 0 or self._shed(connection, None):
+                return 0, ""
+        return beyond, why
+
+    def mark_busy(self, connection: LimitedConnection) -> None:
+        """Mark a connection that has a request or is no longer an HTTP connection."""
+        if connection in self._fresh:
+            del self._fresh[connection]
+        elif connection in self._rested:
+            del self._rested[connection]
+        else:
+            self._unread.pop(connection, None)
+
+    def mark_idle(self, connection: LimitedConnection, unread: bool) -> None:
+        """Mark a connection that has been answered; `unread`: the client has not read the whole answer yet."""
+        if connection not in self._leaving:
+            (self._unread if unread else self._rested)[connection] = None
+
+    def remove(self, connection: LimitedConnection) -> None:
+        """Remove a closed connection."""
+        self.mark_busy(connection)
+        self._leaving.discard(connection)
+
+    def _beyond_own(self, connection: LimitedConnection, present: Collection[Any]) -> tuple[int, str]:
+        if connection.peer is None or len(present) <= self.most_of_one:
+            return 0, ""
+        own = sum(self._peer_of(each) == connection.peer for each in present if each not in self._leaving)
+        limit = f"at most {self.most_of_one} (LIPSERVE_MAX_CONNECTIONS_PER_CLIENT)"
+        return own - self.most_of_one, f"Too many connections from {connection.peer}: {limit}."
+
+    def _peer_of(self, connection: Any) -> str | None:
+        if hasattr(connection, "peer"):
+            peer: str | None = connection.peer
+            return peer
+        return self.find_peer(connection.client)  # a stream
+
+    def _shed(self, coming: LimitedConnection, peer: str | None) -> bool:
+        """Close the first idle connection except the new one, of one client if given; return whether there was one."""
+        for connection in self._idle():
+            if connection is not coming and peer in (None, connection.peer):
+                self.mark_busy(connection)
+                self._leaving.add(connection)
+                connection.drop()
+                return True
+        return False
+
+    def _idle(self) -> Iterator[LimitedConnection]:
+        yield from self._fresh
+        yield from self._rested
+        yield from self._unread
+
+
+async def _nothing(*_: Any) -> None:
+    """Stand in for an application: only the middleware's list of trusted hosts is used."""
