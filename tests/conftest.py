@@ -1,32 +1,40 @@
-"""Settings of the whole suite, and which of its tests run in one process where several share the work."""
+"""Settings of the test suite: the tests of `make test`, and which tests share a process in parallel runs."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 from hypothesis import settings
 
+from tests import ROOT
 from tests.choosing import mark_repetitions
 
-# derandomized: a failure on one machine is a failure on every machine
+# derandomised, so that a failure on one machine is a failure on every machine
 settings.register_profile("lipserve", derandomize=True, deadline=None, max_examples=10)
 settings.register_profile("thorough", settings.get_profile("lipserve"), max_examples=100)  # of `make test-all`
 settings.load_profile("lipserve")
 
-TOGETHER = (
-    "tests/browser/",
-    "tests/cluster/",
+SYSTEM = ("tests/system/", "tests/clients/cpp/", "tests/clients/ros2/")
+"""Folders of tests with real services, browsers, compilers, PostgreSQL, Dask and power cuts.
+
+`make test` runs their tests with the marker `journey`, `make test-all` runs all.
+"""
+GROUP_PREFIXES = (
+    "tests/system/browser/",
+    "tests/system/cluster/",
     "tests/docs/",
     "tests/clients/",
-    "tests/service/test_stream_",
+    "tests/service/api/stream/",
     "tests/service/cli/",
 )
-"""Beginnings of the paths of tests that share what takes seconds to start: each runs in one process. The longest first:
-what takes long and begins late keeps the other processes waiting."""
+"""Path prefixes of tests that share a slow start, so that each group runs in one process. The slowest come first, as
+other processes would wait for a slow group that begins late."""
+_ONLY_SLOW = re.compile(r"^pytestmark = .*mark\.slow", re.MULTILINE)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """What services that the tests start store things in, and where pictures go."""
+    """Add options for the storage of services and for a folder of pictures."""
     parser.addoption(
         "--backend",
         choices=("own", "shared"),
@@ -37,31 +45,41 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave out what takes seconds to import where none of its tests is asked for."""
-    unasked = config.getoption("markexpr") == "not slow"
-    return True if unasked and collection_path == Path(__file__).parent / "service/fuzz" else None
+    """Ignore modules with slow tests only unless these are selected: `make test` lacks packages that they import."""
+    if config.getoption("markexpr") != "not slow" or (collection_path.is_file() and collection_path.suffix != ".py"):
+        return None
+    modules = list(collection_path.rglob("test_*.py")) if collection_path.is_dir() else [collection_path]
+    return True if modules and all(map(_is_slow, modules)) else None
 
 
-def room(test: str) -> str:
-    """What a test is of: the beginning of its path that is in TOGETHER, else its file."""
-    return next((start for start in TOGETHER if test.startswith(start)), test.partition("::")[0])
+def _is_slow(module: Path) -> bool:
+    text, name = module.read_text("utf-8"), module.relative_to(ROOT).as_posix()
+    return bool(_ONLY_SLOW.search(text)) or (name.startswith(SYSTEM) and "mark.journey" not in text)
+
+
+def group_of(test: str) -> str:
+    """Return the group of a test: its path prefix in GROUP_PREFIXES, else its file."""
+    return next((start for start in GROUP_PREFIXES if test.startswith(start)), test.partition("::")[0])
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Choose cases, and begin with what takes long."""
+    """Mark slow tests, and run the slowest groups first."""
     mark_repetitions(items)
-    order = {name: place for place, name in enumerate(TOGETHER)}
-    items.sort(key=lambda item: order.get(room(item.nodeid), len(order)))
+    for item in items:
+        if item.nodeid.startswith(SYSTEM) and item.get_closest_marker("journey") is None:
+            item.add_marker(pytest.mark.slow)
+    order = {name: place for place, name in enumerate(GROUP_PREFIXES)}
+    items.sort(key=lambda item: order.get(group_of(item.nodeid), len(order)))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Hand out whole rooms, for `pytest -n 2 --dist loadfile`."""
+    """Distribute whole groups, for `pytest -n 2 --dist loadfile`."""
     from xdist.scheduler import LoadScopeScheduling
 
-    class Rooms(LoadScopeScheduling):
+    class GroupScheduling(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
-            return room(nodeid)
+            return group_of(nodeid)
 
-    return Rooms(config, log) if config.getvalue("dist") == "loadfile" else None
+    return GroupScheduling(config, log) if config.getvalue("dist") == "loadfile" else None

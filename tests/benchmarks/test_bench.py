@@ -1,4 +1,4 @@
-"""`python -m benchmarks latency`: its arithmetic on known numbers, and a tiny run from start to end."""
+"""`python -m benchmarks latency`: arithmetic on known numbers, and a tiny run."""
 
 from types import SimpleNamespace
 
@@ -35,7 +35,7 @@ def test_percentiles_of_known_times():
     assert found.per_second == pytest.approx(1e6 / 501.0)
     batch = Timing.of(np.array([50_000_000, 70_000_000]), queries=1000)
     assert (batch.p50, batch.per_second) == pytest.approx((60.0, 1000 * 2 / 0.12))
-    with pytest.raises(ValueError, match="no times"):
+    with pytest.raises(ValueError, match="at least one time"):
         Timing.of(np.array([], dtype=np.int64))
     middle = median([timed(1.0, 9.0), timed(3.0, 5.0), timed(2.0, 70.0)])  # figure by figure
     assert (middle.p50, middle.p99, middle.largest, middle.count) == (2.0, 9.0, 70.0, 30)
@@ -67,9 +67,9 @@ def known() -> Results:
     return results
 
 
-def test_promises_are_medians_of_figures_of_the_same_run():
+def test_targets_are_medians_of_figures_of_the_same_run():
     found = {each.name: each for each in targets(known())}
-    # run by run 200, 210, 210: the medians' own difference would be 210, and the noisy second run does not count
+    # run by run 200, 210, 210; the noisy second run does not count
     assert found["WebSocket: p50 above the floor"].value == pytest.approx(210.0)
     assert found["WebSocket: p50 above the floor"].met is True
     assert found["WebSocket: p99 / p50, idle"].value == pytest.approx(3.0)
@@ -77,14 +77,14 @@ def test_promises_are_medians_of_figures_of_the_same_run():
     assert found["WebSocket: p50 while training / idle"].value == pytest.approx(1.2)
     assert found["WebSocket: p99 while training / idle"].value == pytest.approx(3.6)
     assert found["WebSocket: p99 while training / idle"].met is False
-    assert found["times faster than the exact GP, with std"].value == pytest.approx(9000 / 110)
-    assert found["times faster than the exact GP, with std"].met is False
-    assert found["1 kHz WebSocket loop: late answers, floor's set aside"].value == pytest.approx(0.3)
-    assert found["1 kHz WebSocket loop: late answers, floor's set aside"].met is False
+    assert found["speed-up over the exact GP, with std"].value == pytest.approx(9000 / 110)
+    assert found["speed-up over the exact GP, with std"].met is False
+    assert found["1 kHz WebSocket loop: late answers minus the floor's"].value == pytest.approx(0.3)
+    assert found["1 kHz WebSocket loop: late answers minus the floor's"].met is False
     assert found["largest deviation from the exact posterior"].met is False
 
 
-def test_frames_are_as_the_service_documents_them():
+def test_frames_follow_the_protocol():
     motion = np.arange(6.0).reshape(3, 2)
     data = request_frame(motion, std=True, deadline=0.25, sequence=7)
     assert data[:2] == bytes((0x82, 0x80 | 64))  # final and binary; masked, with a mask of zeros
@@ -97,7 +97,7 @@ def test_frames_are_as_the_service_documents_them():
         read_answer(ANSWER.pack(7, ERROR, 0, 1, 0, 0, 0.0) + b"too long")
 
 
-def test_an_answer_that_is_not_the_models_own_stops_the_benchmark():
+def test_wrong_answer_stops_the_benchmark():
     workload = SimpleNamespace(
         model=SimpleNamespace(answer=lambda motion: (np.ones(2), np.ones(2))), queries=np.zeros((9, 3, 2))
     )
@@ -109,8 +109,8 @@ def test_an_answer_that_is_not_the_models_own_stops_the_benchmark():
 
 
 @pytest.mark.slow
-def test_a_run_measures_everything_in_both_states():
-    """On a double pendulum, far too short to tell anything but that every step works."""
+def test_run_measures_all_subjects_in_both_states():
+    """A double pendulum, too short for meaningful figures."""
     source = Source(
         robot="double-pendulum",
         stream=Simulation(n_samples=80, speed=5.0),

@@ -8,7 +8,7 @@ from rich.console import Console
 from benchmarks.exported import running
 from benchmarks.exported.running import SHIPPED, Options, grids, run, targets
 from benchmarks.workload import BenchError
-from tests.lipcore.test_c_writer import needs_compiler
+from tests.lipcore.export.test_c_writer import needs_compiler
 
 
 @needs_compiler
@@ -26,12 +26,12 @@ def test_a_short_run(tmp_path):
 
 
 @needs_compiler
-def test_what_does_not_compile_is_said():
+def test_compiler_error_is_reported():
     with pytest.raises(BenchError, match="-fno-such-flag"):
         run(Options(SHIPPED, calls=20, queries=20, flags=("-fno-such-flag",)), Console(quiet=True))
 
 
-def test_a_compiler_that_is_missing_is_said(monkeypatch):
+def test_missing_compiler_is_reported(monkeypatch):
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(BenchError, match="cc is not installed"):
         running.run(Options(SHIPPED, calls=20, queries=20), Console(quiet=True))

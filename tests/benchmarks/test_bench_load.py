@@ -1,4 +1,4 @@
-"""`python -m benchmarks load`, `soak` and `scale`: what they count and conclude, where things go wrong on purpose."""
+"""`python -m benchmarks load`, `soak` and `scale`: counts and targets, with deliberate faults."""
 
 import json
 import mmap
@@ -12,14 +12,14 @@ import pytest
 from rich.console import Console
 
 from benchmarks.online.sending import Ack
-from benchmarks.processes import PROC, Watch, written
+from benchmarks.processes import PROC, PeriodicCall, written_mib
 from benchmarks.scale import passes
 from benchmarks.scale import running as scaling
 from benchmarks.soak import accounting, hours, running, table
 from benchmarks.soak.accounting import Account
 from benchmarks.soak.clients import Mix
 from benchmarks.soak.connections import TAUGHT, Log, stream_of
-from benchmarks.soak.day import APART_S, Clock
+from benchmarks.soak.day import MAX_LAG_S, Clock
 from benchmarks.soak.resources import Look
 from benchmarks.soak.running import Options, Results
 from benchmarks.timing import Timing
@@ -31,7 +31,7 @@ def ack(sequence, accepted=25):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """Counts logs against lists that the test gives."""
+    """Compare logs with lists that the test provides."""
 
     def count(logs, datasets=(), batches=()):
         lists = {"/v1/datasets": list(datasets), f"/v1/models/{TAUGHT}/observations": list(batches)}
@@ -51,7 +51,7 @@ def batch(sequence, accepted=25, number=0):
     return {"stream_id": stream_of(number), "sequence": sequence, "accepted": accepted}
 
 
-def test_every_write_that_is_not_as_acknowledged_is_found(counted):
+def test_lost_changed_and_surplus_writes_are_counted(counted):
     kept = {"sha256": "a", "rows": 300}
     fine = Log("upload", stored={"ds_1": kept, "ds_2": kept}, deleted={"ds_1"}, unsure=1)
     teaching = Log("observe", acks={0: ack(0), 1: ack(1)})
@@ -65,7 +65,7 @@ def test_every_write_that_is_not_as_acknowledged_is_found(counted):
     account = counted([uploads, teaching], listed, [batch(0), batch(0), batch(1, accepted=24)])
     assert account.lost == 2, "ds_1 and batch 2"
     assert account.changed == 2, "ds_2 and batch 1"
-    assert account.surplus == 3, "ds_3 was deleted, ds_9 never sent, batch 0 is there twice"
+    assert account.surplus == 3, "ds_3 was deleted, ds_9 never sent, batch 0 is stored twice"
 
 
 def _results(**changes):
@@ -99,7 +99,7 @@ def _results(**changes):
         {"service": [400.0] * 30 + [430.0] * 10},
     ],
 )
-def test_every_fault_breaks_a_promise(wrong):
+def test_every_fault_misses_one_target(wrong):
     assert all(each.met is not False for each in table.targets(_results()))
     assert sum(each.met is False for each in table.targets(_results(**wrong))) == 1
 
@@ -116,7 +116,7 @@ def test_a_run_measures_everything():
 
 
 def _looks(**rising):
-    """A run of a thousand looks in which some figures rise, linearly and after the first tenth, by so much in all."""
+    """Return a thousand looks in which the given figures rise linearly after the first tenth, by the given amount."""
     rng = np.random.default_rng(0)
     usual = {"service": 300.0, "learner": 150.0, "jobs": 200.0, "disk": 40.0}
     usual |= {"descriptors": 50.0, "threads": 22.0, "processes": 3.0}
@@ -125,7 +125,7 @@ def _looks(**rising):
         share = max(0.0, (turn - 100) / 900)
         warm = min(1.0, turn / 80)  # at first everything grows
         figures = {name: value * warm + rising.get(name, 0.0) * share for name, value in usual.items()}
-        figures["jobs"] += 300.0 if turn % 100 < 5 else 0.0  # a training now and then
+        figures["jobs"] += 300.0 if turn % 100 < 5 else 0.0  # a training job
         figures["service"] += rng.normal(0.0, 3.0)
         found.append(Look(at=float(turn), **figures))
     return found
@@ -140,6 +140,7 @@ LEAKS = {
     "threads": 3.0,
     "processes": 1.0,
 }
+"""Rise of each figure that is a leak."""
 
 
 def _day(**changes):
@@ -151,18 +152,10 @@ def _day(**changes):
     [
         {"errors": {"move: TimeoutError": 1}},
         {"unasked": ["GET /v2"]},
-        *(
-            {"looks": _looks(**{name: value})}
-            for name, value in {"service": 25.0, "learner": 12.0, "jobs": 15.0}.items()
-        ),
-        *(
-            {"looks": _looks(**{name: value})}
-            for name, value in {"disk": 3.0, "descriptors": 5.0, "threads": 3.0}.items()
-        ),
-        {"looks": _looks(processes=1.0)},
+        *({"looks": _looks(**{name: value})} for name, value in LEAKS.items()),
     ],
 )
-def test_every_leak_breaks_a_promise(wrong):
+def test_every_leak_misses_one_target(wrong):
     assert [each.name for each in hours.targets(_day()) if not each.met] == []
     assert sum(each.met is False for each in hours.targets(_day(**wrong))) == 1
 
@@ -176,33 +169,32 @@ def test_a_soak_is_drawn_and_written(tmp_path):
     assert [grid.title for grid in hours.grids(found)][1].startswith("8 hours")
 
 
-def test_a_watch_that_fails_says_so():
-    """Nothing that is seen after it may pass for a soak."""
+def test_failed_periodic_call_raises_its_error_on_exit():
     looked = threading.Event()
 
     def look():
         looked.set()
         raise FileNotFoundError("a folder")
 
-    with pytest.raises(FileNotFoundError, match="a folder"), Watch(0.0, look):
+    with pytest.raises(FileNotFoundError, match="a folder"), PeriodicCall(0.0, look):
         assert looked.wait(60)
 
 
-@pytest.mark.skipif(not (PROC / "self" / "smaps_rollup").exists(), reason="Linux says what memory a process has")
-def test_memory_is_what_was_written_not_what_is_mapped_of_files(tmp_path):
+@pytest.mark.skipif(not (PROC / "self" / "smaps_rollup").exists(), reason="requires Linux")
+def test_written_memory_excludes_mapped_files(tmp_path):
     file = tmp_path / "library"
     file.write_bytes(bytes(64 << 20))
-    before = written(os.getpid())
+    before = written_mib(os.getpid())
     with file.open("rb") as opened, mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ) as mapped:
         assert sum(mapped[at] for at in range(0, len(mapped), mmap.PAGESIZE)) == 0
-        assert written(os.getpid()) - before < 16
+        assert written_mib(os.getpid()) - before < 16
         kept = np.ones(64 << 17)
-        assert 48 < written(os.getpid()) - before < 80
+        assert 48 < written_mib(os.getpid()) - before < 80
         del kept
-    assert written(1 << 30) is None
+    assert written_mib(1 << 30) is None
 
 
-def test_the_arm_waits_for_those_who_follow_it():
+def test_clock_waits_for_its_followers():
     clock, seen = Clock(300), []
 
     def follow():
@@ -217,11 +209,11 @@ def test_the_arm_waits_for_those_who_follow_it():
         clock.tick()
     thread.join()
     assert len(seen) == 30
-    assert all(at <= now <= at + APART_S + 1 for at, now in seen)
+    assert all(at <= now <= at + MAX_LAG_S + 1 for at, now in seen)
 
 
 @pytest.mark.slow
-def test_a_short_day_goes_well():
+def test_short_day_has_no_errors():
     found = hours.run(hours.Options(0.1, rate=20), Console(quiet=True))
     assert found.errors == {}
     assert found.done["batch of 40 rows"] == 180
@@ -229,7 +221,7 @@ def test_a_short_day_goes_well():
     assert found.looks[-1].learner > 0
 
 
-def test_a_ratio_is_that_of_pairs():
+def test_ratio_is_the_median_of_pairs():
     seconds = {passes.POOL: {1: [10.0, 20.0, 10.0], 2: [5.0, 10.0, 8.0]}}
     part = passes._part(1000, seconds, 42.0, 1)
     ratio, linear, sums = part.targets
@@ -245,6 +237,6 @@ def test_all_that_scale_starts_is_measured():
     results = scaling.run(scaling.Options(**scaling.QUICK), Console(quiet=True))
     assert [part.name for part in results.parts] == list(scaling.PARTS)
     judged = {each.name: each for each in results.targets()}
-    for name in ("different sums", "trials in which their answers differ", "acknowledged and lost", "done twice"):
+    for name in ("different sums", "trials with different answers", "acknowledged and lost", "done twice"):
         assert judged[name].met, name
     assert judged["faults without recovery"].met

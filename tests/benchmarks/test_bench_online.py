@@ -1,4 +1,4 @@
-"""`python -m benchmarks online`: its parts against independent references, and a tiny run from start to end."""
+"""`python -m benchmarks online`: parts against independent references, and a tiny run."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ from rich.console import Console
 
 import lipcore
 from benchmarks.latency import table as bench_table
-from benchmarks.online import flow, promises, table
+from benchmarks.online import flow, table, targets
 from benchmarks.online.fourier import FourierModel
 from benchmarks.online.running import Options, run
 from benchmarks.online.scene import Scene, rows_of
@@ -37,7 +37,7 @@ def _trained(estimator: str) -> TorqueModel:
 # the scene
 
 
-def test_the_live_stream_is_rigid_bodies_with_a_payload_and_friction_that_grows():
+def test_live_stream_has_payload_and_growing_friction():
     scene = Scene(seconds=2.0, change_at=1.0, rate=50.0, noise=0.0, drift=0.5, payload=1.5, viscous=0.7, coulomb=0.4)
     live = scene.live()
     bodies = [inverse_dynamics(scene.arm, live.q, live.dq, live.ddq, *load) for load in ((), (np.ones(100), LOAD))]
@@ -92,11 +92,11 @@ def _ack(acked: int, revision: int, accepted: int = 100) -> Ack:
     return Ack(0, acked - 5_000_000, acked, 100, accepted, revision, False, {"contact": 100 - accepted})
 
 
-def test_lag_reaches_to_the_first_answer_with_the_batch():
+def test_lag_ends_with_the_first_answer_that_has_the_batch():
     second = 1_000_000_000
     acks = [_ack(1 * second, 3), _ack(2 * second, 4), _ack(3 * second, 5, accepted=0), _ack(4 * second, 9)]
     revisions = [(0, 0), (1.5 * second, 3), (4 * second, 7), (8 * second, 8)]
-    # 9 was never seen; 5 teaches nothing; 4 came with revision 7
+    # revision 9 was never seen, batch 5 has no accepted rows, batch 4 came with revision 7
     assert flow.lags(acks, revisions) == pytest.approx([0.5, 2.0])
     assert flow.lags([_ack(2 * second, 3)], revisions) == [0.0]
 
@@ -133,6 +133,6 @@ def test_a_run_measures_everything(websocket: bool):
         assert asked is not None
         assert 0 < asked.answers.p50 <= asked.answers.p99
     assert results.learning is not None
-    assert results.learning.revisions[-1][1] > results.learning.revisions[0][1]  # it learnt while it answered
-    assert all(each.value is not None for each in promises.targets(results))
+    assert results.learning.revisions[-1][1] > results.learning.revisions[0][1]  # the model learnt meanwhile
+    assert all(each.value is not None for each in targets.targets(results))
     assert "nan" not in bench_table.grids_markdown(table.grids(results), results.notes)

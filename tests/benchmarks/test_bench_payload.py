@@ -1,4 +1,4 @@
-"""`python -m benchmarks online --only payload,rivals,quiet`: its parts against independent references."""
+"""`python -m benchmarks online --only payload,rivals,quiet`: parts against independent references."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ CASE = Case("double-pendulum", "clean", 0.3, "centred", "slow", 1)
 GOOD, BAD = Answers((0.1, 0.3), (0.9, 0.95), 0.2), Answers((1.0, 3.0), (0.1, 0.2), 1.0)
 
 
-def test_a_stream_carries_its_payload_between_pick_up_and_putting_down():
+def test_stream_has_its_payload_between_pick_up_and_release():
     samples = ARM.live(replace(CASE, mass=2.0))
     motion, load = (samples.q, samples.dq, samples.ddq), Payload(2.0, 0.0, PLACES["centred"])
     free = inverse_dynamics(ARM.robot, *motion)
@@ -29,7 +29,7 @@ def test_a_stream_carries_its_payload_between_pick_up_and_putting_down():
     assert np.abs(full - free).max() > 1.0
 
 
-def test_contacts_are_the_slope_of_the_work_that_their_force_does():
+def test_contact_torque_is_the_slope_of_the_work_of_its_force():
     samples = ARM.moving(3.0, 1.0, 1, None)
     torque = touches(ARM.robot, samples, np.array([1.0]), np.random.default_rng(3))
     assert np.flatnonzero(np.abs(torque).sum(axis=1)).tolist() == list(range(100, 120))
@@ -56,7 +56,7 @@ def test_least_squares_around_the_urdf_learns_the_payload():
     assert answers.lowest > 0.85
 
 
-def test_rows_and_the_summary_tell_what_was_missed():
+def test_missed_payloads_appear_in_rows_and_summary():
     seen = Outcome(CASE, BAD, GOOD, 0.1, 0.2, masses={0.1: Figure(0.3, 0.01), 0.5: Figure(0.4, 0.01)}, first=GOOD)
     seen.answers = dict.fromkeys((0.1, 0.5, 1.0, 3.0), GOOD)
     never = Outcome(CASE, BAD, GOOD, answers=dict(seen.answers), first=GOOD)
@@ -67,5 +67,5 @@ def test_rows_and_the_summary_tell_what_was_missed():
     (summed,) = summary([seen, never])
     assert summed[:4] == ("clean, slow", "2", "inf | inf", "50%")
     assert "1/2" in summed
-    with pytest.raises(ValueError, match="--kinds has 'wet'"):
+    with pytest.raises(ValueError, match="'wet' in --kinds"):
         Options(("payload",), kinds=("wet",))

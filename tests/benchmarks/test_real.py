@@ -1,4 +1,4 @@
-"""Rivals, splits, cached cells and promises of `python -m benchmarks real`, on simulated arms."""
+"""`python -m benchmarks real` on simulated arms: other methods, splits, cached cells and targets."""
 
 import io
 from dataclasses import replace
@@ -29,14 +29,14 @@ def simulated(robot="double-pendulum", seed=1, samples=300, **stream):
 
 
 def still(seconds, rate=100.0, episode=0):
-    """Samples of one joint whose position counts the rows."""
+    """Return samples of one joint whose position is the number of the row."""
     rows = round(seconds * rate)
     column = np.arange(rows, dtype=float)[:, None]
     return Samples(("a",), column[:, 0] / rate, np.full(rows, episode), column, column, column, column)
 
 
 def nmse(forecast, samples):
-    """Error against the torque without noise."""
+    """Return nMSE against the torque without noise."""
     robot = load_robot("double-pendulum")
     true = inverse_dynamics(robot, samples.q, samples.dq, samples.ddq)
     return np.mean((forecast.mean - true) ** 2, axis=0) / true.var(axis=0)
@@ -50,7 +50,7 @@ def test_least_squares_finds_the_torque_of_a_simulated_robot(predict):
     assert np.all(forecast.std > 0)
 
 
-def test_the_regressor_follows_the_order_of_the_datas_joints():
+def test_regressor_has_the_joint_order_of_the_samples():
     samples, robot = simulated("ur5", noise=0.0), load_robot("ur5")
     turned = [3, 0, 5, 1, 4, 2]
     names = tuple(robot.joint_names[joint] for joint in turned)
@@ -63,14 +63,14 @@ def test_the_regressor_follows_the_order_of_the_datas_joints():
     np.testing.assert_allclose(rigid @ parameters, true, atol=1e-9)
 
 
-def test_ridge_regression_is_far_better_than_the_mean_where_test_and_training_are_alike():
+def test_ridge_regression_beats_the_mean_if_test_and_training_are_alike():
     samples = simulated(samples=600, noise=0.001)
     train, test = samples.rows(slice(0, 600, 2)), samples.rows(slice(1, 600, 2))
     mean, ridge = (nmse(predict(train, test), test) for predict in (rivals.predict_mean, rivals.predict_rbf))
     assert np.all(ridge < 0.01 * mean)
 
 
-def test_the_mean_is_of_the_training_samples():
+def test_mean_is_that_of_the_training_samples():
     train, test = simulated(), simulated(seed=2)
     forecast = rivals.predict_mean(train, test)
     np.testing.assert_allclose(forecast.mean[7], train.tau.mean(axis=0))
@@ -129,7 +129,7 @@ def test_the_time_between_episodes_does_not_count():
 
 
 def toy(recording="toy", split="other", told="nothing", method="mean", error=0.5, **figures):
-    """A result that was never computed."""
+    """Return an invented result."""
     usual = {
         **{"train_s": 20.0, "train_rows": 10, "test_rows": 10, "seconds": 1.0},
         **{"nmse": [error, error], "nmse_mean": [1.0, 1.0], "coverage": [0.95, 0.95], "width": [1.0, 1.0]},
@@ -149,7 +149,7 @@ def test_figures_compare_errors_and_widths_with_what_was_measured():
     assert found.train_s == pytest.approx(2.0)
 
 
-def test_results_of_the_product_belong_to_a_revision_and_those_of_rivals_to_none(tmp_path):
+def test_only_results_of_the_product_belong_to_a_revision(tmp_path):
     first, second = Cache(tmp_path, "aaaa"), Cache(tmp_path, "bbbb")
     product, rival = toy(method=PRODUCT), toy(method="RBF ridge")
     first.add(product)
@@ -161,7 +161,7 @@ def test_results_of_the_product_belong_to_a_revision_and_those_of_rivals_to_none
 
 @pytest.fixture
 def options(tmp_path):
-    """Options of a run on a recording that is prepared already, without the product."""
+    """Return options of a run on a prepared recording, without the product."""
     (tmp_path / "prepared").mkdir()
     write_recording(tmp_path / "prepared" / "pendulum-train.npz", simulated(samples=400, noise=0.01))
     return running.Options(tmp_path, tmp_path, "aaaa", only="mean|least", recordings=(PENDULUM,))
@@ -192,7 +192,7 @@ def test_a_run_continues_after_cells_that_failed(options, monkeypatch):
     assert len(run(options).results) == 9
 
 
-def test_a_table_is_made_without_computing(options):
+def test_tables_need_no_computation(options):
     assert run(replace(options, compute=False)).results == []
 
 
@@ -208,12 +208,12 @@ def test_methods_do_not_see_the_torque_of_the_test(options, monkeypatch):
     assert np.isnan(seen[0]).all()
 
 
-def promises(results):
+def targets(results):
     return {each.name: (each.value, each.met) for each in report.targets(results)}
 
 
-def test_promises_compare_the_product_with_the_best_rival_of_each_split():
-    found = promises(
+def test_targets_compare_the_product_with_the_best_other_method_of_each_split():
+    found = targets(
         [
             toy("a", method=PRODUCT, error=0.3),
             toy("a", told="URDF", method=PRODUCT, error=0.12),
@@ -223,28 +223,28 @@ def test_promises_compare_the_product_with_the_best_rival_of_each_split():
             toy("b", method="mean", error=0.1, train_s=5.0),
         ]
     )
-    assert found["nothing told, 10 s and more: largest error / best rival"] == (pytest.approx(3.0), False)
-    assert found["URDF told, 10 s and more: largest error / best rival"] == (pytest.approx(1.2), False)
-    assert found["nothing told, less than 10 s: largest error / best rival"] == (pytest.approx(4.0), True)
+    assert found["no URDF, at least 10 s: largest error / best other"] == (pytest.approx(3.0), False)
+    assert found["URDF, at least 10 s: largest error / best other"] == (pytest.approx(1.2), False)
+    assert found["no URDF, less than 10 s: largest error / best other"] == (pytest.approx(4.0), True)
     assert found["largest error / error of the recording's mean"] == (pytest.approx(0.4), True)
     assert found["worst joint: error / error of the recording's mean"] == (pytest.approx(1.4), False)
-    assert found["joints whose coverage is 85 to 100 %"] == (pytest.approx(100 * 5 / 6), False)
+    assert found["joints with a coverage of 85 to 100 %"] == (pytest.approx(100 * 5 / 6), False)
     assert found["median width / need"] == (1.0, True)
 
 
-def test_promises_name_the_splits_that_they_are_about():
-    found = promises([toy("panda-9s", "other", "URDF", PRODUCT, error=0.012)])
-    assert found["R2, panda-9s, other motion, told URDF"] == (pytest.approx(0.012), True)
-    assert found["R2, panda-9s, other motion, told nothing"] == (None, None)
-    assert found["kuka, other motion, told nothing"] == (None, None)
+def test_targets_name_their_splits():
+    found = targets([toy("panda-9s", "other", "URDF", PRODUCT, error=0.012)])
+    assert found["panda-9s, other motion, URDF"] == (pytest.approx(0.012), True)
+    assert found["panda-9s, other motion, no URDF"] == (None, None)
+    assert found["kuka, other motion, no URDF"] == (None, None)
 
 
 def test_the_page_holds_every_table():
     results = [toy("a", method=PRODUCT, error=0.3, estimator="rigid-body"), toy("a", error=1.5)]
     page = report.page(running.Outcome(results, {"a/first-30s": "9.0 s recorded"}, {}, ["mujoco.sysid"]), "aaaa")
     assert "| a, other | 20.0 | 3.0e-1 | – | 1.5 |" in page
-    assert "| a, other, nothing | 3.0e-1 3.0e-1 | 95 95 | 1.0 | 0.3 | 0.20 | 0.20 | 1 | rigid-body |" in page
-    assert "| LIPServe, told nothing | 100 | 1.0 | 1.0 | 1.0 | 1 of 1 |" in page
+    assert "| a, other, no URDF | 3.0e-1 3.0e-1 | 95 95 | 1.0 | 0.3 | 0.20 | 0.20 | 1 | rigid-body |" in page
+    assert "| LIPServe, no URDF | 100 | 1.0 | 1.0 | 1.0 | 1 of 1 |" in page
     assert "NOT met" not in page
     assert "a/first-30s (9.0 s recorded)" in page
     assert "Not installed: mujoco.sysid." in page

@@ -1,4 +1,4 @@
-"""The paper's experiment in small: `python -m benchmarks.reproduce` from options to tables and figures."""
+"""`python -m benchmarks.reproduce` on a small experiment, from options to tables and figures."""
 
 import csv
 import json
@@ -33,7 +33,7 @@ TINY = ("--robot", "double-pendulum", "--training-sets", "1", "--test-sets", "2"
 
 
 def reproduce(*arguments):
-    """Run the experiment with arguments in this process; return its exit code."""
+    """Run the experiment in this process; return its exit code."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sys.argv", ["reproduce", *map(str, arguments)])
         with pytest.raises(SystemExit) as ended:
@@ -48,7 +48,7 @@ def tiny(out, *options):
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """The folder of a finished run."""
+    """Return the folder of a finished run."""
     out = tmp_path_factory.mktemp("reproduction")
     assert tiny(out) == 0
     return out
@@ -68,7 +68,7 @@ def rows(folder):
 
 
 @pytest.mark.slow
-def test_every_file_is_written_and_every_cell_computed_once(finished):
+def test_all_files_are_written_and_cells_computed_once(finished):
     assert {path.name for path in finished.iterdir()} == FILES
     for name in FILES:
         assert (finished / name).stat().st_size > 500
@@ -82,8 +82,8 @@ def test_every_file_is_written_and_every_cell_computed_once(finished):
 
 
 @pytest.mark.slow
-def test_results_are_those_of_training_and_judging_by_hand(finished):
-    """Error against Pinocchio's torque, coverage and width against the measured torque, all computed here."""
+def test_results_equal_those_computed_here(finished):
+    """Errors are against Pinocchio's torque, coverage and width are of the measured torque."""
     robot = load_robot("double-pendulum")
     training = simulate(robot, Simulation(40), 1).rows(np.round(np.linspace(0, 39, 20)).astype(int))
     model = lipcore.train(training, robot.joint_types, "lip-chain", FitOptions(device="cpu", prior="zero"))
@@ -111,16 +111,15 @@ def test_results_are_those_of_training_and_judging_by_hand(finished):
 
 
 @pytest.mark.slow
-def test_a_killed_run_goes_on_with_what_is_missing(finished, tmp_path, capsys):
-    """Killed while it wrote the third result: two are kept, the torn line is not."""
+def test_killed_run_is_resumed(finished, tmp_path, capsys):
+    """The run was killed while it wrote the third result, whose line is incomplete."""
     out = tmp_path / "killed"
     shutil.copytree(finished, out)
     whole = (finished / "cells.jsonl").read_bytes().splitlines(keepends=True)
     kept, torn = b"".join(whole[:3]), whole[3][: len(whole[3]) // 2]
     (out / "cells.jsonl").write_bytes(kept + torn)
     assert tiny(out) == 0
-    said = capsys.readouterr().out
-    assert "6 trainings, 2 of them in" in said
+    assert "6 trainings, 2 of them in" in capsys.readouterr().out
     assert (out / "cells.jsonl").read_bytes().startswith(kept)
     assert sorted(cells(out)) == sorted(cells(finished))
     assert "trainings in this run" in (out / "results.md").read_text()
@@ -135,20 +134,20 @@ def test_results_of_other_settings_are_not_mixed(finished, capsys):
     assert tiny(finished, "--samples", 50, "--seed", 5) == 1
     err = capsys.readouterr().err
     assert err.startswith("error: ")
-    for text in ("samples was 40, now 50", "first_seed was 1, now 5", "choose another folder with --out"):
+    for text in ("samples was 40, now 50", "first_seed was 1, now 5", "Choose another folder with --out"):
         assert text in err
     assert (finished / "cells.jsonl").read_bytes() == before
 
 
 def test_two_runs_do_not_share_a_folder(tmp_path):
-    with Results(tmp_path, Experiment()), pytest.raises(ResultsError, match="another run is at work"):
+    with Results(tmp_path, Experiment()), pytest.raises(ResultsError, match="in use by another run"):
         Results(tmp_path, Experiment())
     with pytest.raises(ResultsError, match="now after"):
         Results(tmp_path, Experiment(code="after"))
     Results(tmp_path, Experiment()).__exit__()
 
 
-def test_training_and_test_sets_have_other_seeds_and_frequencies():
+def test_training_and_test_sets_differ_in_seeds_and_frequencies():
     experiment = Experiment(robot="double-pendulum", samples=40, test_sets=4, test_stride=1)
     whole, fewer = (experiment.training_set(Cell(estimator="se", speed=2.0, samples=size, seed=3)) for size in (40, 10))
     assert (len(fewer), fewer.t[0], fewer.t[-1]) == (10, whole.t[0], whole.t[-1])
@@ -161,7 +160,7 @@ def test_training_and_test_sets_have_other_seeds_and_frequencies():
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--robot", "r2d2"), f"robot is 'r2d2', expected one of {', '.join(ROBOTS)}"),
         (("--estimator", "magic"), "estimator is 'magic', expected one of auto, lip, lip-chain"),
@@ -170,10 +169,10 @@ def test_training_and_test_sets_have_other_seeds_and_frequencies():
         (("--test-stride", 200), "--test-stride is 200, expected at most 50"),
     ],
 )
-def test_bad_options_are_named_before_any_work(tmp_path, capsys, options, said):
+def test_bad_options_are_refused_before_any_work(tmp_path, capsys, options, message):
     out = tmp_path / "out"
     assert reproduce(*options, "--out", out) == 1
     err = capsys.readouterr().err
     assert err.startswith("error: ")
-    assert said in err
+    assert message in err
     assert not out.exists()

@@ -1,32 +1,15 @@
-"""The C++ client, compiled."""
+"""What tests of the service share."""
 
-from pathlib import Path
-
-import pytest
-
-from tests.clients.building import COMPILERS, built, here, sanitizers
-
-
-@pytest.fixture(scope="session", params=COMPILERS)
-def compiler(request: pytest.FixtureRequest) -> str:
-    """A compiler of C++ that is installed."""
-    if not here(request.param):
-        pytest.skip(f"{request.param} is not installed")
-    return str(request.param)
-
-
-@pytest.fixture(scope="session")
-def any_compiler() -> str:
-    """One that is installed."""
-    found = here(*COMPILERS)
-    if not found:
-        pytest.skip(f"none of {', '.join(COMPILERS)} is installed")
-    return found[0]
-
-
-@pytest.fixture(scope="session")
-def driver(any_compiler: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The program of `Driver`, under sanitizers where they are installed."""
-    return built(
-        any_compiler, "tests/drive.cpp", tmp_path_factory.mktemp("driver"), "-O1", "-g", *sanitizers(any_compiler)
-    )
+from tests.service.conftest import (  # noqa: F401 - fixtures
+    _own_files,
+    _warm_processes,
+    api,
+    home,
+    pendulum,
+    server,
+    services_share,
+    streaming,
+    strict,
+    strict_service,
+    trained,
+)

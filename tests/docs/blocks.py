@@ -1,14 +1,15 @@
-"""Fenced blocks of the documentation, and the marks before them that say why one is not run."""
+"""Fenced blocks of the documentation, and the comments before them that say why one is not run."""
 
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests import ROOT
+
 GENERATED = ("docs/reference", "docs/reproduction")
-"""Written by commands, which their own tests run."""
-REASONS = frozenset(
+"""Folders of pages that commands generate; other tests run them."""
+ALLOWED_REASONS = frozenset(
     {
         "installs the package",
         "needs Docker",
@@ -19,8 +20,8 @@ REASONS = frozenset(
         "configuration of another program",
     }
 )
-"""Why a block may stay unrun; anything else has to run."""
-RUN = ("sh", "bash", "python", "json")
+"""Allowed reasons not to run a block."""
+RUN_LANGUAGES = ("sh", "bash", "python", "json")
 SLOW = "slow"
 _MARK = re.compile(r"<!--\s*(?:not run:\s*(?P<reason>.*?)|(?P<slow>slow))\s*-->")
 _FENCE = re.compile(r"(?P<indent> *)```(?P<language>[\w-]*)\s*")
@@ -29,7 +30,7 @@ _SERVE = re.compile(r"(\.venv/bin/)?lipserve serve\s*")
 
 @dataclass(frozen=True)
 class Block:
-    """A fenced block. page: its file; line: of its fence; reason: why it is not run, None where it is."""
+    """A fenced block. page: its file; line: of its fence; reason: why it is not run, None if it is."""
 
     page: Path
     line: int
@@ -40,23 +41,23 @@ class Block:
 
     @property
     def place(self) -> str:
-        """Where it is, for people."""
+        """Path and line, for messages."""
         return f"{self.page.relative_to(ROOT)}:{self.line}"
 
     @property
     def serves(self) -> bool:
-        """Whether it starts the service and does nothing else: it goes on until the page has ended."""
+        """Whether the block only starts the service, which runs until the end of the page."""
         return self.language in ("sh", "bash") and _SERVE.fullmatch(self.text) is not None
 
 
 def pages() -> list[Path]:
-    """README.md, and every page of docs that is written by hand."""
+    """Return README.md and the pages of docs that are written by hand."""
     found = [path for path in sorted((ROOT / "docs").rglob("*.md")) if not _generated(path)]
     return [ROOT / "README.md", *found]
 
 
 def all_pages() -> list[Path]:
-    """Every page, generated ones too."""
+    """Return all pages, including generated ones."""
     return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
@@ -65,7 +66,7 @@ def _generated(path: Path) -> bool:
 
 
 def blocks(page: Path) -> list[Block]:
-    """The blocks of a page, in its order. One after a slow one is slow too: it may stand on what that has done."""
+    """Return the blocks of a page in order. Blocks after a slow one are slow too, because they may depend on it."""
     return list(_blocks(page))
 
 
@@ -89,5 +90,5 @@ def _blocks(page: Path) -> Iterator[Block]:
 
 
 def prose(page: Path) -> str:
-    """A page without its fenced blocks."""
+    """Return a page without its fenced blocks."""
     return re.sub(r"^ *```.*?^ *```$", "", page.read_text("utf-8"), flags=re.MULTILINE | re.DOTALL)

@@ -1,4 +1,4 @@
-"""Runs Python blocks in one namespace: lines of JSON with code in, lines of JSON with what it printed out."""
+"""Runs Python blocks in one namespace: reads code as lines of JSON, writes the output as lines of JSON."""
 
 import contextlib
 import io
@@ -8,7 +8,7 @@ import traceback
 
 
 def main() -> None:
-    """Answer every line on standard input."""
+    """Run every line of standard input."""
     namespace = {"__name__": "__main__"}
     for line in sys.stdin:
         printed, error = io.StringIO(), None

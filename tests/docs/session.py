@@ -1,4 +1,4 @@
-"""A reader of the documentation: a folder, a shell, a Python that keeps its variables, and eyes for what is printed."""
+"""Runs the blocks of a documentation page in a folder, with a shell and a Python process, and checks their output."""
 
 import json
 import os
@@ -12,15 +12,15 @@ from tests.docs.blocks import ROOT, Block
 from tests.service import backend
 from tests.service.server import Server
 
-WRITTEN = "127.0.0.1:8000"
-"""Address of the service as the documentation has it."""
-PATIENCE = 600
-"""Seconds that a block may take."""
+DOCUMENTED_ADDRESS = "127.0.0.1:8000"
+"""Address of the service in the documentation."""
+BLOCK_TIMEOUT_S = 600
+"""Timeout of a block, s."""
 NOTEBOOK = Path(__file__).with_name("notebook.py")
 
 
-class Reader:
-    """Environment and folders of who uses a service on an empty home."""
+class BlockRunner:
+    """Environment and folders to run blocks against a service."""
 
     def __init__(self, folder: Path, server: Server) -> None:
         self.folder, self.address = folder, f"127.0.0.1:{server.port}"
@@ -34,7 +34,7 @@ class Reader:
         }
 
     def place(self, name: str) -> Path:
-        """A new folder with what a checkout has that pages name."""
+        """Make a folder with the parts of a checkout that pages mention."""
         made = self.folder / name
         made.mkdir()
         (made / ".venv").symlink_to(sys.prefix)
@@ -43,11 +43,11 @@ class Reader:
 
 
 class Session:
-    """Does what blocks of one page say, in their order. Each of shell is a bash of its own in the page's one folder."""
+    """Runs the blocks of one page in order. Each shell block gets a new bash in the folder of the page."""
 
-    def __init__(self, reader: Reader, name: str) -> None:
-        self._reader, self._work = reader, reader.place(name)
-        self._printed, self._python = "", None
+    def __init__(self, runner: BlockRunner, name: str) -> None:
+        self._runner, self._work = runner, runner.place(name)
+        self._output, self._python = "", None
 
     def __enter__(self) -> Self:
         return self
@@ -58,23 +58,23 @@ class Session:
             self._python.communicate()
 
     def run(self, block: Block) -> None:
-        """Do what a block says; raise AssertionError where it fails, or prints something else than is written."""
-        text = block.text.replace(WRITTEN, self._reader.address)
+        """Run a block; raise AssertionError if it fails, or if its output differs from the page."""
+        text = block.text.replace(DOCUMENTED_ADDRESS, self._runner.address)
         if block.language == "json":
-            compare(json.loads(self._printed), block.text, block.place)
+            check_output(json.loads(self._output), block.text, block.place)
         elif block.language == "python":
-            self._printed = self._in_python(text, block.place)
-        elif not block.serves:  # it does already
-            self._printed = self._in_shell(text, block.place)
+            self._output = self._in_python(text, block.place)
+        elif not block.serves:  # the service is running
+            self._output = self._in_shell(text, block.place)
 
     def _in_shell(self, text: str, place: str) -> str:
         done = subprocess.run(
             ["bash", "-euo", "pipefail", "-c", text],
             cwd=self._work,
-            env=self._reader.environment,
+            env=self._runner.environment,
             capture_output=True,
             text=True,
-            timeout=PATIENCE,
+            timeout=BLOCK_TIMEOUT_S,
             check=False,
         )
         assert done.returncode == 0, f"{place} ended with {done.returncode}\n{text}\n{done.stdout}\n{done.stderr}"
@@ -85,7 +85,7 @@ class Session:
             self._python = subprocess.Popen(
                 [sys.executable, str(NOTEBOOK)],
                 cwd=self._work,
-                env=self._reader.environment,
+                env=self._runner.environment,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 text=True,
@@ -99,22 +99,22 @@ class Session:
         return str(answer["printed"])
 
 
-def compare(printed: Any, written: str, place: str) -> None:
-    """Raise AssertionError where a value that a page shows is not the one printed, to the digits that are written."""
-    _same(printed, json.loads(written, parse_float=Decimal), place)
+def check_output(printed: Any, written: str, place: str) -> None:
+    """Raise AssertionError if a value on the page differs from the output, within the digits that it has."""
+    _check_equal(printed, json.loads(written, parse_float=Decimal), place)
 
 
-def _same(printed: Any, written: Any, place: str) -> None:
+def _check_equal(printed: Any, written: Any, place: str) -> None:
     if isinstance(written, dict):
         assert isinstance(printed, dict), place
         for name, value in written.items():
             assert name in printed, f"{place}: {name} is not printed, but {list(printed)}"
-            _same(printed[name], value, f"{place}, {name}")
+            _check_equal(printed[name], value, f"{place}, {name}")
     elif isinstance(written, list):
         assert isinstance(printed, list), place
         assert len(printed) == len(written), f"{place}: {len(printed)} printed, {len(written)} written"
         for index, (left, right) in enumerate(zip(printed, written, strict=True)):
-            _same(left, right, f"{place}[{index}]")
+            _check_equal(left, right, f"{place}[{index}]")
     elif isinstance(written, Decimal):
         last_digit = Decimal(1).scaleb(int(written.as_tuple().exponent))
         assert abs(Decimal(repr(printed)) - written) <= last_digit, f"{place}: {printed} is written as {written}"

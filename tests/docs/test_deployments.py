@@ -1,4 +1,4 @@
-"""compose.yaml: settings, commands, ports and names in it are those there are."""
+"""compose.yaml: its settings, commands, ports and names exist."""
 
 import re
 import shlex
@@ -19,7 +19,7 @@ PORT = Settings.model_fields["port"].default
 
 
 def environment(name: str) -> dict[str, str]:
-    """Of a container of Compose, with something in place of every variable."""
+    """Return the environment of a Compose container, with a value for every variable."""
     given = SERVICES[name].get("environment", {})
     return {key: VARIABLE.sub("0123456789abcdef", value) for key, value in given.items()}
 
@@ -28,7 +28,7 @@ ENVIRONMENTS = {name: environment(name) for name, each in SERVICES.items() if ea
 
 
 @pytest.mark.parametrize("name", ENVIRONMENTS)
-def test_settings_are_those_that_there_are(name, monkeypatch):
+def test_settings_exist(name, monkeypatch):
     for key, value in ENVIRONMENTS[name].items():
         assert isinstance(value, str), f"{key} is {value!r}: quote it"
         if key.startswith("LIPSERVE_"):
@@ -38,14 +38,14 @@ def test_settings_are_those_that_there_are(name, monkeypatch):
 
 
 def check_command(program: str, *words: str) -> None:
-    """Raise where there is no such command."""
+    """Raise if the command does not exist."""
     if program == "dask":
         dask_scheduler.make_parser(click.Context(dask_scheduler)).parse_args(list(words[1:]))
     else:
         parse(shlex.join([program, *words]))
 
 
-def test_commands_are_those_that_there_are():
+def test_commands_exist():
     for name in ("service", "worker", "scheduler"):
         check_command(*SERVICES[name]["command"])
     program, flag, code = SERVICES["bucket"]["command"]
@@ -55,13 +55,13 @@ def test_commands_are_those_that_there_are():
 
 
 def port_of(url: str) -> tuple[str, int]:
-    """Host and port that a URL names."""
+    """Return host and port of a URL."""
     named = re.fullmatch(r"\w+://(?:[^@/]*@)?([\w-]+):(\d+)(?:/.*)?", url)
     assert named is not None, url
     return named[1], int(named[2])
 
 
-def test_who_is_named_in_compose_is_there_and_listens():
+def test_addresses_match_services_and_ports():
     urls = environment("service")
     command = SERVICES["scheduler"]["command"]
     assert port_of(urls["LIPSERVE_CLUSTER"]) == ("scheduler", int(command[command.index("--port") + 1]))
@@ -79,7 +79,7 @@ def test_who_is_named_in_compose_is_there_and_listens():
 
 
 @pytest.mark.parametrize("name", SERVICES)
-def test_what_a_service_of_compose_uses_is_declared_and_limited(name):
+def test_services_declare_resources_and_limits(name):
     each = SERVICES[name]
     assert set(each.get("networks", [])) <= COMPOSE["networks"].keys()
     assert {config["source"] for config in each.get("configs", [])} <= COMPOSE["configs"].keys()
@@ -94,11 +94,11 @@ def test_what_a_service_of_compose_uses_is_declared_and_limited(name):
     assert re.fullmatch(r"[\w./-]+:[\w.-]+|lipserve", each["image"]), "name a version"
 
 
-def test_only_the_balancer_of_compose_is_published_and_no_secret_has_a_default():
+def test_only_balancer_is_published_and_secrets_have_no_default():
     assert COMPOSE["networks"]["inside"] == {"internal": True}
     assert [name for name, each in SERVICES.items() if "ports" in each or "outside" in each["networks"]] == ["balancer"]
     assert SERVICES["service"]["environment"]["LIPSERVE_KEYS"] == "on"
-    # each container has a home of its own: a volume without a name
+    # each container has its own home: an anonymous volume
     assert SERVICES["service"]["volumes"] == SERVICES["worker"]["volumes"] == ["/data"]
     text = (ROOT / "compose.yaml").read_text("utf-8")
     body = "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("#"))

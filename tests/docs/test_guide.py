@@ -1,4 +1,4 @@
-"""The guide is built without a warning and served as it is: its pages load nothing from other hosts."""
+"""The guide builds without warnings, and its pages load nothing from other hosts."""
 
 import re
 import subprocess
@@ -16,11 +16,12 @@ from service.api.guide import routes
 from service.api.openapi import policy
 from tests.docs.blocks import ROOT
 
+pytestmark = pytest.mark.slow  # needs MkDocs
+
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The site of the documentation as it is now."""
-    pytest.importorskip("material", reason="MkDocs Material is missing: pip install mkdocs-material")
+    """The built site of the documentation."""
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--site-dir", str(folder)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
@@ -30,7 +31,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def guide(site: Path) -> Iterator[TestClient]:
-    """The guide alone: it needs nothing of a service."""
+    """The guide without the rest of the service."""
     app = FastAPI(redirect_slashes=False)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(routes, "SITE", site)
@@ -39,8 +40,8 @@ def guide(site: Path) -> Iterator[TestClient]:
         yield client
 
 
-class Loaded(HTMLParser):
-    """Addresses of what a page loads, and whether it has a heading."""
+class LoadedAddresses(HTMLParser):
+    """Addresses that a page loads, and its number of headings."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -49,7 +50,7 @@ class Loaded(HTMLParser):
         self.feed(page)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """Collect the attributes that make a browser ask for something."""
+        """Collect the attributes that make a browser load something."""
         given = dict(attrs)
         self.headings += tag == "h1"
         names = {"link": ["href"], "a": []}.get(tag, ["src", "srcset", "data", "poster"])
@@ -58,17 +59,17 @@ class Loaded(HTMLParser):
 
 
 def hashes(policy: str) -> set[str]:
-    """Hashes of the scripts that a policy allows."""
+    """Return the hashes of the scripts that a policy allows."""
     return set(re.findall(r"'sha256-(.*?)'", policy))
 
 
-def test_pages_load_only_what_the_guide_has_and_their_policy_allows_their_scripts(site, guide):
+def test_pages_load_only_own_files_and_allowed_scripts(site, guide):
     pages = list(site.rglob("index.html"))
     assert len(pages) == len([*(ROOT / "docs").rglob("*.md")])
     for page in pages:
         address = f"/guide/{page.parent.relative_to(site).as_posix()}/".replace("/./", "/")
         answer = guide.get(address)
-        loaded = Loaded(answer.text)
+        loaded = LoadedAddresses(answer.text)
         assert loaded.headings == 1, address
         assert len(loaded.addresses) >= 4
         for each in loaded.addresses:
@@ -81,9 +82,9 @@ def test_pages_load_only_what_the_guide_has_and_their_policy_allows_their_script
         assert re.findall(r"url\(\"?https?:|@import", sheet.read_text("utf-8")) == []
 
 
-def test_other_hosts_are_noticed():
+def test_addresses_of_other_hosts_are_found():
     page = '<script src="https://a/b.js"></script><a href="https://c"></a><link rel="stylesheet" href="//d/e.css">'
-    assert Loaded(page).addresses == {"https://a/b.js", "//d/e.css"}
+    assert LoadedAddresses(page).addresses == {"https://a/b.js", "//d/e.css"}
 
 
 @pytest.mark.parametrize(
@@ -99,26 +100,26 @@ def test_other_hosts_are_noticed():
         ("/files/screenshots--live.webp", "/screenshots/live.webp"),
     ],
 )
-def test_earlier_addresses_lead_to_the_same_content_on_the_same_host(guide, old, new):
+def test_old_addresses_redirect_on_same_host(guide, old, new):
     answer = guide.get(f"/guide{old}", headers={"host": "evil.example"})
     assert (answer.status_code, answer.headers["location"]) == (307, f"/guide{new}")
     assert guide.get(f"/guide{new}").status_code == 200
 
 
-def test_every_page_that_has_moved_is_there(guide):
+def test_moved_pages_exist(guide):
     for new in routes.MOVED.values():
         assert guide.get(f"/guide/{new}/").status_code == 200
 
 
 @pytest.mark.parametrize("name", ["nothing", "pages.py", "..%2froutes.py", "%2e%2e%2froutes.py", "a/"])
-def test_a_page_that_does_not_exist_has_a_page_that_leads_on(guide, name):
+def test_missing_page_links_to_the_guide(guide, name):
     answer = guide.get(f"/guide/{name}")
     assert answer.status_code == 404
     assert 'href="/guide/first-model/"' in answer.text
     assert hashes(policy(answer.content)) <= hashes(answer.headers["content-security-policy"])
 
 
-def test_pictures_have_their_media_types_and_are_not_sent_twice(guide):
+def test_pictures_have_media_types_and_etags(guide):
     picture = guide.get("/guide/screenshots/live.webp")
     assert picture.headers["content-type"] == "image/webp"
     assert guide.get("/guide/architecture.svg").headers["content-type"] == "image/svg+xml"
@@ -128,7 +129,7 @@ def test_pictures_have_their_media_types_and_are_not_sent_twice(guide):
     assert guide.head("/guide/screenshots/live.webp").headers["content-length"] == str(len(picture.content))
 
 
-def test_a_moving_picture_can_be_hidden_and_stands_still_for_readers_who_want_that(guide):
+def test_animation_can_be_hidden_and_respects_reduced_motion(guide):
     frame = re.search(r"<details open><summary>.*?</picture></details>", guide.get("/guide/").text, re.DOTALL)
     assert frame is not None
     assert '<source srcset="screenshots/live.png" media="(prefers-reduced-motion: reduce)">' in frame[0]
@@ -137,6 +138,6 @@ def test_a_moving_picture_can_be_hidden_and_stands_still_for_readers_who_want_th
     assert moving == []
 
 
-def test_the_site_is_built_where_the_service_reads_it():
+def test_site_is_built_where_service_reads_it():
     config = pytest.importorskip("mkdocs.config", reason="MkDocs is missing: pip install mkdocs-material")
     assert Path(config.load_config(str(ROOT / "mkdocs.yml")).site_dir) == routes.SITE

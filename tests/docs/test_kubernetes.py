@@ -1,4 +1,4 @@
-"""deploy/kubernetes: Kubernetes takes the objects; settings, commands, ports and paths in them are those there are."""
+"""deploy/kubernetes: the objects are valid; their settings, commands, ports and paths exist."""
 
 import shutil
 import subprocess
@@ -17,15 +17,15 @@ from tests.docs.test_deployments import PORT, check_command, port_of
 
 FOLDER = ROOT / "deploy/kubernetes"
 ENTRIES = ("single", "shared", "kserve")
-"""What users apply, and of `shared` with every component."""
+"""Folders that users apply; `shared` is tested with every component."""
 VERSIONS = ("1.31.0", "1.37.0")
-OURS = "lipserve"
+OWN_NAME = "lipserve"
 OPERATORS = ("serving.kserve.io/", "monitoring.coreos.com/")
-"""Groups whose schemas no package has: of their objects, what pods are made of is checked."""
+"""API groups without available schemas; only the pods of their objects are validated."""
 
 
 def objects_of(folder: str) -> Iterator[dict[str, Any]]:
-    """Objects that a folder leads to, without its patches and the names of images."""
+    """Yield the objects of a folder, without its patches and image names."""
     here = FOLDER / folder
     kustomization = yaml.safe_load((here / "kustomization.yaml").read_text("utf-8"))
     for named in (*kustomization["resources"], *kustomization.get("components", [])):
@@ -38,7 +38,7 @@ def objects_of(folder: str) -> Iterator[dict[str, Any]]:
 
 @cache
 def objects(entry: str) -> dict[tuple[str, str], dict[str, Any]]:
-    """Objects of an entry by kind and name, those of all components besides for `shared`; ConfigMaps are patched."""
+    """Return the objects of an entry by kind and name; for `shared` with all components and the patched ConfigMaps."""
     folders = (entry, "gpu", "monitoring") if entry == "shared" else (entry,)
     listed = [each for folder in folders for each in objects_of(folder)]
     made = {(each["kind"], each["metadata"]["name"]): each for each in listed}
@@ -50,19 +50,19 @@ def objects(entry: str) -> dict[tuple[str, str], dict[str, Any]]:
 
 
 def pod_of(each: dict[str, Any]) -> dict[str, Any] | None:
-    """The specification of an object's pods."""
+    """Return the pod specification of an object, if it has one."""
     if each["kind"] == "ServingRuntime":
         return {name: each["spec"][name] for name in ("containers", "volumes")}
     return each["spec"]["template"]["spec"] if each["kind"] in ("Deployment", "StatefulSet") else None
 
 
 def pods(entry: str) -> dict[str, dict[str, Any]]:
-    """Specifications of pods by the names of what makes them."""
+    """Return the pod specifications by name of the owning object."""
     return {name: pod for (_, name), each in objects(entry).items() if (pod := pod_of(each)) is not None}
 
 
 def environment(entry: str, container: dict[str, Any]) -> dict[str, str]:
-    """What a container is given; every source of it is there."""
+    """Return the environment of a container; every source must exist."""
     given: dict[str, str] = {each["name"]: each["value"] for each in container.get("env", [])}
     for source in container.get("envFrom", []):
         ((kind, named),) = source.items()
@@ -72,7 +72,7 @@ def environment(entry: str, container: dict[str, Any]) -> dict[str, str]:
 
 
 def containers() -> list[Any]:
-    """Every container, with its entry and whose it is."""
+    """Return every container with its entry and owner."""
     return [
         pytest.param(entry, name, container, id=f"{entry}-{name}-{container['name']}")
         for entry in ENTRIES
@@ -81,9 +81,10 @@ def containers() -> list[Any]:
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("entry", ENTRIES)
 @pytest.mark.parametrize("version", VERSIONS)
-def test_objects_are_those_that_kubernetes_takes(entry, version):
+def test_objects_match_kubernetes_schemas(entry, version):
     schemas = pytest.importorskip("kubernetes_validate", reason="the schemas of Kubernetes are not installed")
     core = 0
     for (_, name), each in objects(entry).items():
@@ -102,7 +103,7 @@ def test_objects_are_those_that_kubernetes_takes(entry, version):
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
-def test_kustomize_renders_what_is_checked_here(entry):
+def test_kustomize_renders_checked_objects(entry):
     kubectl = shutil.which("kubectl")
     if kubectl is None:
         pytest.skip("kubectl is not installed")
@@ -117,13 +118,14 @@ def test_kustomize_renders_what_is_checked_here(entry):
         for container in () if pod is None else (*pod.get("initContainers", []), *pod["containers"]):
             registry, _, image = container["image"].rpartition("/")
             assert registry
-            assert image.startswith(f"{OURS}:")
-            container["image"] = OURS
+            assert image.startswith(f"{OWN_NAME}:")
+            container["image"] = OWN_NAME
         assert each == expected[key]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("entry", "name", "container"), containers())
-def test_containers_have_settings_commands_and_limits_that_there_are(entry, name, container, monkeypatch):
+def test_containers_have_valid_settings_commands_and_limits(entry, name, container, monkeypatch):
     for key, value in environment(entry, container).items():
         assert isinstance(value, str), f"{key} is {value!r}: quote it"
         if key.startswith("LIPSERVE_"):
@@ -131,7 +133,7 @@ def test_containers_have_settings_commands_and_limits_that_there_are(entry, name
             monkeypatch.setenv(key, value)
     settings = Settings(host="0.0.0.0")
     check_command(*container["command"])
-    assert container["image"] in (OURS, "lipserve-cuda")
+    assert container["image"] in (OWN_NAME, "lipserve-cuda")
     assert container["resources"]["limits"]["memory"]
     assert container["resources"]["requests"].keys() == {"cpu", "memory"}
     secured = container["securityContext"]
@@ -148,16 +150,16 @@ def test_containers_have_settings_commands_and_limits_that_there_are(entry, name
     paths = create_app(Settings(home="/nowhere")).openapi()["paths"]
     for probe in ("startupProbe", "livenessProbe", "readinessProbe"):
         if probe in container:
-            asked = container[probe]["httpGet"]
-            assert asked["path"] in paths
-            assert create_app().state.rules.of("GET", asked["path"]).scope is None  # a probe has no key
-            assert ports.get(asked["port"], asked["port"]) == PORT
+            request = container[probe]["httpGet"]
+            assert request["path"] in paths
+            assert create_app().state.rules.of("GET", request["path"]).scope is None  # probes send no key
+            assert ports.get(request["port"], request["port"]) == PORT
     if "terminationGracePeriodSeconds" in pod:
         assert pod["terminationGracePeriodSeconds"] > settings.stop_notice_s + DRAIN_S
 
 
 @pytest.mark.parametrize("entry", ENTRIES)
-def test_what_is_named_is_there(entry):
+def test_references_between_objects_resolve(entry):
     made = objects(entry)
     for (kind, name), each in made.items():
         spec, pod = each.get("spec", {}), pod_of(each)
@@ -178,7 +180,7 @@ def test_what_is_named_is_there(entry):
             ports = {port["name"]: port["containerPort"] for port in target["ports"]}
             assert {port["targetPort"]: port["port"] for port in spec["ports"]} == ports
         if kind == "ServiceMonitor":
-            selected = made["Service", OURS]
+            selected = made["Service", OWN_NAME]
             assert spec["selector"]["matchLabels"].items() <= selected["metadata"]["labels"].items()
             (endpoint,) = spec["endpoints"]
             assert endpoint["port"] in {port["name"] for port in selected["spec"]["ports"]}
@@ -194,8 +196,8 @@ def test_what_is_named_is_there(entry):
             assert (ROOT / "models" / name).is_dir()
 
 
-def test_one_service_has_one_writer_and_keeps_its_disk():
-    spec = objects("single")["StatefulSet", OURS]["spec"]
+def test_single_service_has_one_writer_and_a_disk():
+    spec = objects("single")["StatefulSet", OWN_NAME]["spec"]
     (claim,) = spec["volumeClaimTemplates"]
     assert (spec["replicas"], claim["spec"]["accessModes"]) == (1, ["ReadWriteOncePod"])
     mounts = spec["template"]["spec"]["containers"][0]["volumeMounts"]
@@ -206,7 +208,7 @@ def test_one_service_has_one_writer_and_keeps_its_disk():
     assert "[train,robots,ingest,cluster,grpc]" in dockerfile
 
 
-def test_only_members_reach_the_cluster():
+def test_only_members_reach_cluster():
     made = objects("shared")
     host, port = port_of(made["ConfigMap", "lipserve-store"]["data"]["LIPSERVE_CLUSTER"])
     assert made["Service", host]["spec"]["ports"][0]["port"] == port
@@ -216,13 +218,13 @@ def test_only_members_reach_the_cluster():
     for name in (host, "lipserve-worker", "lipserve-gpu-worker"):
         labels = made["Deployment", name]["spec"]["template"]["metadata"]["labels"]
         assert all(labels[key] in values for key, values in members.items())
-    service = made["Deployment", OURS]["spec"]["template"]["metadata"]["labels"]
+    service = made["Deployment", OWN_NAME]["spec"]["template"]["metadata"]["labels"]
     assert service["part"] not in members["part"]
     (source,) = policy["ingress"][0]["from"]
     assert source["podSelector"]["matchLabels"].items() <= service.items()
 
 
-def test_no_secret_is_in_the_files():
+def test_files_contain_no_secret():
     for entry in ENTRIES:
         for (kind, _), each in objects(entry).items():
             if kind == "Secret":

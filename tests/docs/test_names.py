@@ -1,4 +1,4 @@
-"""Names in backticks, in docstrings and documents, are names that the code has."""
+"""Names in backticks, in docstrings and documents, exist in the code."""
 
 import ast
 import re
@@ -8,17 +8,17 @@ from pathlib import Path
 import pytest
 
 from service.foundation.settings import Settings
+from tests import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 CODE = ("lipcore", "service", "clients", "benchmarks")
 DOCUMENTS = (*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md")
 NAME = re.compile(r"(?<!`)`([A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*)*)(?:\(\))?`(?!`)")
 WORD = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 FILES = (".js", ".toml", ".in", ".hpp", ".cpp", ".yaml", ".yml", ".sh", ".txt")
-"""Ends of other files that have names."""
+"""Suffixes of other files that define names."""
 COLUMNS = {"tau_J", "J", "actual_q", "pos_deg", "vel_rad_s", "left_panda_joint", "ur5e_elbow_joint", "current_position"}
 COLUMNS |= {"q1_deg", "dq1_deg_per_s"}
-"""Names that recordings give to columns and joints, as examples."""
+"""Example names of columns and joints in recordings."""
 FOREIGN = {"syrk", "max_body_size", "armature", "OTEL_TRACES_SAMPLER", "sarcos_test", "npz", "NOTIFY", "pg_amcheck"}
 FOREIGN |= {"DASK_DISTRIBUTED__COMM__TLS__CA_FILE"}
 """Names of LAPACK, FastAPI, MuJoCo, OpenTelemetry, PostgreSQL, Dask and a file of others."""
@@ -31,12 +31,15 @@ def sources(*folders: str, ends: tuple[str, ...] = (".py",)) -> Iterator[Path]:
                 yield path
 
 
-def without_docstrings(tree: ast.AST) -> ast.AST:
+def words_of(tree: ast.AST) -> Iterator[str]:
+    """Yield the words of names and strings of code, without its docstrings."""
+    docstrings = {id(each.value) for each in ast.walk(tree) if is_text(each)}
     for node in ast.walk(tree):
-        body = getattr(node, "body", None)
-        if isinstance(body, list):
-            node.body = [each for each in body if not is_text(each)]
-    return tree
+        if id(node) not in docstrings:
+            for value in vars(node).values():
+                for text in value if isinstance(value, list) else [value]:
+                    if isinstance(text, str):
+                        yield from WORD.findall(text)
 
 
 def is_text(node: ast.AST) -> bool:
@@ -44,7 +47,7 @@ def is_text(node: ast.AST) -> bool:
 
 
 def texts(tree: ast.AST) -> Iterator[str]:
-    """Docstrings, those of attributes too."""
+    """Yield all docstrings, including those of attributes."""
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
         yield from (each.value.value for each in body if is_text(each)) if isinstance(body, list) else ()
@@ -52,10 +55,11 @@ def texts(tree: ast.AST) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def known() -> set[str]:
-    """Every word of code, strings in it included, docstrings and comments aside; and of files that code reads."""
+    """Return every word of the code, with strings, without docstrings and comments; and of files that the code
+    reads."""
     words = {path.stem for path in sources(*CODE, "docs", "tests")} | {path.name for path in ROOT.iterdir()}
     for path in sources(*CODE, "docs", "tests"):
-        words |= set(WORD.findall(ast.unparse(without_docstrings(ast.parse(path.read_text("utf-8"))))))
+        words.update(words_of(ast.parse(path.read_text("utf-8"))))
     for path in sources(*CODE, "deploy", "docs", ends=FILES):
         words |= set(WORD.findall(path.read_text("utf-8")))
     for name in ("pyproject.toml", "Makefile", "Dockerfile", "compose.yaml"):
@@ -65,7 +69,7 @@ def known() -> set[str]:
 
 
 def unknown(text: str, known: set[str]) -> list[str]:
-    """Names of a text that are not known; `joint_1` is, if `joint` is."""
+    """Return the names of a text that are not known; `joint_1` counts as known if `joint` is."""
     bare = r"\d+$", r"_?\d+$", r"$^"
     return [
         name

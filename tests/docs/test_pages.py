@@ -1,4 +1,4 @@
-"""What pages lead to and mention is there: links, pictures, generated pages, commands."""
+"""Links, pictures, generated pages and commands of the documentation exist."""
 
 import re
 import runpy
@@ -12,25 +12,26 @@ from service.cli.main import app
 from tests.docs.blocks import ROOT, all_pages, blocks, pages, prose
 
 LINK = re.compile(r"\]\(([^)\s]+)\)")
-WIDEST, MOST_WORDS = 120, 15_000
-"""Characters of a line of prose, tables and code aside, and words of all pages written by hand, as `wc -w` counts."""
-BOXES = re.compile(r"^#+ +(.*?)\s*$", re.MULTILINE)
+MAX_LINE_LENGTH, MAX_WORDS = 120, 15_000
+"""Characters of a line of prose, without tables and code; words of all hand-written pages, as `wc -w` counts them."""
+HEADINGS = re.compile(r"^#+ +(.*?)\s*$", re.MULTILINE)
 
 
 def anchor(heading: str) -> str:
-    """What GitHub links a heading by."""
+    """Return the anchor that GitHub gives to a heading."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
 def anchors(page: Path) -> set[str]:
-    """What the headings of a page are linked by."""
+    """Return the anchors of a page."""
     return {
-        anchor(re.sub(r"\[(.*?)\]\(.*?\)", r"\1", heading).replace("`", "")) for heading in BOXES.findall(prose(page))
+        anchor(re.sub(r"\[(.*?)\]\(.*?\)", r"\1", heading).replace("`", ""))
+        for heading in HEADINGS.findall(prose(page))
     }
 
 
 @pytest.mark.parametrize("page", all_pages(), ids=lambda page: page.stem)
-def test_links_lead_somewhere(page):
+def test_links_have_targets(page):
     for link in LINK.findall(prose(page)):
         if re.match(r"[a-z]+:", link):
             continue
@@ -42,39 +43,39 @@ def test_links_lead_somewhere(page):
             assert fragment in anchors(target), f"{page.name}: {link}"
 
 
-def test_the_api_reference_is_up_to_date():
+def test_api_reference_is_up_to_date():
     made = runpy.run_path(str(ROOT / "docs/api.py"))
     assert made["TARGET"].read_text("utf-8") == made["document"](), "run: python docs/api.py"
 
 
-def test_the_page_of_archives_is_up_to_date():
+def test_archives_page_is_up_to_date():
     made = runpy.run_path(str(ROOT / "docs/archives.py"))
     assert made["TARGET"].read_text("utf-8") == made["document"](), "run: python docs/archives.py"
 
 
-def test_the_page_of_the_stream_protocol_is_up_to_date():
+def test_stream_protocol_page_is_up_to_date():
     made = runpy.run_path(str(ROOT / "docs/stream.py"))
     assert made["TARGET"].read_text("utf-8") == made["document"](), "run: python docs/stream.py"
 
 
 @pytest.mark.parametrize("page", [*pages(), ROOT / "CONTRIBUTING.md"], ids=lambda page: page.stem)
-def test_lines_of_prose_fit_a_screen(page):
+def test_prose_lines_are_short(page):
     for line in prose(page).splitlines():
-        assert len(line) <= WIDEST or line.startswith(("|", "    ")), f"{page.name}: {line}"
+        assert len(line) <= MAX_LINE_LENGTH or line.startswith(("|", "    ")), f"{page.name}: {line}"
 
 
 def test_pages_stay_short():
     assert len((ROOT / "README.md").read_text("utf-8").splitlines()) < 120
     written = [page for page in pages() if page.name != "errors.md"]
     words = sum(len(page.read_text("utf-8").split()) for page in written)
-    assert words <= MOST_WORDS, f"{words} words: say each thing once"
+    assert words <= MAX_WORDS, f"{words} words: say each thing once"
 
 
 SETTING = re.compile(r"[A-Z_]+=\S*")
 
 
 def commands(page) -> list[str]:
-    """Every command line of ours on a page: in its text, and in blocks of shell whether they are run or not."""
+    """Return every `lipserve` command line of a page, in its text and in shell blocks, run or not."""
     mentioned = re.findall(r"`((?:[A-Z_]+=\S* )?(?:\.venv/bin/)?lipserve [^`]+)`", prose(page))
     typed = "\n".join(block.text for block in blocks(page) if block.language in ("sh", "bash"))
     lines = typed.replace("\\\n", " ").splitlines()
@@ -82,7 +83,7 @@ def commands(page) -> list[str]:
 
 
 def parse(line: str) -> None:
-    """Raise where a command line names a command or an option that there is not."""
+    """Raise if a command line contains an unknown command or option."""
     words = [word for word in shlex.split(line, comments=True) if word != "…"]
     while SETTING.fullmatch(words[0]):
         words.pop(0)
@@ -99,7 +100,7 @@ def parse(line: str) -> None:
 
 
 @pytest.mark.parametrize("page", all_pages(), ids=lambda page: page.stem)
-def test_commands_on_a_page_are_those_that_there_are(page):
+def test_commands_on_pages_exist(page):
     for line in commands(page):
         try:
             parse(line)
@@ -108,6 +109,6 @@ def test_commands_on_a_page_are_those_that_there_are(page):
 
 
 @pytest.mark.parametrize("line", ["lipserve trian x.csv", "lipserve data ad x", "lipserve predict x --qq 1"])
-def test_commands_that_there_are_not_are_noticed(line):
+def test_unknown_commands_are_found(line):
     with pytest.raises(Exception, match=r"(?i)no such"):
         parse(line)

@@ -1,4 +1,4 @@
-"""Every block that a reader can type is typed, or says why not; what it prints is compared."""
+"""Every block of the documentation runs or has a reason not to, and its output is compared."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -6,18 +6,18 @@ from pathlib import Path
 import pytest
 
 from tests.choosing import few
-from tests.docs.blocks import REASONS, ROOT, RUN, Block, blocks, pages
-from tests.docs.session import Reader, Session, compare
+from tests.docs.blocks import ALLOWED_REASONS, ROOT, RUN_LANGUAGES, Block, blocks, pages
+from tests.docs.session import BlockRunner, Session, check_output
 from tests.service.server import Server
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda page: page.stem)
-def test_every_block_is_run_or_says_why_not(page):
+def test_every_block_is_run_or_has_a_reason(page):
     for block in blocks(page):
-        known = block.language in RUN if block.reason is None else block.reason in REASONS
-        assert known, f"{block.place} is {block.language or 'of no language'}: run it or say why not, {REASONS}"
+        known = block.language in RUN_LANGUAGES if block.reason is None else block.reason in ALLOWED_REASONS
+        assert known, f"{block.place} is {block.language or 'of no language'}: run it or say why not, {ALLOWED_REASONS}"
     for before, block in zip([None, *blocks(page)], blocks(page), strict=False):
-        if block.language == "json" and block.reason is None:  # output follows the command that prints it
+        if block.language == "json" and block.reason is None:  # output must follow the command that prints it
             assert before is not None, block.place
             assert (before.reason, before.language == "json") == (None, False), block.place
 
@@ -32,50 +32,49 @@ def test_every_block_is_run_or_says_why_not(page):
         ({"n": 3}, '{"n": 4}'),
     ],
 )
-def test_output_is_compared_to_the_digits_that_are_shown(printed, written):
-    compare({"a": 1.23456, "id": "ds_12345", "b": 2}, '{"a": 1.235, "id": "ds_…"}', "here")
+def test_output_is_compared_to_the_shown_digits(printed, written):
+    check_output({"a": 1.23456, "id": "ds_12345", "b": 2}, '{"a": 1.235, "id": "ds_…"}', "here")
     with pytest.raises(AssertionError, match="here"):
-        compare(printed, written, "here")
+        check_output(printed, written, "here")
 
 
-def chosen(page: Path, slow: bool) -> list[Block]:
-    """The blocks of a page that are run, those that are slow only where asked for."""
-    found = [each for each in blocks(page) if each.reason is None and each.language in RUN]
+def select_blocks(page: Path, slow: bool) -> list[Block]:
+    """Return the blocks of a page to run; slow ones only on request."""
+    found = [each for each in blocks(page) if each.reason is None and each.language in RUN_LANGUAGES]
     return found if slow else [each for each in found if not each.slow]
 
 
-def name(page: Path) -> str:
-    """Of a page among all."""
+def page_id(page: Path) -> str:
+    """Return a unique id of a page."""
     return page.relative_to(ROOT).with_suffix("").as_posix().replace("/", "-")
 
 
-QUICK = [page for page in pages() if any(not each.serves for each in chosen(page, slow=False))]
-LONGEST = ("operations", "own-robot", "scaling")  # of `make test-all`, though their blocks are quick one by one
-SLOW = [page for page in pages() if len(chosen(page, slow=True)) > len(chosen(page, slow=False))]
+QUICK_PAGES = [page for page in pages() if any(not each.serves for each in select_blocks(page, slow=False))]
+SLOW_PAGES = [page for page in pages() if len(select_blocks(page, slow=True)) > len(select_blocks(page, slow=False))]
 
 
-def run(reader: Reader, page: Path, found: Sequence[Block]) -> None:
+def run_blocks(runner: BlockRunner, page: Path, found: Sequence[Block]) -> None:
     """Run blocks of a page."""
-    with Session(reader, name(page)) as session:
+    with Session(runner, page_id(page)) as session:
         for block in found:
             session.run(block)
 
 
 @pytest.fixture(scope="module")
-def reader(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Reader]:
-    """A service for the quick blocks of all pages."""
+def runner(tmp_path_factory: pytest.TempPathFactory) -> Iterator[BlockRunner]:
+    """Runs the quick blocks of all pages on one service."""
     folder = tmp_path_factory.mktemp("docs")
     with Server(folder / "home", warm=True) as server:
-        yield Reader(folder, server)
+        yield BlockRunner(folder, server)
 
 
-@pytest.mark.parametrize("page", few(QUICK, kept=lambda page: page.stem not in LONGEST), ids=name)
-def test_what_a_page_says_works(reader, page):
-    run(reader, page, chosen(page, slow=False))
+@pytest.mark.parametrize("page", few(QUICK_PAGES, kept=lambda page: page.stem == "README"), ids=page_id)
+def test_quick_blocks_of_page_run(runner, page):
+    run_blocks(runner, page, select_blocks(page, slow=False))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", SLOW, ids=name)
-def test_all_that_a_page_says_works(tmp_path, page):
+@pytest.mark.parametrize("page", SLOW_PAGES, ids=page_id)
+def test_all_blocks_of_page_run(tmp_path, page):
     with Server(tmp_path / "home", warm=True) as server:
-        run(Reader(tmp_path, server), page, chosen(page, slow=True))
+        run_blocks(BlockRunner(tmp_path, server), page, select_blocks(page, slow=True))

@@ -1,7 +1,7 @@
-"""Coverage-guided fuzzing of the readers of strangers' files: `python -m tests.fuzz TARGET SECONDS`, with Atheris.
+"""Coverage-guided fuzzing of the file readers with Atheris: `python -m tests.fuzz TARGET SECONDS`.
 
-TARGET: of `targets.TARGETS`. What is found is kept below build/fuzz; the corpus of the repository is read too. `python
--m tests.fuzz merge TARGET` adds to that, of what was found, what reaches further code.
+TARGET is one of `targets.TARGETS`. New inputs and findings go to build/fuzz; the corpus of the repository is read too.
+`python -m tests.fuzz merge TARGET` adds new inputs to the corpus if they reach further code.
 """
 
 from __future__ import annotations
@@ -18,20 +18,19 @@ with atheris.instrument_imports(include=READERS, enable_loader_override=False):
 
 CORPUS = Path(__file__).parent / "corpus"
 FOLDER = Path("build/fuzz")
-LARGEST = 32_768
-"""Bytes of an input."""
+MAX_INPUT_BYTES = 32_768
 LIMITS = ("-timeout=30", "-rss_limit_mb=3000", "-malloc_limit_mb=4096")
-"""Breaches of these are findings, as are errors that are none of ours."""
+"""Exceeding these is a finding, like any unexpected error."""
 
 
 def main(arguments: list[str]) -> None:
-    """Do what the arguments say; libFuzzer ends the process."""
+    """Run the command of the arguments; libFuzzer ends the process."""
     merging = arguments[0] == "merge"
     target = arguments[1] if merging else arguments[0]
     known, found = CORPUS / target, FOLDER / target
     for folder in (known, found):
         folder.mkdir(parents=True, exist_ok=True)
-    options = [f"-max_len={LARGEST}", *LIMITS, f"-artifact_prefix={found.parent}/{target}-"]
+    options = [f"-max_len={MAX_INPUT_BYTES}", *LIMITS, f"-artifact_prefix={found.parent}/{target}-"]
     if merging:
         options += ["-merge=1", str(known), str(found)]
     else:

@@ -1,5 +1,7 @@
-"""The files that fuzzing starts from, small ones as our own writers and those of others make them: `python -m
-tests.fuzz.seeds` writes them into the corpus."""
+"""Small files that fuzzing starts from, written by this project and by other programs.
+
+`python -m tests.fuzz.seeds` writes them to the corpus.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +22,8 @@ from lipcore.files import persistence
 from lipcore.files.manifest import MANIFEST, TENSORS
 from service.models.archive_reading import EXPORT, FORMAT, FORMAT_VERSION
 from tests.fuzz.targets import JOINTS
-from tests.service.archives.packing import pack, vouched
-from tests.service.recordings import bag_writers as bags
+from tests.service.datasets import bag_writers as bags
+from tests.service.models.archives.packing import pack, with_checksums
 
 ROWS = 24
 T = np.arange(ROWS) / 50
@@ -37,7 +39,7 @@ LINK = """<link name="l{1}"><inertial><origin xyz="0 0 0.1" rpy="0 0 0"/><mass v
 
 
 def seeds() -> Iterator[tuple[str, bytes]]:
-    """Target and content of each."""
+    """Yield the target and the content of each file."""
     rows = [dict(zip(COLUMNS, map(float, row), strict=True)) for row in np.column_stack(list(COLUMNS.values()))]
     table = [",".join(COLUMNS), *(",".join(f"{each:.5g}" for each in row.values()) for row in rows)]
     text = "\n".join(table) + "\n"
@@ -75,12 +77,12 @@ def seeds() -> Iterator[tuple[str, bytes]]:
 
 
 def _models() -> Iterator[tuple[str, bytes]]:
-    from tests.service.learning.pendulums import trained
+    from tests.service.learning.pendulums import trained_model
 
-    _, content = persistence.encode(trained(), {"datasets": []})
+    _, content = persistence.encode(trained_model(), {"datasets": []})
     about = {"format": FORMAT, "format_version": FORMAT_VERSION, "model": "m", "version": 1, "revision": 0}
     about |= {"learnt": False, "created_at": "", "exported_at": "", "software": {}}
-    yield "archive", pack(vouched({EXPORT: json.dumps(about).encode(), **content}))
+    yield "archive", pack(with_checksums({EXPORT: json.dumps(about).encode(), **content}))
     yield "manifest", content[MANIFEST]
     yield "tensors", content[TENSORS]
 

@@ -1,6 +1,6 @@
-"""What is fuzzed: each reader of strangers' files, given bytes. Right is any answer but an error that is none of ours.
+"""Targets of fuzzing: the readers of files from strangers. Any result is correct except an unexpected error.
 
-Sums that files have over themselves are not compared here: nearly every change of a file would end at them.
+Checksums are not compared, because nearly every changed file would stop there.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ SMALL = {
     "formats.json.MAX_LINE_BYTES": 64 * 1024,
     "formats.opening.MAX_LINE_BYTES": 64 * 1024,
 }
-"""Limits of recordings that keep each run short."""
+"""Small limits of recordings, to keep each run short."""
 USAGE = Usage(0, 1 << 40, None, 0)
 JOINTS = 2
-"""Of the models whose tensors are read."""
+"""Joints of the models whose tensors are read."""
 
 
 class _Sum(int):
-    """A sum that is as it should be."""
+    """A checksum that equals any other."""
 
     def __ne__(self, other: object) -> bool:
         return False
@@ -59,7 +59,7 @@ _without_sums = patch.object(files, "zlib", SimpleNamespace(crc32=lambda data: _
 
 
 def _recording(kind: str) -> Callable[[bytes], None]:
-    """A reader of recordings that are sent as a kind, whatever they turn out to be."""
+    """Return a reader of recordings that are sent as this kind."""
 
     def read_bytes(data: bytes) -> None:
         with tempfile.TemporaryDirectory() as folder, patch.object(zipfile.ZipExtFile, "_update_crc", lambda *_: None):
@@ -76,7 +76,7 @@ def _recording(kind: str) -> Callable[[bytes], None]:
 def _urdf(data: bytes) -> None:
     text = data.decode("utf-8-sig", "replace")
     read_urdf(text)
-    from_urdf(text, "fuzzed")  # what has been taken can be used
+    from_urdf(text, "fuzzed")  # a URDF that can be read can also be used
 
 
 def _archive(data: bytes) -> None:
@@ -102,7 +102,7 @@ TARGETS: dict[str, Callable[[bytes], object]] = {
 
 
 def run(target: str, data: bytes) -> bool:
-    """Give bytes to a reader; return whether it has taken them. Raise whatever is no error of ours."""
+    """Read bytes; return whether they could be read. Raise any error that is not one of the service."""
     try:
         TARGETS[target](data)
     except (ServiceError, ModelFormatError):

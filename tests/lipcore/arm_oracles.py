@@ -1,4 +1,4 @@
-"""What an arm does, computed another way: by Pinocchio, and from its energies by automatic differentiation."""
+"""References for an arm: Pinocchio, and automatic differentiation of its energies."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -23,7 +23,7 @@ from tests.lipcore.arms import random_bodies, random_geometry
 
 
 def as_robot(geometry: Geometry, bodies: np.ndarray) -> Robot:
-    """Pinocchio's model of an arm. bodies: (n, 10), base to tip."""
+    """Return Pinocchio's model of an arm. bodies: (n, 10), base to tip."""
     model, last, n = pin.Model(), 0, geometry.n_joints
     model.gravity.linear[:] = geometry.gravity
     for j, kind in enumerate(geometry.joint_types):
@@ -36,31 +36,31 @@ def as_robot(geometry: Geometry, bodies: np.ndarray) -> Robot:
 
 
 def arm(kinds: str, seed: int, gravity: bool = True) -> tuple[Geometry, np.ndarray, Robot]:
-    """A random arm of joints `R` and `P`: geometry, bodies and Pinocchio's model."""
+    """Return geometry, bodies and Pinocchio's model of a random arm of joints `R` and `P`."""
     geometry, bodies = random_geometry(kinds, seed, gravity), random_bodies(len(kinds), seed)
     return geometry, bodies, as_robot(geometry, bodies)
 
 
-def motions(n: int, seed: int, size: int = 5) -> np.ndarray:
-    """Random q, dq and ddq: (N, 3, n)."""
+def random_motions(n: int, seed: int, size: int = 5) -> np.ndarray:
+    """Return random q, dq and ddq, (N, 3, n)."""
     return np.random.default_rng(seed).uniform(-2, 2, (size, 3, n))
 
 
-def followed(
+def train_from_geometry(
     geometry: Geometry, robot: Robot, samples: Samples, options: FitOptions, estimator: str = "rigid-body"
 ) -> TorqueModel:
-    """The model of an arm that is followed from its true geometry, where a search would lead after seconds."""
+    """Train from the true geometry, which saves the seconds of a search."""
     task = Task(samples, robot.joint_types, options)
     return fit_estimator(task, estimator, learn(task, begin=(geometry.canonical(),)))
 
 
-def recorded(robot: Robot, seed: int, size: int = 120, noise: float = 0.01, viscous: float = 0.2) -> Samples:
-    """Samples of a robot that moves over most of its range."""
+def record_motion(robot: Robot, seed: int, size: int = 120, noise: float = 0.01, viscous: float = 0.2) -> Samples:
+    """Simulate a robot that moves over most of its range."""
     return simulate(robot, Simulation(size, speed=10, noise=noise, viscous=viscous, motion="full"), seed)
 
 
-def pendulum_from_its_tip(mode: str, options: FitOptions) -> TorqueModel:
-    """A model around a URDF, of a pendulum whose data have the joints from tip to base. mode: of its geometry."""
+def reversed_pendulum_model(mode: str, options: FitOptions) -> TorqueModel:
+    """Train around the URDF of a pendulum whose data order the joints from tip to base. mode: of the geometry."""
     robot = load_robot("double-pendulum")
     data = simulate(robot, Simulation(80, speed=10, noise=0.002, viscous=0.02), 1)
     turned = {name: getattr(data, name)[:, ::-1].copy() for name in ("q", "dq", "ddq", "tau")}
@@ -70,7 +70,7 @@ def pendulum_from_its_tip(mode: str, options: FitOptions) -> TorqueModel:
 
 
 def energies(geometry: Geometry, bodies: np.ndarray, step: Tensor, q: Tensor, dq: Tensor) -> tuple[Tensor, Tensor]:
-    """Kinetic and potential energy of an arm whose joints lie a step, (g,), away from where the geometry has them.
+    """Return kinetic and potential energy of an arm whose geometry is displaced by a step, (g,).
 
     The step of a joint displaces its frame as `lipcore.kernels.geometry` documents: T ← T exp(turns), and shifts in T.
     """
@@ -110,7 +110,7 @@ def energies(geometry: Geometry, bodies: np.ndarray, step: Tensor, q: Tensor, dq
 
 
 def lagrangian_torque(geometry: Geometry, bodies: np.ndarray, step: Tensor | np.ndarray, motion: np.ndarray) -> Tensor:
-    """Euler and Lagrange: d/dt ∂L/∂dq − ∂L/∂q at one motion (3, n), a differentiable function of the step: (n,)."""
+    """Return the torque d/dt ∂L/∂dq − ∂L/∂q of one motion (3, n), differentiable by the step, (n,)."""
     q, dq, ddq = map(tensor, motion)
 
     def lagrangian(at: Tensor, speed: Tensor) -> Tensor:
@@ -122,30 +122,30 @@ def lagrangian_torque(geometry: Geometry, bodies: np.ndarray, step: Tensor | np.
 
 
 def cross_matrix(vector: Tensor) -> Tensor:
-    """The matrix of vector × …"""
+    """Return the matrix of the cross product with a vector."""
     x, y, z = vector
-    nought = torch.zeros((), dtype=vector.dtype)
-    return torch.stack([nought, -z, y, z, nought, -x, -y, x, nought]).reshape(3, 3)
+    zero = torch.zeros((), dtype=vector.dtype)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
 
 
 def tensor(values: np.ndarray | Sequence[float]) -> Tensor:
-    """Numbers in double precision."""
+    """Return numbers in double precision."""
     return torch.as_tensor(np.array(values, np.float64))
 
 
-EXACT = 1e-8
-"""Relative to the largest number compared."""
+TOLERANCE = 1e-8
+"""Tolerance relative to the largest number compared."""
 
 
 def as_rows(samples: Samples, began: float = 1000.0) -> Rows:
-    """All samples as rows to learn."""
+    """Return all samples as rows to learn."""
     code = np.zeros(len(samples), np.uint8)
     return Rows(began + samples.t, samples.q, samples.dq, samples.ddq, samples.tau, code)
 
 
-def same_answers(one: TorqueModel, other: TorqueModel, rows: Rows, tolerance: float = EXACT) -> None:
+def assert_same_predictions(one: TorqueModel, other: TorqueModel, rows: Rows, tolerance: float = TOLERANCE) -> None:
     """Assert equal means and standard deviations."""
     a, b = (model.predict(rows.q, rows.dq, rows.ddq) for model in (one, other))
     np.testing.assert_allclose(a.tau, b.tau, rtol=0, atol=tolerance * np.abs(b.tau).max())
-    # variances, whose differences of large numbers are what rounding reaches
+    # variances are differences of large numbers, limited by rounding
     np.testing.assert_allclose(a.tau_std**2, b.tau_std**2, rtol=1e-6, atol=tolerance * (b.tau_std**2).max())

@@ -1,4 +1,4 @@
-"""Arms made by hand, and what a manifest says of one."""
+"""Random arms, and the manifest entry `parameters` of an arm."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from lipcore.robots.urdf import RigidBody
 
 
 def random_geometry(kinds: str, seed: int, gravity: bool = True) -> Geometry:
-    """An arm of joints `R` and `P` with nothing aligned, on a tilted base."""
+    """Return an arm of joints `R` and `P` with no aligned axes, on a tilted base."""
     rng = np.random.default_rng(seed)
     n = len(kinds)
     axis, down = rng.standard_normal((n, 3)), rng.standard_normal(3)
@@ -24,7 +24,7 @@ def random_geometry(kinds: str, seed: int, gravity: bool = True) -> Geometry:
 
 
 def random_bodies(n: int, seed: int) -> np.ndarray:
-    """Ten parameters of n clouds of four points: (n, 10)."""
+    """Return the ten parameters of n clouds of four points, (n, 10)."""
     rng = np.random.default_rng(seed)
     out = []
     for _ in range(n):
@@ -35,15 +35,17 @@ def random_bodies(n: int, seed: int) -> np.ndarray:
     return np.array(out)
 
 
-def ten(values: Sequence[float]) -> dict[str, Any]:
-    """Ten parameters as a manifest has them."""
+def ten_parameters(values: Sequence[float]) -> dict[str, Any]:
+    """Return ten parameters in the form of a manifest."""
     mass, *rest = map(float, values)
     return {"mass": mass, "first_moment": rest[:3], "inertia": rest[3:]}
 
 
 def parameters(geometry: Geometry, bodies: np.ndarray, joint_names: Sequence[str], order: Sequence[int]) -> Any:
-    """The entry `parameters` of a manifest. bodies: (n, 10), base to tip; joint_names: of the data; order: the data's
-    joint at each place of the chain."""
+    """Return the entry `parameters` of a manifest.
+
+    bodies: (n, 10), base to tip; joint_names: of the data; order: the data's joint at each place of the chain.
+    """
     n = geometry.n_joints
     counts, at = geometry.screws, np.argsort(order)
     numbers = np.arange(n, dtype=float)
@@ -74,9 +76,9 @@ def parameters(geometry: Geometry, bodies: np.ndarray, joint_names: Sequence[str
             "bodies": [
                 {
                     "joint": joint_names[joint],
-                    "mean": ten(bodies[place]),
-                    "std": ten(np.abs(bodies[place]) * 0.05 + 0.001),
-                    "plausible": ten(bodies[place]),
+                    "mean": ten_parameters(bodies[place]),
+                    "std": ten_parameters(np.abs(bodies[place]) * 0.05 + 0.001),
+                    "plausible": ten_parameters(bodies[place]),
                     "undetermined": ["mass", "first_moment"] if place == 0 else [],
                 }
                 for joint, place in enumerate(at)
@@ -92,6 +94,6 @@ def parameters(geometry: Geometry, bodies: np.ndarray, joint_names: Sequence[str
 
 
 def parameters_of(robot: RigidBody) -> Any:
-    """The entry `parameters` of a manifest whose geometry and masses are those of a robot."""
+    """Return the entry `parameters` of a manifest with the geometry and masses of a robot."""
     chain = np.argsort(robot.order)
     return parameters(Geometry.from_robot(robot), robot.parameters()[chain], robot.joint_names, chain.tolist())

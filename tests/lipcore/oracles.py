@@ -1,4 +1,4 @@
-"""Slow, independent references: the definition, differentiated by machine; kernels to hold against them."""
+"""Slow, independent references: automatic differentiation of the definitions."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -26,14 +26,14 @@ Instant = tuple[Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True)
 class Energy:
-    """One independent energy. kernel: k(q, v, q', v'), scalar; sign in the Lagrangian: + kinetic, − potential."""
+    """One independent energy: k(q, v, q', v'), scalar, and its sign in the Lagrangian, + kinetic, − potential."""
 
     kernel: Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
     sign: int
 
 
 def base_kernel(kind: str, share: Tensor, q: Tensor, q2: Tensor) -> Tensor:
-    """p(q, q') of one joint as the paper writes it."""
+    """Return p(q, q') of one joint, as in the paper."""
     sigma, alpha, beta = share
     if kind == "revolute":
         return sigma + alpha * torch.cos(q) * torch.cos(q2) + beta * torch.sin(q) * torch.sin(q2)
@@ -41,13 +41,13 @@ def base_kernel(kind: str, share: Tensor, q: Tensor, q2: Tensor) -> Tensor:
 
 
 def shares_of(logits: Tensor) -> Tensor:
-    """(σ, α, β) of each joint, (n, 3): proportional to (1, e^first, e^second), summing to one."""
+    """Return (σ, α, β) of each joint, (n, 3), proportional to (1, e^first, e^second) with sum one."""
     parts = torch.cat([torch.ones(len(logits), 1, dtype=logits.dtype), torch.exp(logits)], dim=1)
     return parts / parts.sum(1, keepdim=True)
 
 
 def pooled_weight(params: Mapping[str, Tensor], link: int, joint: int) -> Tensor:
-    """w_{l,a} of link l and joint a ≤ l, both counted from 0: five logarithms added up."""
+    """Return w_{l,a} of link l and joint a ≤ l, both counted from 0: five logarithms added up."""
     before = sum(range(link + 1))  # deviations run link by link, a link's first joint first
     return torch.exp(
         params["kinetic.log_scale"]
@@ -59,7 +59,7 @@ def pooled_weight(params: Mapping[str, Tensor], link: int, joint: int) -> Tensor
 
 
 def lip_energies(joint_types: Sequence[str], params: Mapping[str, Array]) -> list[Energy]:
-    """Energies of the paper: the potential over all joints, then one kinetic energy for each link."""
+    """Return the paper's energies: the potential over all joints, then one kinetic energy per link."""
     params = {name: torch.as_tensor(each) for name, each in params.items()}
     potential_shares = shares_of(params["potential.logits"])
     scale = torch.exp(params["potential.log_scale"])
@@ -90,12 +90,12 @@ def lip_energies(joint_types: Sequence[str], params: Mapping[str, Array]) -> lis
 
 
 def chain_base_kernel(kind: str, alpha: Tensor, q: Tensor, q2: Tensor) -> Tensor:
-    """p(q, q') of one joint of a chain, which has no zero where it is revolute."""
+    """Return p(q, q') of one joint of a chain; it does not depend on a revolute joint's zero."""
     return 1 - alpha + alpha * (torch.cos(q - q2) if kind == "revolute" else q * q2)
 
 
 def chain_energies(joint_types: Sequence[str], params: Mapping[str, Array]) -> list[Energy]:
-    """Energies of a serial chain: the potentials of all links added up, then one kinetic energy for each link."""
+    """Return the energies of a serial chain: the sum of the links' potentials, then one kinetic energy per link."""
     params = {name: torch.as_tensor(each) for name, each in params.items()}
     n, scales = len(joint_types), torch.exp(params["potential.log_scales"])
     alpha = 1 / (1 + torch.exp(-params["chain.logits"]))
@@ -130,14 +130,14 @@ def chain_energies(joint_types: Sequence[str], params: Mapping[str, Array]) -> l
 
 
 def lagrange(lagrangian: Callable[[Tensor, Tensor], Tensor], q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-    """d/dt(∂L/∂v) − ∂L/∂q of every entry of L(q, v), the joint as last axis."""
+    """Return d/dt(∂L/∂v) − ∂L/∂q of every entry of L(q, v), with the joint as last axis."""
     momentum = jacrev(lagrangian, argnums=1)
     by_q, by_v = jacrev(momentum, argnums=(0, 1))(q, v)
     return by_q @ v + by_v @ a - jacrev(lagrangian, argnums=0)(q, v)
 
 
 def torque_terms(energies: Sequence[Energy], x: Instant, y: Instant) -> Tensor:
-    """cov(tau_i(x), tau_j(y)) due to each energy alone, (energies, n, n)."""
+    """Return cov(tau_i(x), tau_j(y)) due to each energy alone, (energies, n, n)."""
 
     def block(energy: Energy) -> Tensor:
         def at_y(q: Tensor, v: Tensor) -> Tensor:
@@ -149,13 +149,13 @@ def torque_terms(energies: Sequence[Energy], x: Instant, y: Instant) -> Tensor:
 
 
 def energy_torque(energies: Sequence[Energy], x: Instant, y: Instant) -> Tensor:
-    """cov(energy(x), tau_j(y)) of each energy, (energies, n)."""
+    """Return cov(energy(x), tau_j(y)) of each energy, (energies, n)."""
     q, v, _ = x
     return torch.stack([e.sign * lagrange(lambda q2, v2, e=e: e.kernel(q, v, q2, v2), *y) for e in energies])
 
 
 def scale_of(energies: Sequence[Energy], x: Instant, y: Instant, terms: Tensor) -> float:
-    """Size that rounding errors are relative to: the largest entry of any one term, or the energies themselves.
+    """Return the scale of rounding errors: the largest entry of any term, or of the energies.
 
     The sum of the terms may cancel, and so may a term where the derivative of a base kernel is zero.
     """
@@ -164,7 +164,7 @@ def scale_of(energies: Sequence[Energy], x: Instant, y: Instant, terms: Tensor) 
 
 
 def instant(motion: Motion, row: int) -> Instant:
-    """One sample of a motion."""
+    """Return one sample of a motion."""
     return torch.from_numpy(motion.q[row]), torch.from_numpy(motion.dq[row]), torch.from_numpy(motion.ddq[row])
 
 
@@ -180,41 +180,41 @@ class Problem:
     motion: Motion
 
     def energies(self) -> list[Energy]:
-        """The energies that the kernel's documentation states: the potential one, then one for each link."""
+        """Return the energies in the kernel's documentation: the potential one, then one per link."""
         energies = lip_energies if isinstance(self.kernel, LipKernel) else chain_energies
         return energies(self.kernel.joint_types, self.params)
 
 
 class TorchForm(PairKernel):
-    """A compiled kernel as its formula has it, gradients by autograd."""
+    """A compiled kernel in the form of its formula, with gradients by autograd."""
 
     def __init__(self, kernel: PairKernel) -> None:
         self.kernel, self.n_joints = kernel, kernel.n_joints
 
     def blocks(self, params: Params, x: State, y: State) -> Array:
-        """Blocks of the kernel itself."""
+        """Return the blocks of the kernel itself."""
         return self.kernel.blocks(params, x, y)
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """Start of the kernel itself."""
+        """Return the start of the kernel itself."""
         return self.kernel.initial(motion, tau)
 
 
 def weight_shapes(n: int) -> Shapes:
-    """Shapes of the velocity weights' hyperparameters."""
+    """Return the shapes of the velocity weights' hyperparameters."""
     vectors = {f"kinetic.{name}": (n,) for name in ("log_link", "log_joint", "log_gap")}
     return {"kinetic.log_scale": (), **vectors, "kinetic.log_deviation": (n * (n + 1) // 2,)}
 
 
 def lip_shapes(n: int, tied: bool) -> Shapes:
-    """Shapes of the paper's kernel's hyperparameters as its documentation states them."""
+    """Return the shapes of the paper kernel's hyperparameters, as documented."""
     kinetic = {"kinetic.logits": n} if tied else {f"kinetic.{link}.logits": link for link in range(1, n + 1)}
     shapes: Shapes = {"potential.log_scale": (), "potential.logits": (n, 2)}
     return shapes | {name: (size, 2) for name, size in kinetic.items()} | weight_shapes(n)
 
 
 def chain_shapes(n: int) -> Shapes:
-    """Shapes of the chain kernel's hyperparameters as its documentation states them."""
+    """Return the shapes of the chain kernel's hyperparameters, as documented."""
     return {"chain.logits": (n,), "potential.log_scales": (n,), **weight_shapes(n)}
 
 
@@ -227,18 +227,18 @@ KERNELS: Mapping[str, tuple[Callable[[Sequence[str]], LipKernel | ChainKernel], 
 
 
 def random_problem(joint_types: Sequence[str], samples: int, seed: int, kernel: str = "tied") -> Problem:
-    """Problem of moderate hyperparameters and motion, noise and friction included. kernel: of KERNELS."""
+    """Return a problem of moderate hyperparameters and motion, with noise and friction. kernel: of KERNELS."""
     rng, n = np.random.default_rng(seed), len(joint_types)
     make, shapes = KERNELS[kernel]
     both = shapes(n) | {"noise.log_std": (n,), "friction.log_std": (n, 3)}
-    params = {name: np.array(rng.uniform(*width(name), shape)) for name, shape in both.items()}
+    params = {name: np.array(rng.uniform(*hyperparameter_range(name), shape)) for name, shape in both.items()}
     params["noise.log_std"] = params["noise.log_std"] - 1.0
     motion = Motion.from_arrays(*rng.uniform(-2.0, 2.0, (3, samples, n)))
     return Problem(make(joint_types), params, motion)
 
 
-def width(name: str) -> tuple[float, float]:
-    """Range that a hyperparameter is drawn from; five of the velocity weights' add up."""
+def hyperparameter_range(name: str) -> tuple[float, float]:
+    """Return the range of a hyperparameter; five of the velocity weights' add up."""
     return (-0.5, 0.4) if name.startswith("kinetic.log_") else (-1.5, 1.0)
 
 
@@ -246,7 +246,7 @@ def width(name: str) -> tuple[float, float]:
 def problems(
     draw: st.DrawFn, max_joints: int = 4, samples: int = 2, kernels: Sequence[str] = tuple(KERNELS)
 ) -> Problem:
-    """Drawn problems: revolute and prismatic joints mixed, any state within a few rad. kernels: of KERNELS."""
+    """Draw problems with mixed joints and states within a few rad. kernels: of KERNELS."""
     joint_types = draw(st.lists(st.sampled_from(["revolute", "prismatic"]), min_size=1, max_size=max_joints))
     make, shapes = KERNELS[draw(st.sampled_from(kernels))]
     n = len(joint_types)
@@ -260,13 +260,13 @@ def problems(
     return Problem(make(joint_types), params, motion)
 
 
-RELATIVE = 1e-10
-"""Error admitted, relative to `scale_of` the terms."""
+RELATIVE_TOLERANCE = 1e-10
+"""Maximum error relative to `scale_of` the terms."""
 PAIRS = ((0, 0), (0, 1))
 
 
 def worst_block_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIRS) -> float:
-    """Largest error of the torques' covariance over pairs of samples, relative to `scale_of` their terms."""
+    """Return the largest error of the torques' covariance over pairs of samples, relative to `scale_of`."""
     motion, energies = problem.motion, problem.energies()
     blocks = problem.kernel.blocks(problem.params, State.rows(motion), State.columns(motion))
     worst = 0.0
@@ -279,7 +279,7 @@ def worst_block_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIRS
 
 
 def worst_energy_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIRS) -> float:
-    """The same for the covariances of kinetic and potential energy with the torques and with themselves."""
+    """Return the same for the covariances of the energies with the torques and with themselves."""
     kernel, motion, energies = problem.kernel, problem.motion, problem.energies()
     rows, columns = State.rows(motion), State.columns(motion)
     torques = kernel.energies(problem.params, rows, columns)
@@ -296,8 +296,8 @@ def worst_energy_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIR
     return worst
 
 
-def opposite(kind: str, share: Sequence[float], q: float) -> float:
-    """The position q' at which the base kernel p(q, q') of shares (σ, α, β) is zero."""
+def zero_position(kind: str, share: Sequence[float], q: float) -> float:
+    """Return the position q' at which the base kernel p(q, q') of shares (σ, α, β) is zero."""
     sigma, alpha, beta = share
     if kind == "prismatic":
         return -(sigma + beta) / (alpha * q)
@@ -305,8 +305,8 @@ def opposite(kind: str, share: Sequence[float], q: float) -> float:
     return math.atan2(sine, cosine) + math.acos(-sigma / math.hypot(cosine, sine))
 
 
-def in_full(model: TorqueModel, samples: Samples) -> TorqueModel:
-    """The model with every sample counted in full, and nothing besides posterior and noise: the textbook's."""
+def with_full_counts(model: TorqueModel, samples: Samples) -> TorqueModel:
+    """Return the model with every sample counted fully and without misfit, as in a textbook."""
     posterior, motion = model.posterior, samples.motion()
     noise, residual = posterior.noise_variance, samples.tau - posterior.kernel.mean(motion)
     every = collect(posterior.basis, noise, motion, residual)

@@ -1,4 +1,4 @@
-"""What is computed step by step, waited for."""
+"""Helper for computations in steps."""
 
 from collections.abc import Generator
 from typing import TypeVar
@@ -6,8 +6,8 @@ from typing import TypeVar
 Result = TypeVar("Result")
 
 
-def finished(steps: Generator[None, None, Result]) -> Result:
-    """What a generator returns after all of its steps."""
+def run_to_end(steps: Generator[None, None, Result]) -> Result:
+    """Run a generator to its end and return its result."""
     while True:
         try:
             next(steps)

@@ -1,4 +1,4 @@
-"""What is compiled ahead is all that a first training takes, also where the disk cannot be written."""
+"""Tests that ahead-of-time compilation covers a first training, also with a read-only disk."""
 
 import gc
 import os
@@ -24,20 +24,21 @@ from lipcore.warm_up import COMPILED_ESTIMATORS, warm_up
 from tests.choosing import few
 
 
-def signatures() -> set[tuple[str, str]]:
-    """Every compiled function of ours with what it was compiled for."""
-    gc.unfreeze()  # a service that ran in this process has frozen what it imported
-    # not `isinstance`, which would wake what others load lazily
+def compiled_signatures() -> set[tuple[str, str]]:
+    """Return every compiled function of ours with its signatures."""
+    gc.unfreeze()  # a service in this process may have frozen its imports
+    # `isinstance` would trigger lazy imports
     dispatchers = [each for each in gc.get_objects() if issubclass(type(each), Dispatcher)]
     ours = [each for each in dispatchers if each.py_func.__module__.startswith("lipcore.")]
     return {(each.py_func.__qualname__, str(one)) for each in ours for one in each.signatures}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", few(COMPILED_ESTIMATORS, lambda name: "+" in name))
-def test_a_first_training_compiles_nothing_more(name: str) -> None:
-    """On a robot of other joints and another number of them."""
+def test_first_training_compiles_nothing_more(name: str) -> None:
+    """Use a robot with other joints and another number of them."""
     warm_up(name)
-    compiled = signatures()
+    compiled = compiled_signatures()
     assert compiled
     rng = np.random.default_rng(0)
     q, dq, ddq, noise = rng.uniform(-1, 1, (4, 90, 3))
@@ -53,17 +54,17 @@ def test_a_first_training_compiles_nothing_more(name: str) -> None:
         friction = np.zeros((3, 4 if model.arm.stribeck else 3))
         other = Alternative(model.arm.geometry, model.arm.parameters, np.zeros(3), friction, 0.5)
         ArmKernel(replace(model.arm, alternatives=(other, other))).features(Motion.from_arrays(q, dq, ddq))
-    assert signatures() <= compiled
+    assert compiled_signatures() <= compiled
 
 
-def test_only_what_there_is_can_be_named() -> None:
-    with pytest.raises(ValueError, match="expected names out of lip, lip-chain, rigid-body"):
+def test_unknown_names_are_rejected() -> None:
+    with pytest.raises(ValueError, match="expected only lip, lip-chain, rigid-body"):
         warm_up("lip", "gpu")
 
 
 @pytest.fixture
-def given(tmp_path, monkeypatch):
-    """A cache, which Numba is told of, and a folder for temporary files."""
+def numba_cache(tmp_path, monkeypatch):
+    """Return a cache that Numba uses, next to a folder for temporary files."""
     cache = tmp_path / "cache"
     (cache / "kernels").mkdir(parents=True)
     (cache / "kernels" / "chain.nbi").write_bytes(b"index")
@@ -75,14 +76,14 @@ def given(tmp_path, monkeypatch):
     return cache
 
 
-def read_only(path, mode):
-    """What the system says of a file system that is read-only; permissions alone do not stop root."""
+def deny_writing(path, mode):
+    """Act like a read-only file system; permissions alone do not stop root."""
     return mode != os.W_OK
 
 
-def test_a_cache_that_cannot_be_written_is_copied_for_this_process_and_its_children(given, monkeypatch):
-    monkeypatch.setattr(os, "access", read_only)
-    environment = {"NUMBA_CACHE_DIR": str(given)}
+def test_read_only_cache_is_copied(numba_cache, monkeypatch):
+    monkeypatch.setattr(os, "access", deny_writing)
+    environment = {"NUMBA_CACHE_DIR": str(numba_cache)}
     folder = use_cache(environment)
     assert folder is not None
     assert environment["NUMBA_CACHE_DIR"] == config.CACHE_DIR == str(folder)
@@ -91,20 +92,20 @@ def test_a_cache_that_cannot_be_written_is_copied_for_this_process_and_its_child
         assert stat.S_IMODE(made.stat().st_mode) == 0o700, "nobody else may put machine code there"
 
 
-def test_one_that_can_be_written_is_used_as_it_is(given):
-    environment = {"NUMBA_CACHE_DIR": str(given)}
+def test_writable_cache_is_used(numba_cache):
+    environment = {"NUMBA_CACHE_DIR": str(numba_cache)}
     assert use_cache(environment) is None
-    assert environment["NUMBA_CACHE_DIR"] == config.CACHE_DIR == str(given)
+    assert environment["NUMBA_CACHE_DIR"] == config.CACHE_DIR == str(numba_cache)
 
 
 @pytest.mark.parametrize("environment", [{}, {"NUMBA_CACHE_DIR": ""}, {"NUMBA_CACHE_DIR": str(Path("/nothing/here"))}])
-def test_without_a_cache_there_is_nothing_to_do(environment):
+def test_without_a_cache_nothing_is_done(environment):
     before = dict(environment)
     assert use_cache(environment) is None
     assert environment == before
 
 
-def test_an_edited_file_is_compiled_anew_with_those_that_import_it_and_no_others(tmp_path, monkeypatch):
+def test_edited_file_recompiles_only_its_importers(tmp_path, monkeypatch):
     folder = tmp_path / "compiled"
     shutil.copytree(compiling.FOLDER, folder, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(compiling, "FOLDER", folder)

@@ -1,4 +1,4 @@
-"""The base installation: it serves, teaches and shows itself without what extras bring, and says what is missing."""
+"""The base installation: it serves, learns and shows the dashboard without extras, and names missing ones."""
 
 import os
 import pickle
@@ -7,7 +7,6 @@ import subprocess
 import sys
 import tomllib
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,14 +14,16 @@ import pytest
 from lipcore import extras
 from lipcore.extras import EXTRAS, MissingExtraError
 from lipserve import ApiError, Client, StreamClient
+from tests import ROOT
 from tests.service.data import DEADLINE, eventually
 from tests.service.server import Server
 
-ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.slow  # starts services without extras
+
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 BASE = {re.split(r"[^\w-]", line)[0] for line in PROJECT["dependencies"]}
 HIDDEN = [name for each in EXTRAS.values() for name in each.modules if name not in BASE]
-"""What a base installation has not. A package that moves from the dependencies to an extra is hidden from then on."""
+"""Modules of extras that the dependencies do not include."""
 ZEROS = [0.0] * 7
 URDF = b"""<robot name="one"><link name="base"/><link name="arm"><inertial><mass value="1"/>
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
@@ -31,13 +32,13 @@ URDF = b"""<robot name="one"><link name="base"/><link name="arm"><inertial><mass
 
 
 def without(*modules):
-    """The environment of a process for which these modules are not installed."""
+    """Return the environment of a process in which these modules are not importable."""
     found = os.pathsep.join(filter(None, [str(ROOT / "tests/packaging/bare"), os.environ.get("PYTHONPATH", "")]))
     return {"PYTHONPATH": found, "LIPSERVE_TEST_HIDDEN": ",".join(modules)}
 
 
 def recording(rows=200):
-    """t, q, dq, ddq, tau of two joints, as an upload may have them."""
+    """Return t, q, dq, ddq and tau of two joints."""
     t = np.arange(rows) / 50
     angle = np.outer(t, [1.7, 2.3])
     q, dq, ddq = np.sin(angle), np.array([1.7, 2.3]) * np.cos(angle), -(np.array([1.7, 2.3]) ** 2) * np.sin(angle)
@@ -46,7 +47,7 @@ def recording(rows=200):
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    """A service of the base installation."""
+    """Start a service of the base installation."""
     with Server(tmp_path_factory.mktemp("bare") / "home", **without(*HIDDEN)) as started:
         yield started
 
@@ -64,7 +65,7 @@ def test_extras_are_those_of_the_project():
     assert set(re.search(r"\[(.*)\]", everything)[1].split(",")) == set(EXTRAS)
 
 
-def test_health_says_what_it_can_do(client):
+def test_health_lists_abilities(client):
     health = client.abilities()
     expected = {name: not any(module in HIDDEN for module in extra.modules) for name, extra in EXTRAS.items()}
     assert health.can == expected
@@ -73,7 +74,7 @@ def test_health_says_what_it_can_do(client):
     }
 
 
-def test_it_serves_and_shows_the_dashboard(server, client):
+def test_service_predicts_and_shows_the_dashboard(server, client):
     assert client.predict("panda-sim", ZEROS, ZEROS, ZEROS).tau.shape == (7,)
     page = server.client.get("/")
     assert (page.status_code, page.headers["content-type"].partition(";")[0]) == (200, "text/html")
@@ -81,8 +82,8 @@ def test_it_serves_and_shows_the_dashboard(server, client):
     assert server.client.get("/metrics").status_code == 200
 
 
-def test_nothing_runs_to_learn_until_something_is_taught_and_a_stream_teaches(server, client):
-    assert len(server.started()) == 1  # which weighs
+def test_learner_starts_with_the_first_frame_with_torque(server, client):
+    assert len(server.started()) == 1  # the weigher
     rng = np.random.default_rng(50)
     with StreamClient("panda-sim", url=server.url, stream_id="robot") as stream:
         for _ in range(5):
@@ -94,7 +95,7 @@ def test_nothing_runs_to_learn_until_something_is_taught_and_a_stream_teaches(se
 
 
 @pytest.mark.skipif("pyarrow" not in HIDDEN, reason="Arrow is part of the base")
-def test_what_arrow_reads_names_its_extra_and_what_numpy_reads_is_taken(server, client):
+def test_csv_names_its_extra_and_npz_is_read(server, client):
     columns = recording()
     rows = np.column_stack(list(columns.values()))
     names = ["t", *(f"{name}{joint}" for name in ("q", "dq", "ddq", "tau") for joint in (1, 2))]
@@ -115,14 +116,14 @@ def test_what_arrow_reads_names_its_extra_and_what_numpy_reads_is_taken(server, 
 
 
 @pytest.mark.skipif("pinocchio" not in HIDDEN, reason="Pinocchio is part of the base")
-def test_a_urdf_names_its_extra(server):
+def test_urdf_names_its_extra(server):
     answer = server.client.post("/v1/robots", content=URDF, headers={"content-type": "application/xml"})
     assert (answer.status_code, answer.json()["error"]["code"]) == (501, "not_installed")
     assert "pip install 'lipserve[robots]'" in answer.json()["error"]["message"]
 
 
 @pytest.mark.skipif("torch" not in HIDDEN, reason="torch is part of the base")
-def test_training_that_differentiates_names_its_extra(client, tmp_path):
+def test_training_with_torch_names_its_extra(client, tmp_path):
     np.savez(tmp_path / "two.npz", **recording())
     data = client.upload(tmp_path / "two.npz").id
     with pytest.raises(ApiError, match=r"pip install 'lipserve\[train\]'") as caught:
@@ -137,7 +138,7 @@ def test_training_that_differentiates_names_its_extra(client, tmp_path):
         (["serve", "--port", "0", "--grpc-port", "0"], "grpc", "grpc"),
     ],
 )
-def test_commands_name_the_extra_and_end_with_1(command, module, extra, tmp_path):
+def test_commands_name_the_extra_and_exit_with_1(command, module, extra, tmp_path):
     environment = {**os.environ, **without(module), "LIPSERVE_HOME": str(tmp_path / "home")}
     done = subprocess.run(
         [sys.executable, "-m", "service", *command],
@@ -153,7 +154,7 @@ def test_commands_name_the_extra_and_end_with_1(command, module, extra, tmp_path
     assert "Traceback" not in done.stderr
 
 
-def test_a_module_that_cannot_be_imported_is_told_from_one_that_is_not_there(tmp_path, monkeypatch):
+def test_broken_module_is_distinguished_from_missing_module(tmp_path, monkeypatch):
     (tmp_path / "halfway.py").write_text("raise ImportError('libgomp.so.1: no such file')")
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(MissingExtraError, match=r"halfway, which cannot be imported \(libgomp") as caught:

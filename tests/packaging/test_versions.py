@@ -1,4 +1,4 @@
-"""One version, and the Pythons that are promised: all that names them names the same."""
+"""The version, and the supported Pythons, are the same in all files."""
 
 import re
 import tomllib
@@ -18,7 +18,7 @@ NEXT = f"{__version__.split('.')[0]}.{int(__version__.split('.')[1]) + 1}"
 
 
 def text(path: str) -> str:
-    """Of a file of the repository."""
+    """Return the text of a file of the repository."""
     return (ROOT / path).read_text("utf-8")
 
 
@@ -33,19 +33,19 @@ def text(path: str) -> str:
         ),
     ],
 )
-def test_what_names_the_version_names_this_one(path, pattern):
+def test_files_have_this_version(path, pattern):
     assert set(re.findall(pattern, text(path), re.MULTILINE)) == {__version__}
 
 
-def test_the_service_asks_for_the_client_of_its_own_minor_version():
+def test_service_requires_the_client_of_its_minor_version():
     assert f"lipserve-client>={MINOR},<{NEXT}" in PROJECTS["pyproject.toml"]["dependencies"]
     assert all(each["dynamic"] == ["version"] for each in PROJECTS.values())
 
 
 @pytest.mark.parametrize("name", PROJECTS)
-def test_pythons_that_are_promised_are_those_that_the_workflow_tests(name):
+def test_supported_pythons_are_those_of_the_workflow(name):
     tested = yaml.safe_load(text(".github/workflows/tests.yml"))["jobs"]["test"]["strategy"]["matrix"]["python"]
     prefix = "Programming Language :: Python :: "
-    promised = [each.removeprefix(prefix) for each in PROJECTS[name]["classifiers"] if each.startswith(prefix + "3.")]
-    assert promised == tested
+    supported = [each.removeprefix(prefix) for each in PROJECTS[name]["classifiers"] if each.startswith(prefix + "3.")]
+    assert supported == tested
     assert PROJECTS[name]["requires-python"] == f">={tested[0]}"

@@ -1,4 +1,4 @@
-"""Both distributions as they are published: built, checked, installed where nothing else is, used. Needs an index."""
+"""Both published distributions: built, checked, installed in an empty environment, used. Needs a package index."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from lipserve import __version__
-from tests.clients.test_python_package import SERVER
+from tests.clients.python.test_package import SERVER
 from tests.docs.blocks import ROOT, all_pages
 from tests.packaging.test_pieces import BASE
 from tests.service.server import Server
@@ -26,10 +26,10 @@ PIP = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
 PLAIN = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
 SOURCES = {"clients/python": "lipserve-client", ".": "lipserve"}
 """Folder and name of each distribution."""
-MOST_MB, MOST_SERVING_MB = 90, 450
+MAX_CLIENT_MB, MAX_SERVICE_MB = 90, 450
 DEPENDENCIES = {"numpy", "httpx", "httpcore", "h11", "anyio", "idna", "certifi", "websockets", "msgspec"}
 MORE = {"typing-extensions", "typing_extensions", "sniffio"}
-"""What some versions of these need on some versions of Python."""
+"""Further dependencies of some versions."""
 
 ASKING = """
 import asyncio, json, sys
@@ -60,7 +60,7 @@ print(json.dumps({
 
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory):
-    """Folder of both sdists, and of the wheels that were built from them."""
+    """Return the folder of both sdists and of their wheels."""
     pytest.importorskip("build", reason="build is missing: pip install build")
     folder = tmp_path_factory.mktemp("dist")
     for source in SOURCES:
@@ -70,7 +70,7 @@ def dist(tmp_path_factory):
 
 
 def installed(place: Path, dist: Path, name: str) -> Path:
-    """Make an environment that has a distribution, its dependencies and nothing else; return its folder of packages."""
+    """Create an environment with only a distribution and its dependencies; return its folder of packages."""
     venv.create(place, with_pip=False)
     python = str(place / "bin/python")
     command = [*PIP, "--quiet", "--python", python, "install", "--no-compile", "--find-links", str(dist)]
@@ -96,15 +96,15 @@ class Installed(Server):
 
 @pytest.fixture(scope="module")
 def server(dist, tmp_path_factory):
-    """A service of the wheel, in an environment of its own."""
+    """Start a service of the wheel in a separate environment."""
     Installed.place = tmp_path_factory.mktemp("environment")
     installed(Installed.place, dist, "lipserve")
     with Installed(tmp_path_factory.mktemp("server") / "home") as started:
         yield started
-    shutil.rmtree(Installed.place)  # gigabytes, which pytest would keep
+    shutil.rmtree(Installed.place)  # pytest would keep gigabytes
 
 
-def test_both_are_there_with_one_version_and_metadata_that_an_index_takes(dist):
+def test_distributions_have_one_version_and_valid_metadata(dist):
     pytest.importorskip("twine", reason="Twine is missing: pip install twine")
     names = {each.name for each in dist.iterdir()}
     stems = {f"{name.replace('-', '_')}-{__version__}" for name in SOURCES.values()}
@@ -116,7 +116,7 @@ def test_both_are_there_with_one_version_and_metadata_that_an_index_takes(dist):
     assert done.stdout.count("PASSED") == len(names)
 
 
-def test_the_wheel_of_the_service_serves_its_model_pages_and_guide(server):
+def test_wheel_of_the_service_serves_model_pages_and_guide(server):
     zeros = [0.0] * 7
     answer = server.client.post("/v1/models/panda-sim/predict", json={"q": zeros, "dq": zeros, "ddq": zeros})
     assert len(answer.json()["tau"]) == len(zeros)
@@ -127,15 +127,15 @@ def test_the_wheel_of_the_service_serves_its_model_pages_and_guide(server):
 
 
 @pytest.mark.skipif("torch" in BASE, reason="torch is part of the base")
-def test_what_serves_is_small_and_brings_what_the_dashboard_draws_with(server):
+def test_service_is_small_and_includes_plotly(server):
     files = (each for each in Installed.place.rglob("*") if each.is_file() and not each.is_symlink())
-    # as pip has put them there: bytecode and machine code came with the start
+    # without bytecode and compiled kernels, which the start has written
     size = sum(each.stat().st_size for each in files if "__pycache__" not in each.parts)
-    assert size < MOST_SERVING_MB * 1_000_000
+    assert size < MAX_SERVICE_MB * 1_000_000
     assert len(server.client.get("/dashboard/plotly/cartesian.js", follow_redirects=True).content) > 1_000_000
 
 
-def test_the_wheel_of_the_client_alone_asks_it(server, dist, tmp_path):
+def test_wheel_of_the_client_works_alone(server, dist, tmp_path):
     place = tmp_path / "environment"
     packages = installed(place, dist, "lipserve-client")
     environment = {**PLAIN, "LIPSERVE_URL": server.url}
@@ -153,7 +153,7 @@ def test_the_wheel_of_the_client_alone_asks_it(server, dist, tmp_path):
     assert seen["missing"] == "bars need Rich: pip install 'lipserve-client[progress]'"
     assert (packages / "lipserve/py.typed").is_file()
     size = sum(each.stat().st_size for each in packages.rglob("*") if each.is_file())
-    assert size < MOST_MB * 1_000_000
+    assert size < MAX_CLIENT_MB * 1_000_000
 
 
 INSTALLING = re.compile(r"pip install((?: +(?:'[^']+'|[\w.\[\]/:=-]+))+)")
@@ -161,7 +161,7 @@ TORCH_OF_CPUS = "https://download.pytorch.org/whl/cpu"
 
 
 def lines() -> dict[str, str]:
-    """Every `pip install` that a page or a message of ours tells of, by what it installs."""
+    """Return every `pip install` of pages and code, by its requirements."""
     code = [path for name in ("lipcore", "service", "clients", "benchmarks") for path in (ROOT / name).rglob("*.py")]
     pages = [*all_pages(), *sorted((ROOT / "docs/examples").iterdir()), *(ROOT / "clients").glob("*/README.md")]
     texts = (path.read_text("utf-8") for path in [*pages, *code])
@@ -169,11 +169,11 @@ def lines() -> dict[str, str]:
 
 
 def requirements(line: str) -> list[str]:
-    """What the arguments of pip install, with folders of the checkout as the distributions that are built of them."""
+    """Return the requirements in the arguments of pip; folders of the checkout become their distributions."""
     words = shlex.split(line)
     if "--index-url" in words:
         at = words.index("--index-url")
-        assert words == ["torch", "--index-url", TORCH_OF_CPUS], "that index has torch alone"
+        assert words == ["torch", "--index-url", TORCH_OF_CPUS], "that index has only torch"
         del words[at:]
     wanted = []
     for word in (each for each in words if each != "-e"):
@@ -183,7 +183,7 @@ def requirements(line: str) -> list[str]:
 
 
 def resolved(dist: Path, folder: Path, *arguments: str) -> list[dict]:
-    """What pip would install, each with its metadata."""
+    """Return the packages that pip would install, with their metadata."""
     report = folder / "report.json"
     command = [*PIP, "install", "--dry-run", "--ignore-installed", "--find-links", str(dist), "--report", str(report)]
     done = subprocess.run([*command, *arguments], cwd=folder, capture_output=True, text=True, check=False)
@@ -192,7 +192,7 @@ def resolved(dist: Path, folder: Path, *arguments: str) -> list[dict]:
 
 
 def missing(install: list[dict], wanted: str) -> list[str]:
-    """Names and extras of a line's requirements that what pip would install does not have."""
+    """Return requirements, or extras of them, that are missing from the packages to install."""
     offered = {
         canonicalize_name(each["metadata"]["name"]): each["metadata"].get("provides_extra", []) for each in install
     }
@@ -205,18 +205,18 @@ def missing(install: list[dict], wanted: str) -> list[str]:
     return lacking
 
 
-def test_lines_that_install_find_what_they_name(dist, tmp_path):
+def test_documented_requirements_exist(dist, tmp_path):
     wanted = sorted(lines())
     assert {"lipserve-client", "lipserve[cluster]"} <= set(wanted)
-    # all together: what answers all of them answers each
+    # resolve all of them at once
     install = resolved(dist, tmp_path, *dict.fromkeys(word for each in wanted for word in each.split()))
     assert {lines()[each]: lack for each in wanted if (lack := missing(install, each))} == {}
     for each in install:
-        if each["metadata"]["name"] in SOURCES.values():  # that of this checkout, not another's of this name
+        if each["metadata"]["name"] in SOURCES.values():  # that of this checkout, not of the index
             assert Path(urlparse(each["download_info"]["url"]).path).parent == dist
 
 
-def test_an_extra_or_a_name_that_there_is_not_is_noticed(dist, tmp_path):
+def test_missing_extras_and_names_are_detected(dist, tmp_path):
     install = resolved(dist, tmp_path, "--no-deps", "lipserve-client[bars]")
     assert missing(install, "lipserve-client[bars]") == ["lipserve-client[bars]"]
     assert missing(install, "lipserve-client[progress] lipserve") == ["lipserve"]

@@ -1,4 +1,4 @@
-"""Workflows of the forge: what they run is there, and the forge would take them."""
+"""The workflows of GitHub: their commands exist, and their files are valid."""
 
 import importlib.util
 import re
@@ -20,7 +20,7 @@ SCHEMAS = {
 
 
 @pytest.mark.parametrize("path", WORKFLOWS, ids=lambda path: path.stem)
-def test_what_a_workflow_runs_is_a_target_of_make_or_a_file(path):
+def test_commands_of_workflows_are_make_targets_or_files(path):
     jobs = yaml.safe_load(path.read_text("utf-8"))["jobs"]
     lines = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
     assert lines or all("uses" in step for job in jobs.values() for step in job["steps"])
@@ -37,7 +37,7 @@ def test_what_a_workflow_runs_is_a_target_of_make_or_a_file(path):
         assert ({needed} if isinstance(needed, str) else set(needed)) <= jobs.keys()
 
 
-def test_hooks_before_a_commit_are_named_and_run_the_target_that_there_is():
+def test_pre_commit_hooks_include_make_lint():
     repositories = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text("utf-8"))["repos"]
     hooks = [hook for each in repositories for hook in each["hooks"]]
     assert {"trailing-whitespace", "end-of-file-fixer", "check-yaml"} <= {hook["id"] for hook in hooks}
@@ -45,9 +45,10 @@ def test_hooks_before_a_commit_are_named_and_run_the_target_that_there_is():
     assert local["entry"] == "make lint"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("schema", SCHEMAS)
 @pytest.mark.skipif(importlib.util.find_spec("check_jsonschema") is None, reason="needs check-jsonschema")
-def test_the_forge_would_take_its_files(schema):
+def test_files_of_github_are_valid(schema):
     assert SCHEMAS[schema]
     command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", schema, *map(str, SCHEMAS[schema])]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

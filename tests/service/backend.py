@@ -1,7 +1,7 @@
-"""`--backend shared`: the services of these tests on PostgreSQL and S3, with nothing else changed.
+"""`--backend shared`: run the services of these tests on PostgreSQL and S3, without other changes.
 
-A home then names what a service shares as well as what it has for itself: settings with the same home find the same
-database and the same prefix, in this process and in those that tests start.
+A home then determines the shared storage too: settings with the same home use the same database and the same prefix,
+in this process and in those that tests start.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from unittest.mock import patch
 from service.foundation.settings import Settings
 
 if TYPE_CHECKING:
-    from tests.cluster.servers import S3, Postgres
+    from tests.system.cluster.servers import S3, Postgres
 
 OWN, SHARED = "own", "shared"
 """SQLite and files below the home of each service, or PostgreSQL and S3."""
@@ -25,15 +25,15 @@ _backend: Backend | None = None
 
 
 class Backend:
-    """Servers, and which database and prefix each home has on them."""
+    """The servers, and the database and prefix of each home."""
 
     def __init__(self, postgres: Postgres, s3: S3) -> None:
         self._postgres, self._s3 = postgres, s3
         self._databases: dict[str, str] = {}
 
     def urls(self, home: Path | str) -> dict[str, str]:
-        """Settings of a service on a home; the first time its database is made."""
-        from tests.cluster.servers import BUCKET
+        """Return the settings of a service on a home; the first call creates its database."""
+        from tests.system.cluster.servers import BUCKET
 
         key = str(Path(home).resolve())
         if key not in self._databases:
@@ -43,7 +43,7 @@ class Backend:
 
 
 def environment(home: Path) -> dict[str, str]:
-    """What a service in a process of its own needs in its environment; nothing on its own files."""
+    """Return the environment of a service in a process of its own; empty if it uses its own files."""
     if _backend is None:
         return {}
     urls = _backend.urls(home)
@@ -52,10 +52,13 @@ def environment(home: Path) -> dict[str, str]:
 
 @contextmanager
 def shared() -> Iterator[None]:
-    """Have every service that is made meanwhile, here or by `tests.service.server`, share a database and files."""
-    global _backend  # noqa: PLW0603 - settings are made all over the tests
-    from tests.cluster.servers import S3, Postgres, server_folder
+    """Let every service made in this block, here or by `tests.service.server`, share a database and files."""
+    global _backend  # noqa: PLW0603 - tests create settings in many places
+    from tests.system.cluster.servers import S3, Postgres, server_folder
 
+    if _backend is not None:  # by another folder of tests
+        yield
+        return
     with server_folder() as folder:
         postgres, s3 = Postgres(folder), S3()
         _backend = Backend(postgres, s3)
@@ -72,7 +75,7 @@ _own_init = Settings.__init__
 
 
 def _init(self: Settings, **values: Any) -> None:
-    """As `Settings` does it, with the database and the prefix of the home unless some are named."""
+    """Replace `Settings.__init__`: add the database and the prefix of the home unless some are given."""
     home = values.get("home") or os.environ.get("LIPSERVE_HOME")
     named = {"database_url", "files_url"} & set(values) or {_DATABASE, _FILES} & set(os.environ)
     if _backend is not None and home is not None and not named:

@@ -1,4 +1,4 @@
-"""Services that tests share: starting one loads torch and a model, training in one starts a process."""
+"""Services that tests share, as starting one loads torch and a model, and training in one starts a process."""
 
 import os
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from tests.service.server import Server
 from tests.service.streams import Streaming, saved_model
 from tests.service.warm import warm_processes
 
-# tests run side by side: where these processes give way as they should, they hardly get to run
+# tests run in parallel: processes with a low priority would hardly run
 for name, value in (("TRAINING_NICENESS", "0"), ("LEARNER_NICENESS", "0"), ("TRAINING_CPUS", "1000")):
     os.environ.setdefault(f"LIPSERVE_{name}", value)
 
@@ -33,9 +33,9 @@ LIMITS = {
     "max_joints": 8,
     "max_samples": 500,
 }
-"""Limits small enough to be exceeded."""
+"""Limits small enough to exceed in a test."""
 BODY_LIMITS = {"MAX_URDF_BYTES": 5_000, "MAX_ARCHIVE_BYTES": 100_000}
-"""The same of constants that an application is made with."""
+"""The same for constants that are read when an application is created."""
 CONSTANTS = {
     "service.inference.predicting.MAX_BATCH": 20,
     "service.inference.evaluating.MAX_EVALUATION_SAMPLES": 50,
@@ -44,12 +44,12 @@ CONSTANTS = {
     "service.training.jobs.MAX_QUEUED": 2,
     "service.training.jobs.MAX_OPTIONS": {**MAX_OPTIONS, "hyperparameter_samples": 30, "posterior_samples": 40},
 }
-"""The same of constants that requests are checked by."""
+"""The same for constants that are read at each request."""
 
 
 @pytest.fixture(scope="session", autouse=True)
 def services_share(request: pytest.FixtureRequest) -> Iterator[bool]:
-    """Whether services share a database and files: where the tests are told so, see `tests.service.backend`."""
+    """Whether services share a database and files, see `tests.service.backend`."""
     if request.config.getoption("backend") == backend.OWN:
         yield False
         return
@@ -65,7 +65,7 @@ def _warm_processes() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def _own_files(request: pytest.FixtureRequest, services_share: bool) -> None:
-    """Skip tests of the files of a single service where there are none: `@pytest.mark.own_files("why")`."""
+    """Skip tests marked `@pytest.mark.own_files("why")` if services share their files."""
     marker = request.node.get_closest_marker("own_files")
     if services_share and marker is not None:
         pytest.skip(f"of a service alone: {marker.args[0]}")
@@ -89,7 +89,7 @@ def strict_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TestCli
 
 @pytest.fixture
 def strict(strict_service: TestClient, monkeypatch: pytest.MonkeyPatch) -> Iterator[TestClient]:
-    """The service with small limits, empty of data sets at the start of every test."""
+    """The service with small limits, without data sets at the start of every test."""
     for place, value in CONSTANTS.items():
         monkeypatch.setattr(place, value)
     yield strict_service
@@ -108,7 +108,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 @pytest.fixture(scope="session")
 def streaming(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Streaming]:
-    """A service in a process of its own that streams torques of a double pendulum."""
+    """A service in a process of its own that has a model for torque streams of a double pendulum."""
     with Server(tmp_path_factory.mktemp("streaming"), warm=True) as started:
         dataset = upload(started.client, stream())["id"]
         train(started.client, "pendulum", dataset)
@@ -123,7 +123,7 @@ def pendulum(api: TestClient) -> dict[str, object]:
 
 @dataclass(frozen=True)
 class Trained:
-    """A model of a double pendulum: its name and data set in the service, and lipcore's own copy of it."""
+    """A model of a double pendulum: its name and data set in the service, and lipcore's copy of it."""
 
     name: str
     dataset: str
@@ -142,14 +142,14 @@ def trained(api: TestClient, pendulum: dict[str, str]) -> Trained:
 
 @pytest.fixture
 def no_worker(strict: TestClient, monkeypatch: pytest.MonkeyPatch) -> TestClient:
-    """The service with small limits, where queued jobs stay queued."""
+    """The service with small limits, in which queued jobs stay queued."""
     monkeypatch.setattr(service_of(strict).jobs, "submit", lambda job: None)
     return strict
 
 
 @pytest.fixture
-def fresh_looks(api: TestClient) -> Iterator[None]:
-    """Health is looked at again: what was found before does not count, nor what is found here later."""
+def fresh_readiness(api: TestClient) -> Iterator[None]:
+    """Clear the cached readiness before and after the test."""
     service_of(api).readiness.forget()
     yield
     service_of(api).readiness.forget()

@@ -1,4 +1,4 @@
-"""Recordings to upload, and what tests do with them again and again."""
+"""Recordings to upload, and common requests of tests."""
 
 import io
 import time
@@ -21,34 +21,34 @@ from service.training.queue import JobQueue
 QUICK = {"hyperparameter_samples": 20, "posterior_samples": 60, "max_iterations": 4}
 """Options of a fit that takes a fraction of a second."""
 ENDLESS = {"hyperparameter_samples": 200, "posterior_samples": 60, "max_iterations": 10_000}
-"""Options of a fit that takes about half a minute on 200 samples of `panda`: far longer than a test needs to end it."""
+"""Options of a fit that takes about half a minute on 200 samples of `panda`, so that a test can end it."""
 
 ADDRESS = "http://localhost"
-"""Where an in-process client finds the service: one without keys answers to names of this machine only."""
+"""Address of the service for an in-process client: without keys it accepts only names of this machine."""
 DEADLINE = 60.0
-"""Seconds after which a condition that a test waits for has failed."""
+"""Time limit for conditions that tests wait for, in seconds."""
 
 
 @cache
 def stream(robot: str = "double-pendulum", samples: int = 80, seed: int = 1, **kwargs: Any) -> Samples:
-    """A simulated recording; equal arguments give the same object."""
+    """Return a simulated recording; equal arguments give the same object."""
     return simulate(load_robot(robot), Simulation(n_samples=samples, **{"speed": 5.0, **kwargs}), seed)
 
 
 def arrays(samples: Samples, *names: str) -> dict[str, np.ndarray]:
-    """Arrays of a recording by name, all that are needed where no names are given."""
+    """Return arrays of a recording by name, by default all required ones."""
     return {name: getattr(samples, name) for name in names or ("t", "q", "dq", "ddq", "tau")}
 
 
 def npz(**members: Any) -> bytes:
-    """An NPZ archive."""
+    """Return an NPZ archive."""
     file = io.BytesIO()
     np.savez(file, **members)
     return file.getvalue()
 
 
 def columns(samples: Samples) -> dict[str, list[Any]]:
-    """Columns of a recording by their canonical names, as lists of texts to be changed at will."""
+    """Return columns of a recording by canonical name, as lists of texts that a test may change."""
     table: dict[str, list[Any]] = {"t": [f"{value:.17g}" for value in samples.t]}
     for name in ("q", "dq", "ddq", "tau"):
         for joint, values in enumerate(getattr(samples, name).T, start=1):
@@ -57,13 +57,13 @@ def columns(samples: Samples) -> dict[str, list[Any]]:
 
 
 def csv(table: Mapping[str, list[Any]], newline: str = "\n") -> bytes:
-    """A CSV file of named columns."""
+    """Return a CSV file of named columns."""
     rows = zip(*table.values(), strict=True)
     return (newline.join([",".join(table), *(",".join(map(str, row)) for row in rows)]) + newline).encode()
 
 
 def post(api: Any, body: Any, media_type: str = "application/x-npz", **params: Any) -> Any:
-    """Upload a body as it is; return the answer."""
+    """Upload a body unchanged; return the answer."""
     return api.post("/v1/datasets", content=body, headers={"content-type": media_type}, params=params)
 
 
@@ -75,8 +75,7 @@ def upload(api: Any, samples: Samples, **params: Any) -> dict[str, Any]:
 
 
 def queue(api: Any, model: str, *datasets: str, **request: Any) -> dict[str, Any]:
-    """Queue a training job, a quick one of `lip-chain` that holds nothing out and answers in any case, unless told
-    otherwise; return it."""
+    """Queue a training job and return it: by default a quick `lip-chain`, nothing held out, promoted always."""
     body = {
         "model": model,
         "datasets": list(datasets),
@@ -92,7 +91,7 @@ def queue(api: Any, model: str, *datasets: str, **request: Any) -> dict[str, Any
 
 
 def eventually(look: Callable[[], Any], seconds: float = DEADLINE) -> Any:
-    """Look until the answer is true and return it; fail after the deadline."""
+    """Wait until a condition is true and return its value; fail after the time limit."""
     end = time.monotonic() + seconds
     while not (seen := look()):
         assert time.monotonic() < end, f"waited {seconds:g} s in vain"
@@ -101,31 +100,31 @@ def eventually(look: Callable[[], Any], seconds: float = DEADLINE) -> Any:
 
 
 def job(api: Any, name: str) -> dict[str, Any]:
-    """A job as it is now."""
+    """Return a job in its present state."""
     answer = api.get(f"/v1/jobs/{name}")
     assert answer.status_code == 200, answer.text
     return answer.json()
 
 
 def ended(api: Any, name: str) -> dict[str, Any]:
-    """Wait for the end of a job, however it ends; return it."""
+    """Wait until a job has ended in any state; return it."""
     return eventually(lambda: (seen := job(api, name))["state"] not in ACTIVE and seen)
 
 
 def running(api: Any, name: str) -> dict[str, Any]:
-    """Wait until a job has made its first iteration; return it."""
+    """Wait until a job has completed its first iteration; return it."""
     return eventually(lambda: (seen := job(api, name))["progress"]["iteration"] > 0 and seen)
 
 
 def train(api: Any, model: str, *datasets: str, **request: Any) -> dict[str, Any]:
-    """Train a model; return the job that succeeded."""
+    """Train a model; return the succeeded job."""
     seen = ended(api, queue(api, model, *datasets, **request)["id"])
     assert seen["state"] == "succeeded", seen
     return seen
 
 
 def error(answer: Any, status: int, code: str) -> dict[str, Any]:
-    """Check that an answer is an error of the one shape; return its body."""
+    """Check that an answer is an error of the common shape; return its body."""
     assert answer.status_code == status, answer.text
     body = answer.json()
     assert set(body) == {"error"}
@@ -137,7 +136,7 @@ def error(answer: Any, status: int, code: str) -> dict[str, Any]:
     return body["error"]
 
 
-class Parts:
+class ServiceParts:
     """The parts of a running service."""
 
     def __init__(self, state: Any) -> None:
@@ -151,6 +150,6 @@ class Parts:
         self.stopping, self.meters = state.stopping, state.meters
 
 
-def service_of(api: Any) -> Parts:
-    """The parts of the service behind a test client."""
-    return Parts(api.app.state)
+def service_of(api: Any) -> ServiceParts:
+    """Return the parts of the service behind a test client."""
+    return ServiceParts(api.app.state)

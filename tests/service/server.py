@@ -20,13 +20,12 @@ from tests.service.warm import Served
 class Server:
     """`lipserve serve` on a home; settings are environment variables.
 
-    warm: forked from a process that has imported it already, for a service that is shared and nothing else; port: to
-    listen on, a free one where None; log: what it prints goes there, beside the home where None; constants: of a warm
-    one, by module and name.
+    warm: fork it from a process with its imports, for shared services only; port: a free one if None; log: file for its
+    output, beside the home if None; constants: of a warm one, by module and name.
     """
 
     patience = DEADLINE
-    """Seconds that it may take to start."""
+    """Maximum time to start, in seconds."""
 
     def __init__(
         self,
@@ -65,21 +64,21 @@ class Server:
             return False
 
     def workers(self) -> list[int]:
-        """Process ids of those that train or learn for the service, where settings have these give way to it."""
+        """Return process ids of training and learning, if settings give them a lower priority than serving."""
         own = os.getpriority(os.PRIO_PROCESS, self.process.pid)
         return [pid for pid in self.started() if os.getpriority(os.PRIO_PROCESS, pid) > own]
 
     def started(self) -> list[int]:
-        """Process ids of all that the service has spawned: these, and the one that weighs."""
+        """Return process ids of all spawned processes: those of `workers`, and the one that estimates payloads."""
         return [pid for pid in children(self.process.pid) if "spawn_main" in command(pid)]
 
     def kill(self) -> None:
-        """End it as a power cut would: nothing of it runs on."""
+        """Kill it as a power cut would, with its children."""
         self.process.send_signal(signal.SIGKILL)
         self.process.wait(DEADLINE)
 
     def terminate(self) -> int:
-        """Ask it to end; return its exit code."""
+        """Send SIGTERM; return the exit code."""
         self.process.terminate()
         return self.process.wait(DEADLINE)
 
@@ -95,14 +94,14 @@ class Server:
 
 
 def free_port() -> int:
-    """A port that nobody listens on."""
+    """Return a free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def command(pid: int) -> str:
-    """Command line of a process, empty where it has ended."""
+    """Return the command line of a process, empty if it has ended."""
     try:
         return Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ")
     except (FileNotFoundError, ProcessLookupError):
@@ -110,7 +109,7 @@ def command(pid: int) -> str:
 
 
 def children(pid: int) -> list[int]:
-    """Process ids of the children of a process."""
+    """Return the process ids of the children of a process."""
     found = []
     for status in Path("/proc").glob("[0-9]*/status"):
         try:

@@ -1,4 +1,4 @@
-"""Frames of a torque stream, packed and read as the README documents them, without the service's own code."""
+"""Frames of a torque stream, packed and parsed as the README documents them, without the service's own code."""
 
 import json
 import socket
@@ -31,7 +31,7 @@ TAU = np.array([5.0, -2.0])
 
 @dataclass(frozen=True)
 class Streaming:
-    """A server with a model "pendulum" of version 1 that no test adds versions to, and lipcore's own copy of it."""
+    """A server with a model "pendulum", of version 1 alone, and lipcore's copy of that version."""
 
     server: Server
     dataset: str
@@ -40,7 +40,7 @@ class Streaming:
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer frame; external, payload: what it says of them; error: what it says instead of numbers."""
+    """An answer frame; `error` replaces the numbers if the request failed."""
 
     sequence: int
     flags: int
@@ -65,7 +65,7 @@ def frame(
     tau: Any = None,
     learn: bool = True,
 ) -> bytes:
-    """A request frame; motion: q, dq, ddq; tau: measured, where given, and flagged to be learnt from unless told."""
+    """Return a request frame; motion: q, dq, ddq; tau: measured torque, to be learnt unless `learn` is false."""
     numbers = np.asarray(motion, "<f8")
     n = numbers.shape[-1] if n is None else n
     torque = b"" if tau is None else np.asarray(tau, "<f8").tobytes()
@@ -77,7 +77,7 @@ def frame(
 
 
 def read(data: bytes) -> Answer:
-    """Read an answer frame, and check that its length is what its header says."""
+    """Parse an answer frame, and check that its length matches its header."""
     assert isinstance(data, bytes)
     sequence, flags, n, version, late, revision, seconds = struct.unpack_from("<IHHIIQd", data)
     assert flags & ~(STD | LATE | ERROR | UNREAD | SCALE | EXTERNAL | PAYLOAD | FALLBACK) == 0
@@ -99,29 +99,29 @@ def read(data: bytes) -> Answer:
     return Answer(**{**vars(reply), **dict(zip(lengths, parts, strict=True))})
 
 
-def dial(server: Server, path: str = STREAM, **options: Any) -> connect:
-    """A connection to enter as a context, its first message unread."""
+def open_stream(server: Server, path: str = STREAM, **options: Any) -> connect:
+    """Return a connection, to be entered as a context, whose first message is unread."""
     made = socket.create_connection(("127.0.0.1", server.port), DEADLINE)
     made.settimeout(None)
     url = f"ws://127.0.0.1:{server.port}{path}"
     return connect(url, sock=made, legacy=False, close_timeout=DEADLINE, **{"compression": None, **options})
 
 
-def hello(connection: ClientConnection) -> dict[str, Any]:
-    """The next message, which has to be text: what the service says of the version that answers."""
+def read_hello(connection: ClientConnection) -> dict[str, Any]:
+    """Return the next message, a JSON text that describes the serving version."""
     reply = connection.recv(DEADLINE)
     assert isinstance(reply, str)
     return json.loads(reply)
 
 
-def ask(connection: ClientConnection, request: bytes | str) -> Answer:
-    """Send a frame and read its answer."""
+def send_frame(connection: ClientConnection, request: bytes | str) -> Answer:
+    """Send a frame; return its answer."""
     connection.send(request)
     return read(connection.recv(DEADLINE))
 
 
 def saved_model(server: Server, name: str, version: int) -> TorqueModel:
-    """A version that a server has stored, loaded by lipcore here."""
+    """Load a version from a server's home with lipcore."""
     settings = Settings(home=server.home)
     database = Database.of(settings)
     try:
@@ -131,12 +131,12 @@ def saved_model(server: Server, name: str, version: int) -> TorqueModel:
 
 
 def motions(count: int, n: int = 2, seed: int = 0) -> np.ndarray:
-    """Motions (count, 3, n) near those that the models are trained on."""
+    """Return motions (count, 3, n) in the range of the training data."""
     return np.random.default_rng(seed).uniform(-0.5, 0.5, (count, 3, n))
 
 
-def batches(server: Server, stream_id: str) -> list[EventRow]:
-    """What is durable of a stream, in the order of the log."""
+def logged_batches(server: Server, stream_id: str) -> list[EventRow]:
+    """Return the durable batches of a stream in the order of the log."""
     database = Database.of(Settings(home=server.home))
     try:
         with database.session() as session:
@@ -146,6 +146,6 @@ def batches(server: Server, stream_id: str) -> list[EventRow]:
         database.close()
 
 
-def rows(server: Server, stream_id: str) -> Rows:
-    """All rows that are durable of a stream."""
-    return Rows.concatenate([log.decode(event.payload) for event in batches(server, stream_id)])
+def logged_rows(server: Server, stream_id: str) -> Rows:
+    """Return all durable rows of a stream."""
+    return Rows.concatenate([log.decode(event.payload) for event in logged_batches(server, stream_id)])

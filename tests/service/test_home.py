@@ -1,4 +1,4 @@
-"""What a service does with the home it finds: sweep what was interrupted, keep what was finished, lock it."""
+"""Startup on an existing home: interrupted work is cleaned up, finished work is kept, and the home is locked."""
 
 import fcntl
 import json
@@ -22,12 +22,12 @@ from tests.service.warm import Served
 QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5], "covariance": True}
 
 
-def started(home, **settings):
+def start_service(home, **settings):
     return TestClient(create_app(Settings(home=home, **settings)), ADDRESS)
 
 
-def interrupted(name, dataset, attempts, model="again", state="running", **fields):
-    """The row of a job that an earlier run had not done when it ended."""
+def interrupted_job(name, dataset, attempts, model="again", state="running", **fields):
+    """Return the row of a job that an earlier run had not finished."""
     request = {"datasets": [dataset], "estimator": "lip", "joint_types": ["revolute"] * 2, "options": QUICK}
     return JobRow(
         id=name,
@@ -43,9 +43,9 @@ def interrupted(name, dataset, attempts, model="again", state="running", **field
 
 @pytest.fixture(scope="module")
 def second_start(tmp_path_factory):
-    """A service started on the home of one that was interrupted; what it answered before; that home."""
+    """A service started on the home of an interrupted one, the earlier answers, and that home."""
     home = tmp_path_factory.mktemp("home")
-    with started(home) as api:
+    with start_service(home) as api:
         dataset = upload(api, stream())["id"]
         train(api, "kept", dataset)
         before = {
@@ -55,11 +55,11 @@ def second_start(tmp_path_factory):
         }
     database = Database.of(Settings(home=home))
     with database.transaction() as session:
-        session.add(interrupted("job_again", dataset, attempts=1, cancel_requested=False))
-        session.add(interrupted("job_enough", dataset, attempts=3, cancel_requested=False))
-        session.add(interrupted("job_unwanted", dataset, attempts=1, cancel_requested=True))
+        session.add(interrupted_job("job_again", dataset, attempts=1, cancel_requested=False))
+        session.add(interrupted_job("job_enough", dataset, attempts=3, cancel_requested=False))
+        session.add(interrupted_job("job_unwanted", dataset, attempts=1, cancel_requested=True))
         for number in (1, 2):
-            session.add(interrupted(f"job_waiting{number}", dataset, attempts=0, model="waiting", state="queued"))
+            session.add(interrupted_job(f"job_waiting{number}", dataset, attempts=0, model="waiting", state="queued"))
     database.close()
     (home / "uploads/tmpabc").write_bytes(b"half an upload")
     (home / "datasets/ds_0123.draft").write_bytes(b"half a data set")
@@ -67,11 +67,12 @@ def second_start(tmp_path_factory):
     (home / "versions/.draft-x").mkdir()
     (home / "versions/.draft-x/model.safetensors").write_bytes(b"half a model")
     shutil.copytree(next(home.glob("versions/mv_*")), home / "versions/mv_without_a_row")
-    with started(home) as api:
+    with start_service(home) as api:
         yield api, before, home
 
 
-def test_what_was_finished_is_kept(second_start):
+@pytest.mark.slow
+def test_finished_work_is_kept(second_start):
     api, before, _ = second_start
     assert api.get("/v1/datasets").json() == before["datasets"]
     models = {item["name"]: item for item in api.get("/v1/models").json()["items"]}
@@ -88,17 +89,19 @@ def test_leftovers_of_interrupted_writes_are_swept(second_start):
     assert {path.name for path in (home / "datasets").iterdir()} == datasets
     ended(api, "job_waiting2")
     names = {path.name for path in (home / "versions").iterdir()}
-    assert len(names) == 5  # panda-sim, kept, and the three made after the restart
+    assert len(names) == 5  # panda-sim, kept, and the three trained after the restart
     assert not names & {".draft-x", "mv_without_a_row"}
 
 
-def test_an_interrupted_job_is_done_again(second_start):
+@pytest.mark.slow
+def test_interrupted_job_is_done_again(second_start):
     api, _, _ = second_start
     seen = ended(api, "job_again")
     assert (seen["state"], seen["attempts"], seen["version"]) == ("succeeded", 2, 1)
 
 
-def test_a_job_that_was_interrupted_too_often_fails_and_an_unwanted_one_is_cancelled(second_start):
+@pytest.mark.slow
+def test_interrupted_jobs_fail_after_three_attempts_or_are_cancelled(second_start):
     api, _, _ = second_start
     seen = job(api, "job_enough")
     assert (seen["state"], seen["attempts"], seen["error"]["code"]) == ("failed", 3, "interrupted")
@@ -106,8 +109,8 @@ def test_a_job_that_was_interrupted_too_often_fails_and_an_unwanted_one_is_cance
     assert job(api, "job_unwanted")["state"] == "cancelled"
 
 
-def earlier_release(home, job):
-    """A home whose newest version of the shipped model is of a format that is no longer read."""
+def make_earlier_home(home, job):
+    """Make a home whose newest version of the shipped model has an obsolete format."""
     database, files = Database.of(Settings(home=home)), Files(home)
     registry.install_shipped(database, files)
     with database.transaction() as session:
@@ -118,8 +121,8 @@ def earlier_release(home, job):
     database.close()
 
 
-def test_an_upgrade_brings_its_shipped_model(home):
-    earlier_release(home, job=None)
+def test_upgrade_adds_its_shipped_model(home):
+    make_earlier_home(home, job=None)
     with TestClient(create_app(Settings(home=home)), ADDRESS) as api:
         assert api.get("/v1/models/panda-sim").json()["latest_version"] == 2
         query = {"q": [0.0] * 7, "dq": [0.0] * 7, "ddq": [0.0] * 7}
@@ -131,19 +134,22 @@ def test_an_upgrade_brings_its_shipped_model(home):
 
 
 @pytest.mark.slow
-def test_an_upgrade_leaves_a_model_alone_that_the_user_has_trained(home):
-    earlier_release(home, job="job_of_the_user")
+def test_upgrade_keeps_a_model_that_the_user_has_trained(home):
+    make_earlier_home(home, job="job_of_the_user")
     with TestClient(create_app(Settings(home=home)), ADDRESS) as api:
         assert api.get("/v1/models/panda-sim").json()["latest_version"] == 1
 
 
-def test_a_second_service_on_the_same_home_is_refused(second_start):
+def test_second_service_on_a_home_is_rejected(second_start):
     _, _, home = second_start
-    with pytest.raises(HomeInUseError, match=r"another service uses .*: stop it, or set LIPSERVE_HOME"), started(home):
+    with (
+        pytest.raises(HomeInUseError, match=r"another service uses .*: stop it, or set LIPSERVE_HOME"),
+        start_service(home),
+    ):
         pass
 
 
-def test_deleting_the_lock_file_admits_no_second_service(tmp_path):
+def test_deleted_lock_file_admits_no_second_service(tmp_path):
     with lock_home(tmp_path / "home"):
         (tmp_path / "home" / ".lock").unlink()
         with pytest.raises(HomeInUseError):
@@ -151,14 +157,14 @@ def test_deleting_the_lock_file_admits_no_second_service(tmp_path):
     lock_home(tmp_path / "home").close()
 
 
-def test_where_folders_cannot_be_locked_the_file_is(tmp_path):
+def test_lock_file_is_used_if_folders_cannot_be_locked(tmp_path):
     with (tmp_path / ".lock").open("w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         with pytest.raises(HomeInUseError):
             lock_home(tmp_path)
 
 
-def test_a_new_home_is_its_owners_alone(tmp_path):
+def test_new_home_belongs_to_its_owner_alone(tmp_path):
     home = tmp_path / "home"
     mask = os.umask(0)
     try:
@@ -170,7 +176,7 @@ def test_a_new_home_is_its_owners_alone(tmp_path):
     assert {stat.S_IMODE(file.stat().st_mode) for file in home.glob("lipserve.sqlite3*")} == {0o600}
 
 
-def test_a_second_server_on_the_same_home_says_why_it_ends(server, tmp_path):
+def test_second_server_explains_why_it_exits(server, tmp_path):
     log = tmp_path / "second.log"
     second = Served(["serve", "--port", "0"], {**os.environ, "LIPSERVE_HOME": str(server.home)}, log)
     assert second.wait(DEADLINE) != 0

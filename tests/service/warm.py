@@ -1,6 +1,6 @@
-"""Processes of services that take a moment to start: forked from one that has imported what they need.
+"""Service processes that start quickly: forked from a process that has imported their modules.
 
-A service that tests share, and training and learning of all services in this process, start so; others as always.
+Shared services, and training and learning of all services in this process, start in this way; others start as usual.
 """
 
 import os
@@ -35,7 +35,7 @@ STARTERS = ("service.runtime.process", "service.runtime.companion")
 
 
 class _Popen(popen_forkserver.Popen):
-    """A forked process whose exit code several threads may ask for: it can be read once, then it would be 255."""
+    """A forked process whose exit code several threads may request, as it can be read only once (255 afterwards)."""
 
     reading = Lock()
 
@@ -47,7 +47,7 @@ class _Popen(popen_forkserver.Popen):
 
 
 class _Process(ForkServerProcess):
-    """A process with the environment of who starts it, as a spawned one has."""
+    """A process with the environment of its parent, like a spawned one."""
 
     def __init__(
         self,
@@ -86,7 +86,7 @@ def _enter(
 
 @contextmanager
 def warm_processes() -> Iterator[None]:
-    """Let services of this process fork theirs."""
+    """Let services of this process fork their processes."""
     with (
         patch.multiple(STARTERS[0], multiprocessing=_shim()),
         patch.multiple(STARTERS[1], multiprocessing=_shim()),
@@ -96,8 +96,8 @@ def warm_processes() -> Iterator[None]:
 
 
 def _start(control: socket.socket) -> ForkServerProcess:
-    """Start a process that reads uploads, of which each service has one."""
-    # who ends does not wait for it, as it waits for calls
+    """Start the process that reads uploads, one for each service."""
+    # a daemon, so that exit does not wait for it
     process = _context().Process(target=_serve_calls, args=(control,), daemon=True)
     process.start()
     return process
@@ -116,8 +116,10 @@ def _shim() -> SimpleNamespace:
 
 
 class Served:
-    """`lipserve` with arguments, in a process of its own that is used like `subprocess.Popen`. log: of its output;
-    constants: of the service, by module and name, that it has other values of."""
+    """`lipserve` with arguments in a process of its own, used like `subprocess.Popen`.
+
+    log: file for its output; constants: of the service, by module and name, to replace.
+    """
 
     def __init__(
         self,
@@ -137,7 +139,7 @@ class Served:
         self.pid = self._process.pid
 
     def poll(self) -> int | None:
-        """The exit code, None while it runs."""
+        """Return the exit code, None while it runs."""
         return self._process.exitcode
 
     def wait(self, timeout: float | None = None) -> int:
@@ -152,7 +154,7 @@ class Served:
         os.kill(self.pid, number)
 
     def terminate(self) -> None:
-        """Ask it to end."""
+        """Send SIGTERM."""
         self.send_signal(signal.SIGTERM)
 
 
@@ -164,7 +166,7 @@ def _serve(
     with log.open("ab") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    # its own processes are forked by the same server as itself, which is not its child
+    # this process and its children are forked by the same server, which is no child of this process
     forkserver._forkserver._forkserver_address = address  # type: ignore[attr-defined]
     forkserver._forkserver.ensure_running = lambda: None  # type: ignore[attr-defined]
     for module in STARTERS:
@@ -173,7 +175,7 @@ def _serve(
     for place, value in constants.items():
         module, _, name = place.rpartition(".")
         vars(import_module(module))[name] = value
-    current_process().name = "MainProcess"  # as logs have it
+    current_process().name = "MainProcess"  # the name in logs
     sys.argv = ["lipserve", *arguments]
     from service.__main__ import main
 

@@ -1,4 +1,4 @@
-"""Found by processes that get this folder on their path, but no environment, as those that read uploads."""
+"""Hides the module from processes that inherit the path but not the environment, such as readers of uploads."""
 
 from hiding import hide
 

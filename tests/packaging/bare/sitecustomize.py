@@ -1,6 +1,6 @@
-"""Hides packages. Python imports this at its start, from PYTHONPATH.
+"""Hides the modules in LIPSERVE_TEST_HIDDEN, separated by commas.
 
-LIPSERVE_TEST_HIDDEN: their modules, separated by commas. Spawned processes inherit it.
+Python imports this file from PYTHONPATH at its start; spawned processes inherit both variables.
 """
 
 import os

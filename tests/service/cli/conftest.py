@@ -9,13 +9,13 @@ from tests.service.models.versions import NO_BODIES, publish_arm_at
 
 
 def options_of_train(options):
-    """Options of a fit as `lipserve train` takes them."""
+    """Return fit options as arguments of `lipserve train`."""
     values = [part for name, value in options.items() for part in ("--option", f"{name}={value}")]
     return ["--estimator", "lip-chain", *values]
 
 
 QUICKLY = options_of_train(QUICK)
-"""Options of `lipserve train` for a fit that takes a fraction of a second."""
+"""Arguments of `lipserve train` for a fit that takes a fraction of a second."""
 
 
 @pytest.fixture
@@ -34,7 +34,7 @@ def lipserve(monkeypatch, capsys):
 
 @pytest.fixture
 def asked(lipserve, server):
-    """Run a command against the shared service; return its output, or its JSON where that is asked for."""
+    """Run a command against the shared service; return its output, with --json as parsed JSON."""
 
     def run(*arguments):
         code, out, err = lipserve(*arguments, "--url", server.url)
@@ -46,7 +46,7 @@ def asked(lipserve, server):
 
 @pytest.fixture
 def refused(lipserve, server):
-    """Run a command that the shared service refuses; return what it says."""
+    """Run a command that the shared service rejects; return its error output."""
 
     def run(*arguments):
         code, out, err = lipserve(*arguments, "--url", server.url)
@@ -70,7 +70,7 @@ def recording(tmp_path):
 
 @pytest.fixture(scope="session")
 def arm(server):
-    """A trained double pendulum in the shared service, of two versions on one data set; its name and data set."""
+    """Name and data set of a double pendulum with two versions in the shared service."""
     dataset = upload(server.client, stream())["id"]
     for seed in (1, 2):
         train(server.client, "cli-arm", dataset, estimator="se", options={**QUICK, "starts": seed})
@@ -79,7 +79,7 @@ def arm(server):
 
 @pytest.fixture(scope="session")
 def robot_arm(server):
-    """Two versions in the shared service, the second without rigid bodies; the name of their model."""
+    """Name of a model in the shared service with two versions, the second without rigid bodies."""
     publish_arm_at(server.home, "cli-robot-arm")
     publish_arm_at(server.home, "cli-robot-arm", **NO_BODIES)
     return "cli-robot-arm"

@@ -1,4 +1,4 @@
-"""`lipserve data` and `simulate`: recordings made, brought in, reported on, and deleted."""
+"""`lipserve data` and `lipserve simulate`."""
 
 from dataclasses import replace
 
@@ -12,14 +12,14 @@ from lipcore.robots.library import ROBOTS
 from lipcore.robots.simulation import Payload
 from service.cli.simulate import write_recording
 from service.datasets.formats.opening import open_table
-from service.datasets.mapping.mapping import resolve
+from service.datasets.mapping.mapping import map_columns
 from service.datasets.options import ReadOptions, UploadOptions
 from service.foundation.settings import Settings
 from tests.service.data import arrays, ended, stream
 
 
 def read(path):
-    """A written recording as it was uploaded: columns by their names."""
+    """Read a written recording like an upload; return the table and its columns by name."""
     with open_table(path, None, ReadOptions(), Settings()) as table:
         rows = np.concatenate(list(table.blocks))
         return table, dict(zip(table.names, rows.T, strict=True))
@@ -29,7 +29,7 @@ WORDS = {"q": "position", "dq": "velocity", "ddq": "acceleration", "tau": "torqu
 
 
 @pytest.mark.parametrize("ending", ["csv", "npz"])
-def test_simulated_streams_are_read_back_equal(lipserve, tmp_path, ending):
+def test_simulated_recordings_are_read_back_unchanged(lipserve, tmp_path, ending):
     path = tmp_path / f"stream.{ending}"
     code, out, _ = lipserve("simulate", "double-pendulum", path, "--samples", 50, "--seed", 3, "--rate", 20)
     assert code == 0
@@ -42,7 +42,7 @@ def test_simulated_streams_are_read_back_equal(lipserve, tmp_path, ending):
     assert table.joint_names == (None if ending == "csv" else ("joint1", "joint2"))
 
 
-def test_options_of_the_simulator_matter(lipserve, tmp_path):
+def test_simulation_options_have_effect(lipserve, tmp_path):
     options = ("--noise", 0, "--viscous", 2, "--coulomb", 1, "--payload", 3, "--fast", "--motion", "full")
     assert lipserve("simulate", "ur5", tmp_path / "other.npz", "--samples", 40, *options)[0] == 0
     columns = read(tmp_path / "other.npz")[1]
@@ -57,17 +57,18 @@ def test_options_of_the_simulator_matter(lipserve, tmp_path):
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
-def test_simulated_recordings_carry_the_names_of_the_robots_joints(tmp_path, robot):
+def test_simulated_recordings_have_the_joint_names_of_the_robot(tmp_path, robot):
     names, moved = ROBOTS[robot].free, np.linspace(0.0, 1.0, 3 * len(ROBOTS[robot].free)).reshape(3, -1)
     path, times = tmp_path / "named.csv", np.arange(3.0)
     write_recording(path, Samples(names, times, np.zeros(3, np.int64), moved, moved, moved, moved))
     table, _ = read(path)
     for known in (None, profile(robot)):
-        columns = resolve(table.names, table.units, table.joint_names, UploadOptions(), known, len(names))
+        columns = map_columns(table.names, table.units, table.joint_names, UploadOptions(), known, len(names))
         assert (columns.joints, columns.unused, columns.torque.effort) == (names, (), "measured")
 
 
-def test_the_same_recording_is_the_same_data_set(asked, recording, tmp_path):
+@pytest.mark.slow
+def test_same_recording_gives_the_same_data_set(asked, recording, tmp_path):
     path = recording(75, "twice.csv")
     first = asked("data", "add", path, "--json")
     again = tmp_path / "elsewhere" / "twice.csv"
@@ -80,7 +81,8 @@ def test_the_same_recording_is_the_same_data_set(asked, recording, tmp_path):
     assert asked("data", "add", path, "--json")["id"] != first["id"]  # what was deleted is stored anew
 
 
-def test_a_file_is_the_data_set_that_it_was_made_before(lipserve, asked, refused, server, recording):
+@pytest.mark.slow
+def test_file_is_found_as_its_existing_data_set(lipserve, asked, refused, server, recording):
     path = recording(90, "read-before.csv", samples=60)
     made = asked("data", "add", path, "--name", "otherwise", "--joint-names", "shoulder,elbow", "--json")
     job = asked("train", path, "--model", "cli-of-file", "--estimator", "se", "--no-wait", "--json")
@@ -90,49 +92,52 @@ def test_a_file_is_the_data_set_that_it_was_made_before(lipserve, asked, refused
     code, _, err = lipserve("data", "add", path, "--name", "plain", "--url", server.url)
     assert code == 0, err
     message, hint = refused("evaluate", "panda-sim", path).splitlines()
-    assert "read-before.csv was uploaded before, read in 2 ways: expected the id of one of them: ds_" in message
+    assert (
+        "read-before.csv was uploaded before and read in 2 different ways: give the id of one data set: ds_" in message
+    )
     assert f"{made['id']} (no robot, " in message
     assert "`lipserve data show ID`" in hint
     asked("data", "delete", "plain", "--yes")
-    assert "the joints shoulder, elbow" in refused("evaluate", "panda-sim", path)
+    assert "are shoulder, elbow" in refused("evaluate", "panda-sim", path)
 
 
-def test_data_sets_are_known_by_their_names(asked, refused, arm, recording):
+@pytest.mark.slow
+def test_data_sets_can_be_given_by_name(asked, refused, arm, recording):
     path = recording(76, "by-name.csv")
     made = asked("data", "add", path, "--name", "by name", "--json")
     assert asked("data", "show", "by name", "--json") == made
     assert asked("evaluate", arm[0], "by name", "--json")["dataset"] == made["id"]
     other = asked("data", "add", path, "--name", "by name", "--cutoff", 3, "--filtering", "always", "--json")
     message = refused("data", "delete", "by name", "--yes")
-    assert f"expected the id of one of those that are called so: {other['id']}, {made['id']}" in message
+    assert f"Use one of their ids: {other['id']}, {made['id']}" in message
     asked("data", "delete", made["id"], "--yes")
     assert asked("data", "delete", "by name", "--yes", "--json") == {"deleted": ["by name"]}
     assert "no dataset 'by name'" in refused("evaluate", arm[0], "by name")
 
 
-def test_refusals_of_an_upload_speak_as_the_shell_does(refused, recording, tmp_path):
+def test_upload_errors_name_command_line_options(refused, recording, tmp_path):
     path = recording(77, "in-degrees.csv", samples=60)
     samples = stream(seed=77, samples=60)
     turned = replace(samples, q=np.degrees(samples.q) * 50)
     write_recording(path, turned)
     message = refused("data", "add", path)
-    assert "are these degrees? Then say --unit q=deg, or --unit q=rad if joints turn on (invalid_data" in message
+    assert "Set --unit q=deg if these are degrees, or --unit q=rad if the joint turns this far (invalid_data" in message
     hint = refused("train", path, "--model", "never").splitlines()[-1]
-    assert f"`lipserve data add {path}` takes options that say how to read it" in hint
+    assert f"upload it with `lipserve data add {path}`, which has options for reading" in hint
     write_recording(path, replace(samples, q=samples.q * [1.0, 0.0]))
-    assert "leave out locked joints, --drop joint2 (invalid_data" in refused("data", "add", path)
+    assert "Leave out locked joints with --drop joint2 (invalid_data" in refused("data", "add", path)
 
 
 @pytest.fixture
 def flat(tmp_path):
-    """Files of a recording without column names: positions.txt, velocities.txt, torques.txt; and its samples."""
+    """Files without column names (positions.txt, velocities.txt, torques.txt), and their samples."""
     samples = stream(seed=78, samples=60, rate=50.0)
     for name, quantity in (("positions", "q"), ("velocities", "dq"), ("torques", "tau")):
         np.savetxt(tmp_path / f"{name}.txt", getattr(samples, quantity))
     return [tmp_path / f"{name}.txt" for name in ("positions", "velocities", "torques")], samples
 
 
-def test_files_that_belong_together_are_joined(asked, refused, flat):
+def test_join_makes_one_data_set_of_several_files(asked, refused, flat):
     files, samples = flat
     made = asked("data", "add", *files, "--join", "--dt", 0.02, "--filtering", "never", "--json")
     assert (made["name"], made["report"]["rows_uploaded"]) == ("positions+velocities+torques", 60)
@@ -141,13 +146,15 @@ def test_files_that_belong_together_are_joined(asked, refused, flat):
     options = ("--join", "--dt", 0.02, "--filtering", "never", "--json")
     assert asked("data", "add", *files, *options)["id"] == made["id"]
     message, hint = refused("data", "add", *files, "--dt", 0.02).splitlines()
-    assert "or --columns t,q1..q7,tau1..tau7 names them" in message
-    assert hint == "hint: --join takes files for one recording"
+    assert "Or set --columns t,q1..q7,tau1..tau7 (invalid_data" in message
+    assert hint == "hint: if the files are parts of one recording, add --join"
     files[2].write_text("\n".join(files[2].read_text().splitlines()[:50]))
-    assert "torques.txt is 50 rows, expected 60, as positions.txt has" in refused("data", "add", *files, "--join")
+    assert "torques.txt is a table of 50 rows, expected 60 rows, like positions.txt" in refused(
+        "data", "add", *files, "--join"
+    )
 
 
-def test_tables_without_names_are_named_from_the_shell(asked, refused, tmp_path):
+def test_columns_option_names_tables_without_header(asked, refused, tmp_path):
     samples = stream(seed=79, samples=60, rate=50.0)
     path, table = tmp_path / "bare.csv", np.column_stack([samples.t, samples.q, samples.dq, samples.ddq, samples.tau])
     np.savetxt(path, table, delimiter=",")
@@ -158,7 +165,7 @@ def test_tables_without_names_are_named_from_the_shell(asked, refused, tmp_path)
     assert "--columns is q5..q1, expected a range" in refused("data", "add", path, "--columns", "q5..q1")
 
 
-def test_an_upload_prints_its_report(asked, recording):
+def test_upload_prints_its_report(asked, recording):
     path = recording(72, "two-joints.csv", samples=600, rate=100.0)
     options = ("--joint-names", "shoulder,elbow", "--filtering", "always", "--rate", 50)
     text = asked("data", "add", path, *options)
@@ -166,7 +173,7 @@ def test_an_upload_prints_its_report(asked, recording):
         assert part in text
 
 
-def test_what_is_added_is_listed_shown_and_deleted(asked, refused, recording):
+def test_added_data_set_is_listed_shown_and_deleted(asked, refused, recording):
     paths = [recording(84, name) for name in ("a.csv", "b.csv")]
     options = ("--name", "monday", "--column", "q={joint}/position", "--unit", "t=s")
     added = asked("data", "add", paths[0], *options, "--json")

@@ -1,4 +1,4 @@
-"""`lipserve learning`, `alarms` and `robots`; and that every route has a command or a reason not to have one."""
+"""`lipserve learning`, `alarms` and `robots`; every route has a command, or a reason not to have one."""
 
 import ast
 import inspect
@@ -12,7 +12,7 @@ from lipserve.wording import percent
 from service import cli
 from tests.service.cli.conftest import QUICKLY
 from tests.service.data import eventually
-from tests.service.learning.lessons import lesson
+from tests.service.learning.learning_models import observation_batch
 
 REASONS = {
     ("GET", "/metrics"): "for Prometheus, in its own format",
@@ -42,17 +42,17 @@ REASONS = {
         "of the Open Inference Protocol, which has clients of its own",
     ),
 }
-"""Routes without a command, and why."""
+"""Routes without a command, and the reason."""
 
 
 def methods(source, owner):
-    """Methods that a source calls of what it names `owner`."""
+    """Return the methods that a source calls on the name `owner`."""
     nodes = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Attribute)]
     return {node.attr for node in nodes if isinstance(node.value, ast.Name) and node.value.id == owner}
 
 
 def used_by_commands():
-    """Calls of the client that commands make, also by methods which make others; the demo is no command of any."""
+    """Return the client calls that commands use, also indirectly; the demo does not count."""
     commands = [path for path in Path(cli.__file__).parent.glob("*.py") if path.name != "demo.py"]
     sources = [path.read_text() for path in commands]
     used = set().union(*(methods(source, "client") for source in sources))
@@ -62,7 +62,7 @@ def used_by_commands():
     return used
 
 
-def test_every_route_has_its_command_or_a_reason(api):
+def test_every_route_has_a_command_or_a_reason(api):
     used, kinds = used_by_commands(), ("get", "post", "put", "patch", "delete")
     paths = api.get("/openapi.json").json()["paths"]
     routes = {(method.upper(), path) for path, found in paths.items() for method in found if method in kinds}
@@ -74,7 +74,7 @@ def test_every_route_has_its_command_or_a_reason(api):
 
 @pytest.fixture
 def pupil(server, arm):
-    """A model of its own that has been taught two batches."""
+    """Separate model that has learnt two batches."""
     name, _ = arm
     archive = server.client.get(f"/v1/models/{name}/export").content
     headers = {"content-type": "application/x-tar"}
@@ -83,21 +83,22 @@ def pupil(server, arm):
     )
     assert made.status_code == 201, made.text
     for number in range(2):
-        answer = server.client.post("/v1/models/cli-pupil/observations", json=lesson(number))
+        answer = server.client.post("/v1/models/cli-pupil/observations", json=observation_batch(number))
         assert answer.status_code == 200, answer.text
     eventually(lambda: server.client.get("/v1/models/cli-pupil/learning").json()["status"]["published"] == 2)
     yield "cli-pupil"
     assert server.client.delete("/v1/models/cli-pupil").status_code == 204
 
 
-def test_learning_is_shown_set_and_taken_back(asked, refused, server, pupil):
+@pytest.mark.slow
+def test_learning_is_shown_set_and_undone(asked, refused, server, pupil):
     quality = server.client.get(f"/v1/models/{pupil}/quality").json()
     text = asked("learning", "show", pupil)
-    assert "revision 2 of 2: learning goes on" in text
+    assert "revision 2 of 2: learning is active" in text
     rows = quality["windows"][-1]["rows"]
-    assert f"{rows} rows of the last 3600 s, each predicted before it was learnt" in text
+    assert f"prediction of {rows} rows of the last 3600 s, before learning from them" in text
     assert asked("learning", "show", pupil, "--json")["quality"]["revision"] == 2
-    assert "revision 2 of 2 answers" in asked("models", "show", pupil)
+    assert "revision 2 of 2 serving" in asked("models", "show", pupil)
 
     text = asked("learning", "set", pupil, "contact_threshold=100", "on_change=learn", "auto_refresh=false")
     assert "on_change = learn" in text
@@ -108,23 +109,23 @@ def test_learning_is_shown_set_and_taken_back(asked, refused, server, pupil):
     found = asked("learning", "batches", pupil, "--json")
     assert [each["sequence"] for each in found] == [1, 0]
     assert "learnt" in asked("learning", "batches", pupil, "--stream", "arm")
-    assert f"no batch of {pupil}" in asked("learning", "batches", pupil, "--stream", "nobody")
+    assert f"no batches of {pupil}" in asked("learning", "batches", pupil, "--stream", "nobody")
     seen = asked("learning", "batch", pupil, "arm", 1)
-    assert f"{found[0]['accepted']} of {found[0]['rows']} rows teach" in seen
+    assert f"{found[0]['accepted']} of {found[0]['rows']} rows accepted" in seen
     assert len(asked("learning", "batch", pupil, "arm", 1, "--rows", "--json")["observed"]["q"]) == found[0]["rows"]
-    assert "is unlearnt" in asked("learning", "unlearn", pupil, "arm", 1, "--yes")
+    assert "batch 1 of arm unlearnt" in asked("learning", "unlearn", pupil, "arm", 1, "--yes")
     assert "unlearnt" in asked("learning", "batch", pupil, "arm", 1)
     assert "has been unlearnt" in refused("learning", "replay", pupil, "arm", 1)
-    assert "is deleted" in asked("learning", "forget", pupil, "arm", "--yes")
+    assert f"stream arm of {pupil} deleted" in asked("learning", "forget", pupil, "arm", "--yes")
     assert asked("learning", "show", pupil, "--json")["learning"]["status"]["streams"] == []
 
 
 def test_alarms_are_listed(asked, pupil):
-    assert f"no alarm of {pupil}" in asked("alarms", pupil)
+    assert f"no alarms of {pupil}" in asked("alarms", pupil)
     assert asked("alarms", pupil, "--json") == []
 
 
-def test_quality_stands_in_every_list(asked, server, recording):
+def test_every_list_shows_quality(asked, server, recording):
     path = recording(21, samples=120, rate=10.0)
     asked("train", path, "--model", "cli-listed", *QUICKLY, "--promotion", "always")
     quality = server.client.get("/v1/models/cli-listed").json()["versions"][0]["quality"]
@@ -150,6 +151,6 @@ def test_robots_are_added_listed_shown_and_deleted(asked, refused, tmp_path):
     assert "sha256" in shown
     assert "-1" in next(line for line in shown.splitlines() if " j " in line)
     assert "7 joints" in asked("robots", "show", "panda")
-    assert "is deleted" in asked("robots", "delete", robot, "--yes")
+    assert f"{robot} deleted" in asked("robots", "delete", robot, "--yes")
     assert "no robot" in refused("robots", "show", robot)
     assert "expected a .urdf file" in refused("robots", "add", Path(__file__))

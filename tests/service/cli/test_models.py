@@ -20,19 +20,19 @@ def test_models_are_listed_and_shown(asked, arm):
     assert shown["version"]["version"] == shown["model"]["serving_version"]
     text = asked("models", "show", name, "--version", 1)
     assert "version 1: se, 2 joints: joint1, joint2" in text
-    assert "nothing was held out" in text
+    assert "no data were held out" in text
 
 
-def test_promoting_is_taken_back(asked, arm):
+def test_promotion_can_be_rolled_back(asked, arm):
     name, _ = arm
     assert asked("models", "promote", name, 1, "--json")["version"] == 1
-    assert "version 2 answers where none is named" in asked("models", "promote", name, 2)
+    assert f"serving → {name} version 2" in asked("models", "promote", name, 2)
     assert asked("models", "rollback", name, "--json")["version"] == 1
     asked("models", "promote", name, 2)
     assert "version 1" in asked("models", "promote", name, 1, "--alias", "night")
     assert asked("models", "promote", name, "night", "--alias", "day", "--json")["version"] == 1
     assert asked("predict", name, "--q", "0.1,0.2", "--alias", "day", "--json")["version"] == 1
-    assert "names version 1" in asked("models", "alias", name, "day")
+    assert f"day → {name} version 1" in asked("models", "alias", name, "day")
     asked("models", "alias", name, "day", 2)
     assert asked("models", "alias", name, "day", "--json")["version"] == 2
     asked("models", "alias", name, "day", "--remove")
@@ -44,21 +44,21 @@ def test_versions_are_compared(asked, arm):
     assert [each["version"] for each in compared["versions"]] == [1, 2]
     text = asked("models", "compare", name, dataset, 1, 2)
     assert compared["verdict"] in text
-    assert "careful: " in text  # both were trained on it
+    assert "warning: " in text  # both were trained on it
 
 
-def test_an_archive_is_written_read_and_deleted(asked, arm, refused, tmp_path):
+def test_archive_is_exported_imported_and_deleted(asked, arm, refused, tmp_path):
     name, _ = arm
     path = tmp_path / "arm.tar"
     assert asked("models", "export", name, path, "--version", 1, "--json")["bytes"] == path.stat().st_size
     made = asked("models", "import", path, "--name", "cli-imported", "--json")
     assert (made["model"], made["version"]) == ("cli-imported", 1)
-    assert "for good?" in refused("models", "delete", "cli-imported")  # nobody has answered the question
+    assert "permanently?" in refused("models", "delete", "cli-imported")  # nobody has answered the question
     asked("models", "delete", "cli-imported", "--yes")
     assert "no model 'cli-imported'" in refused("models", "show", "cli-imported")
 
 
-def test_a_version_is_written_as_c(asked, refused, arm, robot_arm, tmp_path):
+def test_version_is_exported_as_c(asked, refused, arm, robot_arm, tmp_path):
     folder = tmp_path / "made" / "c"
     written = asked("models", "export", robot_arm, "--c", folder, "--version", 1, "--json")
     assert sorted(written.values()) == sorted(map(str, folder.iterdir()))
@@ -68,14 +68,16 @@ def test_a_version_is_written_as_c(asked, refused, arm, robot_arm, tmp_path):
         "models", "export", arm[0], "--c", tmp_path / "none", "--version", 1
     )
     assert not (tmp_path / "none").exists()
-    assert "both given, expected one of them" in refused("models", "export", robot_arm, "x.tar", "--c", folder)
-    assert "missing, expected one of them" in refused("models", "export", robot_arm)
+    assert "give an archive to write or --c FOLDER, not both" in refused(
+        "models", "export", robot_arm, "x.tar", "--c", folder
+    )
+    assert "give an archive to write or --c FOLDER\n" in refused("models", "export", robot_arm)
 
 
-def test_what_a_version_has_learnt_of_its_arm_is_shown(asked, refused, robot_arm):
+def test_estimated_arm_is_shown(asked, refused, robot_arm):
     text = asked("models", "show", robot_arm, "--version", 1)
-    assert f"careful: {WARNING}" in text
-    parts = ("where the joints lie", "rotor kg·m²", "mass, first moment", "shift 2", "mirror image", "-0.05 ± 0.01")
+    assert f"warning: {WARNING}" in text
+    parts = ("joint frames", "rotor kg·m²", "mass, first moment", "shift 2", "mirror image", "-0.05 ± 0.01")
     assert [part for part in parts if part not in text] == []
     assert "mirror image" not in asked("models", "show", robot_arm)
     assert describe(asked("models", "urdf", robot_arm, "--version", 1)).joint_names == JOINTS
@@ -86,15 +88,15 @@ def test_what_a_version_has_learnt_of_its_arm_is_shown(asked, refused, robot_arm
     ("arguments", "hint"),
     [
         (("models", "show", "cli-arm", "--version", 99), "`lipserve models show MODEL` shows the versions"),
-        (("models", "alias", "cli-arm", "noon"), "`lipserve models alias cli-arm noon VERSION` makes it"),
+        (("models", "alias", "cli-arm", "noon"), "`lipserve models alias cli-arm noon VERSION` creates it"),
         (("evaluate", "cli-arm", "ds_none"), "`lipserve data list` shows the data sets"),
         (("evaluate", "cli-arm", "nowhere.csv"), "`lipserve data list` shows the data sets"),
         (("jobs", "show", "job_none"), "`lipserve jobs list` shows the jobs"),
-        (("stream", "nobody", "--simulate", "double-pendulum"), "models that exist: "),
+        (("stream", "nobody", "--simulate", "double-pendulum"), "existing models: "),
         (("stream", "cli-arm"), "`lipserve stream cli-arm --simulate panda`"),
     ],
 )
-def test_refusals_say_what_to_do(refused, arm, arguments, hint):
+def test_errors_have_hints(refused, arm, arguments, hint):
     assert f"hint: {hint}" in refused(*arguments)
 
 
@@ -103,7 +105,7 @@ def judged(estimator, nmse, **given):
     return SelectionCandidate(estimator=estimator, nmse=nmse, **{**figures, "error": None, **given})
 
 
-def test_how_an_estimator_was_chosen_is_printed(capsys):
+def test_estimator_selection_is_printed(capsys):
     failed = judged("lip-chain", None, log_density=None, error="no [factor]")
     best = judged("rigid-body", [0.01, 0.03], difference=0.0, standard_error=None, edge_nmse=[0.05, 0.09])
     held = SelectionHeldOut(rows=90, blocks=6, repeats=True, edge_rows=30, edge_blocks=2)
@@ -111,28 +113,28 @@ def test_how_an_estimator_was_chosen_is_printed(capsys):
     print_selection(Selection(**made, table=[best, judged("rigid-body+lip-chain", None)]))
     out = capsys.readouterr().out
     parts = (
-        "6 stretches",
+        "6 held-out blocks",
         "2 at the edge",
-        "rigid-body (chosen)",
+        "rigid-body (selected)",
         "2.00e-02",
         "7.00e-02",
         "90.0 %",
         "0.25 ± 0.10",
         "it errs least",
-        "these figures flatter",
+        "figures are too optimistic",
     )
     assert not [each for each in parts if each not in out]
     nothing = SelectionHeldOut(rows=0, blocks=0, repeats=False)
     print_selection(Selection(**{**made, "held_out": nothing}, table=[failed]))
     out = capsys.readouterr().out
-    assert ("not judged" in out, "failed: no [factor]" in out, "flatter" in out) == (True, True, False)
+    assert ("not evaluated" in out, "failed: no [factor]" in out, "optimistic" in out) == (True, True, False)
 
 
-def test_what_a_fit_says_of_each_joint_is_shown(capsys):
+def test_fit_report_of_each_joint_is_printed(capsys):
     fit = {"right_angle_2": 0.25, "right_angle_10": 1.0, "local_2": 0.131, "iterations": 9}
     names = [f"j{number}" for number in range(1, 11)]
     print_of_joints(SimpleNamespace(joint_names=names, fit=fit))
     said = capsys.readouterr().out
-    assert "axes at right angles, how probably: j2 0.25, j10 1" in said
-    assert "error that is left: j2 0.13" in said
-    assert "widened" not in said
+    assert "probability that the axis is at a right angle: j2 0.25, j10 1" in said
+    assert "remaining squared error after local correction: j2 0.13" in said
+    assert "interval width" not in said

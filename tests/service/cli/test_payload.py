@@ -1,30 +1,30 @@
-"""`lipserve payload`: what arms carry, in words; declared, and said to be gone."""
+"""`lipserve payload`: show, declare and remove payloads."""
 
 import pytest
 
-from tests.service.learning.payloads import lifting
+from tests.service.learning.payloads import payload_batches
 from tests.service.models.versions import publish_arm_at
 
 
 @pytest.fixture(scope="module")
 def carrier(server):
-    """A model of an arm in the shared service."""
+    """Name of a model of an arm in the shared service."""
     publish_arm_at(server.home, "cli-carrier")
     return "cli-carrier"
 
 
-def test_a_payload_is_declared_shown_and_removed(server, asked, carrier):
-    assert f"no stream has told yet what an arm of {carrier} carries" in asked("payload", carrier)
+def test_payload_is_declared_shown_and_removed(server, asked, carrier):
+    assert f"no payload estimates of {carrier} yet" in asked("payload", carrier)
     for stream_id in ("cell-1", "cell-2"):
-        (first, *_) = lifting(stream_id, 0.0)
+        (first, *_) = payload_batches(stream_id, 0.0)
         assert server.client.post(f"/v1/models/{carrier}/observations", json=first).status_code == 200
     declare = ("payload", carrier, "--mass", 1.5, "--com", "0,0.02,0.12")
     text = asked(*declare, "--stream", "cell-1")
     for line in (
-        "stream cell-1 carries 1.50 ± 0.03 kg, declared",
+        "stream cell-1: payload 1.50 ± 0.03 kg, declared",
         "0.000 ± 0.005, 0.020 ± 0.005, 0.120 ± 0.005 m",
-        "in the frame of the link behind panda_joint7, as it was learnt",
-        "kilograms only as well as its lengths",
+        "in the frame of the link after joint panda_joint7, as estimated",
+        "kilograms are only as accurate as lengths",
     ):
         assert line in text
     asked("payload", carrier, "--mass", 12, "--com", "0,0,0.1", "--stream", "cell-2")
@@ -33,12 +33,12 @@ def test_a_payload_is_declared_shown_and_removed(server, asked, carrier):
     assert [("1.50 ± 0.03 kg" in row, "12.00 ± 0.24 kg" in row) for row in rows] == [(True, False), (False, True)]
     shown = asked("payload", carrier, "--stream", "cell-2", "--json")
     assert [each["stream_id"] for each in shown["streams"]] == ["cell-2"]
-    assert "stream cell-2 carries nothing" in asked("payload", carrier, "--remove", "--stream", "cell-2")
+    assert "stream cell-2: payload none" in asked("payload", carrier, "--remove", "--stream", "cell-2")
     assert asked("payload", carrier, "--json")["streams"][0]["payload"]["mass"]["mean"] == pytest.approx(1.5)
-    assert f"declared for all of {carrier}: 2.00 ± 0.04 kg" in asked(
+    assert f"declared for all streams of {carrier}: 2.00 ± 0.04 kg" in asked(
         "payload", carrier, "--mass", 2, "--com", "0,0,0.1", "--inertia", "0.01,0,0,0.01,0,0.01"
     )
-    assert "carries 2.00" in asked("payload", carrier, "--stream", "cell-2")
+    assert "payload 2.00" in asked("payload", carrier, "--stream", "cell-2")
     asked("payload", carrier, "--remove")
     gone = asked("payload", carrier, "--json")
     assert (gone["default"], [each["payload"] for each in gone["streams"]]) == (None, [None, None])
@@ -47,18 +47,18 @@ def test_a_payload_is_declared_shown_and_removed(server, asked, carrier):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("--mass", 1), "--mass is given, expected --mass and --com together"),
-        (("--remove", "--mass", 1), "--remove and --mass are given, expected one of them"),
+        (("--mass", 1), "--mass and --com must be given together"),
+        (("--remove", "--mass", 1), "give either --remove or --mass, not both"),
         (("--mass", 1, "--com", "0,0,0", "--inertia", "1,2"), "--inertia has 2 numbers, expected 6"),
-        (("--mass", 1, "--com", "0,0,0", "--inertia", "9,0,0,1,0,1"), "a body which can exist"),
+        (("--mass", 1, "--com", "0,0,0", "--inertia", "9,0,0,1,0,1"), "No body has this mass and inertia"),
         (("--mass", -1, "--com", "0,0,0"), "mass"),
     ],
 )
-def test_what_is_no_payload_is_refused(refused, carrier, options, message):
+def test_invalid_payloads_are_rejected(refused, carrier, options, message):
     assert message in refused("payload", carrier, *options)
 
 
-def test_a_model_without_an_arm_says_what_would_help(asked, refused, arm):
+def test_model_without_arm_explains_missing_payload_estimate(asked, refused, arm):
     name, _ = arm
-    assert f"payloads of {name} are not watched: estimator se knows no arm" in asked("payload", name)
-    assert "train rigid-body" in refused("payload", name, "--mass", 1, "--com", "0,0,0")
+    assert f"payloads of {name} are not estimated: estimator se has no arm" in asked("payload", name)
+    assert "train with rigid-body" in refused("payload", name, "--mass", 1, "--com", "0,0,0")

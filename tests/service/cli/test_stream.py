@@ -1,4 +1,4 @@
-"""`lipserve stream` and `bench`: a motion in real time, and what the model makes of it."""
+"""`lipserve stream` and `lipserve bench`."""
 
 import json
 import signal
@@ -20,14 +20,15 @@ def lines(text):
     return [json.loads(line) for line in text.splitlines()]
 
 
-def test_a_simulated_robot_is_played_and_taught(lipserve, server):
+@pytest.mark.slow
+def test_simulated_robot_is_played_and_learnt(lipserve, server):
     train(server.client, "cli-taught", upload(server.client, stream())["id"])
     code, out, err = lipserve(
         *("stream", "cli-taught", "--simulate", "double-pendulum", "--seconds", 1.2, "--rate", 50, "--fast"),
         *("--learn", "--stream-id", "cell", "--url", server.url, "--json"),
     )
     assert code == 0, err
-    assert "60 rows in 1.18 s (50 Hz) to cli-taught version 1, which it learns from as stream cell" in err
+    assert "60 rows in 1.18 s (50 Hz) to cli-taught version 1, learning from stream cell" in err
     *seconds, last = lines(out)
     assert [each["second"] for each in seconds] == [1, 2]
     assert sum(each["rows"] for each in seconds) == last["summary"]["rows"] == 60
@@ -39,8 +40,8 @@ def test_a_simulated_robot_is_played_and_taught(lipserve, server):
     assert sum(each["rows"] for each in observed) == 60
 
 
-def test_a_simulated_stream_takes_what_a_simulated_recording_does():
-    """But for how many samples there are and where they go."""
+def test_stream_and_simulate_have_the_same_simulation_options():
+    """Except for the number of samples and the output."""
     commands = [typer.main.get_command(each) for each in (simulating, streaming_app)]
     simulate, stream_ = ({each.name: each for each in command.params} for command in commands)
     for name in simulate.keys() - {"robot", "output", "samples", "as_json"}:
@@ -51,7 +52,7 @@ def test_a_simulated_stream_takes_what_a_simulated_recording_does():
 
 @pytest.fixture
 def steady(server, arm):
-    """A model that learns with the defaults, and takes contacts for such beyond eight standard deviations."""
+    """Name of a model with default learning options and a contact threshold of eight standard deviations."""
     name = f"cli-steady-{next(NUMBERS)}"
     train(server.client, name, arm[1], estimator="rigid-body")
     return name
@@ -61,34 +62,34 @@ NUMBERS = count()
 PLAYED = ("--simulate", "double-pendulum", "--seconds", 1.5, "--rate", 100)
 
 
-def test_a_stream_that_does_not_fit_is_said_so_and_not_learnt(lipserve, server, steady):
+@pytest.mark.slow
+def test_misfitting_stream_is_reported_and_not_learnt(lipserve, server, steady):
     before = server.client.post(f"/v1/models/{steady}/predict", json=QUERY).json()["tau"]
     off = (*PLAYED, "--viscous", 1, "--coulomb", 1, "--url", server.url, "--json")
     code, out, err = lipserve("stream", steady, *off, "--learn", "--stream-id", "other-arm")
     assert code == 1
-    assert "of the stream's first second lies within the 95 % band of " + steady in err
-    assert "nothing of it is learnt" in err
+    assert f"of the stream's first second is inside the 95 % interval of {steady}: learning is paused" in err
     assert f"`lipserve learning decide {steady} ignore --replay`" in err
     assert lines(out)[-1]["summary"]["learnt"]["kept_out"]["change"] > 0
     alarm = json.loads(lipserve("alarms", steady, "--url", server.url, "--json")[1])[0]
-    assert "stream other-arm does not fit the model: " in alarm["message"]
-    assert "learning is held" in lipserve("learning", "show", steady, "--url", server.url)[1]
+    assert "Stream other-arm does not fit the model: " in alarm["message"]
+    assert "learning is paused until you decide" in lipserve("learning", "show", steady, "--url", server.url)[1]
     code, out, err = lipserve("stream", steady, *off, "--learn", "--stream-id", "another")
-    assert (code, f"learning of {steady} is held: rows are kept, and not learnt" in err) == (1, True)
-    assert f"of this stream's first second lies within the 95 % band of {steady}, too" in err
-    assert "learning is held already" in lipserve("alarms", steady, "--url", server.url)[1]
+    assert (code, f"learning of {steady} is paused: rows are stored but not learnt" in err) == (1, True)
+    assert f"of this stream's first second is inside the 95 % interval of {steady}, too" in err
+    assert "Learning is already paused" in lipserve("alarms", steady, "--url", server.url)[1]
     seen = eventually(lambda: settled(server, steady))
     assert seen == pytest.approx(before, abs=1e-9)
     code, out, err = lipserve("stream", steady, *off)
-    assert (code, "of the first second lies within the 95 % band of the model" in err) == (0, True)
+    assert (code, "of the first second is inside the model's 95 % interval" in err) == (0, True)
     code, out, err = lipserve("learning", "decide", steady, "ignore", "--replay", "--url", server.url)
-    assert (code, "learns again" in out) == (0, True)
-    assert "learning goes on" in lipserve("learning", "show", steady, "--url", server.url)[1]
+    assert (code, "learning resumed" in out) == (0, True)
+    assert "learning is active" in lipserve("learning", "show", steady, "--url", server.url)[1]
     assert "expected adapt or ignore" in lipserve("learning", "decide", steady, "go", "--url", server.url)[2]
 
 
 def settled(server, model):
-    """What a model answers to QUERY once it contains its log."""
+    """Return the answer to QUERY if it includes the whole log, else None."""
     status = server.client.get(f"/v1/models/{model}/learning").json()["status"]
     answer = server.client.post(f"/v1/models/{model}/predict", json=QUERY).json()
     return answer["tau"] if answer["revision"] >= status["revision"] else None
@@ -97,35 +98,36 @@ def settled(server, model):
 QUERY = {"q": [0.3, -0.4], "dq": [0.5, 0.2], "ddq": [0.1, -0.3]}
 
 
-def test_a_stream_that_does_not_fit_is_learnt_where_that_is_confirmed(lipserve, server, steady):
+@pytest.mark.slow
+def test_misfitting_stream_is_learnt_with_yes_learn(lipserve, server, steady):
     off = (*PLAYED, "--viscous", 1, "--coulomb", 1, "--url", server.url, "--json")
     code, _, err = lipserve("stream", steady, *off, "--learn", "--yes-learn")
     assert code == 0, err
-    assert "it is learnt all the same, as --yes-learn says" in err
+    assert "learning anyway (--yes-learn)" in err
     assert (
         json.loads(lipserve("learning", "show", steady, "--url", server.url, "--json")[1])["learning"]["status"]["held"]
         is None
     )
 
 
-def test_a_stream_that_fits_is_learnt_and_nothing_is_said(lipserve, server, steady):
+def test_fitting_stream_is_learnt_without_warning(lipserve, server, steady):
     code, out, err = lipserve("stream", steady, *PLAYED, "--url", server.url, "--json", "--learn")
-    assert (code, "band" in err) == (0, False)
+    assert (code, "interval" in err) == (0, False)
     assert lines(out)[-1]["summary"]["learnt"]["accepted"] > 0
-    assert lipserve("alarms", steady, "--url", server.url)[1] == f"no alarm of {steady}\n"
+    assert lipserve("alarms", steady, "--url", server.url)[1] == f"no alarms of {steady}\n"
 
 
-def test_a_recording_is_played(asked, refused, arm, recording):
+def test_recording_is_played(asked, refused, arm, recording):
     path = recording(85, "motion.csv", samples=20, rate=40.0)
     text = asked("stream", arm[0], path)
-    assert "in all  20 rows; round trip p50 " in text
+    assert "total   20 rows; round trip p50 " in text
     assert " late, " in text
-    assert "in the 95 % band" in text
+    assert "(95 % interval)" in text
     mismatch = "the motion has 2 joints (joint1, joint2), expected the model's 7"
     assert mismatch in refused("stream", "panda-sim", path)
 
 
-def test_ctrl_c_ends_a_stream_with_its_figures(lipserve, arm, server, monkeypatch):
+def test_ctrl_c_ends_stream_and_prints_figures(lipserve, arm, server, monkeypatch):
     asked, send = [], StreamClient.send
 
     def ask_and_press(self, *arguments, **options):
@@ -142,7 +144,7 @@ def test_ctrl_c_ends_a_stream_with_its_figures(lipserve, arm, server, monkeypatc
     assert signal.getsignal(signal.SIGINT) is before
 
 
-def test_a_stream_that_the_service_closes_ends_with_its_figures(lipserve, arm, server, monkeypatch):
+def test_stream_closed_by_the_service_prints_figures(lipserve, arm, server, monkeypatch):
     asked, send = [], StreamClient.send
 
     def ask_or_end(self, *arguments, **options):
@@ -155,10 +157,10 @@ def test_a_stream_that_the_service_closes_ends_with_its_figures(lipserve, arm, s
     code, out, err = lipserve("stream", arm[0], "--simulate", "double-pendulum", "--url", server.url, "--json")
     assert (code, lines(out)[-1]["summary"]["rows"]) == (1, 4)
     assert "error: the service closed the stream: the service stops (closed)" in err
-    assert "hint: open the stream again once the service is back" in err
+    assert "hint: open the stream again when the service is back" in err
 
 
-def test_recordings_are_prepared_as_uploads_are(recording):
+def test_recordings_are_prepared_like_uploads(recording):
     path, samples = recording(86, samples=40, rate=20.0), stream(samples=40, rate=20.0, seed=86)
     motion = recorded(path)
     np.testing.assert_array_equal(motion.tau, samples.tau)
@@ -170,7 +172,7 @@ def test_recordings_are_prepared_as_uploads_are(recording):
     assert not motion.ordered(("shoulder", "elbow"))[1]
 
 
-def test_figures_are_those_of_all_rows():
+def test_tally_matches_figures_of_all_rows():
     rng = np.random.default_rng(87)
     noise, tau = np.array([0.1, 0.2]), rng.normal(size=(40, 2)) * 3
     mean, std = tau + rng.normal(size=(40, 2)) * 0.3, rng.uniform(0.1, 0.3, size=(40, 2))
@@ -197,7 +199,8 @@ def test_figures_are_those_of_all_rows():
     assert Tally(noise).joints(("a", "b")) == []
 
 
-def test_latency_is_timed_over_stream_and_http(lipserve, streaming):
+@pytest.mark.slow
+def test_latency_is_measured_over_stream_and_http(lipserve, streaming):
     arguments = ["latency", "pendulum", "--queries", 30, "--url", streaming.server.url, "--json"]
     code, out, err = lipserve("bench", *arguments)
     assert code == 0, err
@@ -208,7 +211,7 @@ def test_latency_is_timed_over_stream_and_http(lipserve, streaming):
     assert set(timed["milliseconds"]) == {"stream", "HTTP"}
 
 
-def test_what_is_kept_out_for_one_reason_is_said_once():
+def test_consecutive_refusals_for_one_reason_are_merged():
     off, full = ("busy", "too much waits"), ("storage_full", "the disk is full")
     given = [(1, 11, off), (12, 20, off), (21, 22, full), (30, 31, full), (32, 40, off)]
     told = refused_figures([StreamRefusal(first, through, *why, []) for first, through, why in given])

@@ -1,4 +1,4 @@
-"""From a recording to a torque: `lipserve train`, `jobs`, `evaluate` and `predict`."""
+"""`lipserve train`, `jobs`, `evaluate` and `predict`."""
 
 import json
 import threading
@@ -15,27 +15,27 @@ from tests.service.server import Server, free_port
 ENDLESSLY = options_of_train(ENDLESS)
 
 
-def test_from_a_recording_to_figures_on_what_was_held_out_and_a_torque(asked, server, recording):
+def test_train_evaluate_and_predict_from_a_recording(asked, server, recording):
     path = recording(11, samples=120, rate=10.0)
     types = ("--joint-types", "revolute, revolute", "--hold-out", 0.25, "--hold-out-by", "blocks")
     text = asked("train", path, "--model", "from-cli", *types, *QUICKLY)
-    assert "from-cli version 1 is trained and answers" in text
+    assert "from-cli version 1 trained: now serving" in text
     held = server.client.get("/v1/models/from-cli/versions/1").json()["lineage"]["holdout"]
     assert (held["split"]["kind"], held["split"]["share"]) == ("blocks", 0.25)
-    assert f"on {held['samples']} samples held out" in text
+    assert f"{held['samples']} held-out samples" in text
     assert f"{held['nmse'][1]:.2e}" in text
     assert (
-        f"{100 * held['coverage_low'][0]:.0f} % to {100 * held['coverage_high'][0]:.0f} %, by "
-        f"{held['independent'][0]:.0f} errors" in text
+        f"{100 * held['coverage_low'][0]:.0f} % to {100 * held['coverage_high'][0]:.0f} % "
+        f"({held['independent'][0]:.0f} effective)" in text
     )
-    assert "it answers by itself: its error is at most" in text
+    assert "promotion check passed: the error is at most" in text
 
     dataset = held["datasets"][0]["id"]
     text = asked("evaluate", "from-cli", dataset, "--held-out")
     assert f"on {held['samples']} held-out samples of {dataset}" in text
     assert f"{held['rmse'][0]:.4f}" in text
     assert asked("evaluate", "from-cli", dataset, "--json")["part"] == "all"
-    assert "which it was trained on" in asked("evaluate", "from-cli", dataset)
+    assert "training data: figures are too optimistic" in asked("evaluate", "from-cli", dataset)
     assert not asked("evaluate", "from-cli", recording(83), "--json")["in_training"]
 
     answer = asked("predict", "from-cli", "--q", "0.1,-0.2", "--json")
@@ -46,7 +46,7 @@ def test_from_a_recording_to_figures_on_what_was_held_out_and_a_torque(asked, se
     assert f"{answer['tau'][1]:.4f}" in text
 
 
-def test_components_are_printed_beside_the_torque(asked, refused, server):
+def test_components_are_printed(asked, refused, server):
     q, names = [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7], ["gravity", "inertia_matrix", "potential_energy"]
     query = {"q": q, "dq": [0.0] * 7, "ddq": [0.0] * 7, "components": names}
     expected = server.client.post("/v1/models/panda-sim/predict", json=query).json()["components"]
@@ -57,10 +57,10 @@ def test_components_are_printed_beside_the_torque(asked, refused, server):
     assert f"{inertia['mean'][2][3]:.4f} ± {inertia['std'][2][3]:.4f}" in text
     assert f"{expected['potential_energy']['mean']:.4f}" in text
     assert asked(*command, "--json")["components"] == expected
-    assert "tau is given, expected no tau" in refused(*command, "--tau", "0,0,0,0,0,0,0")
+    assert "`tau` is used only for forward_dynamics" in refused(*command, "--tau", "0,0,0,0,0,0,0")
 
 
-def test_a_payload_is_declared_in_two_options(asked, refused, server):
+def test_predict_with_payload_options(asked, refused, server):
     inertia = [[0.02, 0.001, 0.002], [0.001, 0.03, 0.003], [0.002, 0.003, 0.04]]
     payload = {"mass": 2.0, "com": [0.0, 0.01, 0.1], "inertia": inertia}
     query = {"q": [0.1] * 7, "dq": [0.0] * 7, "ddq": [1.0] * 7, "payload": payload}
@@ -73,10 +73,10 @@ def test_a_payload_is_declared_in_two_options(asked, refused, server):
     assert "expected no principal moment above the sum of the other two" in text
 
 
-def test_refusals_of_the_service_are_passed_on(refused, recording, tmp_path):
+def test_errors_of_the_service_are_printed(refused, recording, tmp_path):
     message, hint = refused("predict", "nobody", "--q", "1").splitlines()
     assert message == "error: no model 'nobody' (not_found, 404)"
-    assert hint.startswith("hint: models that exist: ")
+    assert hint.startswith("hint: existing models: ")
     assert "panda-sim" in hint
     bad = tmp_path / "bad.csv"
     bad.write_text("t,q1,speed1\n0,0,0\n")
@@ -89,7 +89,7 @@ WRONG = {
     "--hold-out is 3.0": ("--hold-out", 3),
     "--robot is pandda": ("--robot", "pandda"),
     "--robot is 'no.urdf'": ("--robot", "no.urdf"),
-    "--robot is panda, expected none": ("--robot", "panda", "--estimator", "lip"),
+    "`--robot` is not used by estimator lip": ("--robot", "panda", "--estimator", "lip"),
     "--option starts is 0": ("--option", "starts=0"),
     "--promotion is never": ("--promotion", "never"),
     "no model 'nobody'": ("--base", "nobody"),
@@ -97,20 +97,20 @@ WRONG = {
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_nothing_is_uploaded_for_a_job_that_is_refused(refused, server, recording, message):
+def test_rejected_training_uploads_nothing(refused, server, recording, message):
     before = server.client.get("/v1/datasets", params={"limit": 1}).json()["items"]
     assert message in refused("train", recording(13), "--model", "never", *WRONG[message])
     assert server.client.get("/v1/datasets", params={"limit": 1}).json()["items"] == before
 
 
-def test_nothing_is_uploaded_where_another_argument_is_no_data_set(refused, server, recording):
+def test_unknown_data_set_uploads_nothing(refused, server, recording):
     before = server.client.get("/v1/datasets", params={"limit": 1}).json()["items"]
     assert "no dataset 'gone.csv'" in refused("train", recording(13), "gone.csv", "--model", "never")
     assert "--model is Never!" in refused("train", recording(13), "--model", "Never!")
     assert server.client.get("/v1/datasets", params={"limit": 1}).json()["items"] == before
 
 
-def test_a_draft_of_a_job_is_checked_and_not_queued(server):
+def test_job_draft_is_checked_and_not_queued(server):
     dataset = upload(server.client, stream())["id"]
     before = server.client.get("/v1/jobs", params={"limit": 1}).json()["items"]
     for datasets in ([], [dataset]):
@@ -122,23 +122,23 @@ def test_a_draft_of_a_job_is_checked_and_not_queued(server):
     assert server.client.get("/v1/jobs", params={"limit": 1}).json()["items"] == before
 
 
-def test_a_job_of_data_sets_by_name_remembers_their_ids(server):
+def test_job_stores_ids_of_data_sets_given_by_name(server):
     made = upload(server.client, stream(seed=14), name="named for a job")["id"]
     job = queue(server.client, "cli-by-name", "named for a job", estimator="se")
     assert job["datasets"] == [made]
     assert ended(server.client, job["id"])["state"] == "succeeded"
 
 
-def test_other_names_of_joints_come_with_the_remedy(asked, refused, tmp_path):
+def test_error_for_other_joint_names_has_a_hint(asked, refused, tmp_path):
     path, samples = tmp_path / "numbered.csv", stream("panda", 40, seed=15)
     path.write_bytes(csv(columns(samples)))
     message = refused("evaluate", "panda-sim", path)
-    assert "data set with the joints joint1, joint2" in message
-    assert "expected those of the model, panda_joint1, panda_joint2" in message
-    assert "if they are the same joints, upload the recording with --robot panda (invalid_request" in message
+    assert "are joint1, joint2" in message
+    assert "those of the model are panda_joint1, panda_joint2" in message
+    assert "If they are the same joints, upload the recording with --robot panda. (invalid_request" in message
     answer = asked("evaluate", "panda-sim", path, "--robot", "panda", "--json")
     assert answer["joint_names"] == list(samples.joint_names)
-    assert "beside --robot, expected a recording" in refused(
+    assert "--robot can only be used with a recording" in refused(
         "evaluate", "panda-sim", answer["dataset"], "--robot", "panda"
     )
     two = tmp_path / "two.csv"
@@ -148,7 +148,7 @@ def test_other_names_of_joints_come_with_the_remedy(asked, refused, tmp_path):
 
 @pytest.fixture
 def interrupted(monkeypatch):
-    """Ctrl-C at the first look at the job."""
+    """Press Ctrl-C when the job is first shown."""
 
     @contextmanager
     def bar(console):
@@ -162,7 +162,7 @@ def interrupted(monkeypatch):
 
 @pytest.fixture(scope="module")
 def long(server):
-    """A data set that a fit with the options ENDLESS takes half a minute for."""
+    """Data set for which a fit with the options ENDLESS takes half a minute."""
     return upload(server.client, stream("panda", 200, seed=81))["id"]
 
 
@@ -174,8 +174,8 @@ def test_ctrl_c_in_train_cancels_the_job(lipserve, server, long, interrupted):
     assert f"{job['id']} is cancelled" in err
 
 
-def test_ctrl_c_while_the_job_is_queued_cancels_it(lipserve, server, long, monkeypatch):
-    """It has come before its answer could be read: there is a job, whose id nobody knows."""
+def test_ctrl_c_before_the_answer_cancels_the_job(lipserve, server, long, monkeypatch):
+    """Ctrl-C comes before the answer is read: the job exists, but its id is unknown."""
     send, interruptions = Client.send, iter([KeyboardInterrupt])
 
     def cut(client, call):
@@ -191,15 +191,15 @@ def test_ctrl_c_while_the_job_is_queued_cancels_it(lipserve, server, long, monke
     assert ended(server.client, torn["id"])["state"] == "cancelled"
 
 
-def test_ctrl_c_in_follow_leaves_the_job(lipserve, asked, server, long, interrupted):
+def test_ctrl_c_in_follow_does_not_cancel_the_job(lipserve, asked, server, long, interrupted):
     job = queue(server.client, "cli-left", long, options=ENDLESS)["id"]
     code, out, err = lipserve("jobs", "follow", job, "--url", server.url, "--json")
     assert (code, json.loads(out)["state"] in ("queued", "running")) == (130, True)
-    assert "goes on" in err
+    assert f"{job} continues" in err
     assert asked("jobs", "cancel", job, "--json")["id"] == job
 
 
-def test_a_job_is_queued_followed_and_listed(refused, asked, recording):
+def test_job_is_queued_followed_and_listed(refused, asked, recording):
     queued = asked(
         "train", recording(82), "--model", "cli-queued", "--no-wait", *QUICKLY, "--estimator", "se", "--json"
     )
@@ -211,7 +211,7 @@ def test_a_job_is_queued_followed_and_listed(refused, asked, recording):
     assert "conflict" in refused("jobs", "retry", job)
 
 
-def test_without_options_the_service_holds_out_what_it_does_by_default_and_zero_is_nothing(asked, server, recording):
+def test_hold_out_defaults_to_the_service_and_zero_disables_it(asked, server, recording):
     path = recording(12, samples=120, rate=10.0)
     job = asked("train", path, "--model", "by-default", *QUICKLY, "--json")
     body = {"model": "by-default", "datasets": job["datasets"], "estimator": "lip-chain"}
@@ -224,29 +224,30 @@ def test_without_options_the_service_holds_out_what_it_does_by_default_and_zero_
     assert (job["holdout"], job["quality"]) == (None, None)
 
 
-def test_what_is_held_out_only_is_never_learnt(asked, refused, server, recording):
+@pytest.mark.slow
+def test_hold_out_only_data_are_never_learnt(asked, refused, server, recording):
     path = recording(18, samples=120, rate=10.0)
     text = asked("train", path, "--model", "cli-only", *QUICKLY)
-    assert "Judged on held-out rows; the version was then trained on all rows." in text
-    assert "Judged on" not in asked("train", path, "--model", "cli-only", *QUICKLY, "--hold-out-only")
+    assert "Evaluated on held-out rows; the version was then trained on all rows." in text
+    assert "Evaluated on" not in asked("train", path, "--model", "cli-only", *QUICKLY, "--hold-out-only")
     for number, learnt in ((1, True), (2, False)):
         lineage = server.client.get(f"/v1/models/cli-only/versions/{number}").json()["lineage"]
         assert lineage["holdout"]["learnt"] is learnt
     judged = asked("evaluate", "cli-only", lineage["datasets"][0]["id"], "--held-out", "--version", 1)
-    assert "as judged before it learnt them" in " ".join(judged.split())
+    assert "evaluated before training on them" in " ".join(judged.split())
     assert "--hold-out above 0" in refused("train", path, "--model", "m", "--hold-out", 0, "--hold-out-only")
 
 
-def test_the_id_of_a_job_is_told_before_its_end(lipserve, server, recording):
+def test_job_id_is_printed_before_the_end(lipserve, server, recording):
     code, out, err = lipserve("train", recording(17), "--model", "cli-told", *QUICKLY, "--url", server.url)
     assert code == 0, err
-    assert "cli-told version 1 is trained" in out
+    assert "cli-told version 1 trained" in out
     (job,) = [job["id"] for job in server.client.get("/v1/jobs").json()["items"] if job["model"] == "cli-told"]
-    told = f"{job} is queued: `lipserve jobs follow {job}` follows it, too"
+    told = f"{job} is queued: `lipserve jobs follow {job}` also follows it"
     assert err.index(told) < err.index("100 %")
 
 
-def test_a_service_that_goes_away_is_waited_for(lipserve, server, recording, monkeypatch):
+def test_train_waits_for_an_unreachable_service(lipserve, server, recording, monkeypatch):
     wait, lost = Client.wait, iter([ServiceUnreachableError("gone"), ApiError(503, "not_ready", "starting", [])])
 
     def away(client, *arguments):
@@ -258,12 +259,12 @@ def test_a_service_that_goes_away_is_waited_for(lipserve, server, recording, mon
     monkeypatch.setattr(connecting, "PAUSE", 0.0)
     code, out, err = lipserve("train", recording(18), "--model", "cli-away", *QUICKLY, "--url", server.url)
     assert code == 0, err
-    assert "cli-away version 1 is trained" in out
-    assert "goes on when the service is back: waiting up to 300 s" in err
-    assert "the service is back" in err
+    assert "cli-away version 1 trained" in out
+    assert "continues when the service is back: waiting up to 300 s" in err
+    assert "the service is reachable again" in err
 
 
-def test_a_service_that_stays_away_is_not_waited_for_longer_than_asked(lipserve, server, arm, monkeypatch):
+def test_patience_limits_the_wait_for_the_service(lipserve, server, arm, monkeypatch):
     job = server.client.get("/v1/jobs").json()["items"][0]["id"]
 
     def away(client, *arguments):
@@ -272,11 +273,11 @@ def test_a_service_that_stays_away_is_not_waited_for_longer_than_asked(lipserve,
     monkeypatch.setattr(Client, "wait", away)
     code, _, err = lipserve("jobs", "follow", job, "--patience", 0, "--url", server.url)
     assert code == 1
-    assert "error: the service has been away for 0 s" in err
-    assert f"`lipserve jobs follow {job}` once the service is back" in err
+    assert "error: the service has been unreachable for 0 s" in err
+    assert f"run `lipserve jobs follow {job}` when the service is back" in err
 
 
-def test_refusals_while_a_job_is_followed_are_passed_on(lipserve, server, arm, monkeypatch):
+def test_errors_while_following_a_job_are_printed(lipserve, server, arm, monkeypatch):
     job = server.client.get("/v1/jobs").json()["items"][0]["id"]
 
     def forbidden(client, *arguments):
@@ -287,8 +288,9 @@ def test_refusals_while_a_job_is_followed_are_passed_on(lipserve, server, arm, m
     assert (code, "error: this key may not (forbidden, 403)" in err) == (1, True)
 
 
-def test_training_is_followed_over_a_restart_of_the_service(lipserve, tmp_path, recording):
-    """The service is killed once the job runs, and starts again at its address."""
+@pytest.mark.slow
+def test_training_is_followed_over_a_restart(lipserve, tmp_path, recording):
+    """The service is killed while the job runs, and restarts at the same address."""
     port = free_port()
     first = Server(tmp_path / "home", port=port)
     started = []
@@ -310,10 +312,10 @@ def test_training_is_followed_over_a_restart_of_the_service(lipserve, tmp_path, 
     with first, second:
         assert code == 0, err
         assert f"{job} is queued" in err
-        assert "cli-over version 1 is trained" in out
+        assert "cli-over version 1 trained" in out
         assert second.client.get(f"/v1/jobs/{job}").json()["attempts"] == 2
 
 
 def running(client):
-    """Ids of the jobs that run."""
+    """Return the ids of running jobs."""
     return [job["id"] for job in client.get("/v1/jobs").json()["items"] if job["state"] == "running"]

@@ -1,4 +1,4 @@
-"""The tree of commands: its reference, its lists, completion, exit codes, and what it says of mistakes."""
+"""Tree of commands: reference, lists, completion, exit codes, error messages."""
 
 import json
 import runpy
@@ -14,9 +14,10 @@ from service import __version__
 from service.cli import consoles, options
 from service.cli.consoles import plain
 from service.cli.main import Commands
+from tests import ROOT
 from tests.service.server import free_port
 
-DOCS = Path(__file__).resolve().parents[3] / "docs"
+DOCS = ROOT / "docs"
 PAGE = runpy.run_path(str(DOCS / "cli.py"))
 PRINTS_NO_RESULT = {"serve", "worker", "demo"}
 
@@ -25,7 +26,7 @@ def test_reference_is_up_to_date():
     assert (DOCS / "reference/cli.md").read_text() == PAGE["page"](), "run: python docs/cli.py"
 
 
-def test_names_that_help_lists_are_those_that_there_are():
+def test_names_in_help_exist():
     assert list(ROBOTS) == options.ROBOTS
     assert [AUTO, *ESTIMATORS] == list(ESTIMATOR_CHOICES)
 
@@ -37,7 +38,7 @@ def test_version_and_help(lipserve):
     assert all(f"{command} " in out for command in Commands.entries)
 
 
-def test_every_command_prints_json_and_has_a_help():
+def test_every_command_has_help_and_json_output():
     for path, command, _ in PAGE["commands"]():
         assert command.help, path
         for parameter in command.params:
@@ -61,7 +62,7 @@ def test_settings_are_listed_with_units_and_without_passwords(lipserve, monkeypa
 
 @pytest.fixture
 def completed(lipserve, monkeypatch):
-    """What a shell is offered for the last word of a command line."""
+    """Return the completions of the last word of a command line."""
 
     def run(line):
         shell = {"_LIPSERVE_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
@@ -88,7 +89,7 @@ def test_commands_and_options_are_completed(completed):
     assert "latency" in completed("lipserve bench la")
 
 
-def test_names_of_a_running_service_are_completed(completed, server, arm, monkeypatch):
+def test_names_from_a_running_service_are_completed(completed, server, arm, monkeypatch):
     name, dataset = arm
     monkeypatch.setenv("LIPSERVE_URL", server.url)
     assert completed("lipserve predict cli-ar") == [name]
@@ -123,12 +124,12 @@ def test_exit_codes(lipserve):
         ("predict m --q 1 --dq x", "--dq is 'x'"),
         ("predict m --q 1 --payload 2", "--payload is '2', expected mass,x,y,z"),
         ("predict m --q 1 --payload 2,0,0,0 --payload-inertia 1,1,1", "expected xx,xy,xz,yy,yz,zz"),
-        ("predict m --q 1 --payload-inertia 1,0,0,1,0,1", "expected --payload beside it"),
+        ("predict m --q 1 --payload-inertia 1,0,0,1,0,1", "--payload-inertia requires --payload"),
         ("serve --port 70000", "port: Input should be less than or equal to 65535"),
         ("serve", "max_samples: "),
     ],
 )
-def test_mistakes_are_explained_in_one_line(lipserve, tmp_path, monkeypatch, command, message):
+def test_invalid_arguments_are_explained_in_one_line(lipserve, tmp_path, monkeypatch, command, message):
     monkeypatch.chdir(tmp_path)
     if command == "serve":
         monkeypatch.setenv("LIPSERVE_MAX_SAMPLES", "-5")
@@ -140,22 +141,22 @@ def test_mistakes_are_explained_in_one_line(lipserve, tmp_path, monkeypatch, com
     assert list(tmp_path.iterdir()) == []
 
 
-def test_status_says_what_works_and_what_is_not_installed(lipserve, asked, server):
+def test_status_shows_parts_and_missing_extras(lipserve, asked, server):
     text, document = asked("status"), asked("status", "--json")
     assert f"{server.url} is ready: LIPServe {__version__}" in text
     assert [each["name"] for each in document["checks"]] == ["database", "home", "models", "learner", "training"]
     assert all(f"{each['name']} " in text and each["message"] in text for each in document["checks"])
     assert document["can"] == server.client.get("/health").json()["can"]
-    assert text.count("not installed there: pip install") == len(document["missing"])
+    assert text.count("not installed: pip install") == len(document["missing"])
     code, out, err = lipserve("status", "--url", f"http://127.0.0.1:{free_port()}")
     assert (code, out, "start one with `lipserve serve`" in err) == (1, "", True)
 
 
-def test_a_port_that_is_taken_is_named_before_a_home_is_made(lipserve, server, tmp_path, monkeypatch):
+def test_used_port_is_reported_before_the_home_is_created(lipserve, server, tmp_path, monkeypatch):
     monkeypatch.setenv("LIPSERVE_HOME", str(tmp_path / "home"))
     code, out, err = lipserve("serve", "--port", server.port)
     assert (code, out) == (1, "")
-    assert f"error: port is {server.port}, expected one that is free at 127.0.0.1: Address already in use" in err
+    assert f"error: Cannot listen on port {server.port} of 127.0.0.1: Address already in use" in err
     assert not (tmp_path / "home").exists()
 
 
@@ -167,7 +168,7 @@ def test_address_of_the_dashboard(asked, server):
 @pytest.mark.parametrize(
     ("status", "code", "hint"),
     [
-        (401, "unauthorized", "put yours into LIPSERVE_API_KEY"),
+        (401, "unauthorized", "set LIPSERVE_API_KEY"),
         (403, "forbidden", "lipserve keys create"),
         (429, "busy", "try again in a moment"),
         (422, "invalid_request", None),
@@ -179,12 +180,12 @@ def test_hints(status, code, hint):
     assert (explained.hint is None) if hint is None else (hint in explained.hint)
 
 
-def test_faults_are_not_explained_away():
+def test_faults_of_the_program_keep_their_traceback():
     assert consoles.explain(KeyError("x")) is None
     assert consoles.explain(BrokenPipeError()) is None
     assert consoles.explain(ValueError("x is 1, expected 2")) == ("x is 1, expected 2", None)
 
 
-def test_numbers_that_json_does_not_know_are_null():
+def test_non_finite_numbers_become_null():
     values = {"a": float("nan"), "b": (1.0, float("inf")), "c": Path("x")}
     assert plain(values) == {"a": None, "b": [1.0, None], "c": "x"}

@@ -1,4 +1,4 @@
-"""What the service says, in the words of the shell."""
+"""Messages of the service with command line options instead of API fields."""
 
 import json
 
@@ -27,14 +27,14 @@ SAID = {
 
 
 @pytest.mark.parametrize("said", SAID)
-def test_options_of_the_api_become_options_of_the_command_line(said):
+def test_api_fields_become_command_line_options(said):
     assert in_shell(said) == SAID[said]
 
 
 @pytest.mark.parametrize(
     "said",
     [
-        "upload it with `--torque-factors=-1,1`",
+        "upload the file again with `--torque-factors=-1,1`",
         "row 41 is 29 values, expected 30 values",
         "the joints of the model, joint1: the rate is 3 Hz",
         'columns={"broken": is no JSON',
@@ -42,16 +42,16 @@ def test_options_of_the_api_become_options_of_the_command_line(said):
         "expected a version with the joints of the data; that has other joint_names than the data",
     ],
 )
-def test_other_sentences_stay_as_they_are(said):
+def test_other_sentences_are_unchanged(said):
     assert in_shell(said) == said
 
 
-def test_every_option_of_an_upload_has_its_flag():
+def test_every_upload_option_has_a_flag():
     command = next(each for each in typer.main.get_command(app).commands.values() if each.name == "add")
     options = {option for parameter in command.params for option in parameter.opts}
     assert {FLAGS[name] for name in Reading.__annotations__} <= options
 
 
-def test_a_sentence_may_hold_several():
+def test_several_fields_in_one_sentence():
     text = f"units={json.dumps({'q': 'deg', 't': 'ms'})}, drop_joints=a"
     assert in_shell(text) == "--unit q=deg --unit t=ms, --drop a"

@@ -1,4 +1,4 @@
-"""A home with a model whose log tests write, and batches to write into it."""
+"""Helpers that write observation batches and other events into the log of a model."""
 
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,8 @@ from service.storage.database import Database, EventRow, ModelRow, ServingRow, S
 MODEL, OTHER = "arm", "other"
 
 
-def opened(home: Path) -> Database:
-    """A database with two models, each of one version."""
+def open_database(home: Path) -> Database:
+    """Return a database with two models, each of one version."""
     database = Database.of(Settings(home=home))
     with database.transaction() as session:
         session.add_all(ModelRow(name=name, created_at=now()) for name in (MODEL, OTHER))
@@ -28,17 +28,17 @@ def opened(home: Path) -> Database:
     return database
 
 
-def rows(count: int = 4, n: int = 2, seed: int = 0, codes: tuple[str, ...] = ()) -> Rows:
-    """Rows at 1 kHz from event time 100 s + seed on; codes: of the first ones, the others are learnt."""
+def make_rows(count: int = 4, n: int = 2, seed: int = 0, codes: tuple[str, ...] = ()) -> Rows:
+    """Return rows at 1 kHz from event time 100 s + seed; `codes` are those of the first rows, the others are learnt."""
     values = np.random.default_rng(seed).normal(size=(4, count, n))
     code = np.zeros(count, np.uint8)
     code[: len(codes)] = [CODES.index(name) for name in codes]
     return Rows(100.0 + seed + np.arange(count) / 1000, *values, code)
 
 
-def batch(sequence: int, last: int | None = None, **fields: Any) -> NewBatch:
-    """A batch, of frames where the last one is given; its rows and digest follow from the sequence."""
-    usual = {
+def make_batch(sequence: int, last: int | None = None, **fields: Any) -> NewBatch:
+    """Return a batch, or frames if `last` is given; rows and digest depend on the sequence."""
+    defaults = {
         "stream_id": "robot-1",
         "kind": "batches" if last is None else "frames",
         "sequence": sequence,
@@ -48,26 +48,26 @@ def batch(sequence: int, last: int | None = None, **fields: Any) -> NewBatch:
         "received": 1000.0 + sequence,
         "version": 1,
         "revision": 0,
-        "rows": rows(seed=sequence),
+        "rows": make_rows(seed=sequence),
         "report": {"accepted": 4, "rejected": {}},
         "record": {"rows": 4},
     }
-    return NewBatch(**{**usual, **fields})
+    return NewBatch(**{**defaults, **fields})
 
 
-def everything(database: Database, model: str = MODEL) -> list[EventRow]:
-    """All events of a model by number."""
+def list_events(database: Database, model: str = MODEL) -> list[EventRow]:
+    """Return all events of a model by number."""
     with database.session() as session:
         return list(session.scalars(select(EventRow).where(EventRow.model == model).order_by(EventRow.number)))
 
 
-def live(database: Database, model: str = MODEL) -> list[int]:
-    """Numbers of the events that are not void."""
-    return [event.number for event in everything(database, model) if not event.void]
+def list_valid_numbers(database: Database, model: str = MODEL) -> list[int]:
+    """Return the numbers of the events that are not void."""
+    return [event.number for event in list_events(database, model) if not event.void]
 
 
-def write(database: Database, *batches: NewBatch, model: str = MODEL) -> list[int]:
-    """Log each batch in a transaction of its own; return the numbers."""
+def append_batches(database: Database, *batches: NewBatch, model: str = MODEL) -> list[int]:
+    """Log each batch in its own transaction; return the event numbers."""
     numbers = []
     for item in batches:
         with database.transaction() as session:
@@ -75,26 +75,28 @@ def write(database: Database, *batches: NewBatch, model: str = MODEL) -> list[in
     return numbers
 
 
-def note(database: Database, kind: log.EventKind, detail: dict[str, Any], model: str = MODEL, **more: Any) -> int:
-    """Log an event of another kind; return its number."""
+def append_event(
+    database: Database, kind: log.EventKind, detail: dict[str, Any], model: str = MODEL, **more: Any
+) -> int:
+    """Log an event that is not a batch; return its number."""
     with database.transaction() as session:
         return log.append(session, model, kind, detail, 2000.0, **more).number
 
 
-def take_back(database: Database, number: int) -> int:
-    """Unlearn the batch of this number; return the number of the event that says so."""
+def unlearn_batch(database: Database, number: int) -> int:
+    """Unlearn the batch with this event number; return the number of the unlearn event."""
     with database.transaction() as session:
         [event] = log.events(session, MODEL, number - 1, 1, void=True)
         return undo.unlearn(session, MODEL, event, 3000.0).number
 
 
 def roll_back(database: Database, to: int) -> int:
-    """Roll back to the event of this number; return the number of the event that says so."""
+    """Roll back to an event; return the number of the rollback event."""
     with database.transaction() as session:
         return undo.rollback(session, MODEL, to, 3000.0).number
 
 
-def source(database: Database, stream_id: str = "robot-1", model: str = MODEL) -> StreamRow | None:
-    """What is known of a stream."""
+def find_stream(database: Database, stream_id: str = "robot-1", model: str = MODEL) -> StreamRow | None:
+    """Return the stored row of a stream, or None."""
     with database.session() as session:
         return log.stream(session, model, stream_id)

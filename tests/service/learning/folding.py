@@ -1,4 +1,4 @@
-"""What a log says, by the definition: one event after the other, from the beginning, on lists in memory."""
+"""Reference implementation of learning from a log: one event after the other, in memory."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,22 +14,24 @@ from service.storage.database import EventRow
 
 
 class Fold:
-    """The states of a version that contains the events up to `start` by training. events: all, from number 1 on."""
+    """States of a version that was trained on the events up to `start`; `events` are all events from number 1 on."""
 
     def __init__(self, base: TorqueModel, events: Sequence[EventRow], start: int = 0) -> None:
         self.base, self.start, self.events = base, start, events
-        self._known: dict[int, OnlineModel] = {}
+        self._states: dict[int, OnlineModel] = {}
 
     def after(self, number: int) -> OnlineModel:
-        """The state after an event: what is left of the log up to it, learnt in order."""
-        if number not in self._known:
-            self._known[number] = self._begun() if number <= self.start else self._after(self.events[number - 1])
-        return self._known[number]
+        """Return the state after an event: the events up to it that are in force, learnt in order."""
+        if number not in self._states:
+            self._states[number] = (
+                self._start_online() if number <= self.start else self._after(self.events[number - 1])
+            )
+        return self._states[number]
 
-    def _begun(self) -> OnlineModel:
+    def _start_online(self) -> OnlineModel:
         online = OnlineModel.start(self.base)
         for event in self.events[: self.start]:
-            online = _remembering(online, event.detail) if event.kind == "settings" and not event.void else online
+            online = _with_memory(online, event.detail) if event.kind == "settings" and not event.void else online
         return online
 
     def _after(self, event: EventRow) -> OnlineModel:
@@ -39,17 +41,17 @@ class Fold:
         if event.kind == "change":
             return online.change(event.clock + min(detail["t"] - event.received, 1.0))
         if event.kind == "settings":
-            return _remembering(online, detail)
+            return _with_memory(online, detail)
         online = online.begin(event.clock) if event.kind == "batch" else online
         return online.learn(_rows(event))
 
 
-def _remembering(online: OnlineModel, detail: Any) -> OnlineModel:
+def _with_memory(online: OnlineModel, detail: Any) -> OnlineModel:
     return online.with_forgetting(detail.get("forgetting_s")).with_walk(detail.get("friction_walk_s"))
 
 
 def _rows(event: EventRow) -> Rows:
-    """The rows of an event by the model's clock."""
+    """Return the rows of an event, timed by the model's clock."""
     rows = decode(event.payload)
     late = np.minimum(rows.time - event.received, 1.0)
     return rows if event.kind == "replay" else replace(rows, time=event.clock + late)

@@ -1,4 +1,4 @@
-"""A home with a double pendulum whose log tests write, and what it should have learnt, by one sum over all rows."""
+"""Home with a double pendulum whose log tests write, and its expected predictions from one sum over all rows."""
 
 from __future__ import annotations
 
@@ -38,34 +38,34 @@ ARM = "arm"
 ROWS = 10
 """Rows of a batch."""
 BEGIN = 1000.0
-"""Event time of the first one, s."""
+"""Event time of the first batch, s."""
 QUERIES = np.random.default_rng(5).uniform(-1.5, 1.5, (3, 40, 2))
 CLOSE = {"rtol": 1e-8, "atol": 1e-8}
 
 
 @cache
-def trained() -> TorqueModel:
-    """A model of a double pendulum; always the same object."""
+def trained_model() -> TorqueModel:
+    """Return a model of a double pendulum; always the same object."""
     return lipcore.train(stream(), ["revolute", "revolute"], "lip-chain", FitOptions(**QUICK))
 
 
 @cache
-def recording() -> Samples:
-    """What the robot does later on: other motions, and more friction."""
+def make_recording() -> Samples:
+    """Return a later recording of the robot, with other motions and more friction."""
     return stream(seed=21, samples=3000, viscous=2.0)
 
 
-def rows(number: int, size: int = ROWS) -> Rows:
-    """Rows of the batch with this sequence, at 100 Hz of event time."""
+def make_rows(number: int, size: int = ROWS) -> Rows:
+    """Return the rows of the batch with this sequence, at 100 Hz of event time."""
     part = slice(number * size, (number + 1) * size)
     time = BEGIN + np.arange(part.start, part.stop) / 100
-    values = (getattr(recording(), name)[part] for name in ("q", "dq", "ddq", "tau"))
+    values = (getattr(make_recording(), name)[part] for name in ("q", "dq", "ddq", "tau"))
     return Rows(time, *values, np.zeros(size, np.uint8))
 
 
 @dataclass(frozen=True)
 class Arm:
-    """A model in a home, and what happens to it."""
+    """Model in a home, with methods that write its log."""
 
     database: Database
     files: Files
@@ -74,7 +74,7 @@ class Arm:
 
     @classmethod
     def open(cls, home: Path, **settings: Any) -> Arm:
-        """A home with version 1 of the model."""
+        """Create a home with version 1 of the model."""
         chosen = Settings(home=home, publish_every_s=0.02, **settings)
         arm = cls(Database.of(chosen), Files.of(chosen), chosen)
         arm.publish()
@@ -82,130 +82,134 @@ class Arm:
 
     @property
     def storage(self) -> Storage:
-        """Where it is kept."""
+        """Return the storage of the home."""
         return Storage(self.settings, self.database, self.files, Disk(self.settings))
 
     def publish(self, model: str | None = None, **arguments: Any) -> int:
-        """Add the trained model as a version, of this model unless said."""
+        """Publish the trained model as a version, by default of this model."""
         model = model or self.model
         folder = f"mv_{model}_{len(list(self.files.versions.iterdir()))}"
         with self.files.new_version(folder) as target:
-            manifest = lipcore.save(trained(), target)
+            manifest = lipcore.save(trained_model(), target)
         with self.database.transaction() as session:
             return registry.publish(session, model, folder, manifest, None, **arguments)
 
     @property
     def base(self) -> TorqueModel:
-        """The version as trained, as the service loads it."""
+        """Return version 1 as trained, as the service loads it."""
         return lipcore.load(self.files.version_folder(registry.find(self.database, self.model, 1).folder))
 
-    def followed(self, known: RestoredState) -> RestoredState:
-        """Advance a state until there is nothing new."""
+    def follow_log(self, known: RestoredState) -> RestoredState:
+        """Advance a state to the end of the log."""
         while (following := advance(self.database, self.files, known)) is not known:
             known = following
         return known
 
-    def snapshot(self, at_most: int | None = None) -> int:
-        """Store the state after an event, the last one unless said; return the number of the event that it is of."""
-        known = self.restored(at_most=at_most)
+    def store_snapshot(self, at_most: int | None = None) -> int:
+        """Store the state after an event, by default the last one; return the number of that event."""
+        known = self.restore_state(at_most=at_most)
         payload, most = transfer.dump(known.online), self.settings.max_snapshots
         state = 1, known.number, known.seen
         assert snapshots.save(self.database, self.files, self.model, *state, payload, most=most) is not None
         return known.number
 
-    def batch(self, number: int, size: int = ROWS, model: str | None = None, **fields: Any) -> int:
-        """Log the batch with this sequence, predicted without error unless said; return its event's number."""
-        came = fields.pop("rows", None) or rows(number, size)
-        usual: dict[str, Any] = {
+    def log_batch(self, number: int, size: int = ROWS, model: str | None = None, **fields: Any) -> int:
+        """Log the batch with this sequence, by default predicted without error; return the event number."""
+        new_rows = fields.pop("rows", None) or make_rows(number, size)
+        defaults: dict[str, Any] = {
             "stream_id": "s",
             "kind": "batches",
             "sequence": number,
             "last_sequence": number,
             "digest": f"{number:064x}",
             "offset": 0.0,
-            "received": float(came.time[-1]),
+            "received": float(new_rows.time[-1]),
             "version": 1,
             "revision": 0,
-            "rows": came,
+            "rows": new_rows,
             "report": {"accepted": 0, "rejected": {}},
             "record": None,
         }
         with self.database.transaction() as session:
-            return log.append_batch(session, model or self.model, NewBatch(**usual | fields))[0].number
+            return log.append_batch(session, model or self.model, NewBatch(**defaults | fields))[0].number
 
-    def batches(self, *numbers: int) -> None:
+    def log_batches(self, *numbers: int) -> None:
         """Log several batches."""
         for number in numbers:
-            self.batch(number)
+            self.log_batch(number)
 
-    def event(self, kind: str, rows: Rows | None = None, **detail: Any) -> int:
-        """Log an event of another kind; return its number."""
+    def log_event(self, kind: str, rows: Rows | None = None, **detail: Any) -> int:
+        """Log an event that is not a batch; return its number."""
         with self.database.transaction() as session:
             return log.append(session, self.model, kind, detail, self._now(session), rows).number
 
     def unlearn(self, number: int) -> int:
-        """Unlearn the batch that is the event of this number."""
+        """Unlearn the batch with this event number; return the number of the unlearn event."""
         with self.database.transaction() as session:
             return undo.unlearn(session, self.model, self.find(number), self._now(session)).number
 
     def rollback(self, to: int) -> int:
-        """Roll back to the event of this number."""
+        """Roll back to an event; return the number of the rollback event."""
         with self.database.transaction() as session:
             return undo.rollback(session, self.model, to, self._now(session)).number
 
     def _now(self, session: Session) -> float:
-        """When the last event came."""
+        """Return the time at which the last event was received."""
         latest = select(EventRow.received).where(EventRow.model == self.model).order_by(EventRow.number.desc())
         return session.scalar(latest.limit(1)) or BEGIN
 
     def find(self, number: int) -> EventRow:
-        """An event."""
+        """Return the event with this number."""
         with self.database.session() as session:
             return log.events(session, self.model, number - 1, 1, void=True)[0]
 
-    def restored(self, **arguments: Any) -> Any:
-        """What version 1 has learnt."""
+    def restore_state(self, **arguments: Any) -> Any:
+        """Return the state that version 1 has learnt."""
         return restore(self.database, self.files, self.model, 1, self.base, **arguments)
 
 
-def at_once(numbers: Iterable[int] = (), parts: Iterable[Rows] = ()) -> tuple[np.ndarray, np.ndarray]:
-    """Torques and their deviations at QUERIES after the training and all of these batches, by one sum."""
-    model = trained()
+def expected_predictions(numbers: Iterable[int] = (), parts: Iterable[Rows] = ()) -> tuple[np.ndarray, np.ndarray]:
+    """Return torques and standard deviations at QUERIES after the training and these batches, computed by one sum."""
+    model = trained_model()
     posterior, known = model.posterior, model.posterior.statistics
-    learnt = [*(rows(number) for number in numbers), *parts]
+    learnt = [*(make_rows(number) for number in numbers), *parts]
     if learnt:
-        every = Rows.concatenate(learnt).learnt
-        residual = every.tau - posterior.kernel.mean(every.motion())
-        known = merge(known, collect(posterior.basis, posterior.row_variance(every.motion()), every.motion(), residual))
+        all_rows = Rows.concatenate(learnt).learnt
+        residual = all_rows.tau - posterior.kernel.mean(all_rows.motion())
+        known = merge(
+            known, collect(posterior.basis, posterior.row_variance(all_rows.motion()), all_rows.motion(), residual)
+        )
     noise, misfit = posterior.noise_variance, posterior.misfit
     built = CompactPosterior.build(posterior.kernel, posterior.basis, known, noise, posterior.std_factor, misfit)
-    return predicted(replace(model, posterior=built))
+    return predict_queries(replace(model, posterior=built))
 
 
-def predicted(model: TorqueModel) -> tuple[np.ndarray, np.ndarray]:
-    """Torques and their deviations at QUERIES."""
+def predict_queries(model: TorqueModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return torques and standard deviations at QUERIES."""
     answer = model.predict(*QUERIES)
     return answer.tau, answer.tau_std
 
 
-def same(found: TorqueModel | OnlineModel, expected: tuple[np.ndarray, np.ndarray]) -> None:
-    """Check what a model says against torques and their deviations."""
+def assert_predictions(found: TorqueModel | OnlineModel, expected: tuple[np.ndarray, np.ndarray]) -> None:
+    """Check the predictions of a model against torques and standard deviations."""
     model = found.model() if isinstance(found, OnlineModel) else found
-    for values, wanted in zip(predicted(model), expected, strict=True):
-        np.testing.assert_allclose(values, wanted, **CLOSE)
+    for values, expected_values in zip(predict_queries(model), expected, strict=True):
+        np.testing.assert_allclose(values, expected_values, **CLOSE)
 
 
-def differ(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], least: float = 1e-6) -> bool:
-    """Whether torques differ by more than `least` N·m somewhere."""
-    return bool(np.abs(one[0] - other[0]).max() > least)
+def predictions_differ(
+    one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray], min_difference: float = 1e-6
+) -> bool:
+    """Return whether any torques differ by more than `least` N·m."""
+    return bool(np.abs(one[0] - other[0]).max() > min_difference)
 
 
-def record(error: float, count: int = 100) -> dict[str, Any]:
-    """Prequential sums of rows predicted with an error of this size and either sign, as the log has them."""
+def residual_record(error: float, count: int = 100) -> dict[str, Any]:
+    """Return the prequential record, as logged, of rows predicted with errors of this size and alternating sign."""
     tau = np.where(np.arange(count)[:, None] % 2, 1.0, -1.0) * np.array([[error, 0.0]])
-    return Record.of(tau, np.zeros((count, 2)), np.full((count, 2), 1e-3), trained().noise_std).to_json()
+    return Record.of(tau, np.zeros((count, 2)), np.full((count, 2), 1e-3), trained_model().noise_std).to_json()
 
 
-def adopt(loaded: LoadedModels, message: Publication) -> bool:
-    """Let answers follow what the learner has published, as the service does."""
+def adopt_revision(loaded: LoadedModels, message: Publication) -> bool:
+    """Adopt a published revision for predictions, as the service does."""
     return loaded.revise(message.model, message.version, message.revision, publication.read(message.path))

@@ -1,4 +1,4 @@
-"""The client's methods say what their routes say, and what a model has learnt goes with it to another service."""
+"""The client's learning methods match their routes; exports include or leave out what was learnt."""
 
 import json
 
@@ -7,53 +7,54 @@ import pytest
 
 from lipserve import ApiError, Client
 from service.journal.alarms import raise_alarm
-from tests.service.archives.packing import exported, send, unpack
-from tests.service.learning.lessons import LESSON, QUERIES, answered
+from tests.service.learning.learning_models import BATCH_ROWS, QUERIES, read_json
+from tests.service.models.archives.packing import exported, import_archive, unpack
 
 
 @pytest.fixture
-def client(school):
+def client(learning_service):
     made = Client()
     made.close()
-    made._http = school.client  # the same requests, without a socket
+    made._http = learning_service.client  # no socket needed
     return made
 
 
-def same(answer, body):
+def assert_same(answer, body):
     assert answer.as_dict() == body
 
 
-def same_items(answers, body):
+def assert_same_items(answers, body):
     assert [each.as_dict() for each in answers] == body["items"]
 
 
-def test_what_is_seen(school, client):
-    pupil = school.enrol("seen-by-client")
-    tau = [[None, 0.0]] * LESSON
-    pupil.teach(0)
-    pupil.teach(1, tau=tau)
-    pupil.teach(0, stream_id="other")
-    same(client.quality("seen-by-client"), pupil.get("quality"))
-    same_items(client.observations("seen-by-client"), pupil.get("observations"))
+@pytest.mark.slow
+def test_client_reads_what_the_routes_return(learning_service, client):
+    learning_model = learning_service.create_model("seen-by-client")
+    tau = [[None, 0.0]] * BATCH_ROWS
+    learning_model.send_batches(0)
+    learning_model.send_batches(1, tau=tau)
+    learning_model.send_batches(0, stream_id="other")
+    assert_same(client.quality("seen-by-client"), learning_model.get("quality"))
+    assert_same_items(client.observations("seen-by-client"), learning_model.get("observations"))
     assert [item.sequence for item in client.observations("seen-by-client", "arm", rejected=True)] == [1]
-    same(client.observation("seen-by-client", "arm", 1), pupil.get("observations/arm/1"))
+    assert_same(client.observation("seen-by-client", "arm", 1), learning_model.get("observations/arm/1"))
     seen = client.observation("seen-by-client", "arm", 1, rows=True)
     assert seen.observed is not None
     assert seen.observed.tau == tau
-    same(client.learning("seen-by-client"), pupil.get("learning"))
-    with school.service.database.transaction() as session:
+    assert_same(client.learning("seen-by-client"), learning_model.get("learning"))
+    with learning_service.service.database.transaction() as session:
         raise_alarm(session, "seen-by-client", "novelty", "beyond", {})
-    same_items(client.alarms("seen-by-client"), pupil.get("alarms"))
+    assert_same_items(client.alarms("seen-by-client"), learning_model.get("alarms"))
 
 
-def test_what_is_decided(school, client):
-    pupil = school.enrol("led-by-client")
+def test_client_changes_what_the_routes_change(learning_service, client):
+    learning_model = learning_service.create_model("led-by-client")
     options = client.set_learning("led-by-client", contact_threshold=8.0).options
-    assert (options.contact_threshold, options.on_change) == (8.0, "learn")  # which was set before
-    pupil.teach(0, 1)
-    pupil.teach(2, tau=[[50.0, 50.0]] * LESSON)
-    assert client.replay("led-by-client", "arm", 2, ["contact"]).codes == {"contact": LESSON}
-    assert client.unlearn("led-by-client", "arm", 1).rows == LESSON
+    assert (options.contact_threshold, options.on_change) == (8.0, "learn")  # set before; not reset to its default
+    learning_model.send_batches(0, 1)
+    learning_model.send_batches(2, tau=[[50.0, 50.0]] * BATCH_ROWS)
+    assert client.replay("led-by-client", "arm", 2, ["contact"]).codes == {"contact": BATCH_ROWS}
+    assert client.unlearn("led-by-client", "arm", 1).rows == BATCH_ROWS
     assert client.rollback("led-by-client", revision=1).undone == 2
     for refused in (
         lambda: client.rollback("led-by-client", version=1),
@@ -65,34 +66,34 @@ def test_what_is_decided(school, client):
 
 
 @pytest.fixture(scope="module")
-def pupil(school):
-    pupil = school.enrol("travels")
-    pupil.teach(0, 1, 2)
-    return pupil
+def learning_model(learning_service):
+    learning_model = learning_service.create_model("travels")
+    learning_model.send_batches(0, 1, 2)
+    return learning_model
 
 
-def close(one, other):
+def assert_close(one, other):
     for name in ("tau", "tau_std"):
         np.testing.assert_allclose(one[name], other[name], rtol=1e-9, atol=1e-12)
 
 
-def test_imported_version_answers_as_the_one_that_has_learnt(school, pupil):
-    archive = exported(school.client, pupil.model)
+def test_imported_version_predicts_like_the_learnt_one(learning_service, learning_model):
+    archive = exported(learning_service.client, learning_model.name)
     about = json.loads(unpack(archive)["export.json"])
-    assert (about["learnt"], about["revision"]) == (True, pupil.predict()["revision"])
-    version = send(school.client, archive, name="arrived").json()
+    assert (about["learnt"], about["revision"]) == (True, learning_model.predict()["revision"])
+    version = import_archive(learning_service.client, archive, name="arrived").json()
     assert version["lineage"]["learnt"]["revision"] == about["revision"]
-    answer = answered(school.client.post("/v1/models/arrived/predict", json=QUERIES | {"version": 1}))
+    answer = read_json(learning_service.client.post("/v1/models/arrived/predict", json=QUERIES | {"version": 1}))
     assert answer["revision"] == 0
-    close(answer, pupil.predict())
+    assert_close(answer, learning_model.predict())
 
 
-def test_version_as_trained_is_exported_where_asked(school, pupil):
-    archive = exported(school.client, pupil.model, learnt=False)
+def test_export_can_leave_out_what_was_learnt(learning_service, learning_model):
+    archive = exported(learning_service.client, learning_model.name, learnt=False)
     about = json.loads(unpack(archive)["export.json"])
     assert (about["learnt"], about["revision"]) == (False, 0)
-    assert send(school.client, archive, name="untaught").status_code == 201
-    answer = answered(school.client.post("/v1/models/untaught/predict", json=QUERIES | {"version": 1}))
-    fresh = school.enrol("fresh").predict()
-    close(answer, fresh)
-    assert np.abs(np.array(fresh["tau"]) - np.array(pupil.predict()["tau"])).max() > 1e-6
+    assert import_archive(learning_service.client, archive, name="untaught").status_code == 201
+    answer = read_json(learning_service.client.post("/v1/models/untaught/predict", json=QUERIES | {"version": 1}))
+    fresh = learning_service.create_model("fresh").predict()
+    assert_close(answer, fresh)
+    assert np.abs(np.array(fresh["tau"]) - np.array(learning_model.predict()["tau"])).max() > 1e-6

@@ -1,4 +1,4 @@
-"""A version that follows its log: what it learns, publishes and stores, and how several take turns."""
+"""Followers of the log: what they learn, publish and store, and how several take turns."""
 
 import time
 from math import inf
@@ -10,263 +10,275 @@ from sqlalchemy import select
 from lipcore import NotPositiveDefiniteError
 from lipcore.vocabulary import Code
 from service.journal import log
-from service.learning.learner import follower as following
+from service.learning.learner import follower as follower_module
 from service.learning.learner import publication
 from service.learning.learner.follower import Follower, Novelty
 from service.learning.learner.publication import LearningFailure, Publication
 from service.learning.learner.worker import Learner
 from service.storage.database import SnapshotRow
-from tests.service.learning.pendulums import ARM, QUERIES, Arm, at_once, rows, same, trained
+from tests.service.learning.pendulums import (
+    ARM,
+    QUERIES,
+    Arm,
+    assert_predictions,
+    expected_predictions,
+    make_rows,
+    trained_model,
+)
 
 
 @pytest.fixture
 def arm(home, monkeypatch):
-    """A model of one version, which is stored when it is asked to be."""
-    monkeypatch.setattr(following, "SNAPSHOT_PERIODS", 1e8)
-    opened = Arm.open(home, max_loaded_models=2)
-    publication.clear(opened.files)
-    yield opened
-    opened.database.close()
+    """Model with one version and without periodic snapshots."""
+    monkeypatch.setattr(follower_module, "SNAPSHOT_PERIODS", 1e8)
+    opened_arm = Arm.open(home, max_loaded_models=2)
+    publication.clear(opened_arm.files)
+    yield opened_arm
+    opened_arm.database.close()
 
 
 @pytest.fixture
 def follower(arm):
-    """Version 1, before it has looked at the log."""
+    """Follower of version 1 that has not read the log yet."""
     return Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base)
 
 
-def caught_up(follower):
-    """Step until there is nothing new."""
+def catch_up(follower):
+    """Step to the end of the log."""
     follower.woken = follower.behind = True
     while follower.behind:
         follower.step()
     return follower
 
 
-def stored(arm, version=1):
-    """Numbers of the snapshots of a version."""
+def list_snapshots(arm, version=1):
+    """Return the event numbers of the snapshots of a version."""
     with arm.database.session() as session:
         found = session.scalars(select(SnapshotRow.number).where(SnapshotRow.version == version))
         return sorted(found)
 
 
-def answering(arm, message):
-    """The model that the service would answer with."""
-    return publication.read(message.path).apply(trained())
+def read_published_model(arm, message):
+    """Return the model that the service would predict with."""
+    return publication.read(message.path).apply(trained_model())
 
 
-def test_what_came_is_published(arm, follower):
-    arm.batches(0, 1, 2)
-    message = caught_up(follower).publish()
+def test_logged_batches_are_published(arm, follower):
+    arm.log_batches(0, 1, 2)
+    message = catch_up(follower).publish()
     assert (message.model, message.version, message.number, message.revision) == (ARM, 1, 3, 3)
     assert message.samples == pytest.approx(30)
     assert message.seconds > 0
-    same(answering(arm, message), at_once(range(3)))
+    assert_predictions(read_published_model(arm, message), expected_predictions(range(3)))
     assert not follower.unpublished
-    arm.batches(3)
-    assert caught_up(follower).unpublished
-    same(answering(arm, follower.publish()), at_once(range(4)))
+    arm.log_batches(3)
+    assert catch_up(follower).unpublished
+    assert_predictions(read_published_model(arm, follower.publish()), expected_predictions(range(4)))
 
 
-def test_a_rollback_is_published_as_a_higher_revision(arm, follower):
-    arm.batches(0, 1)
-    caught_up(follower).store()
-    arm.batches(2, 3)
-    caught_up(follower).publish()
+def test_rollback_is_published_as_higher_revision(arm, follower):
+    arm.log_batches(0, 1)
+    catch_up(follower).store()
+    arm.log_batches(2, 3)
+    catch_up(follower).publish()
     arm.rollback(2)
     follower.woken = follower.behind = True
     while follower.behind:
         follower.step()
-        assert not follower.unpublished or follower.number == 5  # nothing of the way back
+        assert not follower.unpublished or follower.number == 5  # no states within the rollback
     message = follower.publish()
     assert message.revision == 5
-    same(answering(arm, message), at_once(range(2)))
+    assert_predictions(read_published_model(arm, message), expected_predictions(range(2)))
 
 
-def test_batches_that_teach_nothing_cost_no_solving(arm, follower, monkeypatch):
-    arm.batches(0, 1)
-    first = answering(arm, caught_up(follower).publish())
-    kept_out = rows(2)
+def test_rejected_batches_do_not_trigger_a_solve(arm, follower, monkeypatch):
+    arm.log_batches(0, 1)
+    first = read_published_model(arm, catch_up(follower).publish())
+    kept_out = make_rows(2)
     kept_out.code[:] = 6
-    arm.batch(2, rows=kept_out)
-    monkeypatch.setattr(following.Revision, "of", None)
-    message = caught_up(follower).publish()
+    arm.log_batch(2, rows=kept_out)
+    monkeypatch.setattr(follower_module.Revision, "of", None)
+    message = catch_up(follower).publish()
     assert message.revision == 3
-    same(answering(arm, message), (first.predict(*QUERIES).tau, first.predict(*QUERIES).tau_std))
+    assert_predictions(
+        read_published_model(arm, message), (first.predict(*QUERIES).tau, first.predict(*QUERIES).tau_std)
+    )
 
 
-def test_a_state_is_stored_and_taken_up_again(arm, follower, monkeypatch):
-    arm.batches(0, 1, 2)
-    caught_up(follower).store()
-    assert stored(arm) == [3]
+def test_follower_resumes_from_stored_state(arm, follower, monkeypatch):
+    arm.log_batches(0, 1, 2)
+    catch_up(follower).store()
+    assert list_snapshots(arm) == [3]
     follower.store()
-    assert stored(arm) == [3]
-    arm.batches(3)
+    assert list_snapshots(arm) == [3]
+    arm.log_batches(3)
     learnt = []
     monkeypatch.setattr(log, "decode", lambda payload, real=log.decode: learnt.append(1) or real(payload))
-    again = caught_up(Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base))
+    again = catch_up(Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base))
     assert len(learnt) == 1
-    same(answering(arm, again.publish()), at_once(range(4)))
+    assert_predictions(read_published_model(arm, again.publish()), expected_predictions(range(4)))
 
 
-def test_one_of_several_services_stores_for_all(arm, follower, monkeypatch):
+def test_several_services_share_snapshots(arm, follower, monkeypatch):
     monkeypatch.setattr(arm.database.adapter, "shared", True)
     other = Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base)
-    arm.batches(0, 1)
-    caught_up(follower).store_in_turn()
-    arm.batches(2)
-    caught_up(other).store_in_turn()
-    assert stored(arm) == [2]
-    caught_up(follower).store_in_turn()
+    arm.log_batches(0, 1)
+    catch_up(follower).store_in_turn()
+    arm.log_batches(2)
+    catch_up(other).store_in_turn()
+    assert list_snapshots(arm) == [2]
+    catch_up(follower).store_in_turn()
     other.store()
-    assert stored(arm) == [2, 3]
-    arm.batches(3)
-    caught_up(other).store()  # at the end all of it, whoever was the last
-    assert stored(arm) == [2, 3, 4]
+    assert list_snapshots(arm) == [2, 3]
+    arm.log_batches(3)
+    catch_up(other).store()  # the final store does not depend on whose turn it is
+    assert list_snapshots(arm) == [2, 3, 4]
 
 
-def test_a_clock_that_is_set_back_keeps_no_state_from_being_stored(arm, follower, monkeypatch):
+def test_snapshots_are_stored_after_clock_is_set_back(arm, follower, monkeypatch):
     monkeypatch.setattr(arm.database.adapter, "shared", True)
     other = Follower(arm.database, arm.files, arm.settings, ARM, 1, arm.base)
-    arm.batches(0)
-    caught_up(other).store()
-    arm.batches(1)
+    arm.log_batches(0)
+    catch_up(other).store()
+    arm.log_batches(1)
     real = time.time
     monkeypatch.setattr(time, "time", lambda: real() - 3600.0)
-    caught_up(follower).store_in_turn()
-    assert stored(arm) == [1, 2]
+    catch_up(follower).store_in_turn()
+    assert list_snapshots(arm) == [1, 2]
 
 
-def test_motion_beyond_the_basis_is_counted():
+def test_novelty_counts_motion_beyond_the_basis():
     novelty, seen = Novelty(window=80), []
-    for count, novel in ((76, 76), (4, 4), (80, 0), (40, 40), (60, 0)):  # not told from few rows
+    for count, novel in ((76, 76), (4, 4), (80, 0), (40, 40), (60, 0)):  # few rows give no share
         novelty.add(np.arange(count) < novel)
         seen.append((novelty.rows, novelty.share))
     assert seen == [(76, 0.0), (80, 1.0), (80, 0.0), (120, 0.5), (120, 0.25)]
 
 
-def test_novelty_is_told_with_what_is_published(arm, follower):
-    """Motion far faster than the version has seen; rows that are not learnt do not count."""
-    quick = rows(0, size=40)
+def test_publication_contains_novelty_of_learnt_rows(arm, follower):
+    """Motion is far faster than in the training; rows that are not learnt do not count."""
+    quick = make_rows(0, size=40)
     quick.dq[:] = 50.0
     quick.code[30:] = Code.CONTACT
-    arm.batch(0, rows=quick)
-    message = caught_up(follower).publish()
+    arm.log_batch(0, rows=quick)
+    message = catch_up(follower).publish()
     assert (message.novel_rows, message.novel_share) == (30, 0.0)
 
 
-def test_the_error_of_a_learnt_arms_linearisation_is_published(arm, follower, monkeypatch):
-    arm.batch(0)
-    assert caught_up(follower).publish().linearisation is None
-    monkeypatch.setattr(following, "linearisation_error", lambda model: np.array([0.1, 0.7]))
-    arm.batch(1)
-    assert caught_up(follower).publish().linearisation == (0.0, 0.0)  # both joints are predicted as well as stated
-    monkeypatch.setattr(following, "error_floor_of", lambda *_: np.array([0.0, 0.5]))
-    arm.batch(2)
-    assert caught_up(follower).publish().linearisation == (0.0, 0.7)
+def test_publication_contains_linearisation_error(arm, follower, monkeypatch):
+    arm.log_batch(0)
+    assert catch_up(follower).publish().linearisation is None
+    monkeypatch.setattr(follower_module, "linearisation_error", lambda model: np.array([0.1, 0.7]))
+    arm.log_batch(1)
+    assert catch_up(follower).publish().linearisation == (0.0, 0.0)  # both errors are below the floor
+    monkeypatch.setattr(follower_module, "error_floor_of", lambda *_: np.array([0.0, 0.5]))
+    arm.log_batch(2)
+    assert catch_up(follower).publish().linearisation == (0.0, 0.7)
 
 
 @pytest.fixture
 def learner(arm):
-    """What the learner process runs, in this one."""
+    """Learner that normally runs in the learner process."""
     return Learner(arm.database, arm.files, arm.settings)
 
 
-def turns(learner, *woken, last=inf):
-    """Wake models, and let all followers do what is to be done before monotonic time stands still; the messages."""
+def run_turns(learner, *woken, last=inf):
+    """Wake models and run turns until no follower has work; return the messages."""
     learner.wake(set(woken))
     messages = []
-    while learner.pause() < last and (learner.pause() == 0 or any(each.unpublished for each in followers(learner))):
+    while learner.pause() < last and (
+        learner.pause() == 0 or any(each.unpublished for each in list_followers(learner))
+    ):
         messages += learner.turn()
     return messages
 
 
-def followers(learner):
+def list_followers(learner):
     return list(learner.followers.values())
 
 
-def test_only_the_version_that_serves_learns(arm, learner):
-    arm.batches(0, 1)
+def test_only_the_serving_version_learns(arm, learner):
+    arm.log_batches(0, 1)
     arm.publish(candidate=True, start=1)
     arm.publish("other")
-    arm.batch(0, model="other")
-    messages = {(each.model, each.version): each for each in turns(learner, ARM)}
+    arm.log_batch(0, model="other")
+    messages = {(each.model, each.version): each for each in run_turns(learner, ARM)}
     assert set(messages) == {(ARM, 1)}
-    same(answering(arm, messages[ARM, 1]), at_once(range(2)))
+    assert_predictions(read_published_model(arm, messages[ARM, 1]), expected_predictions(range(2)))
 
 
-def test_a_version_that_serves_no_more_is_stored_and_left(arm, learner):
-    arm.batches(0, 1)
-    turns(learner, ARM)
+def test_replaced_version_is_stored_and_stops_learning(arm, learner):
+    arm.log_batches(0, 1)
+    run_turns(learner, ARM)
     arm.publish()
-    arm.batches(2)
-    messages = turns(learner, ARM)
+    arm.log_batches(2)
+    messages = run_turns(learner, ARM)
     assert {each.version for each in messages} == {2}
     assert set(learner.followers) == {(ARM, 2)}
-    assert stored(arm) == [2]
+    assert list_snapshots(arm) == [2]
 
 
-def test_no_more_versions_are_kept_than_may_be_and_none_is_lost(arm, learner):
+def test_evicted_versions_are_stored_and_restored(arm, learner):
     for name in ("b", "c"):
         arm.publish(name)
-        arm.batch(0, model=name)
-    arm.batches(0, 1)
-    turns(learner, ARM)
-    turns(learner, "b")
-    turns(learner, "c")
+        arm.log_batch(0, model=name)
+    arm.log_batches(0, 1)
+    run_turns(learner, ARM)
+    run_turns(learner, "b")
+    run_turns(learner, "c")
     assert set(learner.followers) == {("b", 1), ("c", 1)}
-    assert stored(arm) == [2]
-    arm.batches(2)
-    (message,) = turns(learner, ARM)
-    same(answering(arm, message), at_once(range(3)))
-    assert turns(learner, "nobody") == []
+    assert list_snapshots(arm) == [2]
+    arm.log_batches(2)
+    (message,) = run_turns(learner, ARM)
+    assert_predictions(read_published_model(arm, message), expected_predictions(range(3)))
+    assert run_turns(learner, "nobody") == []
     learner.close()
-    assert stored(arm) == [1, 1, 2, 3]  # all of all at the end
+    assert list_snapshots(arm) == [1, 1, 2, 3]  # closing stores all versions
 
 
-def test_snapshots_are_taken_now_and_then(home, monkeypatch):
-    monkeypatch.setattr(following, "SNAPSHOT_PERIODS", 0)
+def test_snapshots_are_stored_periodically(home, monkeypatch):
+    monkeypatch.setattr(follower_module, "SNAPSHOT_PERIODS", 0)
     arm = Arm.open(home)
     publication.clear(arm.files)
     learner = Learner(arm.database, arm.files, arm.settings)
-    arm.batches(0, 1)
-    turns(learner, ARM)
-    assert stored(arm) == [2]
+    arm.log_batches(0, 1)
+    run_turns(learner, ARM)
+    assert list_snapshots(arm) == [2]
     arm.database.close()
 
 
-def test_a_version_that_cannot_learn_does_not_keep_others_from_it(arm, learner, monkeypatch):
+def test_failing_version_does_not_block_others(arm, learner, monkeypatch):
     arm.publish("other")
-    arm.batch(0, model="other")
-    arm.batches(0, 1)
+    arm.log_batch(0, model="other")
+    arm.log_batches(0, 1)
     with arm.database.transaction() as session:
         session.connection().exec_driver_sql("UPDATE events SET payload = x'00' WHERE model = 'arm'")
-    failed, learnt = turns(learner, ARM, "other")
+    failed, learnt = run_turns(learner, ARM, "other")
     assert isinstance(failed, LearningFailure)
     assert (failed.model, failed.version) == (ARM, 1)
     assert isinstance(learnt, Publication)
     assert learnt.model == "other"
     assert 0.0 < learner.pause() <= 1.0
-    assert turns(learner, ARM) == []  # not at once
+    assert run_turns(learner, ARM) == []  # not retried at once
 
 
-def test_a_version_that_failed_is_tried_again_less_and_less_often(arm, learner, monkeypatch):
-    arm.batches(0)
+def test_failed_version_is_retried_with_growing_pauses(arm, learner, monkeypatch):
+    arm.log_batches(0)
 
     def fail(self, floor):
         raise NotPositiveDefiniteError("no samples have such statistics")
 
-    real = following.OnlineModel.model
-    monkeypatch.setattr(following.OnlineModel, "model", fail)
+    real = follower_module.OnlineModel.model
+    monkeypatch.setattr(follower_module.OnlineModel, "model", fail)
     pauses = []
     for _ in range(3):
-        (failed,) = turns(learner, ARM)
+        (failed,) = run_turns(learner, ARM)
         assert failed.error == "NotPositiveDefiniteError: no samples have such statistics"
         ((at, pause),) = learner._failed.values()
         pauses.append(pause)
-        learner._failed[ARM, 1] = (at - 100.0, pause)  # as if that time had passed
+        learner._failed[ARM, 1] = (at - 100.0, pause)  # simulates the pause
     assert pauses == [1.0, 2.0, 4.0]
-    monkeypatch.setattr(following.OnlineModel, "model", real)
-    (message,) = turns(learner)
-    same(answering(arm, message), at_once([0]))
+    monkeypatch.setattr(follower_module.OnlineModel, "model", real)
+    (message,) = run_turns(learner)
+    assert_predictions(read_published_model(arm, message), expected_predictions([0]))
     assert not learner._failed

@@ -1,4 +1,4 @@
-"""Kills while batches come: what was acknowledged is there, and nothing is there, or learnt, twice."""
+"""Kills during ingest: acknowledged batches are logged and learnt exactly once."""
 
 import multiprocessing
 import os
@@ -17,19 +17,19 @@ from service.journal import log
 from service.journal.log import encode
 from service.storage.database import Database
 from tests.service.data import DEADLINE
-from tests.service.learning.batches import MODEL, batch, everything, opened, rows, source
+from tests.service.learning.batches import MODEL, find_stream, list_events, make_batch, make_rows, open_database
 
 ROWS = 50
 
 
 def send_batches(settings, acknowledged, sequence, count, later):
-    """Send batches from a sequence on; be killed `later` s after `count` have been acknowledged."""
+    """Send batches from a sequence on; kill this process `later` s after `count` acknowledgements."""
     database = Database.of(settings)
     killing = threading.Timer(later, os.kill, (os.getpid(), signal.SIGKILL))
     while True:
         with database.transaction() as session:
             if log.find_batch(session, MODEL, "robot-1", sequence) is None:
-                log.append_batch(session, MODEL, batch(sequence, rows=rows(ROWS, seed=sequence)))
+                log.append_batch(session, MODEL, make_batch(sequence, rows=make_rows(ROWS, seed=sequence)))
         acknowledged.send(sequence)
         sequence += 1
         count -= 1
@@ -37,10 +37,10 @@ def send_batches(settings, acknowledged, sequence, count, later):
             killing.start()
 
 
-def sent_until_killed(home, sequence, count, later):
-    """Let a process send until it is killed; return what it has acknowledged."""
+def send_until_killed(home, sequence, count, later):
+    """Run a process that sends until it is killed; return the acknowledged sequences."""
     processes = multiprocessing.get_context("forkserver")
-    processes.set_forkserver_preload([__name__])  # many processes, one import
+    processes.set_forkserver_preload([__name__])  # imports once for many processes
     ours, theirs = processes.Pipe(duplex=False)
     given = Settings(home=home), theirs, sequence, count, later
     process = processes.Process(target=send_batches, args=given, daemon=True)
@@ -56,46 +56,46 @@ def sent_until_killed(home, sequence, count, later):
 
 
 @pytest.mark.slow
-def test_a_kill_at_any_moment_loses_no_acknowledged_batch_and_leaves_none_twice(home):
-    opened(home).close()
-    chance = np.random.default_rng(3)
+def test_kill_loses_and_duplicates_no_acknowledged_batch(home):
+    open_database(home).close()
+    rng = np.random.default_rng(3)
     acknowledged = []
     for kill in range(20):
-        later = chance.uniform(0.0, 0.01) if kill % 2 else 0.0  # at any moment, or just as one was acknowledged
-        following = acknowledged[-1] + 1 if acknowledged else 0  # again what may be there, never what was acknowledged
-        acknowledged += sent_until_killed(home, following, int(chance.integers(1, 6)), later)
+        later = rng.uniform(0.0, 0.01) if kill % 2 else 0.0  # at a random moment, or right after an acknowledgement
+        following = acknowledged[-1] + 1 if acknowledged else 0  # it may be logged already
+        acknowledged += send_until_killed(home, following, int(rng.integers(1, 6)), later)
 
     database = Database.of(Settings(home=home))
-    found = everything(database)
+    found = list_events(database)
     sequences = [event.sequence for event in found]
     assert set(acknowledged) <= set(sequences)
     assert sequences == list(range(len(found)))  # none missing, none twice
     assert [event.number for event in found] == list(range(1, len(found) + 1))
     with database.session() as session:
         for event in log.events(session, MODEL, 0, len(found)):
-            assert event.payload == encode(rows(ROWS, seed=event.sequence))
-    assert (source(database).last, source(database).missing["ranges"]) == (sequences[-1], [])
+            assert event.payload == encode(make_rows(ROWS, seed=event.sequence))
+    assert (find_stream(database).last, find_stream(database).missing["ranges"]) == (sequences[-1], [])
     database.close()
 
 
-TRIALS = 6
-"""Kills, of the service and of its learner in turn."""
+N_TRIALS = 6
+"""Number of kills, alternating between the service and its learner."""
 
 
 @pytest.fixture(scope="module")
 def tally(tmp_path_factory) -> Tally:
-    with open_trials(tmp_path_factory.mktemp("trials"), TRIALS, seed=5, batches=20) as trials:
-        for number in range(TRIALS):
+    with open_trials(tmp_path_factory.mktemp("trials"), N_TRIALS, seed=5, batches=20) as trials:
+        for number in range(N_TRIALS):
             trials.trial(VICTIMS[number % 2], batches=20)
         trials.weigh()
     return trials.tally
 
 
 @pytest.mark.slow
-def test_no_acknowledged_batch_is_lost_nor_applied_twice(tally):
-    assert tally.kills == {"service": TRIALS // 2, "learner": TRIALS // 2}
-    assert tally.batches == 20 * TRIALS
+def test_service_and_learner_kills_lose_and_duplicate_nothing(tally):
+    assert tally.kills == {"service": N_TRIALS // 2, "learner": N_TRIALS // 2}
+    assert tally.batches == 20 * N_TRIALS
     assert min(tally.repeated, tally.late) > 0
     assert (tally.lost, tally.twice, tally.refused) == (0, 0, 0)
-    # a single batch more or less would show
-    assert tally.largest <= durability.TOLERANCE < 0.1 * tally.one_batch
+    # one batch more or less would exceed the tolerance
+    assert tally.largest <= durability.MAX_DIFFERENCE < 0.1 * tally.one_batch

@@ -1,4 +1,4 @@
-"""The learner as a process of its own: woken, heard, killed, started again, and out of serving's way."""
+"""The learner process: waking, messages, kills, restarts, and its low priority."""
 
 import os
 import signal
@@ -19,39 +19,39 @@ from service.models.loaded import LoadedModels
 from service.runtime import companion
 from service.storage.database import SnapshotRow
 from tests.service.data import DEADLINE, eventually
-from tests.service.learning.pendulums import ARM, Arm, adopt, at_once, same
+from tests.service.learning.pendulums import ARM, Arm, adopt_revision, assert_predictions, expected_predictions
 
 linux = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="reads /proc")
 
 
-class Serving:
-    """What the service does with a learner process: answer with what it publishes. arm: a model that learns."""
+class AnsweringService:
+    """Service that predicts with what its learner process publishes; `arm` is the model that learns."""
 
     def __init__(self, home, **settings):
         self.arm = Arm.open(home, learner_niceness=1, **settings)
         self.loaded = LoadedModels(self.arm.storage, LearntVersions(self.arm.database, self.arm.files), capacity=4)
         self.loaded.preload()
         self.messages = []
-        self.learner = LearnerProcess(self.arm.settings, self.take)
+        self.learner = LearnerProcess(self.arm.settings, self.receive)
 
-    def take(self, message):
+    def receive(self, message):
         self.messages.append(message)
         if isinstance(message, Publication):
-            adopt(self.loaded, message)
+            adopt_revision(self.loaded, message)
 
-    def teach(self, *numbers):
+    def log_batches(self, *numbers):
         """Log batches and wake the learner."""
-        self.arm.batches(*numbers)
+        self.arm.log_batches(*numbers)
         self.learner.wake(self.arm.model)
 
-    def answering(self, revision):
-        """The model that answers once a revision does."""
+    def wait_for_model(self, revision):
+        """Return the model that predicts once it contains a revision."""
         return eventually(
             lambda: (served := self.loaded.hot(self.arm.model, None)).revision >= revision and served
         ).model
 
-    def stored(self):
-        """Numbers of the snapshots."""
+    def list_snapshots(self):
+        """Return the event numbers of the snapshots."""
         with self.arm.database.session() as session:
             return sorted(session.scalars(select(SnapshotRow.number)))
 
@@ -61,159 +61,163 @@ class Serving:
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory):
-    """A service whose learner runs."""
-    started = Serving(tmp_path_factory.mktemp("learner"))
-    started.teach(0)
-    started.answering(1)
+def shared_service(tmp_path_factory):
+    """Service with a running learner."""
+    started = AnsweringService(tmp_path_factory.mktemp("learner"))
+    started.log_batches(0)
+    started.wait_for_model(1)
     yield started
     started.close()
 
 
 @pytest.fixture
-def serving(service, request):
-    """That service with a model of the test's own."""
-    service.arm = replace(service.arm, model=request.node.name[:60].replace("[", "-").rstrip("]"))
-    service.arm.publish()
-    service.loaded.get(service.arm.model, None)
-    service.messages.clear()
-    return service
+def answering_service(shared_service, request):
+    """Shared service with a model of this test."""
+    shared_service.arm = replace(shared_service.arm, model=request.node.name[:60].replace("[", "-").rstrip("]"))
+    shared_service.arm.publish()
+    shared_service.loaded.get(shared_service.arm.model, None)
+    shared_service.messages.clear()
+    return shared_service
 
 
 @pytest.fixture
-def alone(home):
-    """A service of the test's own, whose learner has not been needed yet."""
-    started = Serving(home)
+def own_service(home):
+    """Service of this test, whose learner is not started yet."""
+    started = AnsweringService(home)
     yield started
     started.close()
 
 
-def test_what_is_logged_is_learnt_and_answered(serving):
-    serving.teach(0, 1, 2)
-    same(serving.answering(3), at_once(range(3)))
-    serving.teach(3)
-    same(serving.answering(4), at_once(range(4)))
-    assert list(publication.folder(serving.arm.files).iterdir()) == []
-    serving.arm.unlearn(2)
-    serving.learner.wake(serving.arm.model)
-    same(serving.answering(5), at_once([0, 2, 3]))
+def test_logged_batches_are_learnt_and_answered(answering_service):
+    answering_service.log_batches(0, 1, 2)
+    assert_predictions(answering_service.wait_for_model(3), expected_predictions(range(3)))
+    answering_service.log_batches(3)
+    assert_predictions(answering_service.wait_for_model(4), expected_predictions(range(4)))
+    assert list(publication.folder(answering_service.arm.files).iterdir()) == []
+    answering_service.arm.unlearn(2)
+    answering_service.learner.wake(answering_service.arm.model)
+    assert_predictions(answering_service.wait_for_model(5), expected_predictions([0, 2, 3]))
 
 
-def test_a_killed_learner_comes_back_and_catches_up(serving, caplog):
-    serving.teach(0, 1)
-    serving.answering(2)
-    first = serving.learner.pid
+def test_killed_learner_restarts_and_catches_up(answering_service, caplog):
+    answering_service.log_batches(0, 1)
+    answering_service.wait_for_model(2)
+    first = answering_service.learner.pid
     os.kill(first, signal.SIGKILL)
-    serving.teach(2, 3)
-    same(serving.answering(4), at_once(range(4)))
-    assert serving.learner.pid not in (None, first)
+    answering_service.log_batches(2, 3)
+    assert_predictions(answering_service.wait_for_model(4), expected_predictions(range(4)))
+    assert answering_service.learner.pid not in (None, first)
     assert "the learner process ended with exit code -9; it is started again" in caplog.text
-    revisions = [each.revision for each in serving.messages if each.model == serving.arm.model]
+    revisions = [each.revision for each in answering_service.messages if each.model == answering_service.arm.model]
     assert revisions == sorted(revisions)
     assert revisions[-1] == 4
 
 
-def test_a_learner_that_hangs_is_replaced_and_nothing_is_lost(home, caplog, monkeypatch):
+@pytest.mark.slow
+def test_hanging_learner_is_replaced_without_loss(home, caplog, monkeypatch):
     monkeypatch.setattr(companion, "COMPANION", companion.CompanionOptions(quiet_s=2.0))
-    hasty = Serving(home)
+    impatient_service = AnsweringService(home)
     try:
-        hasty.teach(0, 1)
-        hasty.answering(2)
-        first = hasty.learner.pid
-        os.kill(first, signal.SIGSTOP)  # it is there, but does nothing any more
-        hasty.teach(2, 3)
-        same(hasty.answering(4), at_once(range(4)))
-        assert hasty.learner.pid not in (None, first)
-        assert "the learner process hangs and is killed: it has not got on for 2 s" in caplog.text
+        impatient_service.log_batches(0, 1)
+        impatient_service.wait_for_model(2)
+        first = impatient_service.learner.pid
+        os.kill(first, signal.SIGSTOP)  # the process exists but does not run
+        impatient_service.log_batches(2, 3)
+        assert_predictions(impatient_service.wait_for_model(4), expected_predictions(range(4)))
+        assert impatient_service.learner.pid not in (None, first)
+        assert "the learner process hangs and is killed: it has made no progress for 2 s" in caplog.text
     finally:
-        hasty.close()
+        impatient_service.close()
 
 
-def test_where_the_system_starts_no_learner_it_is_tried_again(alone, monkeypatch, caplog):
-    start, failures = alone.learner._start, iter([BlockingIOError("no more processes")])
+@pytest.mark.slow
+def test_failed_learner_start_is_retried(own_service, monkeypatch, caplog):
+    start, failures = own_service.learner._start, iter([BlockingIOError("no more processes")])
 
     def sometimes():
         for failure in failures:
             raise failure
         return start()
 
-    monkeypatch.setattr(alone.learner, "_start", sometimes)
-    alone.teach(0)
-    alone.answering(1)
-    assert "the learner process cannot be started" in caplog.text
+    monkeypatch.setattr(own_service.learner, "_start", sometimes)
+    own_service.log_batches(0)
+    own_service.wait_for_model(1)
+    assert "the learner process could not be started" in caplog.text
 
 
-def test_a_learner_at_rest_says_that_it_gets_on(serving):
-    serving.teach(0)
-    serving.answering(1)
-    process = serving.learner._progress
+def test_idle_learner_reports_progress(answering_service):
+    answering_service.log_batches(0)
+    answering_service.wait_for_model(1)
+    process = answering_service.learner._progress
     process.silent_s = 7.0
     eventually(lambda: process.silent_s == 0.0)
 
 
-def test_what_it_knows_is_stored_when_the_service_ends(alone):
-    assert alone.learner.pid is None  # not before there is something to learn
-    alone.teach(0, 1, 2)
-    alone.answering(3)
-    assert alone.stored() == []
-    os.kill(alone.learner.pid, signal.SIGTERM)  # to all processes of a service, which then ends in order
-    os.kill(alone.learner.pid, signal.SIGINT)
-    alone.learner.close()
-    assert alone.stored() == [3]
-    assert alone.learner.pid is None
-    alone.learner.wake(ARM)  # too late: nothing is started
-    assert alone.learner.pid is None
+def test_state_is_stored_at_shutdown(own_service):
+    assert own_service.learner.pid is None  # the learner is started by the first batch
+    own_service.log_batches(0, 1, 2)
+    own_service.wait_for_model(3)
+    assert own_service.list_snapshots() == []
+    os.kill(own_service.learner.pid, signal.SIGTERM)  # signals reach all processes; the service ends the learner
+    os.kill(own_service.learner.pid, signal.SIGINT)
+    own_service.learner.close()
+    assert own_service.list_snapshots() == [3]
+    assert own_service.learner.pid is None
+    own_service.learner.wake(ARM)  # a closed learner is not started
+    assert own_service.learner.pid is None
 
 
-def test_ending_while_it_starts_does_not_wait_for_it(alone):
-    alone.learner.wake(ARM)
-    alone.learner.close()
-    assert alone.learner.pid is None
+def test_shutdown_does_not_wait_for_a_starting_learner(own_service):
+    own_service.learner.wake(ARM)
+    own_service.learner.close()
+    assert own_service.learner.pid is None
 
 
-def test_waking_one_that_is_busy_does_not_wait(serving):
-    serving.teach(0)
-    serving.answering(1)
-    pid = serving.learner.pid
+def test_waking_a_busy_learner_does_not_block(answering_service):
+    answering_service.log_batches(0)
+    answering_service.wait_for_model(1)
+    pid = answering_service.learner.pid
     os.kill(pid, signal.SIGSTOP)
-    for _ in range(5000):  # more than a pipe holds, were each sent
-        serving.learner.wake(serving.arm.model)
+    for _ in range(5000):  # more messages than a pipe holds
+        answering_service.learner.wake(answering_service.arm.model)
     os.kill(pid, signal.SIGCONT)
-    serving.teach(1)
-    same(serving.answering(2), at_once(range(2)))
+    answering_service.log_batches(1)
+    assert_predictions(answering_service.wait_for_model(2), expected_predictions(range(2)))
 
 
-def test_a_message_that_cannot_be_taken_does_not_end_the_listening(serving, monkeypatch, caplog):
+def test_failing_message_handler_does_not_stop_the_listener(answering_service, monkeypatch, caplog):
     refused = threading.Event()
 
     def take(message):
         if not refused.is_set():
             refused.set()
             raise RuntimeError("no room")
-        serving.take(message)
+        answering_service.receive(message)
 
-    monkeypatch.setattr(serving.learner, "on_message", take)
-    serving.teach(0)
+    monkeypatch.setattr(answering_service.learner, "on_message", take)
+    answering_service.log_batches(0)
     assert refused.wait(DEADLINE)
-    serving.teach(1)
-    same(serving.answering(2), at_once(range(2)))
-    assert "a message of the learner process was not taken" in caplog.text
+    answering_service.log_batches(1)
+    assert_predictions(answering_service.wait_for_model(2), expected_predictions(range(2)))
+    assert "could not handle a message of the learner process" in caplog.text
 
 
 @linux
-def test_it_gives_way_to_serving(serving):
-    serving.teach(0)
-    serving.answering(1)
-    place, pid = learner_place(serving.arm.settings), serving.learner.pid
+def test_learner_runs_at_low_priority(answering_service):
+    answering_service.log_batches(0)
+    answering_service.wait_for_model(1)
+    place, pid = learner_place(answering_service.arm.settings), answering_service.learner.pid
     for task in Path(f"/proc/{pid}/task").iterdir():
         fields = (task / "stat").read_text().rpartition(")")[2].split()
-        assert int(fields[16]) == os.nice(0) + serving.arm.settings.learner_niceness
+        assert int(fields[16]) == os.nice(0) + answering_service.arm.settings.learner_niceness
         assert frozenset(os.sched_getaffinity(int(task.name))) == place.cpus
-    assert (place.threads, place.niceness) == (1, serving.arm.settings.learner_niceness)
+    assert (place.threads, place.niceness) == (1, answering_service.arm.settings.learner_niceness)
 
 
-def test_it_takes_its_place_before_numerics_are_imported():
-    """Spawning imports the module of the process's function before that runs."""
-    said = "import sys, service.learning.learner.process; print(sorted({'numpy', 'torch', 'scipy'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", said], capture_output=True, text=True, check=True)
+def test_process_module_imports_no_numerics():
+    """Spawning imports this module before the process sets its priority and thread count."""
+    reply = (
+        "import sys, service.learning.learner.process; print(sorted({'numpy', 'torch', 'scipy'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", reply], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

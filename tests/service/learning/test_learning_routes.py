@@ -1,4 +1,4 @@
-"""How a model learns is set and seen, a hold ends by a decision, and its owner is told."""
+"""Routes for learning options, status, decisions after a pause, and alarms."""
 
 import time
 
@@ -10,10 +10,10 @@ from service.journal import log, snapshots
 from service.journal.alarms import raise_alarm
 from service.learning import owner
 from service.learning.control import decisions
-from tests.service.learning.batches import MODEL, batch, everything, write
-from tests.service.learning.lessons import LESSON, Pupil, apart, lesson
+from tests.service.learning.batches import MODEL, append_batches, list_events, make_batch
+from tests.service.learning.learning_models import BATCH_ROWS, LearningModel, max_difference, observation_batch
 
-EQUAL = 1e-8
+MAX_DIFFERENCE = 1e-8
 DEFAULTS = {
     "enabled": True,
     "forgetting_s": None,
@@ -28,33 +28,33 @@ DEFAULTS = {
 }
 
 
-def offset(pupil):
-    """Event time of the first row of the recording that lessons are taken from."""
-    return pupil.get("learning")["status"]["streams"][0]["offset_s"]
+def read_offset(learning_model):
+    """Return the event time of the first row of the recording."""
+    return learning_model.get("learning")["status"]["streams"][0]["offset_s"]
 
 
-def hold(school, pupil):
-    """Hold a model as ingest does once a change is found: at the first row that is to come. Return its event time."""
-    rows = log_rows(school, pupil)
-    at = offset(pupil) + rows * 0.01 - 0.005
-    with school.service.database.transaction() as session:
-        number = log.newest(session, pupil.model) + 1
-        owner.pause(session, pupil.model, {"at": at, "event": number, "evidence": {"joints": ["joint1"]}})
+def pause_model(learning_service, learning_model):
+    """Pause a model at its next row, as ingest does after a change; return the event time."""
+    rows = count_logged_rows(learning_service, learning_model)
+    at = read_offset(learning_model) + rows * 0.01 - 0.005
+    with learning_service.service.database.transaction() as session:
+        number = log.newest(session, learning_model.name) + 1
+        owner.pause(session, learning_model.name, {"at": at, "event": number, "evidence": {"joints": ["joint1"]}})
     return at
 
 
-def log_rows(school, pupil):
-    with school.service.database.session() as session:
-        return sum(event.rows for event in log.events(session, pupil.model, 0, 100) if event.kind == "batch")
+def count_logged_rows(learning_service, learning_model):
+    with learning_service.service.database.session() as session:
+        return sum(event.rows for event in log.events(session, learning_model.name, 0, 100) if event.kind == "batch")
 
 
-def changes(school, pupil):
-    with school.service.database.session() as session:
-        return [event.detail for event in log.events(session, pupil.model, 0, 100) if event.kind == "change"]
+def list_changes(learning_service, learning_model):
+    with learning_service.service.database.session() as session:
+        return [event.detail for event in log.events(session, learning_model.name, 0, 100) if event.kind == "change"]
 
 
-def test_a_model_that_nothing_was_set_for_has_the_defaults(school):
-    seen = Pupil(school.client, "panda-sim").get("learning")
+def test_options_have_defaults(learning_service):
+    seen = LearningModel(learning_service.client, "panda-sim").get("learning")
     assert (seen["model"], seen["options"]) == ("panda-sim", DEFAULTS)
     status = seen["status"]
     assert (status["version"], status["revision"], status["published"], status["events"]) == (1, 0, 0, 0)
@@ -62,19 +62,21 @@ def test_a_model_that_nothing_was_set_for_has_the_defaults(school):
     assert (status["novel_share"], status["failure"], status["reachable"]) == (None, None, [[0, 0]])
 
 
-def test_options_are_set_as_a_whole(school):
-    pupil = school.enrol("set")
+def test_put_replaces_all_options(learning_service):
+    learning_model = learning_service.create_model("set")
     wanted = {"forgetting_s": 60.0, "torque_limits": [10.0, 5.0], "on_change": "adapt"}
-    assert pupil.put("learning", wanted)["options"] == DEFAULTS | wanted
-    assert pupil.put("learning", {"contact_threshold": 4.0})["options"] == DEFAULTS | {"contact_threshold": 4.0}
-    assert pupil.get("learning")["options"] == DEFAULTS | {"contact_threshold": 4.0}
+    assert learning_model.put("learning", wanted)["options"] == DEFAULTS | wanted
+    assert learning_model.put("learning", {"contact_threshold": 4.0})["options"] == DEFAULTS | {
+        "contact_threshold": 4.0
+    }
+    assert learning_model.get("learning")["options"] == DEFAULTS | {"contact_threshold": 4.0}
 
 
-def test_where_learning_stands(school):
-    pupil = school.enrol("stands")
-    pupil.teach(0, 1, 5)
-    pupil.teach(7, stream_id="second")
-    status = pupil.get("learning")["status"]
+def test_status_shows_revisions_and_streams(learning_service):
+    learning_model = learning_service.create_model("stands")
+    learning_model.send_batches(0, 1, 5)
+    learning_model.send_batches(7, stream_id="second")
+    status = learning_model.get("learning")["status"]
     assert (status["revision"], status["published"], status["lag_events"], status["events"]) == (4, 4, 0, 4)
     assert 0 <= status["novel_share"] <= 1
     streams = {each["stream_id"]: each for each in status["streams"]}
@@ -87,117 +89,119 @@ def test_where_learning_stands(school):
     assert abs(streams["arm"]["offset_s"] - time.time()) < 600
 
 
-def test_stored_states_are_listed(school):
-    pupil = school.enrol("stored")
-    pupil.teach(0, 1)
-    service = school.service
+def test_status_lists_snapshots(learning_service):
+    learning_model = learning_service.create_model("stored")
+    learning_model.send_batches(0, 1)
+    service = learning_service.service
     assert snapshots.save(service.database, service.files, "stored", 1, 2, 2, b"state", most=9) is not None
-    status = pupil.get("learning")["status"]
+    status = learning_model.get("learning")["status"]
     assert [each["revision"] for each in status["snapshots"]] == [2]
 
 
 @pytest.mark.parametrize("chunk", [decisions.CHUNK_EVENTS, 1])
-def test_adapting_learns_what_was_held_in_a_new_regime(school, monkeypatch, chunk):
-    """In one transaction, or in as many as there are batches."""
+def test_adapt_with_replay_learns_held_rows_in_new_regime(learning_service, monkeypatch, chunk):
+    """Events are replayed in one transaction, or in one per batch."""
     monkeypatch.setattr(decisions, "CHUNK_EVENTS", chunk)
-    held, told = school.enrol(f"held-{chunk}"), school.enrol(f"told-{chunk}")
-    held.teach(0)
-    at = hold(school, held)
-    said = [held.teach(number) for number in (1, 2)]
-    assert [each["rejected"] for each in said] == [{"change": LESSON}] * 2
-    assert said[-1]["held"] is True
-    assert held.get("learning")["status"]["held"] == {"at": at, "evidence": {"joints": ["joint1"]}}
-    before = held.predict()
+    paused, reference = learning_service.create_model(f"held-{chunk}"), learning_service.create_model(f"told-{chunk}")
+    paused.send_batches(0)
+    at = pause_model(learning_service, paused)
+    replies = [paused.send_batches(number) for number in (1, 2)]
+    assert [each["rejected"] for each in replies] == [{"change": BATCH_ROWS}] * 2
+    assert replies[-1]["held"] is True
+    assert paused.get("learning")["status"]["held"] == {"at": at, "evidence": {"joints": ["joint1"]}}
+    before = paused.predict()
 
-    decided = held.post("learning/change", {"decision": "adapt", "replay": True})
-    assert (decided["decision"], decided["at"], decided["rows"]) == ("adapt", at, 2 * LESSON)
-    assert held.get("learning")["status"]["held"] is None
-    assert changes(school, held) == [{"t": at}]
-    adapted = held.settled(decided["revision"])
+    result = paused.post("learning/change", {"decision": "adapt", "replay": True})
+    assert (result["decision"], result["at"], result["rows"]) == ("adapt", at, 2 * BATCH_ROWS)
+    assert paused.get("learning")["status"]["held"] is None
+    assert list_changes(learning_service, paused) == [{"t": at}]
+    adapted = paused.wait_for_revision(result["revision"])
 
-    told.teach(0)
-    with school.service.database.transaction() as session:
-        log.append(session, told.model, "change", {"t": offset(told) + LESSON * 0.01 - 0.005}, time.time())
-    told.teach(1, 2)
-    assert apart(adapted, told.predict()) < EQUAL
-    assert apart(adapted, before) > 1e3 * EQUAL
-    assert held.teach(3)["accepted"] == LESSON
-
-
-def test_ignoring_goes_on_as_if_nothing_had_been(school):
-    held, steady = school.enrol("ignores"), school.enrol("steady")
-    held.teach(0)
-    hold(school, held)
-    held.teach(1)
-    decided = held.post("learning/change", {"decision": "ignore", "replay": True})
-    assert (decided["rows"], changes(school, held)) == (LESSON, [])
-    steady.teach(0, 1)
-    assert apart(held.settled(decided["revision"]), steady.predict()) < EQUAL
+    reference.send_batches(0)
+    with learning_service.service.database.transaction() as session:
+        log.append(
+            session, reference.name, "change", {"t": read_offset(reference) + BATCH_ROWS * 0.01 - 0.005}, time.time()
+        )
+    reference.send_batches(1, 2)
+    assert max_difference(adapted, reference.predict()) < MAX_DIFFERENCE
+    assert max_difference(adapted, before) > 1e3 * MAX_DIFFERENCE
+    assert paused.send_batches(3)["accepted"] == BATCH_ROWS
 
 
-def test_without_replay_the_held_rows_stay_out(school):
-    held, short = school.enrol("stay-out"), school.enrol("short")
-    held.teach(0)
-    hold(school, held)
-    held.teach(1)
-    assert held.post("learning/change", {"decision": "ignore"})["rows"] == 0
-    held.teach(2)
-    short.teach(0, 2)
-    assert apart(held.predict(), short.predict()) < EQUAL
-    assert held.post("observations/arm/1/replay", {"codes": ["change"]})["rows"] == LESSON  # later, on its own
+def test_ignore_with_replay_equals_uninterrupted_learning(learning_service):
+    paused, reference = learning_service.create_model("ignores"), learning_service.create_model("steady")
+    paused.send_batches(0)
+    pause_model(learning_service, paused)
+    paused.send_batches(1)
+    result = paused.post("learning/change", {"decision": "ignore", "replay": True})
+    assert (result["rows"], list_changes(learning_service, paused)) == (BATCH_ROWS, [])
+    reference.send_batches(0, 1)
+    assert max_difference(paused.wait_for_revision(result["revision"]), reference.predict()) < MAX_DIFFERENCE
 
 
-def test_there_is_nothing_to_decide_without_a_hold(school):
-    pupil = school.enrol("undecided")
-    pupil.teach(0)
+def test_held_rows_are_not_learnt_without_replay(learning_service):
+    paused, reference = learning_service.create_model("stay-out"), learning_service.create_model("short")
+    paused.send_batches(0)
+    pause_model(learning_service, paused)
+    paused.send_batches(1)
+    assert paused.post("learning/change", {"decision": "ignore"})["rows"] == 0
+    paused.send_batches(2)
+    reference.send_batches(0, 2)
+    assert max_difference(paused.predict(), reference.predict()) < MAX_DIFFERENCE
+    assert paused.post("observations/arm/1/replay", {"codes": ["change"]})["rows"] == BATCH_ROWS
+
+
+def test_decision_without_pause_is_rejected(learning_service):
+    learning_model = learning_service.create_model("undecided")
+    learning_model.send_batches(0)
     for decision in ("adapt", "ignore"):
-        pupil.refused("POST", "learning/change", 409, "conflict", json={"decision": decision})
-    pupil.refused("POST", "learning/change", 422, "invalid_request", json={"decision": "wait"})
-    assert pupil.get("learning")["status"]["events"] == 1
+        learning_model.expect_error("POST", "learning/change", 409, "conflict", json={"decision": decision})
+    learning_model.expect_error("POST", "learning/change", 422, "invalid_request", json={"decision": "wait"})
+    assert learning_model.get("learning")["status"]["events"] == 1
 
 
-def given(database, model=MODEL):
+def read_options(database, model=MODEL):
     with database.session() as session:
         return owner.read_options(session, model)
 
 
-def put(database, model=MODEL, **fields):
+def set_options(database, model=MODEL, **fields):
     owner.set_options(database, model, LearningOptions(**fields), 2, 500.0)
 
 
-def logged(database, model=MODEL):
-    return [(event.number, event.kind, event.detail) for event in everything(database, model) if event.kind != "batch"]
+def list_other_events(database, model=MODEL):
+    return [(event.number, event.kind, event.detail) for event in list_events(database, model) if event.kind != "batch"]
 
 
-def test_only_another_time_constant_is_an_event(database):
-    put(database, contact_threshold=5.0)
-    assert logged(database) == []
-    put(database, forgetting_s=60.0)
-    write(database, batch(0))
-    put(database, forgetting_s=60.0, enabled=False)
-    put(database, forgetting_s=30.0)
-    put(database)
-    put(database, friction_walk_s=1800.0)
-    assert logged(database) == [
+def test_only_time_constants_are_logged_as_settings(database):
+    set_options(database, contact_threshold=5.0)
+    assert list_other_events(database) == []
+    set_options(database, forgetting_s=60.0)
+    append_batches(database, make_batch(0))
+    set_options(database, forgetting_s=60.0, enabled=False)
+    set_options(database, forgetting_s=30.0)
+    set_options(database)
+    set_options(database, friction_walk_s=1800.0)
+    assert list_other_events(database) == [
         (1, "settings", {"forgetting_s": 60.0}),
         (3, "settings", {"forgetting_s": 30.0}),
         (4, "settings", {"forgetting_s": None}),
         (5, "settings", {"forgetting_s": None, "friction_walk_s": 1800.0}),
     ]
-    assert everything(database)[0].received == 500.0
+    assert list_events(database)[0].received == 500.0
     with pytest.raises(NotFoundError, match="no model 'nobody'"):
-        put(database, model="nobody")
+        set_options(database, model="nobody")
 
 
-def test_alarms_are_listed_newest_first(school):
-    pupil = school.enrol("alarmed")
-    assert pupil.get("alarms") == {"items": [], "next_cursor": None}
-    with school.service.database.transaction() as session:
+def test_alarms_are_listed_newest_first(learning_service):
+    learning_model = learning_service.create_model("alarmed")
+    assert learning_model.get("alarms") == {"items": [], "next_cursor": None}
+    with learning_service.service.database.transaction() as session:
         for number, kind in enumerate(("change", "novelty", "refresh", "promotion")):
             raise_alarm(session, "alarmed", kind, f"message {number}", {"number": number, "joints": ["joint1"]})
         raise_alarm(session, "panda-sim", "change", "of another model", {})
-    first = pupil.get("alarms", limit=3)
-    rest = pupil.get("alarms", limit=3, cursor=first["next_cursor"])
+    first = learning_model.get("alarms", limit=3)
+    rest = learning_model.get("alarms", limit=3, cursor=first["next_cursor"])
     items = first["items"] + rest["items"]
     assert [item["kind"] for item in items] == ["promotion", "refresh", "novelty", "change"]
     assert [item["message"] for item in items] == [f"message {number}" for number in (3, 2, 1, 0)]
@@ -207,7 +211,7 @@ def test_alarms_are_listed_newest_first(school):
     assert rest["next_cursor"] is None
 
 
-NOBODY = (
+MODEL_ROUTES = (
     "GET learning",
     "PUT learning",
     "POST learning/change",
@@ -221,12 +225,12 @@ NOBODY = (
 )
 
 
-@pytest.mark.parametrize("request_line", NOBODY)
-def test_a_model_that_does_not_exist_has_nothing_of_it(school, request_line):
+@pytest.mark.parametrize("request_line", MODEL_ROUTES)
+def test_unknown_model_is_not_found(learning_service, request_line):
     method, path = request_line.split()
     body = {
-        "observations": lesson(0),
+        "observations": observation_batch(0),
         "rollback": {"revision": 0},
         "learning/change": {"decision": "adapt"},
     }.get(path, {})
-    Pupil(school.client, "nobody").refused(method, path, 404, "not_found", json=body)
+    LearningModel(learning_service.client, "nobody").expect_error(method, path, 404, "not_found", json=body)

@@ -1,4 +1,4 @@
-"""The event log: its numbers, its rows, how batches are found and taken back, and which of a stream have not come."""
+"""The event log: event numbers, undoing, gaps of streams, and the encoding of rows."""
 
 import dataclasses
 import json
@@ -21,79 +21,79 @@ from service.storage.database import SnapshotRow, now
 from tests.service.learning.batches import (
     MODEL,
     OTHER,
-    batch,
-    everything,
-    live,
-    note,
+    append_batches,
+    append_event,
+    find_stream,
+    list_events,
+    list_valid_numbers,
+    make_batch,
+    make_rows,
     roll_back,
-    rows,
-    source,
-    take_back,
-    write,
+    unlearn_batch,
 )
 
 
-def test_each_model_counts_its_own_events_without_a_hole(database):
-    assert write(database, batch(0), batch(1)) == [1, 2]
-    assert write(database, batch(0), model=OTHER) == [1]
-    assert note(database, "change", {"t": 5.0}) == 3
+def test_event_numbers_are_contiguous_per_model(database):
+    assert append_batches(database, make_batch(0), make_batch(1)) == [1, 2]
+    assert append_batches(database, make_batch(0), model=OTHER) == [1]
+    assert append_event(database, "change", {"t": 5.0}) == 3
     with suppress(ZeroDivisionError), database.transaction() as session:
-        assert log.append_batch(session, MODEL, batch(2))[0].number == 4
+        assert log.append_batch(session, MODEL, make_batch(2))[0].number == 4
         raise ZeroDivisionError
-    assert write(database, batch(2)) == [4]
+    assert append_batches(database, make_batch(2)) == [4]
     with database.session() as session:
         assert [log.newest(session, name) for name in (MODEL, OTHER, "unknown")] == [4, 1, 0]
 
 
-def test_writers_at_the_same_time_get_numbers_of_their_own(database):
+def test_concurrent_writers_get_distinct_numbers(database):
     def writer(name):
-        write(database, *(batch(sequence, stream_id=name) for sequence in range(20)))
+        append_batches(database, *(make_batch(sequence, stream_id=name) for sequence in range(20)))
 
     threads = [threading.Thread(target=writer, args=(f"robot-{k}",)) for k in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert [event.number for event in everything(database)] == list(range(1, 81))
+    assert [event.number for event in list_events(database)] == list(range(1, 81))
 
 
-def test_times_of_rows_that_have_none_are_left_out(database):
-    leaps = rows(4, codes=("time_jump", "non_finite"))
+def test_event_span_ignores_rows_without_valid_time(database):
+    leaps = make_rows(4, codes=("time_jump", "non_finite"))
     leaps.time[0], leaps.time[1] = 1e300, np.nan
-    write(database, batch(0, rows=leaps), batch(1, rows=leaps.take(slice(0, 2))))
-    spans = [(event.first, event.last) for event in everything(database)]
+    append_batches(database, make_batch(0, rows=leaps), make_batch(1, rows=leaps.take(slice(0, 2))))
+    spans = [(event.first, event.last) for event in list_events(database)]
     assert spans == [(leaps.time[2], leaps.time[3]), (None, None)]
 
 
-def test_unlearning_takes_out_a_batch_with_its_replays_and_nothing_else(database):
-    write(database, batch(0), batch(1), batch(2))
-    replays = [note(database, "replay", {"event": number}, rows=rows()) for number in (2, 1, 2)]
+def test_unlearning_voids_a_batch_and_its_replays_only(database):
+    append_batches(database, make_batch(0), make_batch(1), make_batch(2))
+    replays = [append_event(database, "replay", {"event": number}, rows=make_rows()) for number in (2, 1, 2)]
     assert replays == [4, 5, 6]
-    write(database, *(batch(k) for k in range(7)), model=OTHER)
-    assert take_back(database, 2) == 7
-    assert live(database) == [1, 3, 5, 7]
-    assert live(database, OTHER) == [1, 2, 3, 4, 5, 6, 7]
-    last = everything(database)[-1]
+    append_batches(database, *(make_batch(k) for k in range(7)), model=OTHER)
+    assert unlearn_batch(database, 2) == 7
+    assert list_valid_numbers(database) == [1, 3, 5, 7]
+    assert list_valid_numbers(database, OTHER) == [1, 2, 3, 4, 5, 6, 7]
+    last = list_events(database)[-1]
     assert (last.kind, last.detail, last.received, last.rows) == ("unlearn", {"event": 2}, 3000.0, 0)
 
 
-def test_a_rollback_takes_out_what_came_later_and_leaves_what_was_unlearnt(database):
-    write(database, batch(0), batch(1), batch(2))  # 1, 2, 3
-    note(database, "change", {"t": 5.0})  # 4
-    note(database, "replay", {"event": 1}, rows=rows())  # 5
-    take_back(database, 1)  # 6: takes out 1 and 5
-    write(database, batch(3), batch(0), model=OTHER)
+def test_rollback_voids_later_events_and_keeps_unlearning(database):
+    append_batches(database, make_batch(0), make_batch(1), make_batch(2))  # 1, 2, 3
+    append_event(database, "change", {"t": 5.0})  # 4
+    append_event(database, "replay", {"event": 1}, rows=make_rows())  # 5
+    unlearn_batch(database, 1)  # 6: voids 1 and 5
+    append_batches(database, make_batch(3), make_batch(0), model=OTHER)
     assert roll_back(database, 2) == 7
-    assert live(database) == [2, 6, 7]
-    assert live(database, OTHER) == [1, 2]
-    last = everything(database)[-1]
+    assert list_valid_numbers(database) == [2, 6, 7]
+    assert list_valid_numbers(database, OTHER) == [1, 2]
+    last = list_events(database)[-1]
     assert (last.kind, last.detail) == ("rollback", {"to": 2})
-    assert write(database, batch(3)) == [8]  # learning goes on
-    assert live(database) == [2, 6, 7, 8]
+    assert append_batches(database, make_batch(3)) == [8]  # learning continues
+    assert list_valid_numbers(database) == [2, 6, 7, 8]
 
 
-def test_a_rollback_removes_later_snapshots_of_all_versions_of_the_model(database):
-    write(database, *(batch(k) for k in range(4)))
+def test_rollback_deletes_later_snapshots_of_all_versions(database):
+    append_batches(database, *(make_batch(k) for k in range(4)))
     with database.transaction() as session:
         for model, version, number in ((MODEL, 1, 2), (MODEL, 1, 3), (MODEL, 2, 4), (OTHER, 1, 4)):
             name = f"snap_{model}_{number}"
@@ -104,24 +104,30 @@ def test_a_rollback_removes_later_snapshots_of_all_versions_of_the_model(databas
     assert left == {(MODEL, 2), (OTHER, 4)}
 
 
-def test_a_stream_goes_on_as_it_began_and_takes_nothing_twice(database):
-    write(database, batch(2), batch(5), batch(0, 4, stream_id="robot-2"), batch(7, 9, stream_id="robot-2"))
-    assert source(database, "robot-2").missing["ranges"] == [[5, 6]]
+def test_stream_rejects_other_kinds_and_duplicates(database):
+    append_batches(
+        database,
+        make_batch(2),
+        make_batch(5),
+        make_batch(0, 4, stream_id="robot-2"),
+        make_batch(7, 9, stream_id="robot-2"),
+    )
+    assert find_stream(database, "robot-2").missing["ranges"] == [[5, 6]]
     with database.transaction() as session:
         log.stream(session, MODEL, "robot-1").forgotten = 4
     for refused, reason in (
-        (batch(2, 3), "'robot-1' of model 'arm' carries batches, not frames: use another"),
-        (batch(5, stream_id="robot-2"), "'robot-2' of model 'arm' carries frames, not batches"),
-        (batch(9, 10, stream_id="robot-2"), "has come to frame 9, frame 9 does not go on from there"),
-        (batch(2), "batch 2 of stream 'robot-1' of model 'arm' may have come before"),
+        (make_batch(2, 3), "'robot-1' of model 'arm' consists of batches, not frames: use another"),
+        (make_batch(5, stream_id="robot-2"), "'robot-2' of model 'arm' consists of frames, not batches"),
+        (make_batch(9, 10, stream_id="robot-2"), "has reached frame 9: frame 9 is not newer"),
+        (make_batch(2), "batch 2 of stream 'robot-1' of model 'arm' may be a repetition"),
     ):
         with pytest.raises(ConflictError, match=reason):
-            write(database, refused)
-    assert write(database, batch(3), batch(1)) == [5, 6]  # known not to have come
+            append_batches(database, refused)
+    assert append_batches(database, make_batch(3), make_batch(1)) == [5, 6]  # known gaps
 
 
-def misses(seen):
-    """Ranges that are missing, by looking at every number."""
+def find_missing_ranges(seen):
+    """Return the missing ranges by checking every number."""
     out = []
     for number in range(min(seen), max(seen)):
         if number not in seen:
@@ -136,35 +142,39 @@ SEQUENCES = st.lists(st.integers(0, 25), min_size=1, max_size=15, unique=True)
 
 
 @given(SEQUENCES)
-def test_the_gaps_are_right_after_every_arrival_in_any_order(sequences):
-    known = Gaps(sequences[0], sequences[0])
+def test_gaps_are_right_after_arrivals_in_any_order(sequences):
+    gaps = Gaps(sequences[0], sequences[0])
     for count, sequence in enumerate(sequences, start=1):
-        known = Gaps.from_json(known.arrived(sequence, sequence).to_json(), known.arrived(sequence, sequence).last)
+        gaps = Gaps.from_json(gaps.arrived(sequence, sequence).to_json(), gaps.arrived(sequence, sequence).last)
         seen = set(sequences[:count])
-        assert known.to_json() == {"first": min(seen), "ranges": misses(seen)}
-        assert [s for s in range(-1, 27) if known.may_contain(s)] == sorted(seen)
+        assert gaps.to_json() == {"first": min(seen), "ranges": find_missing_ranges(seen)}
+        assert [s for s in range(-1, 27) if gaps.may_contain(s)] == sorted(seen)
 
 
 @given(st.lists(st.tuples(st.integers(0, 30), st.integers(0, 5)), min_size=1, max_size=10))
-def test_the_gaps_of_ranges_are_right_even_where_they_overlap(spans):
-    known = Gaps(spans[0][0], sum(spans[0]))
+def test_gaps_are_right_for_overlapping_ranges(spans):
+    gaps = Gaps(spans[0][0], sum(spans[0]))
     seen = set()
     for first, more in spans:
-        known = known.arrived(first, first + more)
+        gaps = gaps.arrived(first, first + more)
         seen |= set(range(first, first + more + 1))
-    assert (known.first, known.last, [list(pair) for pair in known.ranges]) == (min(seen), max(seen), misses(seen))
+    assert (gaps.first, gaps.last, [list(pair) for pair in gaps.ranges]) == (
+        min(seen),
+        max(seen),
+        find_missing_ranges(seen),
+    )
 
 
-def test_only_the_newest_of_very_many_gaps_are_remembered():
-    known = Gaps(0, 0)
+def test_only_the_newest_gaps_are_kept():
+    gaps = Gaps(0, 0)
     for sequence in range(2, 2 * MAX_RANGES + 6, 2):
-        known = known.arrived(sequence, sequence)
-    assert len(known.ranges) == MAX_RANGES
-    assert (known.ranges[0], known.ranges[-1]) == ((5, 5), (2003, 2003))
-    assert known.may_contain(3)  # it may have, for all that is known
+        gaps = gaps.arrived(sequence, sequence)
+    assert len(gaps.ranges) == MAX_RANGES
+    assert (gaps.ranges[0], gaps.ranges[-1]) == ((5, 5), (2003, 2003))
+    assert gaps.may_contain(3)  # older gaps are forgotten
 
 
-ANY = st.floats(width=64, allow_nan=True, allow_infinity=True)
+ANY_FLOAT = st.floats(width=64, allow_nan=True, allow_infinity=True)
 
 
 @st.composite
@@ -172,25 +182,25 @@ def any_rows(draw):
     count, n = draw(st.integers(0, 6)), draw(st.integers(1, 4))
     code = draw(arrays(np.uint8, count, elements=st.integers(0, len(CODES) - 1)))
     return Rows(
-        draw(arrays(float, count, elements=ANY)),
-        *(draw(arrays(float, (count, n), elements=ANY)) for _ in range(4)),
+        draw(arrays(float, count, elements=ANY_FLOAT)),
+        *(draw(arrays(float, (count, n), elements=ANY_FLOAT)) for _ in range(4)),
         code,
-        draw(arrays(float, count, elements=ANY)),
+        draw(arrays(float, count, elements=ANY_FLOAT)),
     )
 
 
-def same(one: Rows, other: Rows) -> bool:
+def has_equal_bytes(one: Rows, other: Rows) -> bool:
     pairs = [(getattr(one, f.name), getattr(other, f.name)) for f in dataclasses.fields(Rows)]
     return all(a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes() for a, b in pairs)
 
 
 @given(any_rows())
-def test_every_bit_comes_back(given_rows):
-    assert same(decode(encode(given_rows)), given_rows)
+def test_encoding_keeps_every_bit(given_rows):
+    assert has_equal_bytes(decode(encode(given_rows)), given_rows)
 
 
-def test_any_reader_of_safetensors_understands_it():
-    data = encode(rows(3))
+def test_encoding_is_valid_safetensors():
+    data = encode(make_rows(3))
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     assert {name: (entry["dtype"], entry["shape"]) for name, entry in header.items() if name != "__metadata__"} == {
         "time": ("F64", [3]),
@@ -201,6 +211,6 @@ def test_any_reader_of_safetensors_understands_it():
 
 
 @pytest.mark.parametrize("length", [0, 7, 40, -1])
-def test_what_is_cut_off_is_refused(length):
+def test_truncated_rows_are_rejected(length):
     with pytest.raises(ValueError, match="cannot be read"):
-        decode(encode(rows())[:length])
+        decode(encode(make_rows())[:length])

@@ -1,4 +1,4 @@
-"""Motion beyond what a version can learn: it is told, a better version is trained, and it takes over unnoticed."""
+"""Novel motion: it raises an alarm, and a better version is trained and promoted without interruption."""
 
 import threading
 from collections.abc import Callable, Iterator
@@ -14,47 +14,46 @@ import lipcore
 from lipcore.data.samples import Samples
 from service.models import registry
 from tests.service.data import DEADLINE, ended, eventually, stream, train, upload
-from tests.service.learning.lessons import Pupil, answered
-from tests.service.learning.lessons import school as opened
+from tests.service.learning.learning_models import LearningModel, read_json, start_service
 
-ROWS = 50
+BATCH_ROWS = 50
 """Rows of a batch."""
 RATE = 100.0
 OPTIONS = {"hyperparameter_samples": 30, "posterior_samples": 60, "max_iterations": 10}
-"""Of a fit of about a second that gets both motions right."""
+"""Options of a fit of about one second that predicts both motions well."""
 
 
-def slow() -> Samples:
-    """What a version is trained on: at most 0.2 rad/s."""
+def slow_recording() -> Samples:
+    """Return the training recording, with at most 0.2 rad/s."""
     return stream(samples=120, speed=1.0, seed=1, n_sinusoids=20)
 
 
-def fast(seed: int = 2) -> Samples:
-    """What is observed: up to 0.7 rad/s, most of it beyond what the slow motion tells."""
+def fast_recording(seed: int = 2) -> Samples:
+    """Return the observed recording, with up to 0.7 rad/s, mostly beyond the training range."""
     return stream(samples=20_000, speed=15.0, seed=seed, rate=RATE, n_sinusoids=20)
 
 
-def batch(number: int) -> dict[str, Any]:
-    """The batch of a number: ROWS rows of the fast motion."""
-    rows = slice(number * ROWS, (number + 1) * ROWS)
-    body = {name: getattr(fast(), name)[rows].tolist() for name in ("q", "dq", "ddq", "tau")}
-    times = (np.arange(ROWS) + number * ROWS) / RATE
+def fast_batch(number: int) -> dict[str, Any]:
+    """Return a batch of consecutive rows of the fast recording."""
+    rows = slice(number * BATCH_ROWS, (number + 1) * BATCH_ROWS)
+    body = {name: getattr(fast_recording(), name)[rows].tolist() for name in ("q", "dq", "ddq", "tau")}
+    times = (np.arange(BATCH_ROWS) + number * BATCH_ROWS) / RATE
     return {"stream_id": "arm", "sequence": number, "t": times.tolist(), **body}
 
 
 pytestmark = pytest.mark.slow
 PAUSE_S = 0.01
-"""Between two questions of the watcher: the learner needs the processor too."""
+"""Pause between two predictions; the learner needs the processor too."""
 
 
 @contextmanager
-def watched(pupil: Pupil, queries: dict[str, Any]) -> Iterator[list[Any]]:
-    """Ask the same again and again in a thread of its own; all answers so far."""
+def repeat_predictions(learning_model: LearningModel, queries: dict[str, Any]) -> Iterator[list[Any]]:
+    """Repeat a prediction in a thread; yield the list of responses."""
     answers, end = [], threading.Event()
 
     def watch() -> None:
         while not end.wait(PAUSE_S):
-            answers.append(pupil.client.post(pupil.url("predict"), json=queries))
+            answers.append(learning_model.client.post(learning_model.url("predict"), json=queries))
 
     thread = threading.Thread(target=watch)
     thread.start()
@@ -66,76 +65,86 @@ def watched(pupil: Pupil, queries: dict[str, Any]) -> Iterator[list[Any]]:
 
 
 @pytest.fixture(scope="module")
-def story(tmp_path_factory):
-    """What was seen from the first fast batch to the promotion."""
-    with opened(tmp_path_factory.mktemp("novel"), tmp_path_factory.mktemp("unused")) as school:
-        api, pupil = school.client, Pupil(school.client, "arm")
-        dataset = upload(api, slow(), name="slow")
+def refresh_run(tmp_path_factory):
+    """Everything observed from the first fast batch to the promotion."""
+    with start_service(tmp_path_factory.mktemp("novel"), tmp_path_factory.mktemp("unused")) as learning_service:
+        api, learning_model = learning_service.client, LearningModel(learning_service.client, "arm")
+        dataset = upload(api, slow_recording(), name="slow")
         train(api, "arm", dataset["id"], options=OPTIONS)
-        queries = {name: getattr(fast(), name)[-5:].tolist() for name in ("q", "dq", "ddq")}
-        sent = _teacher(pupil)
+        queries = {name: getattr(fast_recording(), name)[-5:].tolist() for name in ("q", "dq", "ddq")}
+        sent = _make_sender(learning_model)
 
         def alarms_of(kind: str) -> list[dict[str, Any]]:
-            return [each for each in pupil.get("alarms")["items"] if each["kind"] == kind]
+            return [each for each in learning_model.get("alarms")["items"] if each["kind"] == kind]
 
-        with watched(pupil, queries) as answers:
+        with repeat_predictions(learning_model, queries) as answers:
             eventually(lambda: sent() and alarms_of("novelty"))
             job = ended(api, alarms_of("novelty")[0]["evidence"]["job"])
             eventually(lambda: sent() and answers[-1].json()["version"] == 2)
-        alarms = pupil.get("alarms")["items"]
-        yield SimpleNamespace(pupil=pupil, school=school, dataset=dataset, job=job, answers=answers, alarms=alarms)
+        alarms = learning_model.get("alarms")["items"]
+        yield SimpleNamespace(
+            learning_model=learning_model,
+            learning_service=learning_service,
+            dataset=dataset,
+            job=job,
+            answers=answers,
+            alarms=alarms,
+        )
 
 
-def test_novel_motion_is_told_and_a_candidate_trained_on_data_and_log(story):
-    [alarm] = [each for each in story.alarms if each["kind"] == "novelty"]
+def test_novel_motion_raises_alarm_and_trains_candidate(refresh_run):
+    [alarm] = [each for each in refresh_run.alarms if each["kind"] == "novelty"]
     assert alarm["evidence"]["novel_share"] > alarm["evidence"]["threshold"] == 0.2
     assert alarm["evidence"]["version"] == 1
     assert f"{100 * alarm['evidence']['novel_share']:.0f} % of the last 2000 samples" in alarm["message"]
-    refresh = story.job["refresh"]
-    assert (story.job["state"], story.job["version"], refresh["version"]) == ("succeeded", 2, 1)
+    refresh = refresh_run.job["refresh"]
+    assert (refresh_run.job["state"], refresh_run.job["version"], refresh["version"]) == ("succeeded", 2, 1)
     assert refresh["trigger"] == "novelty"
-    lineage = answered(story.pupil.client.get("/v1/models/arm/versions/2"))["lineage"]
-    assert [each["id"] for each in lineage["datasets"]] == story.job["datasets"] == [story.dataset["id"]]
+    lineage = read_json(refresh_run.learning_model.client.get("/v1/models/arm/versions/2"))["lineage"]
+    assert [each["id"] for each in lineage["datasets"]] == refresh_run.job["datasets"] == [refresh_run.dataset["id"]]
     assert lineage["refresh"].items() >= {**refresh, "left_out": []}.items()
     assert (lineage["log"]["through"], lineage["log"]["rows"]) == (refresh["through"], 50 * refresh["through"])
 
 
-def test_the_candidate_predicts_better_and_is_promoted(story):
-    [alarm] = [each for each in story.alarms if each["kind"] == "promotion"]
+def test_better_candidate_is_promoted(refresh_run):
+    [alarm] = [each for each in refresh_run.alarms if each["kind"] == "promotion"]
     evidence = alarm["evidence"]
     assert (evidence["serving"], evidence["candidate"], evidence["promoted"]) == (1, 2, True)
     assert evidence["blocks"] >= 20
     assert evidence["gain"] > 2 * evidence["standard_error"] > 0
     assert max(evidence["figures"]["candidate"]["nmse"]) < 0.02
-    assert answered(story.pupil.client.get("/v1/models/arm"))["serving_version"] == 2
-    unseen = fast(seed=5)
+    assert read_json(refresh_run.learning_model.client.get("/v1/models/arm"))["serving_version"] == 2
+    unseen = fast_recording(seed=5)
     query = {name: getattr(unseen, name)[:500].tolist() for name in ("q", "dq", "ddq")}
     errors = {}
     for version in (1, 2):
-        model = lipcore.load(_folder(story, version))
+        model = lipcore.load(_folder(refresh_run, version))
         tau = model.predict(*query.values()).tau
         errors[version] = np.mean((tau - unseen.tau[:500]) ** 2)
     assert errors[2] < errors[1]
 
 
-def test_no_answer_fails_and_versions_never_go_back(story):
-    assert {answer.status_code for answer in story.answers} == {200}
-    seen = [(answer.json()["version"], answer.json()["revision"]) for answer in story.answers]
+def test_predictions_never_fail_and_versions_never_decrease(refresh_run):
+    assert {answer.status_code for answer in refresh_run.answers} == {200}
+    seen = [(answer.json()["version"], answer.json()["revision"]) for answer in refresh_run.answers]
     assert seen == sorted(seen)
     assert {version for version, _ in seen} == {1, 2}
 
 
-def _teacher(pupil: Pupil) -> Callable[[], bool]:
-    """Sends the next batch and waits until it is learnt: the motion must not end before a slow machine has seen it."""
+def _make_sender(learning_model: LearningModel) -> Callable[[], bool]:
+    """Return a function that sends the next batch and waits until it is learnt.
+
+    Waiting keeps a slow machine from reaching the end of the recording first.
+    """
     numbers = count()
 
     def sent() -> bool:
-        pupil.post("observations", batch(next(numbers)))
-        return eventually(lambda: pupil.get("learning")["status"]["lag_events"] == 0)
+        learning_model.post("observations", fast_batch(next(numbers)))
+        return eventually(lambda: learning_model.get("learning")["status"]["lag_events"] == 0)
 
     return sent
 
 
-def _folder(story: SimpleNamespace, version: int) -> Any:
-    service = story.school.service
+def _folder(refresh_run: SimpleNamespace, version: int) -> Any:
+    service = refresh_run.learning_service.service
     return service.files.version_folder(registry.find(service.database, "arm", version).folder)

@@ -1,34 +1,34 @@
-"""How a stream begins: one that does not fit the model from its first row on is said so, and not learnt."""
+"""The opening of a stream: a stream that does not fit the model is reported and not learnt."""
 
 import numpy as np
 import pytest
 from scipy.stats import binom
 
 from lipcore.online.changes.opening import OPENING, Opening
-from tests.service.learning import lessons
-from tests.service.learning.lessons import Pupil, apart
-from tests.service.learning.recordings import codes
-from tests.service.learning.test_changes import BATCH, WATCHFUL, drive
+from tests.service.learning import learning_models
+from tests.service.learning.learning_models import LearningModel, max_difference
+from tests.service.learning.recordings import read_codes
+from tests.service.learning.test_changes import BATCH_ROWS, STRICT_OPTIONS, send_recording
 
-OFF = 0.05
-"""N·m: five times the noise, which is no contact."""
+BIAS_NM = 0.05
+"""Five times the noise, below a contact."""
 
 
-def opened(inside: float, rows: float = OPENING.rows, joints: int = 3) -> Opening:
-    """An opening of rows of a tenth of a second, that share of which the intervals of all joints held."""
+def make_opening(inside: float, rows: float = OPENING.rows, joints: int = 3) -> Opening:
+    """Return an opening of rows at 10 Hz with this coverage on all joints."""
     count = round(rows)
     error = np.where(np.arange(count)[:, None] < inside * count, 1.0, 3.0) * np.ones(joints)
     return Opening.start(joints).step(np.arange(count) / 10, np.ones(count), error, np.ones((count, joints)))
 
 
-def test_rows_count_as_far_as_they_are_independent():
+def test_opening_weights_rows_by_independence():
     rng = np.random.default_rng(3)
     error, spread = rng.standard_normal((250, 2)) * [1.0, 3.0], rng.uniform(0.5, 2.0, (250, 2))
     time, weight = np.arange(250) / 100, np.full(250, 0.1)
     opening = Opening.start(2)
     for rows in np.split(np.arange(250), [30, 31, 95, 140]):
         opening = opening.step(time[rows], weight[rows], error[rows], spread[rows])
-    first = slice(0, 100)  # a second
+    first = slice(0, 100)  # one second
     held = np.abs(error[first]) <= OPENING.band * spread[first]
     assert opening.is_complete
     np.testing.assert_allclose(opening.coverage, held.mean(axis=0))
@@ -36,136 +36,137 @@ def test_rows_count_as_far_as_they_are_independent():
     assert Opening.from_json(opening.to_json()).to_json() == opening.to_json()
 
 
-def test_only_what_is_known_to_be_far_outside_is_a_misfit():
-    """Known: where the intervals hold the min share, so few or fewer come once in forty streams at most."""
+def test_misfit_requires_significantly_low_coverage():
+    """If coverage is the minimum share, at most one stream in forty has so few rows inside."""
     for hits in range(11):
         chance = binom.cdf(hits, 10, OPENING.min_share)
-        assert opened(hits / 10).is_misfit == (chance < 0.025)
-    assert opened(0.0).joints == (0, 1, 2)
-    assert not opened(0.0, rows=OPENING.rows - 1).is_misfit  # it has not been a second yet
+        assert make_opening(hits / 10).is_misfit == (chance < 0.025)
+    assert make_opening(0.0).joints == (0, 1, 2)
+    assert not make_opening(0.0, rows=OPENING.rows - 1).is_misfit  # less than one second
 
 
-def test_joints_are_no_witnesses_of_their_own():
-    """One joint of three that is off is told by other means: its errors may last for a second."""
+def test_single_misfitting_joint_is_no_misfit():
+    """One joint of three is left to other detectors: its errors may last for a second."""
     error = np.ones((10, 3)) * [9.0, 1.0, 1.0]
     opening = Opening.start(3).step(np.arange(10) / 10, np.ones(10), error, np.ones((10, 3)))
     assert (opening.is_misfit, opening.joints) == (False, (0,))
 
 
 @pytest.fixture(scope="module")
-def strange(school):
-    """A model that a stream of another robot was sent to; what was said, and what it had answered before."""
-    pupil = school.enrol("strange", **WATCHFUL, on_change="hold")
-    before = pupil.predict()
-    return pupil, drive(pupil, range(4), push=OFF), before
+def mismatched_model(learning_service):
+    """Model with a stream of another robot, its replies, and the prediction before."""
+    learning_model = learning_service.create_model("strange", **STRICT_OPTIONS, on_change="hold")
+    before = learning_model.predict()
+    return learning_model, send_recording(learning_model, range(4), external_torque=BIAS_NM), before
 
 
-def test_a_stream_that_begins_outside_the_band_is_held_after_a_second(strange):
-    _, said, _ = strange
-    assert [each["held"] for each in said] == [False, True, True, True]
-    assert [each["rejected"] for each in said[1:]] == [{"change": BATCH}] * 3
+def test_misfitting_stream_is_paused_after_one_second(mismatched_model):
+    _, replies, _ = mismatched_model
+    assert [each["held"] for each in replies] == [False, True, True, True]
+    assert [each["rejected"] for each in replies[1:]] == [{"change": BATCH_ROWS}] * 3
 
 
-def test_its_first_second_is_taken_out_again(strange):
-    pupil, _, before = strange
-    after = pupil.settled(pupil.get("learning")["status"]["revision"])
-    assert apart(after, before) < 1e-9
-    (first, *_) = pupil.get("observations", stream_id="arm")["items"][::-1]
+def test_first_second_of_misfitting_stream_is_unlearnt(mismatched_model):
+    learning_model, _, before = mismatched_model
+    after = learning_model.wait_for_revision(learning_model.get("learning")["status"]["revision"])
+    assert max_difference(after, before) < 1e-9
+    (first, *_) = learning_model.get("observations", stream_id="arm")["items"][::-1]
     assert first["state"] == "unlearnt"
 
 
-def test_the_owner_is_told_how_it_began(strange):
-    pupil, _, _ = strange
-    (alarm,) = pupil.get("alarms")["items"]
+def test_opening_alarm_contains_the_evidence(mismatched_model):
+    learning_model, _, _ = mismatched_model
+    (alarm,) = learning_model.get("alarms")["items"]
     evidence = alarm["evidence"]
     assert alarm["kind"] == "change"
-    assert "stream arm does not fit the model: " in alarm["message"]
-    assert "nothing is learnt until its owner has decided" in alarm["message"]
+    assert "Stream arm does not fit the model: " in alarm["message"]
+    assert "Learning is paused until you decide." in alarm["message"]
     assert (evidence["kind"], evidence["stream_id"], evidence["joints"]) == ("opening", "arm", ["joint1", "joint2"])
     assert evidence["coverage"] == pytest.approx(np.mean(list(evidence["joint_coverage"].values())))
     assert evidence["coverage"] < 0.15
-    assert pupil.get("learning")["status"]["held"]["evidence"] == evidence
+    assert learning_model.get("learning")["status"]["held"]["evidence"] == evidence
 
 
-def test_its_errors_widen_no_other_answers(strange, school):
-    """The answers to its own questions are wide; those of others are not about this robot."""
-    pupil, _, before = strange
-    assert pupil.predict()["scale"] == before["scale"]
-    scales = school.service.loaded.get(pupil.model, None).scales
+def test_misfitting_stream_does_not_widen_default_intervals(mismatched_model, learning_service):
+    """Only predictions for this stream become wide."""
+    learning_model, _, before = mismatched_model
+    assert learning_model.predict()["scale"] == before["scale"]
+    scales = learning_service.service.loaded.get(learning_model.name, None).scales
     assert (scales.of("arm") > 2 * scales.of(None)).all()
-    pupil.post("learning/change", {"decision": "ignore"})
-    drive(pupil, range(4, 5), push=OFF)
-    assert (np.array(pupil.predict()["scale"]) > 2 * np.array(before["scale"])).all()
+    learning_model.post("learning/change", {"decision": "ignore"})
+    send_recording(learning_model, range(4, 5), external_torque=BIAS_NM)
+    assert (np.array(learning_model.predict()["scale"]) > 2 * np.array(before["scale"])).all()
 
 
-def test_once_confirmed_it_is_learnt(school):
-    pupil = school.enrol("confirmed", **WATCHFUL, on_change="hold")
-    drive(pupil, range(3), push=OFF)
-    decided = pupil.post("learning/change", {"decision": "ignore", "replay": True})
-    assert decided["rows"] == 2 * BATCH
-    (said,) = drive(pupil, range(3, 4), push=OFF)
-    assert (said["rejected"], said["held"], said["accepted"]) == ({}, False, BATCH)
-    assert len(pupil.get("alarms")["items"]) == 1
+def test_confirmed_stream_is_learnt(learning_service):
+    learning_model = learning_service.create_model("confirmed", **STRICT_OPTIONS, on_change="hold")
+    send_recording(learning_model, range(3), external_torque=BIAS_NM)
+    decided = learning_model.post("learning/change", {"decision": "ignore", "replay": True})
+    assert decided["rows"] == 2 * BATCH_ROWS
+    (reply,) = send_recording(learning_model, range(3, 4), external_torque=BIAS_NM)
+    assert (reply["rejected"], reply["held"], reply["accepted"]) == ({}, False, BATCH_ROWS)
+    assert len(learning_model.get("alarms")["items"]) == 1
 
 
-def test_a_stream_that_fits_goes_on_though_another_one_did_not(school):
-    pupil = school.enrol("both", **WATCHFUL, on_change="hold")
-    said = drive(pupil, range(4), stream_id="fits")
-    assert all(each["accepted"] == BATCH for each in said)
-    assert drive(pupil, range(2), push=OFF, stream_id="odd")[-1]["held"]
-    pupil.settled(pupil.get("learning")["status"]["revision"])
-    states = {each["stream_id"]: each["state"] for each in pupil.get("observations", limit=10)["items"]}
+def test_fitting_stream_is_unaffected_by_a_misfitting_one(learning_service):
+    learning_model = learning_service.create_model("both", **STRICT_OPTIONS, on_change="hold")
+    replies = send_recording(learning_model, range(4), stream_id="fits")
+    assert all(each["accepted"] == BATCH_ROWS for each in replies)
+    assert send_recording(learning_model, range(2), external_torque=BIAS_NM, stream_id="odd")[-1]["held"]
+    learning_model.wait_for_revision(learning_model.get("learning")["status"]["revision"])
+    states = {each["stream_id"]: each["state"] for each in learning_model.get("observations", limit=10)["items"]}
     assert states["fits"] == "learnt"
-    pupil.post("learning/change", {"decision": "ignore"})
-    assert drive(pupil, range(4, 5), stream_id="fits")[0]["accepted"] == BATCH
+    learning_model.post("learning/change", {"decision": "ignore"})
+    assert send_recording(learning_model, range(4, 5), stream_id="fits")[0]["accepted"] == BATCH_ROWS
 
 
-def test_another_stream_that_does_not_fit_is_said_so_while_learning_is_held(school):
-    """Its errors widen no answers of others, and a decision about the first is no blind one about it."""
-    pupil = school.enrol("second", **WATCHFUL, on_change="hold")
-    drive(pupil, range(3), push=OFF)
-    before = pupil.settled(pupil.get("learning")["status"]["revision"])
-    held = pupil.get("learning")["status"]["held"]
-    said = drive(pupil, range(4), push=20 * OFF, stream_id="other")
-    assert all(each["held"] and each["accepted"] == 0 for each in said)
-    newest, first = pupil.get("alarms")["items"]
-    assert "stream other does not fit the model: " in newest["message"]
-    assert "learning is held already" in newest["message"]
+def test_second_misfitting_stream_raises_alarm_while_paused(learning_service):
+    """It does not widen intervals of others, and the pause stays that of the first stream."""
+    learning_model = learning_service.create_model("second", **STRICT_OPTIONS, on_change="hold")
+    send_recording(learning_model, range(3), external_torque=BIAS_NM)
+    before = learning_model.wait_for_revision(learning_model.get("learning")["status"]["revision"])
+    held = learning_model.get("learning")["status"]["held"]
+    replies = send_recording(learning_model, range(4), external_torque=20 * BIAS_NM, stream_id="other")
+    assert all(each["held"] and each["accepted"] == 0 for each in replies)
+    newest, first = learning_model.get("alarms")["items"]
+    assert "Stream other does not fit the model: " in newest["message"]
+    assert "Learning is already paused" in newest["message"]
     assert (newest["evidence"]["kind"], newest["evidence"]["stream_id"]) == ("opening", "other")
     assert first["evidence"]["stream_id"] == "arm"
-    assert pupil.get("learning")["status"]["held"] == held
-    after = pupil.settled(pupil.get("learning")["status"]["revision"])
-    assert apart(after, before) < 1e-9
+    assert learning_model.get("learning")["status"]["held"] == held
+    after = learning_model.wait_for_revision(learning_model.get("learning")["status"]["revision"])
+    assert max_difference(after, before) < 1e-9
     assert after["scale"] == before["scale"]
 
 
-def test_where_learning_goes_on_as_before_it_is_only_said(school):
-    pupil = school.enrol("told-only", **WATCHFUL, on_change="learn")
-    said = drive(pupil, range(3), push=OFF)
-    assert not any(each["held"] or "change" in each["rejected"] for each in said)
-    assert sum(each["accepted"] for each in said) > 2.5 * BATCH  # a few of its rows are contacts
-    (alarm,) = pupil.get("alarms")["items"]
+def test_misfit_only_raises_alarm_with_on_change_learn(learning_service):
+    learning_model = learning_service.create_model("told-only", **STRICT_OPTIONS, on_change="learn")
+    replies = send_recording(learning_model, range(3), external_torque=BIAS_NM)
+    assert not any(each["held"] or "change" in each["rejected"] for each in replies)
+    assert sum(each["accepted"] for each in replies) > 2.5 * BATCH_ROWS  # a few rows are contacts
+    (alarm,) = learning_model.get("alarms")["items"]
     assert alarm["evidence"]["kind"] == "opening"
-    assert "learning goes on as before" in alarm["message"]
+    assert "Learning continues as before." in alarm["message"]
 
 
-def test_a_new_regime_begins_with_the_stream(school):
-    pupil = school.enrol("adapts", **WATCHFUL, on_change="adapt")
-    said = drive(pupil, range(3), push=OFF)
-    assert [each["held"] for each in said] == [False] * 3
-    assert "a new regime begins" in pupil.get("alarms")["items"][0]["message"]
+def test_misfit_starts_new_regime_with_on_change_adapt(learning_service):
+    learning_model = learning_service.create_model("adapts", **STRICT_OPTIONS, on_change="adapt")
+    replies = send_recording(learning_model, range(3), external_torque=BIAS_NM)
+    assert [each["held"] for each in replies] == [False] * 3
+    assert "The model adapts" in learning_model.get("alarms")["items"][0]["message"]
 
 
-def test_how_a_stream_began_is_remembered_over_a_restart(school, tmp_path):
+@pytest.mark.slow
+def test_opening_survives_restart(learning_service, tmp_path):
     home = tmp_path / "home"
-    with lessons.school(home, school.trained) as first:
-        pupil = first.enrol("arm", **WATCHFUL, on_change="hold")
-        assert not drive(pupil, range(1), push=OFF)[0]["held"]
-        drive(pupil, range(4), stream_id="old")
-    with lessons.school(home, school.trained) as second:
-        pupil = Pupil(second.client, "arm")
-        assert drive(pupil, range(1, 2), push=OFF)[0]["held"]
-        pupil.post("learning/change", {"decision": "ignore"})
-        (said,) = drive(pupil, range(4, 5), stream_id="old")
-        assert said["accepted"] == BATCH
-        assert codes(second, pupil)[-BATCH:] == ["learnt"] * BATCH
+    with learning_models.start_service(home, learning_service.trained) as first:
+        learning_model = first.create_model("arm", **STRICT_OPTIONS, on_change="hold")
+        assert not send_recording(learning_model, range(1), external_torque=BIAS_NM)[0]["held"]
+        send_recording(learning_model, range(4), stream_id="old")
+    with learning_models.start_service(home, learning_service.trained) as second:
+        learning_model = LearningModel(second.client, "arm")
+        assert send_recording(learning_model, range(1, 2), external_torque=BIAS_NM)[0]["held"]
+        learning_model.post("learning/change", {"decision": "ignore"})
+        (reply,) = send_recording(learning_model, range(4, 5), stream_id="old")
+        assert reply["accepted"] == BATCH_ROWS
+        assert read_codes(second, learning_model)[-BATCH_ROWS:] == ["learnt"] * BATCH_ROWS

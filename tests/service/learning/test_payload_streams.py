@@ -1,4 +1,4 @@
-"""What a robot carries, through a service: noticed from a stream, answered with, kept over kills, declared, gone."""
+"""Payloads in a service: detected, declared, used for predictions, kept over kills, and removed."""
 
 from dataclasses import replace
 
@@ -9,24 +9,24 @@ from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Simulation, simulate
 from tests.service.data import error, eventually
 from tests.service.server import Server
-from tests.service.streams import PAYLOAD, ask, dial, frame, hello
+from tests.service.streams import PAYLOAD, frame, open_stream, read_hello, send_frame
 
 PANDA = "/v1/models/panda-sim"
-UP, DOWN, RATE = 20.0, 21.0, 100.0
+PICKUP_S, RELEASE_S, RATE = 20.0, 21.0, 100.0
 
 
 @pytest.fixture(scope="module")
 def robot_stream():
-    """Rows of a Panda from 19 s on that carries 1.5 kg from UP to DOWN."""
-    asked = Simulation(2200, RATE, speed=5.0, noise=0.05)
-    free = simulate(load_robot("panda"), asked, 300)
-    full = simulate(load_robot("panda"), replace(asked, payload=Payload(1.5, 0.0, (0.02, 0.02, 0.08))), 300)
-    carried = ((free.t >= UP) & (free.t < DOWN))[:, None]
-    return replace(free, tau=np.where(carried, full.tau, free.tau)).rows(slice(1900, 2200))
+    """Rows of a Panda from 19 s on, with a payload of 1.5 kg from PICKUP_S to RELEASE_S."""
+    simulation = Simulation(2200, RATE, speed=5.0, noise=0.05)
+    free = simulate(load_robot("panda"), simulation, 300)
+    full = simulate(load_robot("panda"), replace(simulation, payload=Payload(1.5, 0.0, (0.02, 0.02, 0.08))), 300)
+    with_payload = ((free.t >= PICKUP_S) & (free.t < RELEASE_S))[:, None]
+    return replace(free, tau=np.where(with_payload, full.tau, free.tau)).rows(slice(1900, 2200))
 
 
-def observed(client, samples, first, last, stream_id="arm"):
-    """Send the rows from one time to another, ten a batch; return the rows by what became of them."""
+def send_rows(client, samples, first, last, stream_id="arm"):
+    """Send the rows between two times, ten per batch; return the number of rows by outcome."""
     counts = {"accepted": 0}
     for start in range(0, len(samples), 10):
         part = samples.rows(slice(start, start + 10))
@@ -41,91 +41,104 @@ def observed(client, samples, first, last, stream_id="arm"):
     return counts
 
 
-def of(client, stream_id="arm"):
-    """What a stream's robot carries."""
+def find_stream(client, stream_id="arm"):
+    """Return the payload of a stream."""
     streams = {each["stream_id"]: each for each in client.get(f"{PANDA}/payload").json()["streams"]}
     return streams[stream_id]
 
 
-def rms(client, samples):
-    """Root mean square error of the torques of questions, joint by joint."""
+def rms_error(client, samples):
+    """Return the root mean square error of predicted torques per joint."""
     query = {name: getattr(samples, name).tolist() for name in ("q", "dq", "ddq")}
     return np.sqrt(((np.array(client.post(f"{PANDA}/predict", json=query).json()["tau"]) - samples.tau) ** 2).mean(0))
 
 
-def test_a_payload_is_noticed_answered_with_kept_over_a_kill_and_put_down(tmp_path, robot_stream):
+@pytest.mark.slow
+def test_payload_is_detected_and_survives_kill_until_released(tmp_path, robot_stream):
     with Server(tmp_path / "home", warm=True) as server:
         client = server.client
-        assert observed(client, robot_stream, 19.0, UP)["accepted"] == 100
-        assert of(client)["payload"] is None
+        assert send_rows(client, robot_stream, 19.0, PICKUP_S)["accepted"] == 100
+        assert find_stream(client)["payload"] is None
         later = robot_stream.rows(slice(170, 200))
-        unaware = rms(client, later).max()
-        observed(client, robot_stream, UP, UP + 0.1)
-        eventually(lambda: of(client)["state"] == "payload" and rms(client, later).max() < 0.1 * unaware)
-        counts = observed(client, robot_stream, UP + 0.1, UP + 0.6)
+        error_without_payload = rms_error(client, later).max()
+        send_rows(client, robot_stream, PICKUP_S, PICKUP_S + 0.1)
+        eventually(
+            lambda: (
+                find_stream(client)["state"] == "payload"
+                and rms_error(client, later).max() < 0.1 * error_without_payload
+            )
+        )
+        counts = send_rows(client, robot_stream, PICKUP_S + 0.1, PICKUP_S + 0.6)
         assert counts == {"accepted": 0, "payload": 50}
-        eventually(lambda: of(client)["rows"] >= 30)
-        held = of(client)
-        mass = held["payload"]["mass"]
+        eventually(lambda: find_stream(client)["rows"] >= 30)
+        estimate = find_stream(client)
+        mass = estimate["payload"]["mass"]
         assert abs(mass["mean"] - 1.5) < max(4 * mass["std"], 0.02)
-        assert not held["declared"]
-        assert rms(client, later).max() < 0.05 * unaware
+        assert not estimate["declared"]
+        assert rms_error(client, later).max() < 0.05 * error_without_payload
         alarms = client.get(f"{PANDA}/alarms").json()["items"]
         assert [each["kind"] for each in alarms] == ["payload"]
         assert "kg" in alarms[0]["message"]
         server.kill()
     with Server(tmp_path / "home", warm=True) as server:
         client = server.client
-        assert of(client)["payload"]["mass"]["mean"] == pytest.approx(mass["mean"], rel=0.01)
-        assert rms(client, later).max() < 0.05 * unaware  # with what its rows had shown of the arm
-        observed(client, robot_stream, UP + 0.6, DOWN + 0.1)
+        assert find_stream(client)["payload"]["mass"]["mean"] == pytest.approx(mass["mean"], rel=0.01)
+        # what its rows taught about the arm is kept
+        assert rms_error(client, later).max() < 0.05 * error_without_payload
+        send_rows(client, robot_stream, PICKUP_S + 0.6, RELEASE_S + 0.1)
         eventually(
-            lambda: of(client)["payload"] is None and rms(client, robot_stream.rows(slice(220, 300))).max() < 0.2
+            lambda: (
+                find_stream(client)["payload"] is None
+                and rms_error(client, robot_stream.rows(slice(220, 300))).max() < 0.2
+            )
         )
-        assert observed(client, robot_stream, DOWN + 0.1, DOWN + 0.3)["accepted"] == 20
+        assert send_rows(client, robot_stream, RELEASE_S + 0.1, RELEASE_S + 0.3)["accepted"] == 20
 
 
 @pytest.fixture
 def panda(tmp_path):
-    """A service of its own, whose model no other test teaches."""
+    """Service of this test."""
     with Server(tmp_path / "home", warm=True) as server:
         yield server
 
 
-def test_a_declared_payload_is_answered_with_until_it_is_gone(panda, robot_stream):
-    client, carried = panda.client, robot_stream.rows(slice(100, 200))
-    before = rms(client, carried).max()
+@pytest.mark.slow
+def test_declared_payload_is_used_until_removed(panda, robot_stream):
+    client, with_payload = panda.client, robot_stream.rows(slice(100, 200))
+    before = rms_error(client, with_payload).max()
     learnt = client.put(f"{PANDA}/payload", json={"mass": 1.5, "com": [0.0, 0.03, 0.1]})
     assert learnt.status_code == 200, learnt.text
-    assert rms(client, carried).max() < 0.5 * before
-    with dial(panda, f"{PANDA}/stream?payload=1&stream_id=arm") as connection:
-        hello(connection)
-        answer = ask(connection, frame(np.zeros((3, 7))))
+    assert rms_error(client, with_payload).max() < 0.5 * before
+    with open_stream(panda, f"{PANDA}/stream?payload=1&stream_id=arm") as connection:
+        read_hello(connection)
+        answer = send_frame(connection, frame(np.zeros((3, 7))))
         assert answer.flags & PAYLOAD
         assert answer.payload[0] == pytest.approx(1.5)
     assert client.delete(f"{PANDA}/payload").status_code == 200
-    assert rms(client, carried).max() == pytest.approx(before)
+    assert rms_error(client, with_payload).max() == pytest.approx(before)
 
 
-def test_streams_carry_what_they_carry_by_themselves(panda, robot_stream):
+@pytest.mark.slow
+def test_payloads_of_streams_are_independent(panda, robot_stream):
     client = panda.client
-    observed(client, robot_stream, 19.0, UP + 0.3, "one")
-    eventually(lambda: of(client, "one")["payload"] is not None)
+    send_rows(client, robot_stream, 19.0, PICKUP_S + 0.3, "one")
+    eventually(lambda: find_stream(client, "one")["payload"] is not None)
     free = replace(robot_stream, t=robot_stream.t).rows(slice(0, 100))
-    observed(client, free, 19.0, UP, "two")
-    assert of(client, "two")["payload"] is None
+    send_rows(client, free, 19.0, PICKUP_S, "two")
+    assert find_stream(client, "two")["payload"] is None
     client.put(f"{PANDA}/payload", json={"mass": 0.4, "com": [0, 0, 0.1], "stream_id": "two"})
-    assert of(client, "two")["declared"]
-    assert not of(client, "one")["declared"]
+    assert find_stream(client, "two")["declared"]
+    assert not find_stream(client, "one")["declared"]
     client.delete(f"{PANDA}/payload", params={"stream_id": "one"})
-    assert of(client, "one")["payload"] is None
-    assert of(client, "two")["payload"] is not None
+    assert find_stream(client, "one")["payload"] is None
+    assert find_stream(client, "two")["payload"] is not None
 
 
-def test_what_is_switched_off_notices_nothing_and_says_why(panda, robot_stream):
+@pytest.mark.slow
+def test_disabled_payload_detection_explains_itself(panda, robot_stream):
     client = panda.client
     client.put(f"{PANDA}/learning", json={"payloads": False})
-    assert observed(client, robot_stream, 19.5, UP + 0.3).get("payload", 0) == 0
+    assert send_rows(client, robot_stream, 19.5, PICKUP_S + 0.3).get("payload", 0) == 0
     shown = client.get(f"{PANDA}/payload").json()
     assert shown["streams"] == []
     assert "payloads" in shown["reason"]
@@ -145,14 +158,14 @@ def test_what_is_switched_off_notices_nothing_and_says_why(panda, robot_stream):
         ({"com": [0, 0, 0]}, "mass"),
     ],
 )
-def test_what_cannot_be_declared_is_refused(api, body, field):
-    said = error(api.put(f"{PANDA}/payload", json=body), 422, "invalid_request")
-    assert said["detail"][0]["field"] == field
+def test_invalid_payloads_are_rejected(api, body, field):
+    reply = error(api.put(f"{PANDA}/payload", json=body), 422, "invalid_request")
+    assert reply["detail"][0]["field"] == field
 
 
-def test_a_model_without_an_arm_says_so(api, trained):
+def test_model_without_arm_explains_missing_payloads(api, trained):
     shown = api.get(f"/v1/models/{trained.name}/payload").json()
     assert shown["streams"] == []
-    assert "knows no arm" in shown["reason"]
+    assert "has no arm" in shown["reason"]
     error(api.put(f"/v1/models/{trained.name}/payload", json={"mass": 1, "com": [0, 0, 0]}), 409, "conflict")
     error(api.get("/v1/models/nobody/payload"), 404, "not_found")

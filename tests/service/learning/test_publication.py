@@ -1,4 +1,4 @@
-"""What has been learnt reaches answers: through files, by one assignment, whole, never backwards; and is waited for."""
+"""Publication of revisions: files, adoption for predictions, eviction, and `min_revision`."""
 
 import asyncio
 import gc
@@ -19,37 +19,53 @@ from service.models.loaded import LoadedModels
 from service.models.served import RevisionWaiters
 from service.storage.files import Files
 from tests.service.data import error, service_of
-from tests.service.learning.lessons import QUERIES as ASKED
-from tests.service.learning.lessons import lesson
-from tests.service.learning.pendulums import ARM, QUERIES, adopt, at_once, differ, rows, same, trained
+from tests.service.learning.learning_models import QUERIES as HTTP_QUERIES
+from tests.service.learning.learning_models import observation_batch
+from tests.service.learning.pendulums import (
+    ARM,
+    QUERIES,
+    adopt_revision,
+    assert_predictions,
+    expected_predictions,
+    make_rows,
+    predictions_differ,
+    trained_model,
+)
 
 
 @pytest.fixture
-def loaded(arm):
-    """What a service has in memory: the model as trained."""
+def loaded_models(arm):
+    """Loaded models of a service, with the model as trained."""
     found = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
     found.get(ARM, None)
     return found
 
 
-def revision(batches, floor=None):
-    """The arrays of the trained model after some batches."""
-    online = OnlineModel.start(trained(), None, 0.0)
+def make_revision(batches, floor=None):
+    """Return the revision of the trained model after some batches."""
+    online = OnlineModel.start(trained_model(), None, 0.0)
     if batches:
-        online = online.learn(Rows.concatenate([rows(number) for number in range(batches)]))
+        online = online.learn(Rows.concatenate([make_rows(number) for number in range(batches)]))
     return Revision.of(online.model(floor))
 
 
-def published(arm, batches, number=None, **fields):
-    """The message of the learner that goes with them."""
-    path = publication.write(publication.clear(arm.files), revision(batches))
+def make_publication(arm, batches, number=None, **fields):
+    """Return the learner's message that publishes a revision."""
+    path = publication.write(publication.clear(arm.files), make_revision(batches))
     number = batches if number is None else number
-    usual = {"model": ARM, "version": 1, "revision": number, "number": number, "path": path, "samples": 10.0 * batches}
-    return Publication(**usual | {"novel_rows": 0, "novel_share": 0.0, "seconds": 0.1, "at": 0.0} | fields)
+    defaults = {
+        "model": ARM,
+        "version": 1,
+        "revision": number,
+        "number": number,
+        "path": path,
+        "samples": 10.0 * batches,
+    }
+    return Publication(**defaults | {"novel_rows": 0, "novel_share": 0.0, "seconds": 0.1, "at": 0.0} | fields)
 
 
-def test_arrays_come_back_as_they_were_and_their_files_are_gone(arm):
-    written = revision(3, floor=np.array([0.5, 0.0]))
+def test_published_arrays_are_read_once(arm):
+    written = make_revision(3, floor=np.array([0.5, 0.0]))
     path = publication.write(publication.clear(arm.files), written)
     found = publication.read(path)
     assert not path.exists()
@@ -58,131 +74,132 @@ def test_arrays_come_back_as_they_were_and_their_files_are_gone(arm):
     assert found.floor[0] == 0.5
 
 
-def test_a_revision_is_answered_with_from_then_on(arm, loaded):
-    before = loaded.hot(ARM, None)
-    assert adopt(loaded, published(arm, 3))
-    after = loaded.hot(ARM, None)
+def test_adopted_revision_is_used_for_predictions(arm, loaded_models):
+    before = loaded_models.hot(ARM, None)
+    assert adopt_revision(loaded_models, make_publication(arm, 3))
+    after = loaded_models.hot(ARM, None)
     assert (before.revision, after.revision, after.version) == (0, 3, 1)
-    same(after.model, at_once(range(3)))
-    same(before.model, at_once())
-    assert differ(at_once(range(3)), at_once())
-    assert loaded.hot(ARM, 1) is after
+    assert_predictions(after.model, expected_predictions(range(3)))
+    assert_predictions(before.model, expected_predictions())
+    assert predictions_differ(expected_predictions(range(3)), expected_predictions())
+    assert loaded_models.hot(ARM, 1) is after
     assert after.base is before.base
     single = [after.model.answer(np.ascontiguousarray(QUERIES[:, row])) for row in range(QUERIES.shape[1])]
-    np.testing.assert_allclose([tau for tau, _ in single], at_once(range(3))[0], rtol=1e-8, atol=1e-8)
-    np.testing.assert_allclose([std for _, std in single], at_once(range(3))[1], rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose([tau for tau, _ in single], expected_predictions(range(3))[0], rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose([std for _, std in single], expected_predictions(range(3))[1], rtol=1e-8, atol=1e-8)
 
 
-def test_only_higher_revisions_are_adopted(arm, loaded):
-    assert adopt(loaded, published(arm, 3))
-    known = loaded.hot(ARM, None)
+def test_only_higher_revisions_are_adopted(arm, loaded_models):
+    assert adopt_revision(loaded_models, make_publication(arm, 3))
+    known = loaded_models.hot(ARM, None)
     for number in (2, 3):
-        assert not adopt(loaded, published(arm, 5, number=number))
-        assert loaded.hot(ARM, None) is known
-    assert adopt(loaded, published(arm, 1, number=4))  # after a rollback
-    same(loaded.hot(ARM, None).model, at_once(range(1)))
-    assert loaded.hot(ARM, None).revision == 4
+        assert not adopt_revision(loaded_models, make_publication(arm, 5, number=number))
+        assert loaded_models.hot(ARM, None) is known
+    assert adopt_revision(loaded_models, make_publication(arm, 1, number=4))  # a rollback has a higher revision
+    assert_predictions(loaded_models.hot(ARM, None).model, expected_predictions(range(1)))
+    assert loaded_models.hot(ARM, None).revision == 4
 
 
-def test_a_version_dropped_from_memory_has_what_it_had_learnt_when_it_is_loaded_again(arm, loaded):
-    adopt(loaded, published(arm, 3))
-    drop(arm, loaded)
-    again = loaded.get(ARM, None)
+def test_reloaded_version_has_its_learnt_state(arm, loaded_models):
+    adopt_revision(loaded_models, make_publication(arm, 3))
+    evict_model(arm, loaded_models)
+    again = loaded_models.get(ARM, None)
     assert again.revision == 3
-    same(again.model, at_once(range(3)))
-    adopt(loaded, published(arm, 5))
-    same(loaded.hot(ARM, None).model, at_once(range(5)))
+    assert_predictions(again.model, expected_predictions(range(3)))
+    adopt_revision(loaded_models, make_publication(arm, 5))
+    assert_predictions(loaded_models.hot(ARM, None).model, expected_predictions(range(5)))
 
 
-def test_a_version_dropped_from_memory_that_a_stream_holds_learns_on(arm, loaded):
-    held = loaded.get(ARM, None)
-    drop(arm, loaded)
-    assert adopt(loaded, published(arm, 4))
-    assert loaded.hot(ARM, None).revision == 4
-    assert loaded.hot(ARM, None).base is held.base
-    assert len(loaded._snapshot.served) == loaded.capacity
+def test_evicted_version_held_by_a_stream_keeps_learning(arm, loaded_models):
+    held = loaded_models.get(ARM, None)
+    evict_model(arm, loaded_models)
+    assert adopt_revision(loaded_models, make_publication(arm, 4))
+    assert loaded_models.hot(ARM, None).revision == 4
+    assert loaded_models.hot(ARM, None).base is held.base
+    assert len(loaded_models._snapshot.served) == loaded_models.capacity
 
 
-def test_a_service_that_starts_has_what_the_log_says(arm):
-    arm.batches(*range(4))
+def test_started_service_restores_from_the_log(arm):
+    arm.log_batches(*range(4))
     started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
     assert started.preload() == 1
     found = started.hot(ARM, None)
     assert found.revision == 4
-    same(found.model, at_once(range(4)))
-    same(found.base, at_once())
+    assert_predictions(found.model, expected_predictions(range(4)))
+    assert_predictions(found.base, expected_predictions())
 
 
-def test_what_is_learnt_while_a_version_is_being_loaded_is_not_lost(arm, loaded, monkeypatch):
-    drop(arm, loaded)
+def test_revision_published_during_loading_is_kept(arm, loaded_models, monkeypatch):
+    evict_model(arm, loaded_models)
     load = Files.load_version
 
-    def meanwhile(*given):
+    def publish_while_loading(*given):
         model = load(*given)
-        assert not adopt(loaded, published(arm, 4))
+        assert not adopt_revision(loaded_models, make_publication(arm, 4))
         return model
 
-    monkeypatch.setattr(Files, "load_version", meanwhile)
-    assert loaded.get(ARM, None).revision == 4
-    assert loaded.hot(ARM, None).revision == 4
+    monkeypatch.setattr(Files, "load_version", publish_while_loading)
+    assert loaded_models.get(ARM, None).revision == 4
+    assert loaded_models.hot(ARM, None).revision == 4
 
 
-def test_a_learner_is_woken_for_what_was_loaded_without_all_of_its_log(arm, monkeypatch):
+def test_learner_is_woken_for_partially_restored_version(arm, monkeypatch):
     monkeypatch.setattr(learnt, "MAX_PAGES", 0)
     woken = []
     started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
-    arm.batches(*range(4))
+    arm.log_batches(*range(4))
     started.preload()
     started.learn_from(woken.append)
     assert woken == [ARM]
     assert started.hot(ARM, None).revision == 0
-    drop(arm, started)
+    evict_model(arm, started)
     started.get(ARM, None)
     assert woken == [ARM, ARM]
 
 
-def test_a_log_that_cannot_be_read_leaves_the_version_as_trained(arm, caplog):
-    arm.batches(0)
+def test_unreadable_log_leaves_version_as_trained(arm, caplog):
+    arm.log_batches(0)
     with arm.database.transaction() as session:
         session.connection().exec_driver_sql("UPDATE events SET payload = x'00'")
     started = LoadedModels(arm.storage, LearntVersions(arm.database, arm.files), capacity=2)
     started.preload()
     found = started.hot(ARM, None)
     assert found.revision == 0
-    same(found.model, at_once())
-    assert "what version 1 of model 'arm' has learnt is not known" in caplog.text
+    assert_predictions(found.model, expected_predictions())
+    assert "could not read what version 1 of model 'arm' has learnt" in caplog.text
 
 
-def test_revisions_that_nobody_answers_from_are_freed(arm, loaded):
-    adopt(loaded, published(arm, 1))
-    first = weakref.ref(loaded.hot(ARM, None).model)
-    adopt(loaded, published(arm, 2))
+def test_replaced_revisions_are_freed(arm, loaded_models):
+    adopt_revision(loaded_models, make_publication(arm, 1))
+    first = weakref.ref(loaded_models.hot(ARM, None).model)
+    adopt_revision(loaded_models, make_publication(arm, 2))
     gc.collect()
     assert first() is None
 
 
-def test_answers_are_whole_while_revisions_come(arm, loaded):
-    """Torque, deviation and revision of every answer belong together, in several threads, while all of them change."""
-    revisions = [revision(number) for number in range(1, 9)]
+@pytest.mark.slow
+def test_predictions_are_consistent_while_revisions_change(arm, loaded_models):
+    """In several threads, torque, standard deviation and revision of every prediction belong together."""
+    revisions = [make_revision(number) for number in range(1, 9)]
     motion = np.ascontiguousarray(QUERIES[:, 7])
-    expected = {0: trained().answer(motion)}
-    expected |= {n: each.apply(trained()).answer(motion) for n, each in enumerate(revisions, start=1)}
+    expected = {0: trained_model().answer(motion)}
+    expected |= {n: each.apply(trained_model()).answer(motion) for n, each in enumerate(revisions, start=1)}
     answers, failed, stop = [[] for _ in range(3)], [], threading.Event()
 
-    def ask(into):
+    def predict_until_stopped(into):
         try:
             while not stop.is_set():
-                served = loaded.hot(ARM, None)
+                served = loaded_models.hot(ARM, None)
                 into.append((served.revision, *served.model.answer(motion)))
         except Exception as error:
             failed.append(error)
 
-    threads = [threading.Thread(target=ask, args=(into,)) for into in answers]
+    threads = [threading.Thread(target=predict_until_stopped, args=(into,)) for into in answers]
     for thread in threads:
         thread.start()
     for number in range(1, 9):
-        loaded.revise(ARM, 1, number, revisions[number - 1])
-        known = [len(each) for each in answers]  # of three more, two at least have begun since
+        loaded_models.revise(ARM, 1, number, revisions[number - 1])
+        known = [len(each) for each in answers]  # of three more predictions, at least two began after the revision
         while any(len(each) < before + 3 for each, before in zip(answers, known, strict=True)) and not failed:
             pass
     stop.set()
@@ -200,62 +217,70 @@ def test_answers_are_whole_while_revisions_come(arm, loaded):
     assert len({float(tau[0]) for tau, _ in expected.values()}) == 9
 
 
-def drop(arm, loaded):
-    """Ask for so many other models that this one has to go."""
-    for number in range(loaded.capacity):
+def evict_model(arm, loaded_models):
+    """Load other models until this one is evicted."""
+    for number in range(loaded_models.capacity):
         other = f"other-{number}"
-        if other not in {name for name, _ in loaded._snapshot.served}:
+        if other not in {name for name, _ in loaded_models._snapshot.served}:
             arm.publish(other)
-        loaded.get(other, None)
-    assert loaded.hot(ARM, None) is None
+        loaded_models.get(other, None)
+    assert loaded_models.hot(ARM, None) is None
 
 
-SINGLE = {name: rows[0] for name, rows in ASKED.items()}
+SINGLE_QUERY = {name: rows[0] for name, rows in HTTP_QUERIES.items()}
 
 
-def test_what_was_taught_is_in_the_answer(pupil):
-    pupil.predict()
-    said = pupil.post("observations", lesson(0))
-    with ThreadPoolExecutor(2) as threads:  # through the event loop, which goes on, and through a thread
-        asked = [
-            threads.submit(pupil.client.post, pupil.url("predict"), json=query | {"min_revision": said["revision"]})
-            for query in (SINGLE, ASKED)
+def test_min_revision_is_waited_for(learning_model):
+    learning_model.predict()
+    reply = learning_model.post("observations", observation_batch(0))
+    with ThreadPoolExecutor(2) as threads:  # single queries wait in the event loop, batches in a thread
+        requests = [
+            threads.submit(
+                learning_model.client.post,
+                learning_model.url("predict"),
+                json=query | {"min_revision": reply["revision"]},
+            )
+            for query in (SINGLE_QUERY, HTTP_QUERIES)
         ]
-        answers = [each.result() for each in asked]
-    # a learner that is only started may take longer than they wait
+        answers = [each.result() for each in requests]
+    # a learner that is still starting may take longer than the wait
     assert all(each.status_code in (200, 503) for each in answers)
-    pupil.settled(said["revision"])
-    for query in (SINGLE, ASKED):
-        assert pupil.post("predict", query | {"min_revision": said["revision"]})["revision"] == said["revision"]
+    learning_model.wait_for_revision(reply["revision"])
+    for query in (SINGLE_QUERY, HTTP_QUERIES):
+        assert (
+            learning_model.post("predict", query | {"min_revision": reply["revision"]})["revision"] == reply["revision"]
+        )
 
 
-def test_a_revision_that_does_not_come_is_refused(pupil, monkeypatch):
+def test_unreached_min_revision_is_an_error(learning_model, monkeypatch):
     woken = []
-    monkeypatch.setattr(service_of(pupil.client).loaded, "_wake", woken.append)
-    monkeypatch.setitem(vars(service_of(pupil.client).settings), "min_revision_wait_s", 0.05)
-    for query in (SINGLE, ASKED):
+    monkeypatch.setattr(service_of(learning_model.client).loaded, "_wake", woken.append)
+    monkeypatch.setitem(vars(service_of(learning_model.client).settings), "min_revision_wait_s", 0.05)
+    for query in (SINGLE_QUERY, HTTP_QUERIES):
         woken.clear()
-        answer = pupil.client.post(pupil.url("predict"), json=query | {"min_revision": 3})
+        answer = learning_model.client.post(learning_model.url("predict"), json=query | {"min_revision": 3})
         (item,) = error(answer, 503, "revision_not_reached")["detail"]
-        assert item == {"field": "min_revision", "value": "3", "expected": "0 or less now, of version 1"}
+        assert item == {"field": "min_revision", "value": "3", "expected": "at most 0 at present, of version 1"}
         assert answer.headers["retry-after"] == "1"
-        assert woken == [pupil.model]  # once: who has logged it may have told nobody
+        assert woken == [learning_model.name]  # once: the service that logged it may not have woken a learner
 
 
-def test_a_data_set_is_compared_with_what_was_taught(pupil, monkeypatch):
-    monkeypatch.setitem(vars(service_of(pupil.client).settings), "min_revision_wait_s", 0.05)
+def test_evaluation_waits_for_min_revision(learning_model, monkeypatch):
+    monkeypatch.setitem(vars(service_of(learning_model.client).settings), "min_revision_wait_s", 0.05)
     body = {"dataset": "ds_0", "min_revision": 1}
-    error(pupil.client.post(pupil.url("evaluate"), json=body), 503, "revision_not_reached")
-    pupil.refused("POST", "evaluate", 404, "not_found", json=body | {"min_revision": 0})
+    error(learning_model.client.post(learning_model.url("evaluate"), json=body), 503, "revision_not_reached")
+    learning_model.expect_error("POST", "evaluate", 404, "not_found", json=body | {"min_revision": 0})
 
 
-def test_what_is_not_there_is_not_waited_for(school, pupil):
-    pupil.refused("POST", "predict", 404, "not_found", json=ASKED | {"min_revision": 1, "version": 9})
-    answer = school.client.post("/v1/models/nobody/predict", json=ASKED | {"min_revision": 1})
+def test_unknown_versions_are_not_waited_for(learning_service, learning_model):
+    learning_model.expect_error(
+        "POST", "predict", 404, "not_found", json=HTTP_QUERIES | {"min_revision": 1, "version": 9}
+    )
+    answer = learning_service.client.post("/v1/models/nobody/predict", json=HTTP_QUERIES | {"min_revision": 1})
     error(answer, 404, "not_found")
 
 
-def test_a_waiter_misses_nothing_and_leaves_nothing():
+def test_waiters_miss_no_wakeup_and_are_removed():
     waiting = RevisionWaiters()
 
     async def wait() -> None:
@@ -264,8 +289,8 @@ def test_a_waiter_misses_nothing_and_leaves_nothing():
             thread = threading.Thread(target=waiting.wake, args=("arm",))
             thread.start()
             thread.join()
-            await asyncio.gather(first.wait(60.0), second.wait(60.0))  # told before they wait
-            await first.wait(0.0)  # told once
+            await asyncio.gather(first.wait(60.0), second.wait(60.0))  # woken before they wait
+            await first.wait(0.0)  # woken once
 
     asyncio.run(wait())
     assert waiting._waiters == {}

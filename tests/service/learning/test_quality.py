@@ -1,4 +1,4 @@
-"""Prequential quality: what was predicted of rows before they were learnt, as a route and for Prometheus."""
+"""Prequential quality of rows predicted before they were learnt, as a route and as metrics."""
 
 import math
 import os
@@ -14,14 +14,14 @@ from lipcore.vocabulary import CODES
 from service.learning.control import status
 from service.learning.ingest.monitor import WINDOWS_S
 from tests.service.data import eventually
-from tests.service.learning.lessons import lesson
+from tests.service.learning.learning_models import observation_batch
 
 FIGURES = ("nmse", "rmse", "coverage", "nlpd")
 
 
-def by_hand(taught, answers):
-    """The four figures, straight from their definitions, of all rows against the answers that came before."""
-    tau = np.vstack([batch["tau"] for batch in taught])
+def compute_figures(batches, answers):
+    """Return the four figures of all rows against earlier predictions, computed from their definitions."""
+    tau = np.vstack([batch["tau"] for batch in batches])
     mean, std = (np.vstack([answer[name] for answer in answers]) for name in ("tau", "tau_std"))
     noise = np.array(answers[0]["noise_std"])
     error, total = tau - mean, np.sqrt(std**2 + noise**2)
@@ -34,15 +34,16 @@ def by_hand(taught, answers):
     }
 
 
-def test_rows_are_predicted_before_they_are_learnt(school):
-    pupil = school.enrol("prequential")
-    taught, answers = [lesson(number) for number in range(3)], []
-    for number, batch in enumerate(taught):
-        answers.append(pupil.predict({name: batch[name] for name in ("q", "dq", "ddq")}))
+@pytest.mark.slow
+def test_rows_are_predicted_before_they_are_learnt(learning_service):
+    learning_model = learning_service.create_model("prequential")
+    batches, answers = [observation_batch(number) for number in range(3)], []
+    for number, batch in enumerate(batches):
+        answers.append(learning_model.predict({name: batch[name] for name in ("q", "dq", "ddq")}))
         assert answers[-1]["revision"] == number
-        pupil.teach(number)
-    expected = by_hand(taught, answers)
-    seen = pupil.get("quality")
+        learning_model.send_batches(number)
+    expected = compute_figures(batches, answers)
+    seen = learning_model.get("quality")
     assert (seen["model"], seen["version"], seen["revision"], seen["level"]) == ("prequential", 1, 3, 0.95)
     assert seen["joint_names"] == ["joint1", "joint2"]
     assert [window["seconds"] for window in seen["windows"]] == list(WINDOWS_S)
@@ -50,12 +51,12 @@ def test_rows_are_predicted_before_they_are_learnt(school):
         assert (window["rows"], window["accepted"], window["rejected"]) == (30, 30, {})
         for name in FIGURES:
             assert window[name] == pytest.approx(expected[name], rel=1e-9), name
-    after = pupil.predict({name: taught[0][name] for name in ("q", "dq", "ddq")})
-    late, early = (np.abs(np.subtract(answer["tau"], taught[0]["tau"])).mean() for answer in (after, answers[0]))
-    assert late < early  # which would have flattered
+    after = learning_model.predict({name: batches[0][name] for name in ("q", "dq", "ddq")})
+    late, early = (np.abs(np.subtract(answer["tau"], batches[0]["tau"])).mean() for answer in (after, answers[0]))
+    assert late < early  # predictions after learning would flatter
 
 
-def test_windows_slide():
+def test_quality_windows_slide():
     seen = Window(60.0, 1)
     for at, value in ((1000.0, 1.0), (1050.0, 3.0)):
         record = Record.of(np.full((4, 1), value), np.zeros((4, 1)), np.zeros((4, 1)), np.ones(1))
@@ -67,9 +68,9 @@ def test_windows_slide():
     assert (none.rows, none.accepted, none.rejected, none.rmse) == (0, 0, {}, [None])
 
 
-def scraped(school, model):
-    """Samples of one model, {(name, the other labels): value}."""
-    answer = school.client.get("/metrics")
+def scrape_metrics(learning_service, model):
+    """Return the metrics of one model as {(name, *other labels): value}."""
+    answer = learning_service.client.get("/metrics")
     assert answer.status_code == 200
     assert answer.headers["content-type"].startswith("text/plain")
     samples = {}
@@ -81,10 +82,10 @@ def scraped(school, model):
     return samples
 
 
-def test_quality_is_that_of_the_other_route(school):
-    pupil = school.enrol("scraped")
-    pupil.teach(0, 1)
-    samples, seen = scraped(school, "scraped"), pupil.get("quality")
+def test_metrics_match_the_quality_route(learning_service):
+    learning_model = learning_service.create_model("scraped")
+    learning_model.send_batches(0, 1)
+    samples, seen = scrape_metrics(learning_service, "scraped"), learning_model.get("quality")
     for window in seen["windows"]:
         for name in ("nmse", "coverage", "nlpd"):
             for joint, value in zip(seen["joint_names"], window[name], strict=True):
@@ -92,21 +93,21 @@ def test_quality_is_that_of_the_other_route(school):
                 assert samples[key] == pytest.approx(value, rel=1e-12)
     assert samples["lipserve_revision", ("version", "1")] == 2
     assert (samples["lipserve_learning_lag_rows",], samples["lipserve_learning_lag_seconds",]) == (0, 0)
-    assert samples["lipserve_novel_share",] == pupil.get("learning")["status"]["novel_share"]
+    assert samples["lipserve_novel_share",] == learning_model.get("learning")["status"]["novel_share"]
 
 
-def test_what_became_of_rows_is_counted_and_what_is_not_known_left_out(school):
-    pupil = school.enrol("rows")
-    body = lesson(0)
-    body["tau"] = [[row[0], 0.25] for row in body["tau"]]  # which has no NMSE
+def test_row_outcomes_are_counted_and_unknown_figures_left_out(learning_service):
+    learning_model = learning_service.create_model("rows")
+    body = observation_batch(0)
+    body["tau"] = [[row[0], 0.25] for row in body["tau"]]  # constant torque has no NMSE
     body["q"][2][0], body["q"][5][1], body["dq"][7][0] = None, 1000.0, 1000.0
-    pupil.teach(0, **{name: body[name] for name in ("q", "dq", "tau")})
-    pupil.post("observations", body)  # again, which counts no row
-    for window in pupil.get("quality")["windows"]:
+    learning_model.send_batches(0, **{name: body[name] for name in ("q", "dq", "tau")})
+    learning_model.post("observations", body)  # duplicates count no rows
+    for window in learning_model.get("quality")["windows"]:
         assert (window["rows"], window["accepted"], window["rejected"]) == (7, 7, {"non_finite": 1, "limit": 2})
         assert [value is None for value in window["nmse"]] == [False, True]
         assert None not in window["rmse"] + window["coverage"] + window["nlpd"]
-    samples = scraped(school, "rows")
+    samples = scrape_metrics(learning_service, "rows")
     counted = {
         dict(key[1:])["outcome"]: value for key, value in samples.items() if key[0] == "lipserve_observations_total"
     }
@@ -114,19 +115,19 @@ def test_what_became_of_rows_is_counted_and_what_is_not_known_left_out(school):
     assert {dict(key[1:])["joint"] for key in samples if key[0] == "lipserve_quality_nmse"} == {"joint1"}
 
 
-def test_what_is_not_learnt_yet_is_the_lag(school):
-    pupil = school.enrol("lagging")
-    pupil.teach(0)
-    learner = school.service.learners.process.pid
+def test_lag_counts_rows_not_learnt_yet(learning_service):
+    learning_model = learning_service.create_model("lagging")
+    learning_model.send_batches(0)
+    learner = learning_service.service.learners.process.pid
     os.kill(learner, signal.SIGSTOP)
     try:
         for number in (1, 2):
-            pupil.post("observations", lesson(number))
-        samples, status = scraped(school, "lagging"), pupil.get("learning")["status"]
+            learning_model.post("observations", observation_batch(number))
+        samples, status = scrape_metrics(learning_service, "lagging"), learning_model.get("learning")["status"]
     finally:
         os.kill(learner, signal.SIGCONT)
     assert samples["lipserve_learning_lag_rows",] == status["lag_rows"] == 20
     assert 0 < samples["lipserve_learning_lag_seconds",] <= status["lag_s"]
-    pupil.settled(3)
-    after = eventually(lambda: not (now := pupil.get("learning")["status"])["lag_rows"] and now)
+    learning_model.wait_for_revision(3)
+    after = eventually(lambda: not (now := learning_model.get("learning")["status"])["lag_rows"] and now)
     assert after["lag_s"] == 0.0

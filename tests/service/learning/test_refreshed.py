@@ -1,4 +1,4 @@
-"""A refreshed version against the one that serves, on logged rows that neither has learnt."""
+"""Comparison of a refreshed version with the serving one, on logged rows that neither has learnt."""
 
 from dataclasses import replace
 
@@ -10,69 +10,71 @@ from lipcore.online.learner import OnlineModel
 from service.models import registry
 from service.training import refresh_data, refreshed
 from service.training.refresh_data import ComparisonRows
-from tests.service.learning.pendulums import ARM, Arm, rows, trained
+from tests.service.learning.pendulums import ARM, Arm, make_rows, trained_model
 
-SECOND = 100
-"""Rows of a batch of a second."""
-AFTER = 4
+SECOND_ROWS = 100
+"""Rows of a batch of one second."""
+TRAINED_EVENTS = 4
 
 
 @pytest.fixture(scope="module")
 def arm(tmp_path_factory):
-    """A model that has observed 26 s of a robot with more friction than it was trained with."""
+    """Model with 26 s of observations of a robot that has more friction than in the training."""
     arm = Arm.open(tmp_path_factory.mktemp("refreshed"))
     for number in range(26):
-        arm.batch(number, size=SECOND)
+        arm.log_batch(number, size=SECOND_ROWS)
     yield arm
     arm.database.close()
 
 
-def unlearnt(*numbers: int) -> ComparisonRows:
-    """Rows of these seconds, in one stream."""
-    every = rows(0).concatenate([rows(number, SECOND) for number in numbers])
+def make_comparison_rows(*numbers: int) -> ComparisonRows:
+    """Return the rows of these seconds in one stream."""
+    every = make_rows(0).concatenate([make_rows(number, SECOND_ROWS) for number in numbers])
     episode = np.zeros(len(every), np.int64)
-    samples = Samples(trained().joint_names, every.time, episode, every.q, every.dq, every.ddq, every.tau)
-    return ComparisonRows(AFTER, samples)
+    samples = Samples(trained_model().joint_names, every.time, episode, every.q, every.dq, every.ddq, every.tau)
+    return ComparisonRows(TRAINED_EVENTS, samples)
 
 
-def learnt(seconds: int):
-    online = OnlineModel.start(trained())
+def learn_seconds(seconds: int):
+    online = OnlineModel.start(trained_model())
     for number in range(seconds):
-        online = online.learn(rows(number, SECOND))
+        online = online.learn(make_rows(number, SECOND_ROWS))
     return online.model()
 
 
 @pytest.mark.parametrize(
     ("seconds", "passed", "words"),
     [
-        (14, True, "better than version 1"),  # knows more of the robot than version 1 did after 4 s
-        (0, False, "no better than version 1"),  # as trained: the wrong friction
-        (AFTER, False, "no better than version 1"),  # the same
+        (14, True, "better than those of version 1"),  # more data of the robot than version 1 had after 4 s
+        (0, False, "no better than those of version 1"),  # as trained: the wrong friction
+        (TRAINED_EVENTS, False, "no better than those of version 1"),  # the same as version 1
     ],
 )
-def test_the_one_that_predicts_the_newest_rows_better_is_accepted(arm, seconds, passed, words):
+def test_candidate_is_accepted_if_it_predicts_newest_rows_better(arm, seconds, passed, words):
     serving = registry.find(arm.database, ARM, 1)
-    found = refreshed.compare(arm.database, arm.files, serving, learnt(seconds), unlearnt(*range(AFTER, 26)))
+    found = refreshed.compare(
+        arm.database, arm.files, serving, learn_seconds(seconds), make_comparison_rows(*range(TRAINED_EVENTS, 26))
+    )
     assert (found.acceptance.passed, words in found.acceptance.reason) == (passed, True)
-    assert (found.evidence["rows"], found.evidence["blocks"]) == (22 * SECOND, 22)
+    assert (found.evidence["rows"], found.evidence["blocks"]) == (22 * SECOND_ROWS, 22)
     better = found.evidence["gain"] > 2 * found.evidence["standard_error"]
     assert better == passed
     assert set(found.evidence["figures"]) == {"serving", "candidate"}
 
 
-def test_few_rows_tell_nothing(arm):
+def test_too_few_rows_give_no_verdict(arm):
     serving = registry.find(arm.database, ARM, 1)
-    for few in (None, unlearnt(4, 5, 6)):
-        found = refreshed.compare(arm.database, arm.files, serving, learnt(14), few)
+    for few in (None, make_comparison_rows(4, 5, 6)):
+        found = refreshed.compare(arm.database, arm.files, serving, learn_seconds(14), few)
         assert (found.acceptance.passed, found.acceptance.reason) == (
             None,
-            "too few rows are logged to compare it with version 1",
+            "not compared with version 1, because too few rows are logged",
         )
 
 
-def test_the_newest_third_of_what_teaches_is_compared(arm):
+def test_newest_third_of_learnt_rows_is_compared(arm):
     with arm.database.session() as session:
         scope = refresh_data.scope_of(session, ARM, 24)
         assert refresh_data.newest_part(session, ARM, scope, 0) == 16
-        assert refresh_data.newest_part(session, ARM, scope, 20) == 20  # which the version contains by training
-        assert refresh_data.newest_part(session, ARM, replace(scope, since=rows(18, SECOND).time[0]), 0) == 22
+        assert refresh_data.newest_part(session, ARM, scope, 20) == 20  # the version contains these by training
+        assert refresh_data.newest_part(session, ARM, replace(scope, since=make_rows(18, SECOND_ROWS).time[0]), 0) == 22

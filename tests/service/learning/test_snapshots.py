@@ -1,4 +1,4 @@
-"""Snapshots: stored durably, thinned evenly, refused where the log has gone another way since."""
+"""Snapshots: storage, even thinning, and rejection after a rollback."""
 
 from itertools import pairwise
 
@@ -11,15 +11,15 @@ from service.journal import snapshots
 from service.journal.snapshots import choose_kept
 from service.storage.database import SnapshotRow, VersionRow, now
 from service.storage.files import Files
-from tests.service.learning.batches import MODEL, OTHER, batch, roll_back, write
+from tests.service.learning.batches import MODEL, OTHER, append_batches, make_batch, roll_back
 
 
 @pytest.fixture
 def database(database):
-    """With a second version, and forty batches."""
+    """Database with a second version and forty batches."""
     with database.transaction() as session:
         session.add(VersionRow(model=MODEL, version=2, folder="mv_2", created_at=now(), job=None, manifest={}))
-    write(database, *(batch(k) for k in range(40)))
+    append_batches(database, *(make_batch(k) for k in range(40)))
     return database
 
 
@@ -28,69 +28,69 @@ def files(home):
     return Files(home)
 
 
-def save(database, files, number, version=1, most=20, model=MODEL, seen=None):
+def save_snapshot(database, files, number, version=1, most=20, model=MODEL, seen=None):
     payload = f"{model} {version} {number}".encode()
     seen = number if seen is None else seen
     return snapshots.save(database, files, model, version, number, seen, payload, most=most)
 
 
-def latest(database, version=1, at_most=None, model=MODEL):
+def find_latest(database, version=1, at_most=None, model=MODEL):
     with database.session() as session:
         return snapshots.find_latest(session, model, version, at_most)
 
 
-def numbers(database):
+def list_numbers(database):
     with database.session() as session:
         return sorted(session.scalars(select(SnapshotRow.number)))
 
 
-def stored(files):
+def list_files(files):
     return {path.name.removesuffix(".safetensors") for path in files.learning.iterdir()}
 
 
-def named(database):
+def list_ids(database):
     with database.session() as session:
         return set(session.scalars(select(SnapshotRow.id)))
 
 
-def test_the_latest_snapshot_of_a_version_comes_back(database, files):
+def test_latest_snapshot_of_a_version_is_found(database, files):
     for number in (10, 30, 20):
-        save(database, files, number)
-    save(database, files, 40, version=2)
-    save(database, files, 35, model=OTHER)
-    found = {at_most: latest(database, at_most=at_most) for at_most in (None, 30, 29, 10)}
+        save_snapshot(database, files, number)
+    save_snapshot(database, files, 40, version=2)
+    save_snapshot(database, files, 35, model=OTHER)
+    found = {at_most: find_latest(database, at_most=at_most) for at_most in (None, 30, 29, 10)}
     assert {at_most: row.number for at_most, row in found.items()} == {None: 30, 30: 30, 29: 20, 10: 10}
-    assert latest(database, at_most=9) is None
-    assert latest(database, version=3) is None
+    assert find_latest(database, at_most=9) is None
+    assert find_latest(database, version=3) is None
     assert snapshots.read(files, found[29]) == b"arm 1 20"
-    assert snapshots.read(files, latest(database, version=2)) == b"arm 2 40"
+    assert snapshots.read(files, find_latest(database, version=2)) == b"arm 2 40"
 
 
-def test_files_and_rows_agree(database, files):
-    names = [save(database, files, number) for number in (5, 6, 7, 7)]
-    assert stored(files) == named(database) == {*names[:2], names[3]}  # the second of 7 has replaced the first
+def test_files_match_rows(database, files):
+    names = [save_snapshot(database, files, number) for number in (5, 6, 7, 7)]
+    assert list_files(files) == list_ids(database) == {*names[:2], names[3]}  # the second 7 replaces the first
 
 
-def test_a_state_that_was_rolled_back_meanwhile_is_refused(database, files):
+def test_rolled_back_state_is_not_stored(database, files):
     roll_back(database, 20)  # event 41
-    assert save(database, files, 30) is None
-    assert save(database, files, 40) is None
-    assert (numbers(database), stored(files)) == ([], set())
-    assert save(database, files, 20)  # the rollback leads there
-    assert save(database, files, 41)
-    assert numbers(database) == [20, 41]
+    assert save_snapshot(database, files, 30) is None
+    assert save_snapshot(database, files, 40) is None
+    assert (list_numbers(database), list_files(files)) == ([], set())
+    assert save_snapshot(database, files, 20)  # the rollback target
+    assert save_snapshot(database, files, 41)
+    assert list_numbers(database) == [20, 41]
 
 
-def test_no_more_than_the_most_are_kept_for_each_version(database, files):
-    save(database, files, 3, version=2)
+def test_snapshots_per_version_are_limited(database, files):
+    save_snapshot(database, files, 3, version=2)
     for number in range(1, 31):
-        save(database, files, number, most=6)
-    left = sorted(set(numbers(database)) - {3})
+        save_snapshot(database, files, number, most=6)
+    left = sorted(set(list_numbers(database)) - {3})
     assert len(left) == 6
     assert left[0] == 1
     assert left[-3:] == [28, 29, 30]
-    assert latest(database, version=2).number == 3
-    assert stored(files) == named(database)
+    assert find_latest(database, version=2).number == 3
+    assert list_files(files) == list_ids(database)
 
 
 @given(st.lists(st.integers(0, 1000), unique=True, max_size=40), st.integers(2, 12))
@@ -103,7 +103,7 @@ def test_thinning_keeps_the_newest_half_and_the_oldest(numbers, most):
     assert kept[-1:] == falling[-1:]
 
 
-def test_old_snapshots_stay_evenly_apart_however_long_it_goes_on():
+def test_old_snapshots_stay_evenly_spaced():
     most, kept = 10, []
     for number in range(1, 1001):
         before = [number, *kept]
@@ -114,17 +114,17 @@ def test_old_snapshots_stay_evenly_apart_however_long_it_goes_on():
     assert max(steps) <= 2.5 * even
 
 
-def test_files_that_an_interrupted_save_has_left_are_swept(database, files):
-    kept = save(database, files, 10)
+def test_files_of_interrupted_saves_are_deleted(database, files):
+    kept = save_snapshot(database, files, 10)
     (files.learning / "snap_half.draft").write_bytes(b"half")
     (files.learning / "snap_unnamed.safetensors").write_bytes(b"whole")
     assert snapshots.sweep(database, files) == 2
-    assert stored(files) == {kept}
+    assert list_files(files) == {kept}
     assert snapshots.sweep(database, files) == 0
 
 
-def test_files_of_a_shared_store_are_not_swept_at_once(database, home):
-    """Another service may be about to name them."""
+def test_new_files_in_shared_store_are_not_deleted(database, home):
+    """Another service may be about to insert their rows."""
     (home / "mounted").mkdir(parents=True)
     files = Files(home, (home / "mounted").as_uri())
     files.write_snapshot("snap_unnamed", b"whole")

@@ -1,4 +1,4 @@
-"""Wherever a version can be named, an alias can: answers follow it in one step and always name the version."""
+"""An alias can replace a version number everywhere; answers follow it atomically and name the version."""
 
 import threading
 from itertools import pairwise
@@ -7,7 +7,7 @@ import pytest
 
 from service.inference.predicting import queries
 from tests.service.data import service_of, stream, upload
-from tests.service.models.versions import QUERY, predict, publish, worse
+from tests.service.models.versions import QUERY, predict, publish, train_worse
 
 BINARY = {
     "inputs": [{"name": name, "shape": [2], "datatype": "FP64", "data": QUERY[name]} for name in ("q", "dq", "ddq")]
@@ -16,13 +16,13 @@ BINARY = {
 
 @pytest.fixture(scope="module")
 def arm(api):
-    """A model whose version 1, `production`, says something else than version 2, which serves."""
-    assert [publish(api, "alias-answers"), publish(api, "alias-answers", worse())] == [1, 2]
+    """A model whose version 1, `production`, differs from version 2, which serves."""
+    assert [publish(api, "alias-answers"), publish(api, "alias-answers", train_worse())] == [1, 2]
     assert api.put("/v1/models/alias-answers/aliases/production", json={"version": 1}).status_code == 200
     return "alias-answers"
 
 
-def test_queries_are_answered_by_where_an_alias_points(api, arm):
+def test_queries_are_answered_by_the_alias_target(api, arm):
     by_number, by_alias = predict(api, arm, version=1).json(), predict(api, arm, alias="production").json()
     assert by_alias == by_number
     assert by_alias["version"] == 1
@@ -32,7 +32,7 @@ def test_queries_are_answered_by_where_an_alias_points(api, arm):
     assert predict(api, arm, **batch, alias="production").json()["tau"] == [by_number["tau"]] * 2
 
 
-def test_the_hot_route_knows_aliases(api, arm):
+def test_hot_route_resolves_aliases(api, arm):
     query = queries.decode(b'{"q": [0, 0], "dq": [0, 0], "ddq": [0, 0], "alias": "production"}')
     assert query.alias == "production"
     assert service_of(api).loaded.hot(arm, query.version, query.alias).version == 1
@@ -48,7 +48,7 @@ def test_evaluations_follow_an_alias(api, arm):
     assert first.json() == second.json()
 
 
-def test_the_open_inference_protocol_takes_an_alias_for_a_version(api, arm):
+def test_open_inference_protocol_resolves_aliases(api, arm):
     answer = api.post(f"/v2/models/{arm}/versions/production/infer", json=BINARY).json()
     assert answer["model_version"] == "1"
     assert answer["outputs"][0]["data"] == predict(api, arm, version=1).json()["tau"]
@@ -60,18 +60,18 @@ def test_the_open_inference_protocol_takes_an_alias_for_a_version(api, arm):
     assert "one of production, 1, 2" in refused.json()["error"]
 
 
-def test_queries_follow_every_move_at_once_and_none_fails(api, arm):
-    """Each answer is of a version that the alias pointed to while it was asked, and that version's to the last bit."""
+def test_queries_follow_every_move_at_once_without_failure(api, arm):
+    """Each answer equals, bit for bit, that of a version to which the alias pointed during the query."""
     expected = {version: predict(api, arm, version=version).json()["tau"] for version in (1, 2)}
     api.put(f"/v1/models/{arm}/aliases/moving", json={"version": 1})
     loaded, seen, stop = service_of(api).loaded, [], threading.Event()
 
-    def ask():
+    def query_repeatedly():
         while not stop.is_set():
             served = loaded.hot(arm, None, "moving")
             seen.append(None if served is None else served.version)
 
-    thread = threading.Thread(target=ask)
+    thread = threading.Thread(target=query_repeatedly)
     thread.start()
     try:
         for version in (2, 1) * 5:
@@ -85,12 +85,12 @@ def test_queries_follow_every_move_at_once_and_none_fails(api, arm):
     assert sum(one != other for one, other in pairwise(seen)) <= 10
 
 
-def test_moves_at_the_same_time_leave_memory_and_database_of_one_mind(api, arm):
-    def move(version):
+def test_concurrent_moves_leave_memory_and_database_equal(api, arm):
+    def move_repeatedly(version):
         for _ in range(5):
             assert api.put(f"/v1/models/{arm}/aliases/contested", json={"version": version}).status_code == 200
 
-    threads = [threading.Thread(target=move, args=(version,)) for version in (1, 2)]
+    threads = [threading.Thread(target=move_repeatedly, args=(version,)) for version in (1, 2)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -101,7 +101,7 @@ def test_moves_at_the_same_time_leave_memory_and_database_of_one_mind(api, arm):
     assert all(later["before"] == earlier["version"] for later, earlier in pairwise(moves))
 
 
-def test_an_alias_to_a_version_that_was_dropped_from_memory_loads_it(api, arm):
+def test_alias_to_a_version_not_in_memory_loads_it(api, arm):
     loaded = service_of(api).loaded
     for number in range(loaded.capacity):
         publish(api, f"crowd-{number}")

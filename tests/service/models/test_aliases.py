@@ -1,4 +1,4 @@
-"""Aliases: made, moved, taken back and removed, and what the service says of them."""
+"""Aliases: set, moved, rolled back and removed, and the messages about them."""
 
 import pytest
 
@@ -30,11 +30,11 @@ def pointers(api, model):
     return {alias: item["version"] for alias, item in listed(api, model).items()}
 
 
-def test_an_alias_is_made_moved_and_removed(api, arm):
+def test_alias_is_set_moved_and_removed(api, arm):
     made = put(api, arm, "production", version=1)
     assert made.status_code == 200
     assert (made.json()["alias"], made.json()["version"], made.json()["previous"]) == ("production", 1, None)
-    assert put(api, arm, "production", version=1).json() == made.json()  # no move
+    assert put(api, arm, "production", version=1).json() == made.json()  # the alias is there already
     moved = put(api, arm, "production", version=2).json()
     assert (moved["version"], moved["previous"]) == (2, 1)
     assert [(move["before"], move["version"]) for move in moved["history"]] == [(1, 2), (None, 1)]
@@ -46,7 +46,7 @@ def test_an_alias_is_made_moved_and_removed(api, arm):
     error(predict(api, arm, alias="production"), 404, "not_found")
 
 
-def test_an_alias_is_pointed_to_where_another_one_points(api, arm):
+def test_alias_can_be_set_to_another_alias(api, arm):
     put(api, arm, "candidate", version=2)
     assert put(api, arm, "production", alias="candidate").json()["version"] == 2
     assert put(api, arm, "serving", alias="candidate").json()["version"] == 2
@@ -54,18 +54,18 @@ def test_an_alias_is_pointed_to_where_another_one_points(api, arm):
     assert pointers(api, arm) == {"serving": 2, "candidate": 3, "production": 2}
 
 
-def test_rollbacks_go_back_move_by_move(api, arm):
+def test_rollbacks_undo_one_move_at_a_time(api, arm):
     for version in (1, 2, 3):
         put(api, arm, "production", version=version)
     back = rollback(api, arm, "production").json()
     assert (back["version"], back["previous"], back["history"][0]["rollback"]) == (2, 1, True)
     assert put(api, arm, "production", version=3).json()["previous"] == 2
     assert [rollback(api, arm, "production").json()["version"] for _ in range(2)] == [2, 1]
-    assert "nothing before version 1" in error(rollback(api, arm, "production"), 409, "conflict")["message"]
+    assert "no version before version 1" in error(rollback(api, arm, "production"), 409, "conflict")["message"]
     assert predict(api, arm, alias="production").json()["version"] == 1
 
 
-def test_a_rollback_brings_a_removed_alias_back(api, arm):
+def test_rollback_restores_a_removed_alias(api, arm):
     put(api, arm, "production", version=2)
     api.delete(f"/v1/models/{arm}/aliases/production")
     assert rollback(api, arm, "production").json()["version"] == 2
@@ -73,16 +73,16 @@ def test_a_rollback_brings_a_removed_alias_back(api, arm):
     error(rollback(api, arm, "never-was"), 404, "not_found")
 
 
-def test_a_rollback_to_a_deleted_version_says_so(api, arm):
+def test_rollback_to_a_deleted_version_is_an_error(api, arm):
     put(api, arm, "production", version=1)
     put(api, arm, "production", version=2)
     assert api.delete(f"/v1/models/{arm}/versions/1").status_code == 204
     refusal = error(rollback(api, arm, "production"), 409, "conflict")
-    assert "version 1 before, which has been deleted" in refusal["message"]
+    assert "version 1, to which" in refusal["message"]
     assert pointers(api, arm)["production"] == 2
 
 
-def test_serving_is_moved_by_training_and_by_its_owner_and_taken_back(api, arm):
+def test_serving_alias_is_moved_by_training_and_owner(api, arm):
     moves = listed(api, arm)["serving"]["history"]
     assert [(each["before"], each["version"]) for each in moves] == [(2, 3), (1, 2), (None, 1)]
     assert put(api, arm, "serving", version=1).json()["version"] == 1
@@ -94,18 +94,18 @@ def test_serving_is_moved_by_training_and_by_its_owner_and_taken_back(api, arm):
     assert "built in" in error(api.delete(f"/v1/models/{arm}/aliases/serving"), 409, "conflict")["message"]
 
 
-def test_a_model_has_so_many_aliases_and_no_more(api, arm, monkeypatch):
+def test_number_of_aliases_is_limited(api, arm, monkeypatch):
     monkeypatch.setattr(registry, "MAX_ALIASES", 2)
     put(api, arm, "one", version=1)
     put(api, arm, "two", version=1)
-    assert "2 aliases, the most" in error(put(api, arm, "three", version=1), 409, "conflict")["message"]
+    assert "2 aliases, the max" in error(put(api, arm, "three", version=1), 409, "conflict")["message"]
     assert put(api, arm, "two", version=2).status_code == 200
     api.delete(f"/v1/models/{arm}/aliases/one")
     assert put(api, arm, "three", version=1).status_code == 200
 
 
 @pytest.mark.own_files("damages the files below the home, where others lie in the store")
-def test_a_version_that_cannot_be_read_is_not_pointed_to(api, arm):
+def test_alias_to_an_unreadable_version_is_rejected(api, arm):
     put(api, arm, "production", version=1)
     service = service_of(api)
     publish(api, arm, candidate=True)
@@ -117,7 +117,7 @@ def test_a_version_that_cannot_be_read_is_not_pointed_to(api, arm):
     assert predict(api, arm, alias="production").json()["version"] == 1
 
 
-def test_aliases_outlive_a_restart(api, arm):
+def test_aliases_survive_a_restart(api, arm):
     put(api, arm, "production", version=2)
     put(api, arm, "production", version=1)
     put(api, arm, "gone", version=1)

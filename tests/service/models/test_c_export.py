@@ -1,4 +1,4 @@
-"""A version asked for as C: two files, with what it has learnt, or as it was trained."""
+"""Export of a version as C: two files, with or without what was learnt online."""
 
 import ctypes
 import hashlib
@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from lipcore.data.samples import Array
-from tests.lipcore.test_c_writer import asked, compiled, drawn, needs_compiler
-from tests.service.archives.packing import exported, unpack
+from tests.lipcore.export.test_c_writer import compile_library, draw_motions, evaluate_library, needs_compiler
 from tests.service.data import error, service_of
-from tests.service.models.versions import publish, publish_arm, trained
+from tests.service.models.archives.packing import exported, unpack
+from tests.service.models.versions import publish, publish_arm, trained_model
 
 FILES = {"lipserve_model.c", "lipserve_model.h"}
 
@@ -19,29 +19,29 @@ FILES = {"lipserve_model.c", "lipserve_model.h"}
 def arm(api) -> str:
     service = service_of(api)
     publish_arm(service.database, service.files, "c-arm")
-    publish(api, "c-none", trained())
+    publish(api, "c-none", trained_model())
     return "c-arm"
 
 
-def answers(api, model: str, motion: Array) -> Array:
+def predictions(api, model: str, motion: Array) -> Array:
     q, dq, ddq = motion.tolist()
     answer = api.post(f"/v1/models/{model}/predict", json={"q": q, "dq": dq, "ddq": ddq}).json()
     return np.array([answer["tau"], answer["tau_std"]])
 
 
 @needs_compiler
-def test_its_numbers_are_those_of_the_api(api, arm, tmp_path):
+def test_exported_c_computes_the_numbers_of_the_api(api, arm, tmp_path):
     files = unpack(exported(api, arm, format="c"))
     assert set(files) == FILES
-    path = compiled({name: content.decode() for name, content in files.items()}, tmp_path)
+    path = compile_library({name: content.decode() for name, content in files.items()}, tmp_path)
     assert ctypes.CDLL(str(path)).lipserve_selftest() == 0
-    motion = drawn(service_of(api).loaded.get(arm, None).model, 300, 1)
-    (tau, std), (mean, deviation) = asked(path, motion), answers(api, arm, motion)
+    motion = draw_motions(service_of(api).loaded.get(arm, None).model, 300, 1)
+    (tau, std), (mean, deviation) = evaluate_library(path, motion), predictions(api, arm, motion)
     np.testing.assert_allclose(tau, mean, rtol=1e-9, atol=1e-12 * np.abs(mean).max())
     np.testing.assert_allclose(std, deviation, rtol=1e-9)
 
 
-def test_the_file_says_what_it_is_of(api, arm):
+def test_c_file_names_its_model(api, arm):
     archive = unpack(exported(api, arm))
     header = unpack(exported(api, arm, format="c", version=1))["lipserve_model.h"].decode()
     digest = hashlib.sha256(archive["model.safetensors"]).hexdigest()
@@ -57,33 +57,34 @@ def test_the_file_says_what_it_is_of(api, arm):
     assert answer.headers["content-disposition"] == f'attachment; filename="{arm}-v1-c.tar"'
 
 
+@pytest.mark.slow
 @needs_compiler
-def test_what_was_learnt_online_is_in_it(api, arm, tmp_path):
+def test_c_file_includes_online_learning(api, arm, tmp_path):
     name = "c-taught"
     service = service_of(api)
     publish_arm(service.database, service.files, name)
     served = service.loaded.get(name, None)
-    motion = drawn(served.model, 200, 1)
-    tau = answers(api, name, motion)[0] + 0.05 * np.sin(np.arange(200))[:, None]
+    motion = draw_motions(served.model, 200, 1)
+    tau = predictions(api, name, motion)[0] + 0.05 * np.sin(np.arange(200))[:, None]
     q, dq, ddq = motion.tolist()
     batch = {"stream_id": "s", "sequence": 0, "t": (0.01 * np.arange(200)).tolist()}
     batch |= {"q": q, "dq": dq, "ddq": ddq, "tau": tau.tolist()}
-    taught = api.post(f"/v1/models/{name}/observations", json=batch)
-    assert taught.status_code == 200, taught.text
+    answer = api.post(f"/v1/models/{name}/observations", json=batch)
+    assert answer.status_code == 200, answer.text
     files = {learnt: unpack(exported(api, name, format="c", learnt=learnt)) for learnt in (True, False)}
     found = {}
     for learnt, each in files.items():
         folder = tmp_path / str(learnt)
         folder.mkdir()
-        path = compiled({part: content.decode() for part, content in each.items()}, folder)
-        found[learnt] = asked(path, motion)[0]
+        path = compile_library({part: content.decode() for part, content in each.items()}, folder)
+        found[learnt] = evaluate_library(path, motion)[0]
     assert b"LIPSERVE_REVISION 0\n" in files[False]["lipserve_model.h"]
     assert b"LIPSERVE_REVISION 0\n" not in files[True]["lipserve_model.h"]
     np.testing.assert_allclose(found[False], served.base.predict(*motion).tau, rtol=1e-9, atol=1e-10)
     assert np.abs(found[True] - found[False]).max() > 1e-6
 
 
-def test_other_estimators_and_formats_are_refused(api, arm):
+def test_other_estimators_and_formats_are_rejected(api, arm):
     refusal = error(api.get("/v1/models/c-none/export", params={"format": "c"}), 422, "invalid_request")
     assert "version 1 of model 'c-none' cannot be written as C: estimator is" in refusal["message"]
     assert refusal["detail"][0]["field"] == "version"

@@ -1,4 +1,4 @@
-"""Comparing two versions on a data set: figures, paired errors, and a verdict that does not go beyond them."""
+"""Comparison of two versions on a data set: metrics, paired errors, and a verdict that they support."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from lipcore.data.metrics import Comparison, Difference, compare
 from service.inference.comparison import _verdict
 from tests.service.data import arrays, error, npz, post, stream, upload
 from tests.service.models.test_aliases import CODES
-from tests.service.models.versions import publish, trained, worse
+from tests.service.models.versions import publish, train_worse, trained_model
 
 SAMPLES = {"seed": 9, "samples": 400}
 
@@ -22,26 +22,26 @@ def recorded(api):
 
 @pytest.fixture(scope="module")
 def arm(api, recorded):
-    """A model of three versions: one of another pendulum, one of the one that was recorded, and that one over again."""
+    """A model of three versions: one of another pendulum, one of the recorded pendulum, and an equal one."""
     lineage = {"datasets": [{"id": "ds_of_another_service", "sha256": recorded["sha256"]}]}
-    assert publish(api, "compared", worse()) == 1
+    assert publish(api, "compared", train_worse()) == 1
     assert publish(api, "compared") == 2
     assert publish(api, "compared", lineage=lineage) == 3
     return "compared"
 
 
-def ask(api, model, dataset, *versions):
+def post_comparison(api, model, dataset, *versions):
     return api.post(f"/v1/models/{model}/compare", json={"dataset": dataset, "versions": list(versions)})
 
 
 def expected():
     samples = stream(**SAMPLES)
-    answers = [model.predict(samples.q, samples.dq, samples.ddq) for model in (worse(), trained())]
+    answers = [model.predict(samples.q, samples.dq, samples.ddq) for model in (train_worse(), trained_model())]
     return compare(samples, *(each.interval for each in answers))
 
 
-def test_the_better_version_is_named_with_the_evidence(api, arm, recorded):
-    found = ask(api, arm, recorded["id"], 1, 2).json()
+def test_better_version_is_named_with_the_evidence(api, arm, recorded):
+    found = post_comparison(api, arm, recorded["id"], 1, 2).json()
     assert (found["outcome"], found["better"]) == ("second_better", 2)
     assert found["verdict"].startswith("Version 2 predicts better than version 1: its negative log predictive density")
     assert (found["samples"], found["samples_used"], found["blocks"]) == (400, 400, 40)
@@ -55,31 +55,34 @@ def test_the_better_version_is_named_with_the_evidence(api, arm, recorded):
         np.testing.assert_allclose(found[name]["difference"], exact.total.mean[place], rtol=1e-9)
     assert found["warnings"] == []
     for shown in found["versions"]:
-        asked = {"dataset": recorded["id"], "version": shown["version"]}
-        evaluated = api.post(f"/v1/models/{arm}/evaluate", json=asked).json()
+        request = {"dataset": recorded["id"], "version": shown["version"]}
+        evaluated = api.post(f"/v1/models/{arm}/evaluate", json=request).json()
         assert shown == {name: evaluated[name] for name in shown}
 
 
-def test_the_order_turns_the_signs_and_not_the_verdict(api, arm, recorded):
-    one, other = ask(api, arm, recorded["id"], 1, 2).json(), ask(api, arm, recorded["id"], 2, 1).json()
+def test_order_changes_the_signs_but_not_the_verdict(api, arm, recorded):
+    one, other = (
+        post_comparison(api, arm, recorded["id"], 1, 2).json(),
+        post_comparison(api, arm, recorded["id"], 2, 1).json(),
+    )
     assert (other["outcome"], other["better"], other["verdict"]) == ("first_better", 2, one["verdict"])
     assert other["nlpd"]["difference"] == pytest.approx(-one["nlpd"]["difference"])
 
 
-def test_versions_that_answer_alike_do_not_differ_and_training_data_are_noticed(api, arm, recorded):
+def test_equal_versions_do_not_differ_and_training_data_are_noticed(api, arm, recorded):
     api.put(f"/v1/models/{arm}/aliases/second", json={"version": 2})
-    found = ask(api, arm, recorded["id"], "second", "serving").json()
+    found = post_comparison(api, arm, recorded["id"], "second", "serving").json()
     assert (found["outcome"], found["better"], found["nlpd"]["difference"]) == ("no_difference", None, 0.0)
-    assert found["verdict"].startswith("These data show no difference between versions 2 and 3")
+    assert found["verdict"].startswith("Versions 2 and 3 do not differ significantly")
     assert [each["in_training"] for each in found["versions"]] == [False, True]
-    assert found["warnings"] == ["version 3 was trained on this data set: its figures flatter it"]
+    assert found["warnings"] == ["Version 3 was trained on this data set, so its figures are too optimistic."]
 
 
-def test_a_short_recording_cannot_tell(api, arm):
+def test_short_recording_is_inconclusive(api, arm):
     short = upload(api, stream(seed=7))["id"]
-    found = ask(api, arm, short, 1, 2).json()
+    found = post_comparison(api, arm, short, 1, 2).json()
     assert (found["outcome"], found["better"], found["blocks"]) == ("cannot_tell", None, 8)
-    assert "they make 8 stretches" in found["verdict"]
+    assert "8 stretches" in found["verdict"]
     assert "Record longer" in found["verdict"]
 
 
@@ -91,21 +94,21 @@ def test_a_short_recording_cannot_tell(api, arm):
         ([1, "nowhere"], 404, "alias"),
     ],
 )
-def test_bad_choices_are_named(api, arm, recorded, versions, status, field):
-    answer = ask(api, arm, recorded["id"], *versions)
+def test_wrong_choices_are_named(api, arm, recorded, versions, status, field):
+    answer = post_comparison(api, arm, recorded["id"], *versions)
     assert error(answer, status, CODES[status])["detail"][0]["field"] == field
 
 
-def test_data_sets_have_to_fit(api, arm):
-    error(ask(api, arm, "ds_none", 1, 2), 404, "not_found")
+def test_unsuitable_data_set_is_rejected(api, arm):
+    error(post_comparison(api, arm, "ds_none", 1, 2), 404, "not_found")
     others = stream(seed=7)
     answer = post(api, npz(**arrays(others), joint_names=np.array(["a", "b"])))
-    refusal = error(ask(api, arm, answer.json()["id"], 1, 2), 422, "invalid_request")
+    refusal = error(post_comparison(api, arm, answer.json()["id"], 1, 2), 422, "invalid_request")
     assert refusal["detail"][0]["field"] == "dataset"
 
 
-def compared(density, nmse, blocks=30):
-    """A comparison with these totals, each a mean and the half width of its interval."""
+def comparison(density, nmse, blocks=30):
+    """Return a comparison with these totals, each a mean and the half width of its interval."""
     nothing = Difference(np.zeros(1), np.zeros(1), np.zeros(1), np.ones(1))
     mean, width = np.array([[density[0], nmse[0]], [density[1], nmse[1]]])
     return Comparison(nothing, nothing, nothing, nothing, Difference(mean, width / 2, width, np.full(1, 60.0)), blocks)
@@ -116,15 +119,15 @@ def compared(density, nmse, blocks=30):
     [
         ((-1.0, 0.2), (-0.01, 0.002), "second_better", "The errors of version 5 are smaller: its mean nMSE is lower"),
         ((-1.0, 0.2), (0.01, 0.002), "second_better", "The errors of version 5 are larger: its mean nMSE is higher"),
-        ((-1.0, 0.2), (0.001, 0.002), "second_better", "which shows no difference"),
+        ((-1.0, 0.2), (0.001, 0.002), "second_better", "which is not significant"),
         ((1.0, 0.2), (0.01, 0.002), "first_better", "The errors of version 4 are smaller"),
         ((0.1, 0.2), (0.01, 0.002), "no_difference", "The errors of version 5 are larger"),
-        ((0.1, 0.2), (0.001, 0.002), "no_difference", "differ by 0.1 ± 0.2 nats a sample"),
+        ((0.1, 0.2), (0.001, 0.002), "no_difference", "differ by 0.1 ± 0.2 nats per sample"),
     ],
 )
-def test_the_words_say_what_the_numbers_do(density, nmse, outcome, words):
-    verdict, text = _verdict(4, 5, compared(density, nmse))
+def test_text_agrees_with_the_numbers(density, nmse, outcome, words):
+    verdict, text = _verdict(4, 5, comparison(density, nmse))
     assert verdict == outcome
     assert words in text
-    assert ("how true its stated uncertainty is" in text) == (outcome == "second_better" and nmse[0] > nmse[1])
-    assert _verdict(4, 5, replace(compared(density, nmse), blocks=19))[0] == "cannot_tell"
+    assert ("its stated uncertainty is more accurate" in text) == (outcome == "second_better" and nmse[0] > nmse[1])
+    assert _verdict(4, 5, replace(comparison(density, nmse), blocks=19))[0] == "cannot_tell"

@@ -1,4 +1,4 @@
-"""Deleting versions and models: what is needed stays, the rest goes whole, and no number comes back."""
+"""Deletion of versions and models: used ones stay, others are removed completely, and no number is reused."""
 
 import threading
 from types import SimpleNamespace
@@ -33,7 +33,7 @@ from service.storage.database import (
 )
 from service.storage.files import Files
 from tests.service.data import error, service_of
-from tests.service.learning.batches import batch
+from tests.service.learning.batches import make_batch
 from tests.service.models.versions import QUERY, predict, publish
 
 
@@ -41,7 +41,7 @@ def delete(api, path):
     return api.delete(f"/v1/models/{path}")
 
 
-def refusal(api, path):
+def error_message(api, path):
     return error(delete(api, path), 409, "conflict")["message"]
 
 
@@ -50,8 +50,8 @@ def folder(api, model, version):
     return service.files.versions / registry.find(service.database, model, version).folder
 
 
-def job(api, model, state, **request):
-    """A job of a model, as a row: of this service, which else would take it for one of a service that is gone."""
+def job_row(api, model, state, **request):
+    """Return a row of a job that this service runs; otherwise it would be taken over from a dead service."""
     service = service_of(api)
     row = JobRow(id=f"job_{model[-30:]}", model=model, state=state, created_at=now(), heartbeat_at=now())
     row.request, row.progress = {"estimator": "lip-chain", "datasets": []} | request, {"stage": "waiting"}
@@ -61,7 +61,7 @@ def job(api, model, state, **request):
     return row.id
 
 
-def snapshot(api, model, version, number=1):
+def store_snapshot(api, model, version, number=1):
     service = service_of(api)
     return snapshots.save(service.database, service.files, model, version, number, number, b"state", most=5)
 
@@ -73,9 +73,9 @@ def observe(api, model, sequence=1):
 
 
 @pytest.mark.own_files("looks for the files below the home")
-def test_a_version_goes_with_its_files_and_its_number(api, arm):
+def test_version_is_deleted_with_its_files_and_number(api, arm):
     service, place = service_of(api), folder(api, arm, 2)
-    kept, gone = snapshot(api, arm, 1), snapshot(api, arm, 2)
+    kept, gone = store_snapshot(api, arm, 1), store_snapshot(api, arm, 2)
     assert predict(api, arm, version=2).status_code == 200
     assert delete(api, f"{arm}/versions/2").status_code == 204
     assert not place.exists()
@@ -88,41 +88,41 @@ def test_a_version_goes_with_its_files_and_its_number(api, arm):
         assert session.scalars(select(SnapshotRow.version).where(SnapshotRow.model == arm)).all() == [1]
 
 
-def test_what_serves_stays_and_the_newest_number_is_not_given_again(api, arm):
-    assert f"version 3 of model '{arm}' serves" in refusal(api, f"{arm}/versions/3")
+def test_serving_version_stays_and_the_newest_number_is_not_reused(api, arm):
+    assert f"version 3 of model '{arm}' is the serving version" in error_message(api, f"{arm}/versions/3")
     assert predict(api, arm).json()["version"] == 3
     api.put(f"/v1/models/{arm}/aliases/serving", json={"version": 1})
     assert delete(api, f"{arm}/versions/3").status_code == 204
     assert publish(api, arm) == 4
 
 
-def test_what_an_alias_points_to_stays(api, arm):
+def test_alias_target_stays(api, arm):
     for alias in ("production", "canary"):
         api.put(f"/v1/models/{arm}/aliases/{alias}", json={"version": 1})
-    assert "has the alias 'canary', 'production'" in refusal(api, f"{arm}/versions/1")
+    assert "has the alias 'canary', 'production'" in error_message(api, f"{arm}/versions/1")
     delete(api, f"{arm}/aliases/canary")
     api.put(f"/v1/models/{arm}/aliases/production", json={"version": 2})
     assert delete(api, f"{arm}/versions/1").status_code == 204
 
 
-def test_what_a_job_trains_anew_stays(api, arm):
-    name = job(api, arm, RUNNING, refresh={"version": 1, "through": 0, "trigger": "asked"})
-    assert f"{name} trains version 1" in refusal(api, f"{arm}/versions/1")
+def test_version_that_a_job_retrains_stays(api, arm):
+    name = job_row(api, arm, RUNNING, refresh={"version": 1, "through": 0, "trigger": "asked"})
+    assert f"{name} refreshes version 1" in error_message(api, f"{arm}/versions/1")
     assert delete(api, f"{arm}/versions/2").status_code == 204
-    assert f"{name} of model '{arm}' is running" in refusal(api, arm)
+    assert f"{name} of model '{arm}' is running" in error_message(api, arm)
     with service_of(api).database.transaction() as session:
         session.execute(update(JobRow).where(JobRow.id == name).values(state=CANCELLED))
     assert delete(api, f"{arm}/versions/1").status_code == 204
     assert delete(api, arm).status_code == 204
 
 
-def test_nothing_of_a_model_is_left_but_its_history(api, arm):
-    """Every table that names a model is looked at, so that one that is added later is not forgotten."""
+def test_only_the_history_of_a_deleted_model_is_left(api, arm):
+    """The test checks every table that names a model, so that it includes tables added later."""
     service, places = service_of(api), [folder(api, arm, version) for version in (1, 2, 3)]
     assert observe(api, arm).status_code == 200
     api.put(f"/v1/models/{arm}/learning", json={"auto_refresh": False})
     api.put(f"/v1/models/{arm}/aliases/production", json={"version": 1})
-    name, kept = job(api, arm, CANCELLED), snapshot(api, arm, 1)
+    name, kept = job_row(api, arm, CANCELLED), store_snapshot(api, arm, 1)
     with service.database.transaction() as session:
         session.add(AlarmRow(model=arm, kind="change", at=now(), message="", evidence={}))
     every = {mapper.class_ for mapper in Base.registry.mappers if "model" in mapper.columns}
@@ -146,7 +146,7 @@ def test_nothing_of_a_model_is_left_but_its_history(api, arm):
     assert arm not in [each["name"] for each in api.get("/v1/models", params={"limit": 100}).json()["items"]]
 
 
-def test_a_model_of_the_same_name_begins_with_the_next_number(api, arm):
+def test_new_model_of_the_same_name_continues_the_numbers(api, arm):
     observe(api, arm)
     assert delete(api, arm).status_code == 204
     assert publish(api, arm) == 4
@@ -157,8 +157,8 @@ def test_a_model_of_the_same_name_begins_with_the_next_number(api, arm):
     assert publish(api, arm) == 5
 
 
-def test_a_deleted_version_is_not_published_by_who_still_holds_it(api, arm):
-    """A query that has begun keeps its version; a load, a revision or a snapshot that comes late changes nothing."""
+def test_deleted_version_is_not_published_by_its_users(api, arm):
+    """A running query keeps its version; a load, a revision or a snapshot that comes late changes nothing."""
     service = service_of(api)
     held, row = service.loaded.get(arm, 1), registry.find(service.database, arm, 1)
     assert delete(api, f"{arm}/versions/1").status_code == 204
@@ -167,16 +167,16 @@ def test_a_deleted_version_is_not_published_by_who_still_holds_it(api, arm):
     assert service.loaded.revise(arm, 1, 5, None) is False
     assert service.loaded.hot(arm, 1) is None
     assert service.loaded.newest(arm) != 1
-    assert snapshot(api, arm, 1) is None
+    assert store_snapshot(api, arm, 1) is None
     with pytest.raises(NotFoundError, match="no version '1'"):
         service.loaded._load(row)
 
 
-def test_a_batch_that_was_predicted_by_what_is_deleted_is_not_logged(api, arm):
+def test_batch_predicted_by_a_deleted_version_is_not_logged(api, arm):
     service = service_of(api)
     served = service.loaded.get(arm, None)
     observed = service.learners._log
-    monitor, new = service.learners.monitor(arm), batch(0)
+    monitor, new = service.learners.monitor(arm), make_batch(0)
     arrival = Arrival(new, SimpleNamespace(rows=new.rows, own=slice(0, 1)), False, Placement((0, 1)))
     assert delete(api, arm).status_code == 204
     with pytest.raises(NotFoundError, match="no model"):
@@ -186,14 +186,14 @@ def test_a_batch_that_was_predicted_by_what_is_deleted_is_not_logged(api, arm):
         observed.append(monitor, served, LearningOptions(), arrival)
 
 
-def test_who_asks_for_a_pointer_is_answered_though_it_moves_and_the_version_before_goes(api, arm, monkeypatch):
+def test_query_survives_alias_move_and_version_deletion(api, arm, monkeypatch):
     service = service_of(api)
     fresh = LoadedModels(service.storage, LearntVersions(service.database, service.files), capacity=2)
     find = registry.find
     moved = threading.Event()
 
     def find_late(database, model, version):
-        if not moved.is_set():  # between the look at the pointer and the look at the version
+        if not moved.is_set():  # between reading the alias and reading the version
             moved.set()
             api.put(f"/v1/models/{arm}/aliases/serving", json={"version": 1})
             assert delete(api, f"{arm}/versions/3").status_code == 204
@@ -204,14 +204,14 @@ def test_who_asks_for_a_pointer_is_answered_though_it_moves_and_the_version_befo
 
 
 @pytest.mark.own_files("damages a file below the home, of which there is another copy")
-def test_files_that_are_damaged_are_told_from_files_that_were_deleted(api, arm):
+def test_damaged_files_are_distinguished_from_deleted_ones(api, arm):
     (folder(api, arm, 1) / "model.safetensors").write_bytes(b"")
     with pytest.raises(UnreadableVersionError):
         service_of(api).loaded.get(arm, 1)
     assert delete(api, f"{arm}/versions/1").status_code == 204
 
 
-def test_the_shipped_model_stays_deleted(home):
+def test_shipped_model_stays_deleted(home):
     database, files = Database.of(Settings(home=home)), Files(home)
     registry.install_shipped(database, files)
     registry.install_shipped(database, files)

@@ -1,4 +1,4 @@
-"""The arm that a version has learnt, asked for as a URDF."""
+"""Export of the arm that a version has learnt as a URDF."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def arm(api) -> str:
     return "urdf-arm"
 
 
-def test_it_is_the_robot(api, arm):
+def test_urdf_describes_the_robot(api, arm):
     answer = api.get(f"/v1/models/{arm}/urdf")
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/xml"
@@ -30,7 +30,7 @@ def test_it_is_the_robot(api, arm):
     np.testing.assert_allclose(Geometry.from_robot(robot).constants, expected, atol=1e-12)
 
 
-def test_a_version_is_named_by_number_or_alias(api, arm):
+def test_version_is_named_by_number_or_alias(api, arm):
     assert api.put(f"/v1/models/{arm}/aliases/best", json={"version": 2}).status_code == 200
     for params in ({"version": 2}, {"alias": "best"}, {"alias": "serving"}):
         assert api.get(f"/v1/models/{arm}/urdf", params=params).status_code == 200, params
@@ -38,7 +38,7 @@ def test_a_version_is_named_by_number_or_alias(api, arm):
         assert api.get(f"/v1/models/{arm}/urdf", params=params).status_code == status, params
 
 
-def test_a_version_without_an_arm_is_refused(api, arm):
+def test_version_without_an_arm_is_rejected(api, arm):
     refusal = error(api.get("/v1/models/urdf-none/urdf", params={"version": 1}), 422, "invalid_request")
     assert "version 1 of model 'urdf-none'" in refusal["message"]
     assert "no rigid bodies" in refusal["message"]

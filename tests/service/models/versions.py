@@ -1,4 +1,4 @@
-"""Versions put into a service without training them: pendulums, and the shipped arm."""
+"""Versions added to a service without training: pendulums, and the shipped arm."""
 
 import json
 from functools import cache
@@ -16,25 +16,25 @@ from service.storage.database import Database
 from service.storage.files import Files, new_id
 from tests.lipcore.arms import parameters_of
 from tests.service.data import QUICK, service_of, stream
-from tests.service.learning.pendulums import trained
+from tests.service.learning.pendulums import trained_model
 
-__all__ = ["QUERY", "predict", "publish", "trained", "worse"]
+__all__ = ["QUERY", "predict", "publish", "train_worse", "trained_model"]
 
 QUERY: dict[str, Any] = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5]}
 
 
 @cache
-def worse() -> TorqueModel:
-    """A model of a pendulum with more friction; always the same object."""
+def train_worse() -> TorqueModel:
+    """Return a model of a pendulum with more friction; always the same object."""
     return lipcore.train(stream(viscous=2.0), ["revolute"] * 2, "lip-chain", FitOptions(**QUICK))
 
 
 def publish(api: Any, model: str, found: TorqueModel | None = None, lineage: Any = None, **arguments: Any) -> int:
-    """Add a version to a model of the service, which answers from then on; return its number."""
+    """Add a version to a model of the service, which serves from then on; return its number."""
     service = service_of(api)
     folder = new_id("mv")
     with service.files.new_version(folder) as target:
-        manifest = lipcore.save(found or trained(), target, lineage or {})
+        manifest = lipcore.save(found or trained_model(), target, lineage or {})
     with service.database.transaction() as session:
         version = registry.publish(session, model, folder, manifest, None, **arguments)
     service.loaded.announce([model])
@@ -42,7 +42,7 @@ def publish(api: Any, model: str, found: TorqueModel | None = None, lineage: Any
 
 
 def predict(api: Any, model: str, **chosen: Any) -> Any:
-    """Ask for a torque; return the answer."""
+    """Query a torque; return the answer."""
     return api.post(f"/v1/models/{model}/predict", json=QUERY | chosen)
 
 
@@ -51,18 +51,18 @@ JOINTS = tuple(f"panda_joint{number}" for number in range(1, 8))
 
 
 NO_BODIES: dict[str, Any] = {"inertia": None, "rotor": None, "geometry": None}
-"""What an estimator without rigid bodies leaves out of its `parameters`."""
+"""Entries that an estimator without rigid bodies omits from its `parameters`."""
 
 
 def panda() -> RigidBody:
-    """The robot that the shipped model was trained on."""
+    """Return the robot that the shipped model was trained on."""
     return RigidBody.from_profile("panda", JOINTS, load_robot("panda").joint_types)
 
 
 def publish_arm(database: Database, files: Files, model: str, **changed: Any) -> dict[str, Any]:
-    """Add a version to a model: the shipped one, with its robot's geometry and WARNING; return its manifest.
+    """Add a version with the shipped model, its robot's geometry and WARNING; return its manifest.
 
-    changed: other entries of its `parameters`; None leaves one out.
+    changed: other entries of its `parameters`; None removes one.
     """
     source, folder = persistence.read_files(shipped_models() / registry.SHIPPED), new_id("mv")
     manifest = json.loads(source[MANIFEST])
@@ -78,6 +78,6 @@ def publish_arm(database: Database, files: Files, model: str, **changed: Any) ->
 
 
 def publish_arm_at(home: Any, model: str, **changed: Any) -> dict[str, Any]:
-    """`publish_arm` in the home of a service that may be running in another process."""
+    """Call `publish_arm` on the home of a service that may be running in another process."""
     settings = Settings(home=home)
     return publish_arm(Database.of(settings), Files.of(settings), model, **changed)

@@ -1,4 +1,4 @@
-"""What readers of hostile files may come to do, to be called in a cage."""
+"""Readers of hostile files that misbehave in various ways, to be called in a cage."""
 
 import ctypes
 import os
@@ -33,11 +33,11 @@ def crash() -> None:
     ctypes.string_at(0)
 
 
-def kill_itself() -> None:
+def kill_self() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def leave() -> None:
+def exit_at_once() -> None:
     os._exit(3)
 
 
@@ -73,22 +73,22 @@ def open_files(path: Path) -> None:
         files.append(path.open())
 
 
-def refuse(kind: str) -> None:
+def raise_reader_error(kind: str) -> None:
     raise invalid_data("q1, row 3", "x", "a number") if kind == "data" else TooLargeError("too large")
 
 
-def bug() -> None:
+def raise_key_error() -> None:
     os.write(2, b"noise\n\x1b[31m of a library\n")
     raise KeyError("a bug")
 
 
-def noise(size: int) -> int:
+def write_output(size: int) -> int:
     os.write(1, b"out\n")
     os.write(2, b"\x1b[2J" + b"x" * size)
     return 7
 
 
-def threads() -> int:
+def count_threads() -> int:
     found = []
     each = threading.Thread(target=lambda: found.append(1))
     each.start()
@@ -103,7 +103,7 @@ def environment() -> str:
     return repr(dict(os.environ))
 
 
-def descriptors() -> list[int]:
+def open_descriptors() -> list[int]:
     return [number for number in range(256) if _is_open(number)]
 
 
@@ -115,9 +115,9 @@ def _is_open(number: int) -> bool:
     return True
 
 
-def tried(what: str, secret: str, pid: int) -> str:
-    """What comes of doing something that no reader does: the name of the error."""
-    deeds = {
+def attempt(action: str, secret: str, pid: int) -> str:
+    """Attempt something that no reader does; return the name of the error."""
+    actions = {
         "socket": socket.socket,
         "fork": os.fork,
         "exec": lambda: os.execv("/bin/true", ["true"]),
@@ -135,11 +135,11 @@ def tried(what: str, secret: str, pid: int) -> str:
         "more processor time": lambda: resource.setrlimit(resource.RLIMIT_CPU, (10**6, 10**6)),
     }
     try:
-        deeds[what]()
+        actions[action]()
     except (OSError, ValueError) as error:
         return type(error).__name__
     return "done"
 
 
-def crash_over(upload: Any, kind: Any, options: Any, robot: Any, usage: Any, folder: Any, settings: Any) -> None:
+def crash_reader(upload: Any, kind: Any, options: Any, robot: Any, usage: Any, folder: Any, settings: Any) -> None:
     crash()

@@ -1,4 +1,4 @@
-"""A job's pass over all rows of its data sets: what is read, and what it comes to, whoever does it."""
+"""A job's pass over all rows of its data sets: which rows are read and what their statistics are."""
 
 from dataclasses import replace
 from functools import partial
@@ -24,7 +24,7 @@ ROWS = SHARD + 700
 
 
 def recording(seed: int = 1) -> Samples:
-    """Two episodes at 100 Hz, longer than a shard together."""
+    """Return two episodes at 100 Hz that together are longer than a shard."""
     samples = stream(samples=ROWS, seed=seed, rate=100.0)
     return replace(samples, episode=np.repeat([4, 9], [900, ROWS - 900]))
 
@@ -52,13 +52,13 @@ def model():
 
 
 def masked(part: TablePart) -> TablePart:
-    """Some stretches of it, and none of the middle."""
+    """Return the part with some stretches of rows chosen, none in the middle."""
     mask = np.arange(ROWS) % 50 < 30
     mask[1000:2000] = False
     return replace(part, chosen=mask)
 
 
-def test_a_reader_reads_rows(parts):
+def test_reader_reads_rows(parts):
     reader: Reader = parts[0].reader
     np.testing.assert_array_equal(reader.array("q", 17, 940), recording().q[17:940])
     index = np.array([0, 3, 4, 899, 900, ROWS - 1])
@@ -69,14 +69,14 @@ def test_a_reader_reads_rows(parts):
         reader.array("tau", 0, ROWS + 1)
 
 
-def test_a_table_is_its_parts_in_order(parts):
+def test_table_concatenates_its_parts(parts):
     table = Table([masked(parts[0]), parts[1]])
     whole = Samples.concatenate([recording(1).rows(table.parts[0].chosen), recording(2)])
     assert len(table) == len(whole) == len(table.thinned(10**6))
     np.testing.assert_array_equal(table.thinned(10**6).tau, whole.tau)
     index = np.linspace(0, len(whole) - 1, 300).round().astype(np.int64)
     np.testing.assert_array_equal(table.thinned(300).q, whole.q[index])
-    # a new episode begins where rows are left out
+    # a new episode begins after omitted rows
     assert len(Table([masked(parts[0])]).thinned(10**6).episodes()) == 35
     assert len(Table([parts[0]]).thinned(10**6).episodes()) == 2
 
@@ -88,7 +88,7 @@ def test_stretches_are_contiguous(parts):
         np.testing.assert_allclose(np.diff(found.t[each]), 0.01, rtol=1e-6)
 
 
-def test_shards_weigh_rows_as_the_whole_does(settings, parts):
+def test_weights_in_shards_equal_weights_of_the_whole(settings, parts):
     for part in (masked(parts[0]), parts[0]):
         shards = list(part.shards())
         assert {each.last - each.first for each in shards} == {SHARD, ROWS - SHARD}
@@ -100,14 +100,14 @@ def test_shards_weigh_rows_as_the_whole_does(settings, parts):
         assert part.independent_rows() == pytest.approx(weights.sum())
 
 
-def test_rows_without_times_count_for_no_more_than_the_chosen_ones(parts):
+def test_rows_without_times_count_at_most_as_chosen_rows(parts):
     table = Table(parts).weighed(500)
     assert [part.factor for part in table.parts] == [1.0, 500 / ROWS]
     assert table.independent_rows() == pytest.approx(0.1 * ROWS + 500, rel=0.01)
     assert Table([parts[1]]).weighed(500).independent_rows() == pytest.approx(500)
 
 
-def test_the_rows_of_a_sparse_table_count_for_those_left_out(parts):
+def test_rows_of_a_sparse_table_count_for_omitted_rows(parts):
     table = Table([masked(parts[0]), parts[1]]).weighed(500)
     assert table.sparse(len(table)) is table
     sparse = table.sparse(len(table) // 3 + 1)
@@ -116,7 +116,7 @@ def test_the_rows_of_a_sparse_table_count_for_those_left_out(parts):
     assert sparse.independent_rows() == pytest.approx(table.independent_rows(), rel=0.02)
 
 
-def test_shards_without_rows_are_left_out(parts):
+def test_shards_without_rows_are_omitted(parts):
     mask = np.zeros(ROWS, dtype=bool)
     mask[SHARD + 5] = True
     (shard,) = replace(parts[0], chosen=mask).shards()
@@ -124,8 +124,8 @@ def test_shards_without_rows_are_left_out(parts):
 
 
 @pytest.mark.slow
-def test_the_pass_is_the_same_in_processes_and_here(settings, parts, model):
-    """To the last bit; and what the plain way finds, to rounding."""
+def test_sum_is_the_same_in_processes_and_inline(settings, parts, model):
+    """Inline and in processes the bits are equal; the direct computation agrees to rounding."""
     table = Table([masked(parts[0]), parts[0]])
     context = Context(settings, packed(model), model.joint_names, "cpu")
     work, shards = partial(shard_statistics, context), table.shards()

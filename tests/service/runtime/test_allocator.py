@@ -1,4 +1,4 @@
-"""The C library's heaps in a process that keeps little, counted by what it tells of itself."""
+"""The C library's heaps in a process that limits free memory, counted with `malloc_info`."""
 
 import ctypes
 import os
@@ -37,12 +37,12 @@ library.fflush(file)
 
 
 def heaps(**environment: str) -> tuple[bool, int]:
-    """What a process says of whether it keeps little, and how many heaps it has after threads have allocated."""
+    """Return whether the process limits free memory, and its number of heaps after threads have allocated."""
     usual = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "GLIBC_TUNABLES"))}
     command = [sys.executable, "-u", "-c", SCRIPT]
     done = subprocess.run(command, env={**usual, **environment}, capture_output=True, text=True, check=True)
-    first, _, told = done.stdout.partition("\n")
-    return first == "True", told.count("<heap nr=")
+    first, _, report = done.stdout.partition("\n")
+    return first == "True", report.count("<heap nr=")
 
 
 @glibc
@@ -51,7 +51,7 @@ def test_threads_share_few_heaps():
 
 
 @glibc
-def test_what_the_environment_says_stays():
+def test_environment_variable_takes_precedence():
     kept, count = heaps(MALLOC_ARENA_MAX="5")
     assert not kept
     assert HEAPS < count <= 5
@@ -80,6 +80,6 @@ print((before - resident()) / {BLOCKS * 50_000})
 
 
 @glibc
-def test_what_is_free_below_a_block_in_use_is_given_back():
+def test_free_memory_below_a_used_block_is_returned():
     done = subprocess.run([sys.executable, "-c", PINNED], capture_output=True, text=True, check=True)
     assert float(done.stdout) > 0.9

@@ -1,4 +1,4 @@
-"""A function called in a cage: what it returns, what it may take, and what it cannot do."""
+"""The cage that reads files: return values, limits, and what the confined process is not allowed to do."""
 
 import logging
 import os
@@ -29,7 +29,7 @@ filtered = pytest.mark.skipif(not protections()["seccomp"], reason="a system wit
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _as_a_service_does():
+def _start_processes_as_the_service_does():
     """Start processes as a service does, not as its tests."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(cage, "start", start)
@@ -40,7 +40,7 @@ def _as_a_service_does():
 
 @pytest.fixture
 def settings(tmp_path):
-    """Limits that a test reaches in a moment."""
+    """Limits that a test reaches quickly."""
     limits = {"parser_memory_bytes": 200 * MiB, "parser_s": 30, "max_unpacked_bytes": 10 * MiB}
     return Settings(home=tmp_path, **limits)
 
@@ -49,138 +49,143 @@ def call(name, returns, *given, settings, **options):
     return cage.run(f"{HERE}:{name}", returns, *given, settings=settings, **options)
 
 
-def refused(name, *given, settings, error=InvalidDataError, **options):
-    """What is said of a call that fails."""
+def failure_message(name, *given, settings, error=InvalidDataError, **options):
+    """Return the message of a call that fails."""
     with pytest.raises(error) as caught:
         call(name, object, *given, settings=settings, **options)
     return caught.value.message
 
 
-def test_a_value_comes_back_and_is_of_the_type_that_was_asked_for(settings, tmp_path):
+def test_value_is_returned_and_its_type_checked(settings, tmp_path):
     given = (2, 0.5, tmp_path)
     assert call("add", dict[str, float | str], *given, settings=settings) == {"sum": 2.5, "path": str(tmp_path)}
-    with pytest.raises(InvalidDataError, match="cannot be read"):
+    with pytest.raises(InvalidDataError, match="could not be read"):
         cage.run(f"{HERE}:text", int, settings=settings)
 
 
-def test_an_answer_that_is_too_large_is_none(settings):
+def test_answer_above_the_size_limit_is_rejected(settings):
     assert len(call("long_text", str, MAX_ANSWER_BYTES - 100, settings=settings)) == MAX_ANSWER_BYTES - 100
-    assert "exit code 0" in refused("long_text", MAX_ANSWER_BYTES, settings=settings)
+    assert "exit code 0" in failure_message("long_text", MAX_ANSWER_BYTES, settings=settings)
 
 
-def test_errors_that_a_reader_may_raise_come_back_as_they_are(settings):
+def test_errors_of_readers_are_passed_on_unchanged(settings):
     with pytest.raises(InvalidDataError) as caught:
-        call("refuse", object, "data", settings=settings)
+        call("raise_reader_error", object, "data", settings=settings)
     (item,) = caught.value.detail
     assert (item.field, item.value, item.expected) == ("q1, row 3", "x", "a number")
-    assert refused("refuse", "size", settings=settings, error=TooLargeError) == "too large"
+    assert failure_message("raise_reader_error", "size", settings=settings, error=TooLargeError) == "too large"
 
 
-def test_an_error_of_ours_is_none_of_the_file_and_is_logged_with_what_was_written(settings, caplog):
+def test_bug_in_a_reader_is_logged_with_its_output(settings, caplog):
     with pytest.raises(cage.UnexpectedReaderError, match="KeyError: 'a bug'"):
-        call("bug", object, settings=settings)
+        call("raise_key_error", object, settings=settings)
     (record,) = [each for each in caplog.records if each.name == "service.runtime.cage"]
     assert "noise\\n\\x1b[31m of a library" in record.fields["output"]
-    assert "in bug" in record.fields["output"]
+    assert "in raise_key_error" in record.fields["output"]
 
 
-def test_what_libraries_write_is_kept_short_and_printable(settings, caplog, capfd):
-    assert call("noise", int, 100_000, settings=settings) == 7
+def test_logged_output_is_short_and_printable(settings, caplog, capfd):
+    assert call("write_output", int, 100_000, settings=settings) == 7
     (record,) = caplog.records
     assert record.levelno == logging.WARNING
-    assert record.fields["reader"] == f"{HERE}:noise"
+    assert record.fields["reader"] == f"{HERE}:write_output"
     assert record.fields["output"].startswith("out\\n\\x1b[2Jxxx")
     assert len(record.fields["output"]) <= MAX_OUTPUT_BYTES
     assert capfd.readouterr() == ("", "")
 
 
 @pytest.mark.parametrize(
-    ("name", "ending"), [("crash", "SIGSEGV"), ("kill_itself", "SIGKILL"), ("leave", "exit code 3")]
+    ("name", "ending"), [("crash", "SIGSEGV"), ("kill_self", "SIGKILL"), ("exit_at_once", "exit code 3")]
 )
-def test_a_reader_that_crashes_says_that_the_file_cannot_be_read(settings, name, ending):
-    message = refused(name, settings=settings, field="urdf")
-    assert message.startswith("urdf is one that cannot be read")
+def test_crashed_reader_reports_an_unreadable_file(settings, name, ending):
+    message = failure_message(name, settings=settings, field="urdf")
+    assert message.startswith("The upload could not be read")
     assert ending in message
-    assert call("noise", int, 0, settings=settings) == 7
+    assert call("write_output", int, 0, settings=settings) == 7
 
 
 @memory_is_limited
-def test_memory_is_limited_whatever_a_reader_makes_of_that(settings):
+def test_memory_is_limited(settings):
     assert call("allocate", int, 100 * MiB, settings=settings) == 100 * MiB
-    message = refused("allocate", 300 * MiB, settings=settings)
+    message = failure_message("allocate", 300 * MiB, settings=settings)
     assert f"more than {200 * MiB} bytes of memory" in message
     assert "LIPSERVE_PARSER_MEMORY_BYTES" in message
 
 
 @pytest.mark.parametrize("name", ["sleep", "close_all_and_sleep"])
 def test_time_is_limited(settings, name):
-    message = refused(name, settings=settings.model_copy(update={"parser_s": 0.2}))
+    message = failure_message(name, settings=settings.model_copy(update={"parser_s": 0.2}))
     assert "more than 0.2 s of time" in message
     assert "LIPSERVE_PARSER_S" in message
 
 
-def test_files_are_limited_in_size_and_number(settings, tmp_path):
+def test_file_size_and_count_are_limited(settings, tmp_path):
     call("write", type(None), tmp_path, 10 * MiB, settings=settings, folder=tmp_path)
-    message = refused("write", tmp_path, 11 * MiB, settings=settings, folder=tmp_path, error=TooLargeError)
+    message = failure_message("write", tmp_path, 11 * MiB, settings=settings, folder=tmp_path, error=TooLargeError)
     assert "LIPSERVE_MAX_UNPACKED_BYTES" in message
-    assert "open files" in refused("open_files", tmp_path / "large", settings=settings)
+    assert "open files" in failure_message("open_files", tmp_path / "large", settings=settings)
 
 
-def test_processor_time_is_limited_and_others_are_read_meanwhile(settings):
+@pytest.mark.slow
+def test_cpu_time_is_limited_while_others_are_read(settings):
     with ThreadPoolExecutor() as pool:
-        long = pool.submit(refused, "spin", settings=settings)
-        several = pool.map(lambda _: call("noise", int, 0, settings=settings), range(8))
+        long = pool.submit(failure_message, "spin", settings=settings)
+        several = pool.map(lambda _: call("write_output", int, 0, settings=settings), range(8))
         assert list(several) == [7] * 8
         message = long.result()
     assert "more than 1 s of processor time" in message
     assert "LIPSERVE_PARSER_S" in message
 
 
-def test_a_reader_has_neither_the_environment_nor_the_files_of_the_service(settings, monkeypatch):
+def test_reader_sees_no_environment_or_files_of_the_service(settings, monkeypatch):
     monkeypatch.setenv("LIPSERVE_DATABASE_URL", "postgresql://secret")
-    monkeypatch.setattr(cage, "_spawner", cage._Spawner())  # one that is started with it
+    monkeypatch.setattr(cage, "_spawner", cage._Spawner())  # the new spawner is started with this variable
     seen = call("environment", str, settings=settings.model_copy(update={"database_url": "postgresql://secret"}))
     assert "LANG" in seen
     assert "secret" not in seen
     with open(os.devnull), open(os.devnull):
-        numbers = call("descriptors", list[int], settings=settings)
+        numbers = call("open_descriptors", list[int], settings=settings)
     assert numbers[:3] == [0, 1, 2]
-    assert len(numbers) == 4  # and that for its answer
+    assert len(numbers) == 4  # the fourth is for the reader's answer
 
 
 @filtered
 @pytest.mark.parametrize(
-    "deed",
+    "action",
     ["socket", "fork", "exec", "spawn", "kill", "kill all", "priority", "limit of another", "more processor time"],
 )
-def test_a_reader_has_no_network_and_no_other_process(settings, tmp_path, deed):
-    assert call("tried", str, deed, str(tmp_path), os.getpid(), settings=settings) in ("PermissionError", "ValueError")
-    assert call("threads", int, settings=settings) == 1
+def test_reader_has_no_network_and_no_other_process(settings, tmp_path, action):
+    assert call("attempt", str, action, str(tmp_path), os.getpid(), settings=settings) in (
+        "PermissionError",
+        "ValueError",
+    )
+    assert call("count_threads", int, settings=settings) == 1
 
 
 @landlocked
-@pytest.mark.parametrize("deed", ["read", "write", "list", "link", "symbolic link", "memory"])
-def test_a_reader_has_no_files_but_those_it_is_given(settings, tmp_path, deed):
+@pytest.mark.parametrize("action", ["read", "write", "list", "link", "symbolic link", "memory"])
+def test_reader_opens_only_the_files_it_is_given(settings, tmp_path, action):
     secret, folder = tmp_path / "home" / "secret", tmp_path / "folder"
     secret.parent.mkdir()
     folder.mkdir()
     secret.write_text("key")
-    result = call("tried", str, deed, str(secret), os.getpid(), settings=settings, folder=folder)
-    assert result == ("OSError" if deed == "link" else "PermissionError")
+    result = call("attempt", str, action, str(secret), os.getpid(), settings=settings, folder=folder)
+    assert result == ("OSError" if action == "link" else "PermissionError")
     assert secret.read_text() == "key"
 
 
-def test_a_process_that_waits_for_calls_is_replaced_once_it_has_ended(settings):
-    assert call("noise", int, 0, settings=settings) == 7
+def test_spawner_that_has_exited_is_replaced(settings):
+    assert call("write_output", int, 0, settings=settings) == 7
     process = cage._spawner._process
     process.kill()
     process.wait()
-    assert call("noise", int, 0, settings=settings) == 7
+    assert call("write_output", int, 0, settings=settings) == 7
     assert cage._spawner._process.pid != process.pid
 
 
-def test_a_process_that_waits_for_calls_and_hangs_is_replaced(settings, caplog):
-    assert call("noise", int, 0, settings=settings) == 7
+@pytest.mark.slow
+def test_spawner_that_hangs_is_replaced(settings, caplog):
+    assert call("write_output", int, 0, settings=settings) == 7
     process = cage._spawner._process
     process.send_signal(signal.SIGSTOP)
     hasty = settings.model_copy(update={"parser_s": 4.0})
@@ -188,64 +193,64 @@ def test_a_process_that_waits_for_calls_and_hangs_is_replaced(settings, caplog):
         waiting = [pool.submit(call, "noise", int, 0, settings=hasty) for _ in range(3)]
         assert [each.result() for each in waiting] == [7, 7, 7]
     assert process.wait(60) == -signal.SIGKILL
-    assert "hangs and is killed: it has not got on for 4 s" in caplog.text
+    assert "hangs and is killed: it has made no progress for 4 s" in caplog.text
 
 
-def test_it_ends_with_the_one_that_has_started_it(settings):
-    assert call("noise", int, 0, settings=settings) == 7
+def test_spawner_exits_with_its_parent(settings):
+    assert call("write_output", int, 0, settings=settings) == 7
     process = cage._spawner._process
-    eventually(lambda: _confined(process.pid))
-    others = [*children(process.pid), *_confined(process.pid)]
+    eventually(lambda: _confined_processes(process.pid))
+    others = [*children(process.pid), *_confined_processes(process.pid)]
     cage._spawner._control.close()
     assert process.wait(60) == 0
-    eventually(lambda: not any(map(_runs, others)))
+    eventually(lambda: not any(map(_is_running, others)))
 
 
-def _runs(pid):
-    """Whether a process is there and has not ended, whether or not anybody has asked how."""
+def _is_running(pid):
+    """Return whether a process exists and is no zombie."""
     try:
         return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
     except (FileNotFoundError, ProcessLookupError):
         return False
 
 
-def test_nobody_waits_for_ever_where_no_process_can_be_started(settings, monkeypatch):
+def test_call_fails_if_no_process_can_be_started(settings, monkeypatch):
     monkeypatch.setattr(cage, "_spawner", cage._Spawner())
 
     def fail(control):
         raise BlockingIOError(11, "Resource temporarily unavailable")
 
     monkeypatch.setattr(cage, "start", fail)
-    assert "uploads cannot be read now" in refused("text", settings=settings, error=NotReadyError)
+    assert "uploads cannot be read at present" in failure_message("text", settings=settings, error=NotReadyError)
 
 
-def test_a_caller_that_goes_away_ends_its_process(settings, monkeypatch):
-    """A reader that would go on for an hour, when the connection of the thread that waits for it breaks."""
+def test_lost_caller_ends_its_process(settings, monkeypatch):
+    """The reader sleeps for an hour; the connection of the thread that waits for it breaks."""
     connections = []
 
-    class Watched(cage._Spawner):
+    class WatchedSpawner(cage._Spawner):
         def connect(self):
             connection, process = super().connect()
             connections.append(connection)
             return connection, process
 
-    own = Watched()
+    own = WatchedSpawner()
     monkeypatch.setattr(cage, "_spawner", own)
     with ThreadPoolExecutor() as pool:
-        waiting = pool.submit(refused, "sleep", settings=settings, error=NotReadyError)
-        for _ in range(2):  # it is tried again
-            eventually(lambda: connections and len(_confined(own._process.pid)) == 2)
+        waiting = pool.submit(failure_message, "sleep", settings=settings, error=NotReadyError)
+        for _ in range(2):
+            eventually(lambda: connections and len(_confined_processes(own._process.pid)) == 2)
             connections.pop().shutdown(socket.SHUT_RDWR)
-        assert "uploads cannot be read now" in waiting.result()
-    eventually(lambda: len(_confined(own._process.pid)) == 1)
+        assert "uploads cannot be read at present" in waiting.result()
+    eventually(lambda: len(_confined_processes(own._process.pid)) == 1)
 
 
-def _confined(pid):
-    """Processes that read a file, and the one that will read the next."""
+def _confined_processes(pid):
+    """Return the processes that read a file, and the one that is ready for the next file."""
     return [each for child in children(pid) for each in children(child)]
 
 
-def test_a_missing_extra_is_told(settings):
+def test_missing_extra_is_named(settings):
     failure = Failure("extra", "", [("ingest", "pyarrow", "")])
     error = cage._error(failure, "reader", "file", settings)
     assert isinstance(error, MissingExtraError)
@@ -253,8 +258,8 @@ def test_a_missing_extra_is_told(settings):
 
 
 @pytest.mark.parametrize(("machine", "place"), [(0xC000003E, 0), (0xC00000B7, 1)])
-def test_a_filter_answers_each_call_as_its_tables_say(machine, place):
-    """The program, interpreted here, for each call that it knows and some that it does not."""
+def test_filter_decides_each_system_call_as_its_tables_do(machine, place):
+    """Interpret the filter program for each listed system call and for some that are not listed."""
     program = build_filter(machine, place, 4242)
 
     def answer(number, first=0, seen=machine):
@@ -283,7 +288,7 @@ def test_a_filter_answers_each_call_as_its_tables_say(machine, place):
     assert answer(0, seen=0x40000003) == "kill"
 
 
-FIRST_AT_ONCE = """
+DECODE_IN_THREADS = """
 import sys, threading
 from importlib import import_module
 
@@ -317,12 +322,13 @@ class Outer(msgspec.Struct):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("maker", "encoder"),
     [("service.runtime.cage:_decoder", "msgspec.msgpack"), ("lipserve.call:decoder", "msgspec.json")],
 )
-def test_threads_that_are_the_first_to_read_a_type_at_once_all_read_it(maker, encoder):
-    """msgspec makes what it knows of a type in steps, without a lock: a second thread ends the process (SIGSEGV)."""
-    command = [sys.executable, "-c", FIRST_AT_ONCE, maker, encoder, TYPES]
+def test_threads_can_build_a_decoder_at_the_same_time(maker, encoder):
+    """msgspec builds type information in steps and without a lock: a second thread crashes the process (SIGSEGV)."""
+    command = [sys.executable, "-c", DECODE_IN_THREADS, maker, encoder, TYPES]
     done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "done\n"), done.stderr

@@ -1,4 +1,4 @@
-"""Whether a process gets on: by its steps and the CPU time of its main thread, not by its being there."""
+"""Hang detection: a process makes progress if it completes steps or its main thread uses CPU time."""
 
 import subprocess
 import sys
@@ -19,18 +19,18 @@ lock.acquire()
 print("waits", flush=True)
 lock.acquire()
 """
-"""Waits for ever, though another thread of it is busy."""
+"""The main thread waits for ever while another thread is busy."""
 
 
-class Process:
-    """Time that the test moves, CPU time of one process, and the watch over it: 10 s quiet, 100 s a step."""
+class WatchedProcess:
+    """A fake clock, the CPU time of one process, and its watch: at most 10 s without progress, 100 s a step."""
 
     def __init__(self):
         self.now, self.spent = 0.0, 0.0
         self.progress = Progress(lambda: (1,), 10.0, 100.0, lambda pid: self.spent, lambda: self.now)
 
-    def looks(self, seconds, busy=False):
-        """Look each second for so long; the last answer."""
+    def look_for(self, seconds, busy=False):
+        """Look once a second for this long; return the last result."""
         answer = None
         for _ in range(round(seconds)):
             self.now += 1.0
@@ -39,40 +39,40 @@ class Process:
         return answer
 
 
-def test_one_that_neither_steps_nor_computes_hangs():
-    process = Process()
-    assert process.looks(9) is None
+def test_process_without_steps_or_cpu_time_hangs():
+    process = WatchedProcess()
+    assert process.look_for(9) is None
     process.progress.step()
-    assert process.looks(9) is None
+    assert process.look_for(9) is None
     assert process.progress.silent_s == 9.0
-    assert process.looks(1) == "it has not got on for 10 s"
+    assert process.look_for(1) == "it has made no progress for 10 s"
 
 
-def test_one_that_computes_may_take_long_but_not_for_ever():
-    process = Process()
-    assert process.looks(99, busy=True) is None
+def test_computing_process_may_take_long_but_not_for_ever():
+    process = WatchedProcess()
+    assert process.look_for(99, busy=True) is None
     assert process.progress.silent_s == 0.0
-    assert process.looks(1, busy=True) == "one step of it has taken 100 s"
+    assert process.look_for(1, busy=True) == "one of its steps has taken 100 s"
 
 
-def test_where_the_system_does_not_tell_of_cpu_time_only_steps_count():
-    process = Process()
+def test_only_steps_count_if_cpu_time_is_unknown():
+    process = WatchedProcess()
     process.spent = None
-    assert process.looks(99) is None
-    assert process.looks(1) == "one step of it has taken 100 s"
+    assert process.look_for(99) is None
+    assert process.look_for(1) == "one of its steps has taken 100 s"
 
 
-def test_time_in_which_nobody_could_look_does_not_count():
-    process = Process()
-    process.looks(1)
-    process.now += 1000.0  # the machine slept, or who looks was suspended too
+def test_time_without_looks_does_not_count():
+    process = WatchedProcess()
+    process.look_for(1)
+    process.now += 1000.0  # the machine slept, or the watching process was suspended too
     assert process.progress.look() is None
     assert process.progress.silent_s <= 2 * LOOK_S + 1.0
 
 
 @pytest.mark.skipif(main_thread_s(1) is None, reason="the system does not tell")
 @pytest.mark.parametrize("source", [BUSY, WAITING], ids=["computes", "waits"])
-def test_only_the_main_thread_of_a_process_counts(source):
+def test_only_the_main_thread_counts(source):
     with subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE) as child:
         try:
             if source is WAITING:
@@ -94,7 +94,7 @@ def test_only_the_main_thread_of_a_process_counts(source):
 
 
 def all_threads_s(pid):
-    """CPU time of all threads of a process, in hundredths at the finest."""
+    """Return the CPU time of all threads of a process; its resolution is 10 ms at best."""
     with open(f"/proc/{pid}/stat") as file:
         fields = file.read().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / 100

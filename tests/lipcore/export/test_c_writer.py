@@ -1,0 +1,356 @@
+"""Tests of a model exported as C: the compiled code matches the model, and its self-test works."""
+
+import ctypes
+import re
+import shutil
+import subprocess
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lipcore import FitOptions, TorqueModel, load, train
+from lipcore.arm.learning import learn
+from lipcore.data.motion import Motion
+from lipcore.estimators.catalogue import make_estimator
+from lipcore.estimators.task import Task
+from lipcore.export.c_weights import UnsupportedEstimatorError
+from lipcore.export.c_writer import HEADER, SOURCE, ModelOrigin, c_files
+from lipcore.kernels.base import PairKernel
+from lipcore.model.body import Body
+from lipcore.model.payload import Carrier
+from lipcore.posterior.compression import build_linear
+from lipcore.posterior.misfit import Misfit
+from lipcore.training.fit import fit_estimator
+from tests import ROOT
+from tests.choosing import few, slow
+from tests.clients.cpp.building import sanitizers
+from tests.lipcore.arm.test_model import with_alternatives
+from tests.lipcore.arm_oracles import arm, record_motion, reversed_pendulum_model, train_from_geometry
+
+OPTIONS = FitOptions(device="cpu", statistics="chosen")
+ORIGIN = ModelOrigin("an-arm", 3, 7, "0123")
+FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
+PANDA = ROOT / "models/panda-sim"
+INERTIA = np.array([[0.020, 0.003, 0.001], [0.003, 0.015, -0.002], [0.001, -0.002, 0.010]])
+BODY = Body(2.0, np.array([0.05, -0.03, 0.12]), INERTIA)
+
+needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, cc, which is not installed")
+
+
+def compile_library(files: dict[str, str], folder: Path, *more: str) -> Path:
+    """Compile the source as a shared library, without warnings."""
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="ascii")
+    command = ["cc", *FLAGS, *more, "-shared", "-fPIC", SOURCE, "-o", "model.so", "-lm"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder / "model.so"
+
+
+class Payload(ctypes.Structure):
+    _fields_ = [("mass", ctypes.c_double), ("com", ctypes.c_double * 3), ("inertia", ctypes.c_double * 9)]
+
+
+def c_payload(body: Body) -> Payload:
+    inertia = np.zeros((3, 3)) if body.inertia is None else body.inertia
+    return Payload(body.mass, (ctypes.c_double * 3)(*body.com), (ctypes.c_double * 9)(*inertia.ravel()))
+
+
+def c_array(row: np.ndarray) -> ctypes.Array:
+    return (ctypes.c_double * len(row)).from_buffer(row)
+
+
+def evaluate_library(path: Path, motion: np.ndarray, body: Body | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation of motions (3, N, n), and check the function of the mean alone."""
+    library, motion = ctypes.CDLL(str(path)), np.ascontiguousarray(motion)
+    tau, alone, std = (np.full_like(motion[0], np.nan) for _ in range(3))
+    carried = None if body is None else ctypes.byref(c_payload(body))
+    for k in range(motion.shape[1]):
+        query = [c_array(part[k]) for part in motion]
+        if body is None:
+            library.lipserve_torque(*query, c_array(alone[k]))
+            library.lipserve_torque_std(*query, c_array(tau[k]), c_array(std[k]))
+        else:
+            library.lipserve_torque_payload(*query, carried, c_array(alone[k]))
+            library.lipserve_torque_std_payload(*query, carried, c_array(tau[k]), c_array(std[k]))
+    np.testing.assert_array_equal(alone, tau)
+    return tau, std
+
+
+def draw_motions(model: TorqueModel, count: int, seed: int, beyond: float = 1.0) -> np.ndarray:
+    """Return motions (3, N, n) within the training range times `beyond`."""
+    draw, limits = np.random.default_rng(seed).uniform, model.training_range
+    each = [draw(limits[name]["min"], limits[name]["max"], (count, model.n_joints)) for name in ("q", "dq", "ddq")]
+    return beyond * np.stack(each)
+
+
+def evaluate_exactly(model: TorqueModel, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return tau and tau_std by the posterior's formulas, in exact fractions."""
+    posterior, query = model.posterior, Motion.from_arrays(*motion)
+    basis, n = posterior.basis, model.n_joints
+    features = np.concatenate([each.features(query) for each in basis.linear], axis=2)
+    prior = np.concatenate([each.variances(posterior.params) for each in basis.linear])
+    rubbing = np.zeros(features.shape[2] - basis.linear[0].size)
+    centre = np.concatenate([basis.linear[0].prior_weights(), rubbing])
+    fraction = np.frompyfunc(Fraction, 1, 1)
+    cross, first = fraction(features) * fraction(prior), len(basis.outputs)
+    before = np.zeros(query.q.shape)
+    if basis.term is not None:
+        inducing = PairKernel.gram(basis.term, posterior.params, basis.inducing, query)[basis.outputs]
+        inducing = inducing.reshape(first, len(query), n).transpose(1, 2, 0)
+        cross = np.concatenate([fraction(inducing), cross], axis=2)
+        before = PairKernel.variance(basis.term, posterior.params, query).diagonal(axis1=1, axis2=2)
+    tau = (cross @ fraction(posterior.weights) + fraction(features) @ fraction(centre)).astype(float)
+    squares = (cross @ fraction(posterior.root).T) ** 2
+    variance = fraction(before) - squares[..., :first].sum(2) + squares[..., first:].sum(2)
+    variance = variance.astype(float) * posterior.std_factor**2 + posterior.misfit.variance(query)
+    return tau, np.sqrt(np.maximum(variance, posterior.floor))
+
+
+def train_arm(kinds: str, seed: int, estimator: str = "rigid-body", options: FitOptions = OPTIONS) -> TorqueModel:
+    geometry, _, robot = arm(kinds, seed)
+    return train_from_geometry(geometry, robot, record_motion(robot, 1, 100), options, estimator)
+
+
+def train_with_energies(kinds: str, seed: int) -> TorqueModel:
+    return train_arm(
+        kinds, seed, "rigid-body+lip-chain", replace(OPTIONS, hyperparameter_samples=20, max_iterations=3, starts=1)
+    )
+
+
+def train_with_correction(kinds: str, seed: int) -> TorqueModel:
+    """Train an arm with a local correction of its first two joints."""
+    geometry, _, robot = arm(kinds, seed)
+    samples = record_motion(robot, 1, 200)
+    samples = replace(samples, tau=samples.tau + 0.1 * np.sin(9 * samples.q))
+    task = Task(samples, robot.joint_types, OPTIONS)
+    return fit_estimator(task, "rigid-body+local", learn(task, begin=(geometry.canonical(),)), corrected=(0, 1))
+
+
+def with_misfit(model: TorqueModel) -> TorqueModel:
+    """Return the model with every contribution to the variance."""
+    rng, n = np.random.default_rng(0), model.n_joints
+    rows = np.stack([rng.uniform(0.1, 1.0, n), np.full(n, 0.1), *rng.uniform(0.5, 1.0, (3, n))])
+    misfit = Misfit.unpacked(rows)
+    floor = np.array([1e-4, 10.0, *[1e-4] * (n - 2)])
+    return replace(model, posterior=replace(model.posterior, misfit=misfit, floor=floor, std_factor=1.3))
+
+
+def train_with_alternatives() -> TorqueModel:
+    _, _, robot = arm("RPR", 51)
+    return with_alternatives(train_arm("RPR", 51), record_motion(robot, 1, 100), 2)
+
+
+def train_with_stribeck() -> TorqueModel:
+    """Train an arm with the fourth friction term."""
+    _, _, robot = arm("RRR", 50)
+    model, samples = train_arm("RRR", 50), record_motion(robot, 1, 100)
+    posterior = model.posterior
+    estimator = make_estimator("rigid-body", model.joint_types, arm=replace(model.arm, stribeck=True))
+    widths = posterior.params["friction.log_std"]
+    params = {**posterior.params, "friction.log_std": np.concatenate([widths, widths[:, 1:2]], axis=1)}
+    variance = np.broadcast_to(posterior.noise_variance, samples.tau.shape)
+    made = build_linear(estimator.kernel, params, samples, variance, 0.01, 1.0, posterior.misfit)
+    return replace(model, estimator=estimator, posterior=made.posterior)
+
+
+MODELS = {
+    "panda": lambda: load(PANDA),
+    "prismatic": lambda: train_arm("RPR", 51),
+    "prismatic first": lambda: train_arm("PRR", 50),
+    "alternatives": train_with_alternatives,
+    "fixed, from its tip": lambda: reversed_pendulum_model("fixed", OPTIONS),
+    "calibrated, from its tip": lambda: reversed_pendulum_model("calibrate", OPTIONS),
+    "friction of slow joints": train_with_stribeck,
+    "misfit": lambda: with_misfit(train_arm("RRR", 50)),
+    "energies": lambda: with_misfit(train_with_energies("RRR", 50)),
+    "local": lambda: train_with_correction("RPR", 51),
+    "energies of a prismatic joint": lambda: train_with_energies("RPR", 51),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", few(MODELS, kept=lambda name: name == "panda"))
+def test_compiled_numbers_match_the_model(name: str, tmp_path: Path) -> None:
+    model = MODELS[name]()
+    path = compile_library(c_files(model, ORIGIN), tmp_path)
+    assert ctypes.CDLL(str(path)).lipserve_selftest() == 0
+    for seed, beyond in ((1, 1.0), (2, 3.0)):
+        motion = draw_motions(model, 1500, seed, beyond)
+        tau, std = evaluate_library(path, motion)
+        expected, tau_std, *_ = model.evaluator.many(*motion)
+        np.testing.assert_allclose(tau, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
+        np.testing.assert_allclose(std, tau_std, rtol=1e-9)
+        few = 3 if model.n_joints > 3 else 30
+        mean, deviation = evaluate_exactly(model, motion[:, :few])
+        np.testing.assert_allclose(tau[:few], mean, rtol=1e-9, atol=1e-12 * np.abs(mean).max())
+        np.testing.assert_allclose(std[:few], deviation, rtol=1e-9)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    "name",
+    few(
+        ["panda", "prismatic", "alternatives", "fixed, from its tip", "energies", "local"],
+        kept=lambda name: name == "panda",
+    ),
+)
+@pytest.mark.parametrize("body", [BODY, Body(0.7, np.array([0.1, 0.2, -0.3]))], ids=["body", "point"])
+def test_compiled_payload_matches_a_declared_payload(name: str, body: Body, tmp_path: Path) -> None:
+    model = MODELS[name]()
+    motion, carrier = draw_motions(model, 300, 1), Carrier(model)
+    expected, tau_std, *_ = carrier.with_payload(carrier.known(body.parameters)).evaluator.many(*motion)
+    tau, std = evaluate_library(compile_library(c_files(model, ORIGIN), tmp_path), motion, body)
+    np.testing.assert_allclose(tau, expected, rtol=1e-9, atol=1e-10 * np.abs(expected).max())
+    np.testing.assert_allclose(std, tau_std, rtol=1e-7)
+    empty, _ = evaluate_library(tmp_path / "model.so", motion, replace(body, mass=1e-300, inertia=None))
+    np.testing.assert_array_equal(empty, evaluate_library(tmp_path / "model.so", motion)[0])
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.parametrize(
+    ("name", "between"),
+    [
+        ("panda", ("arm_t ARM", "double MISFIT")),
+        ("energies of a prismatic joint", ("double CONSTANT", "int PLACE")),
+    ],
+)
+def test_self_test_detects_a_changed_number(name: str, between: tuple[str, str], tmp_path: Path) -> None:
+    files = c_files(MODELS[name](), ORIGIN)
+    text = files[SOURCE]
+    first, last = (text.index(f"static const {each}") for each in between)
+    found = [each.span() for each in re.compile(r"-?\d+\.\d{12,}(e-?\d+)?").finditer(text, first, last)]
+    large = [span for span in found if abs(float(text[slice(*span)])) > 0.05]
+    for start, end in np.random.default_rng(0).choice(large, 8, replace=False):
+        wrong = repr(float(text[start:end]) * (1 + 1e-5))
+        path = compile_library({**files, SOURCE: text[:start] + wrong + text[end:]}, make_folder(tmp_path / str(start)))
+        assert ctypes.CDLL(str(path)).lipserve_selftest() > 0, text[start:end]
+
+
+def make_folder(folder: Path) -> Path:
+    folder.mkdir()
+    return folder
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.parametrize(
+    "make", [train_with_alternatives, lambda: train_with_energies("RPR", 51)], ids=["alternatives", "energies"]
+)
+def test_code_has_no_mutable_state(make: Callable[[], TorqueModel], tmp_path: Path) -> None:
+    """The object has no writable data and calls only five functions of libm."""
+    compile_library(c_files(make(), ORIGIN), tmp_path)
+    subprocess.run(["cc", *FLAGS, "-c", SOURCE, "-o", "model.o"], cwd=tmp_path, check=True)
+    listed = subprocess.run(["nm", "model.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    kinds = {line.split()[-1]: line.split()[-2] for line in listed.splitlines()}
+    called = {name for name, kind in kinds.items() if kind == "U"}
+    by_compilers = {"memcpy", "memmove", "memset", "sincos", "_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
+    assert called - by_compilers <= {"sin", "cos", "sqrt", "exp", "tanh"}
+    assert set(kinds.values()) <= set("TtRrU"), kinds
+
+
+MAIN = '#include "lipserve_model.h"\nint main(void) { return lipserve_selftest(); }\n'
+
+
+@pytest.mark.parametrize("compiler", ["gcc", slow("clang")])
+@pytest.mark.parametrize("name", ["panda", slow("alternatives"), slow("energies of a prismatic joint")])
+def test_compilers_and_sanitizers_report_nothing(name: str, compiler: str, tmp_path: Path) -> None:
+    if shutil.which(compiler) is None:
+        pytest.skip(f"needs {compiler}, which is not installed")
+    (tmp_path / "main.c").write_text(MAIN)
+    for file, text in c_files(MODELS[name](), ORIGIN).items():
+        (tmp_path / file).write_text(text, encoding="ascii")
+    sanitized = sanitizers(compiler)
+    for more in ((), (*sanitized, "-O1")) if sanitized else ((),):
+        command = [compiler, *FLAGS, *more, "main.c", SOURCE, "-o", "main", "-lm"]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        ran = subprocess.run(["./main"], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert ran.returncode == 0, ran.stderr
+
+
+@needs_compiler
+def test_threads_do_not_disturb_each_other(tmp_path: Path) -> None:
+    model = load(PANDA)
+    path = compile_library(c_files(model, ORIGIN), tmp_path)
+    motions = [draw_motions(model, 2000, seed) for seed in (1, 2)]
+    alone, together = [evaluate_library(path, motion) for motion in motions], [None, None]
+
+    def ask(place: int) -> None:
+        together[place] = evaluate_library(path, motions[place])
+
+    threads = [threading.Thread(target=ask, args=(place,)) for place in (0, 1)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for before, after in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(before, after)
+
+
+@needs_compiler
+def test_interval_and_training_range(tmp_path: Path) -> None:
+    model = load(PANDA)
+    library = ctypes.CDLL(str(compile_library(c_files(model, ORIGIN), tmp_path)))
+    motion = draw_motions(model, 2, 1)
+    std, half = np.full(7, 0.02), np.zeros(7)
+    library.lipserve_interval(c_array(std), c_array(half))
+    expected = 1.959963984540054 * model.scale * np.sqrt(std**2 + model.noise_std**2)
+    np.testing.assert_allclose(half, expected, rtol=1e-12)
+    assert library.lipserve_in_range(*[c_array(part[0]) for part in motion]) == 1
+    for part, name in enumerate(("q", "dq", "ddq")):
+        for joint, value in ((0, model.training_range[name]["max"][0] + 1e-6), (6, np.nan)):
+            far = motion[:, 0].copy()
+            far[part, joint] = value
+            assert library.lipserve_in_range(*[c_array(row) for row in far]) == 0
+
+
+def test_names_cannot_end_comments_or_strings(tmp_path: Path) -> None:
+    names = ("*/ int x; /*", '", 0}; int y; //', "gelenk ü\\\n?/")
+    model = replace(train_arm("RRR", 50), joint_names=names)
+    files = c_files(model, ModelOrigin('*/"\\', 1, 0, "*/"))
+    assert all(text.isascii() for text in files.values())
+    code = re.sub(r'/\*.*?\*/|"(\\.|[^"\\\n])*"', "", files[HEADER] + files[SOURCE], flags=re.DOTALL)
+    assert "int x" not in code
+    assert "int y" not in code
+    if shutil.which("cc") is None:
+        return
+    library = ctypes.CDLL(str(compile_library(files, tmp_path)))
+    size = max(len(name.encode()) for name in names) + 1
+    stored = (ctypes.c_char * (3 * size)).in_dll(library, "lipserve_joint_names").raw
+    assert [stored[k * size : (k + 1) * size].rstrip(b"\0").decode() for k in range(3)] == list(names)
+
+
+def test_other_estimators_are_rejected() -> None:
+    _, _, robot = arm("RRR", 50)
+    few = FitOptions(device="cpu", hyperparameter_samples=20, max_iterations=2, starts=1)
+    model = train(record_motion(robot, 1, 40), robot.joint_types, "lip-chain", few)
+    with pytest.raises(
+        UnsupportedEstimatorError, match=r"'lip-chain', expected one of rigid-body, .*rigid-body\+lip-chain for C"
+    ):
+        c_files(model, ORIGIN)
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler, c++, which is not installed")
+def test_example_controller_uses_the_code(tmp_path: Path) -> None:
+    model = load(PANDA)
+    compile_library(c_files(model, ORIGIN), tmp_path)
+    subprocess.run(["cc", *FLAGS, "-c", SOURCE], cwd=tmp_path, check=True)
+    example = ROOT / "docs/examples/feedforward_controller.cpp"
+    strict = ("-std=c++17", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-I.")
+    command = ["c++", *strict, str(example), "lipserve_model.o", "-o", "controller"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    limits = np.array([model.training_range["q"][end] for end in ("min", "max")])
+    for middle, used in ((limits.mean(0), 20), (limits[1] + 1.0, 0)):
+        ran = subprocess.run(
+            ["./controller", "20", *map(str, middle)], cwd=tmp_path, check=True, capture_output=True, text=True
+        )
+        assert ran.stdout.startswith(f"used {used} of 20, the longest cycle took")

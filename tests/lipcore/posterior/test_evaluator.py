@@ -1,0 +1,271 @@
+"""Tests of the compiled evaluator against the dense formulas."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from threading import Barrier
+
+import numpy as np
+import pytest
+
+from lipcore.data.motion import Array, Motion
+from lipcore.kernels.arm import ArmKernel
+from lipcore.kernels.arm_prior import arm_of_robot
+from lipcore.kernels.base import LinearKernel, PairKernel, SumKernel
+from lipcore.kernels.friction import FrictionKernel
+from lipcore.posterior.evaluator import QUERIES, Evaluator
+from lipcore.robots.library import load_robot
+from lipcore.robots.urdf import RigidBody
+from tests.lipcore.kernels.test_baseline_kernels import BASELINES, random_case
+from tests.lipcore.oracles import random_problem
+
+RELATIVE_TOLERANCE = 1e-10
+STD_FACTOR = 1.3
+MIXED = ("revolute", "prismatic", "revolute", "prismatic", "revolute")
+
+
+@dataclass
+class Case:
+    """Random arguments of an evaluator, and queries."""
+
+    term: PairKernel | None
+    linear: list[LinearKernel]
+    params: dict[str, Array]
+    inducing: Motion | None
+    outputs: np.ndarray
+    weights: np.ndarray
+    root: np.ndarray
+    query: Motion
+
+    def evaluator(self) -> Evaluator:
+        return Evaluator(
+            self.term, self.params, self.inducing, self.outputs, self.linear, self.weights, self.root, STD_FACTOR
+        )
+
+    def dense(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean (N, n) and covariance (N, n, n) by the formulas of `Evaluator`."""
+        mean, prior, explained, left = self.parts()
+        return mean, STD_FACTOR**2 * (prior - explained + left)
+
+    def parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the mean, the term's prior and explained covariance, and the weights' remaining covariance."""
+        query, n = self.query, self.query.n_joints
+        prior = SumKernel(*([] if self.term is None else [self.term]), *self.linear)
+        rows = []
+        if self.term is not None and self.inducing is not None:
+            rows.append(self.term.gram(self.params, self.inducing, query)[self.outputs])
+        for each in self.linear:
+            features = each.features(query)
+            rows.append(np.diag(each.variances(self.params)) @ features.reshape(len(query) * n, -1).T)
+        cross = np.concatenate(rows)
+        mean = prior.mean(query) + (self.weights @ cross).reshape(-1, n)
+        white, chosen = (self.root @ cross).reshape(-1, len(query), n), len(self.outputs)
+        explained, left = (np.einsum("kmi,kmj->mij", part, part) for part in (white[:chosen], white[chosen:]))
+        before = np.zeros((len(query), n, n)) if self.term is None else self.term.variance(self.params, query)
+        return mean, before, explained, left
+
+
+def rigid_body(name: str, order: tuple[int, ...] | None = None, **options: object) -> ArmKernel:
+    """Return the kernel of a robot with another joint order in the data."""
+    robot = load_robot(name)
+    order = order or tuple(range(robot.n_joints))
+    names, types = (tuple(parts[i] for i in order) for parts in (robot.joint_names, robot.joint_types))
+    return ArmKernel(arm_of_robot(RigidBody.from_profile(name, names, types), **options))
+
+
+def case(
+    joint_types: tuple[str, ...],
+    kernel: str | None = "chain",
+    linear: tuple[LinearKernel, ...] = (),
+    *,
+    samples: int = 20,
+    queries: int = 5,
+    seed: int = 0,
+) -> Case:
+    """About half of the torques are inducing outputs; the first two samples have none, the third has one."""
+    rng, n = np.random.default_rng(seed), len(joint_types)
+    if kernel in BASELINES:
+        term, params, motion = random_case(kernel, joint_types, samples + queries)
+    else:
+        problem = random_problem(joint_types, samples + queries, seed, kernel or "chain")
+        term, params, motion = problem.kernel, dict(problem.params), problem.motion
+    size = sum(len(each.features(motion[:1])[0, 0]) for each in linear)
+    for each in linear:
+        params |= each.initial(motion, rng.uniform(0.5, 2.0, (samples + queries, n)))
+    chosen = rng.random((samples, n)) < 0.5
+    chosen[:2], chosen[2, 1:], chosen[2, 0] = False, False, True
+    outputs = np.flatnonzero(chosen) if kernel else np.zeros(0, dtype=np.int64)
+    anchors = len(outputs) + size
+    root = np.tril(rng.standard_normal((anchors, anchors)) + 4 * np.eye(anchors))
+    made = Case(
+        term=term if kernel else None,
+        linear=list(linear),
+        params=params,
+        inducing=motion[:samples] if kernel else None,
+        outputs=outputs,
+        weights=rng.standard_normal(anchors),
+        root=root,
+        query=motion[samples:],
+    )
+    if term is not None and kernel:
+        _, prior, explained, _ = made.parts()
+        # up to half of a variance is explained: errors in that half show, and little cancels
+        diagonals = (part.diagonal(axis1=1, axis2=2) for part in (explained, prior))
+        made.root = root * np.sqrt(0.5 / np.divide(*diagonals).max())
+    return made
+
+
+def friction(n: int) -> tuple[LinearKernel, ...]:
+    return (FrictionKernel(n),)
+
+
+PANDA, KINOVA, TIAGO = ("revolute",) * 7, ("revolute",) * 6, ("prismatic", *("revolute",) * 7)
+CASES: dict[str, Callable[[], Case]] = {
+    "chain": lambda: case(PANDA, "chain", friction(7)),
+    "lip": lambda: case(PANDA, "tied", friction(7)),
+    "lip-untied": lambda: case(MIXED, "untied", friction(5)),
+    "prismatic": lambda: case(MIXED, "chain", friction(5)),
+    **{name: lambda name=name: case(MIXED, name, friction(5)) for name in BASELINES},
+    "frictionless": lambda: case(MIXED, "chain"),
+    "rigid-body": lambda: case(PANDA, None, (rigid_body("panda"), FrictionKernel(7))),
+    "rigid-body alone, from zero": lambda: case(PANDA, None, (rigid_body("panda", prior="zero", gravity=False),)),
+    "rigid-body with friction of slow joints": lambda: case(
+        PANDA, None, (rigid_body("panda"), FrictionKernel(7, stribeck=True))
+    ),
+    "rigid-body and chain": lambda: case(PANDA, "chain", (rigid_body("panda"), FrictionKernel(7))),
+    "rigid-body with geometry": lambda: case(PANDA, None, (rigid_body("panda", mode="calibrate"), FrictionKernel(7))),
+    "unbounded joints in another order": lambda: case(
+        KINOVA, "chain", (rigid_body("kinova", (3, 0, 5, 1, 4, 2)), FrictionKernel(6))
+    ),
+    "prismatic rigid body in another order": lambda: case(
+        TIAGO[1:] + TIAGO[:1],
+        None,
+        (rigid_body("tiago", (1, 2, 3, 4, 5, 6, 7, 0), mode="calibrate"), FrictionKernel(8)),
+    ),
+    **{
+        f"{n} joints": lambda n=n: case((("revolute", "prismatic") * 5)[:n], "chain", friction(n))
+        for n in (1, 2, 3, 4, 6, 8, 9, 10)
+    },
+}
+
+
+@pytest.fixture(params=CASES)
+def evaluator_case(request: pytest.FixtureRequest) -> Case:
+    return CASES[request.param]()
+
+
+def arrays_of(query: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    return query.q, query.dq, query.ddq
+
+
+def assert_close(found: np.ndarray | None, expected: np.ndarray) -> None:
+    assert found is not None
+    np.testing.assert_allclose(found, expected, rtol=0, atol=RELATIVE_TOLERANCE * np.abs(expected).max())
+
+
+def test_batch_equals_the_dense_formulas(evaluator_case: Case) -> None:
+    mean, covariance = evaluator_case.dense()
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    assert (variance > 0).all()
+    tau, std, found, _ = evaluator_case.evaluator().many(*arrays_of(evaluator_case.query), covariance=True)
+    assert_close(tau, mean)
+    assert_close(std, np.sqrt(variance))
+    assert_close(found, covariance)
+    assert np.array_equal(found, found.transpose(0, 2, 1))
+
+
+def test_single_query_gives_identical_bits(evaluator_case: Case) -> None:
+    evaluator, query = evaluator_case.evaluator(), np.stack(arrays_of(evaluator_case.query))
+    tau, std, nothing, _ = evaluator.many(*query)
+    assert nothing is None
+    between, own = evaluator.many(*query, covariance=True)[2], np.empty((1, *query.shape[2:] * 2))
+    assert between is not None
+    for k in range(query.shape[1]):
+        one, deviation, _ = evaluator.one(np.ascontiguousarray(query[:, k]))
+        assert np.array_equal(one, tau[k])
+        assert deviation is not None
+        assert np.array_equal(deviation, std[k])
+        mean_only, nothing, _ = evaluator.one(np.ascontiguousarray(query[:, k]), std=False)
+        assert nothing is None
+        assert np.array_equal(mean_only, tau[k])
+        one, deviation, _ = evaluator.one(np.ascontiguousarray(query[:, k]), covariance=own)
+        assert np.array_equal(one, tau[k])
+        assert_close(deviation, std[k])
+        assert_close(own[0], between[k])
+
+
+@pytest.mark.parametrize("queries", [1, QUERIES - 1, QUERIES, QUERIES + 1, 2 * QUERIES + 3])
+def test_batches_of_any_size_match_the_formulas(queries: int) -> None:
+    chain = case(MIXED, "chain", friction(5), queries=queries)
+    mean, covariance = chain.dense()
+    evaluator = chain.evaluator()
+    evaluator.warm_up()  # changes nothing
+    tau, _, found, _ = evaluator.many(*arrays_of(chain.query), covariance=True)
+    assert_close(tau, mean)
+    assert_close(found, covariance)
+
+
+def test_negative_variance_gives_zero_std() -> None:
+    chain = case(MIXED)
+    chain.root *= 100
+    _, std, covariance, _ = chain.evaluator().many(*arrays_of(chain.query), covariance=True)
+    assert covariance is not None
+    assert (np.diagonal(covariance, axis1=1, axis2=2) == 0).all()
+    assert (std == 0).all()
+
+
+def test_threads_get_identical_and_own_predictions() -> None:
+    threads, rounds = 4, 30
+    both = case(PANDA, "chain", (rigid_body("panda"), FrictionKernel(7)), queries=threads)
+    evaluator, query = both.evaluator(), np.stack(arrays_of(both.query))
+    tau, std, covariance, _ = evaluator.many(*query, covariance=True)
+    assert covariance is not None
+    start = Barrier(threads)
+
+    def work(k: int) -> bool:
+        start.wait(timeout=60)
+        mine, same = np.ascontiguousarray(query[:, k]), True
+        for _ in range(rounds):
+            one, deviation, _ = evaluator.one(mine)
+            same &= np.array_equal(one, tau[k]) and deviation is not None and np.array_equal(deviation, std[k])
+            many = evaluator.many(*mine[:, None], covariance=True)[2]
+            same &= many is not None and np.array_equal(many[0], covariance[k])
+        return same
+
+    with ThreadPoolExecutor(threads) as pool:
+        assert all(pool.map(work, range(threads)))
+
+
+def test_inputs_stay_unchanged_and_results_are_owned() -> None:
+    chain = case(MIXED, "chain", friction(5))
+    evaluator, query = chain.evaluator(), np.stack(arrays_of(chain.query))
+    motion = np.ascontiguousarray(query[:, 0])
+    motion.flags.writeable = False  # like bytes from a socket
+    first = evaluator.one(motion)[0]
+    before = first.copy()
+    evaluator.one(np.ascontiguousarray(query[:, 1]))
+    assert np.array_equal(first, before)
+    for array in (chain.outputs, chain.weights, chain.root):
+        assert array.any()
+        array[:] = 0
+    assert np.array_equal(evaluator.one(motion)[0], first)  # no view of the arguments is kept
+
+
+def test_invalid_arguments_are_named() -> None:
+    def refused(**changes: object) -> str:
+        chain = case(MIXED, "chain", friction(5))
+        for name, value in changes.items():
+            setattr(chain, name, value)
+        with pytest.raises(ValueError, match="expected") as error:
+            chain.evaluator()
+        return str(error.value)
+
+    good = case(MIXED, "chain", friction(5))
+    anchors = len(good.weights)
+    assert "outputs are" in refused(outputs=np.append(good.outputs[:-1], 100))
+    assert "outputs are" in refused(outputs=np.append(-1, good.outputs[1:]))
+    assert f"weights have shape (3,), expected ({anchors},)" in refused(weights=np.zeros(3))
+    assert f"expected ({anchors}, {anchors})" in refused(root=np.zeros((anchors, anchors - 1)))
+    assert "above the diagonal" in refused(root=np.ones((anchors, anchors)))
+    assert "term and inducing" in refused(inducing=None)
+    assert "neither term nor linear" in refused(term=None, inducing=None, linear=[])

@@ -1,0 +1,137 @@
+"""The limits of concurrent requests and of the request rate of a client."""
+
+import asyncio
+import json
+
+import pytest
+
+from service.api.access.middleware import KEY_ID, KeyAccess
+from service.api.limits.requests import OTHERS, BodyLimit, Gate, Rate, RateLimit, client_of
+from service.app import create_app
+from service.foundation.settings import Settings
+
+MODELS, STREAM = "/v1/models", "/v1/echo/stream"
+
+
+async def call(middleware, path=MODELS, kind="http"):
+    """Call a middleware; return the messages of the answer."""
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    async def receive():
+        return {"type": "websocket.connect"}
+
+    await middleware({"type": kind, "path": path, "headers": [], "client": ("10.0.0.1", 1)}, receive, send)
+    return sent
+
+
+def error_of(sent, status):
+    """Return headers and error of a rejected request."""
+    assert sent[0]["status"] == status
+    return dict(sent[0]["headers"]), json.loads(sent[-1]["body"])["error"]
+
+
+@pytest.mark.parametrize(
+    ("path", "kind"), [("/health/live", "http"), (STREAM, "websocket"), ("", "lifespan")], ids=["health", "ws", "start"]
+)
+def test_full_gate_rejects_requests_but_not_health_or_streams(path, kind):
+    async def send_requests():
+        go = asyncio.Event()
+
+        async def app(_, __, send):
+            await go.wait()
+            await send({"type": "http.response.start", "status": 200, "headers": []})
+
+        gate = Gate(app, 2)
+        tasks = [asyncio.create_task(call(gate)) for _ in range(2)]
+        await asyncio.sleep(0)
+        headers, error = error_of(await call(gate), 429)
+        assert (headers[b"retry-after"], error["code"]) == (b"1", "busy")
+        tasks.append(asyncio.create_task(call(gate, path, kind)))
+        await asyncio.sleep(0)
+        go.set()
+        answers = [*await asyncio.gather(*tasks), await call(gate)]
+        assert [sent[0]["status"] for sent in answers] == [200] * 4
+        assert gate.open == 0
+
+    asyncio.run(send_requests())
+
+
+def test_failed_request_frees_its_place():
+    async def app(*_):
+        raise ZeroDivisionError
+
+    gate = Gate(app, 1)
+    for _ in range(3):
+        with pytest.raises(ZeroDivisionError):
+            asyncio.run(call(gate))
+    assert gate.open == 0
+
+
+def test_bucket_of_a_client_holds_a_burst_and_refills():
+    rate = Rate(per_s=10, burst=3)
+    assert [rate.wait("a", 0.0) for _ in range(5)] == [0, 0, 0, pytest.approx(0.1), pytest.approx(0.1)]
+    assert rate.wait("b", 0.0) == 0
+    assert rate.wait("a", 0.05) == pytest.approx(0.05)
+    assert [rate.wait("a", 0.1) for _ in range(2)] == [0, pytest.approx(0.1)]
+    assert [rate.wait("a", 100.0) for _ in range(4)] == [0, 0, 0, pytest.approx(0.1)]
+
+
+def test_long_term_rate_is_the_limit():
+    rate = Rate(per_s=7, burst=2)
+    passed = sum(rate.wait("a", tick / 100) == 0 for tick in range(10_000))
+    assert passed == pytest.approx(7 * 100 + 2, abs=1)
+
+
+def test_clients_beyond_the_max_share_a_bucket():
+    rate = Rate(per_s=1, burst=1, max_clients=3)
+    assert [rate.wait(name, 0) for name in "abcd"] == [0, 0, 0, 0]
+    assert rate.wait("e", 0) == 1
+    assert set(rate._full) == {*"abc", OTHERS}
+    assert rate.wait("f", 10) == 0
+    assert set(rate._full) == {"f"}
+
+
+@pytest.mark.parametrize(
+    ("client", "expected"),
+    [
+        (("10.1.2.3", 5000), "10.1.2.3"),
+        (("::ffff:10.1.2.3", 5000), "10.1.2.3"),
+        (("2001:db8:1:2:3:4:5:6", 1), "2001:db8:1:2::/64"),
+        (("fe80::1%eth0", 1), "fe80::/64"),
+        (("odd:name", 1), "odd:name"),
+        (("", 0), "a local socket"),
+        (None, "a local socket"),
+    ],
+)
+def test_client_is_identified_by_key_or_address(client, expected):
+    assert client_of({"client": client}) == expected
+    assert client_of({"client": client, KEY_ID: "key_1"}) == "API key key_1"
+
+
+def test_requests_beyond_the_rate_get_429():
+    async def fine(_, __, send):
+        await send({"type": "http.response.start", "status": 200, "headers": []})
+
+    async def send_requests():
+        limited = RateLimit(fine, per_s=0.001, burst=2)
+        assert [(await call(limited))[0]["status"] for _ in range(2)] == [200, 200]
+        headers, error = error_of(await call(limited), 429)
+        assert 900 < int(headers[b"retry-after"]) <= 1000
+        assert error["code"] == "rate_limited"
+        assert "Too many requests from 10.0.0.1: at most 0.001 per s" in error["message"]
+        assert isinstance(error_of(await call(limited, "/v2/models/panda-sim/infer"), 429)[1], str)
+        assert (await call(limited, STREAM, "websocket"))[0]["status"] == 429
+        assert (await call(limited, "/health/live"))[0]["status"] == 200
+
+    asyncio.run(send_requests())
+
+
+def test_middlewares_are_in_order(home):
+    """Keys are checked before their requests are counted, and requests are counted before bodies are read."""
+    limits = (Gate, KeyAccess, RateLimit, BodyLimit)
+    app = create_app(Settings(home=home, max_requests_per_s=5.0, keys="on"))
+    assert [each.cls for each in app.user_middleware if each.cls in limits] == [*limits]
+    assert RateLimit not in [each.cls for each in create_app(Settings(home=home)).user_middleware]

@@ -1,0 +1,45 @@
+"""The extensions of uvicorn match the installed and allowed versions, which `HOLDS_FOR` names."""
+
+import tomllib
+from importlib.metadata import version
+
+import pytest
+import uvicorn
+from packaging.requirements import Requirement
+from packaging.specifiers import SpecifierSet
+from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from service.api.server import HOLDS_FOR
+from service.api.server.connections import GuardedProtocol, StreamProtocol
+from service.api.server.sockets import Server
+from tests import ROOT
+
+PYPROJECT = ROOT / "pyproject.toml"
+REPLACED = {
+    GuardedProtocol: (
+        HttpToolsProtocol,
+        *("connection_made", "connection_lost", "data_received", "on_body", "on_response_complete", "pause_writing"),
+        *("resume_writing", "handle_websocket_upgrade", "send_400_response", "_unsupported_upgrade_warning"),
+    ),
+    StreamProtocol: (WebSocketsSansIOProtocol, "data_received", "shutdown"),
+    Server: (uvicorn.Server, "startup", "shutdown", "handle_exit"),
+}
+"""Methods of uvicorn that subclasses replace, and the classes that define them; uvicorn must call these names."""
+
+
+@pytest.mark.parametrize("library", HOLDS_FOR)
+def test_checked_versions_are_the_installed_and_allowed_ones(library):
+    needed = (Requirement(each) for each in tomllib.loads(PYPROJECT.read_text())["project"]["dependencies"])
+    bounds = {each.name: each.specifier for each in needed}
+    assert version(library) in SpecifierSet(HOLDS_FOR[library])
+    assert bounds[library] == SpecifierSet(HOLDS_FOR[library])
+
+
+@pytest.mark.parametrize("kind", REPLACED)
+def test_replaced_methods_exist(kind):
+    base, *names = REPLACED[kind]
+    assert issubclass(kind, base)
+    for name in names:
+        assert name in vars(kind), name
+        assert callable(getattr(base, name)), name

@@ -1,0 +1,72 @@
+"""Reading uploads in tests."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+
+from service.datasets.formats.opening import open_table
+from service.datasets.formats.table import BLOCK_ROWS
+from service.datasets.options import ReadOptions
+from service.foundation.errors import ServiceError
+from service.foundation.settings import Settings
+
+
+@dataclass
+class Read:
+    """The contents of a table: columns by name, units, facts and joint names."""
+
+    columns: dict[str, np.ndarray]
+    units: dict[str, str]
+    facts: list[str]
+    joint_names: tuple[str, ...] | None
+
+    def __getitem__(self, name):
+        return self.columns[name]
+
+    @property
+    def names(self):
+        return tuple(self.columns)
+
+    @property
+    def rows(self):
+        return np.column_stack(list(self.columns.values()))
+
+
+def taken(table):
+    """Read the blocks of a table and check the properties of every table."""
+    blocks = list(table.blocks)
+    for block in blocks:
+        assert block.dtype == np.float64
+        assert 1 <= len(block) <= BLOCK_ROWS
+        assert block.shape == (len(block), len(table.names))
+    assert len(set(table.names)) == len(table.names)
+    entire = np.concatenate(blocks) if blocks else np.empty((0, len(table.names)))
+    return Read(dict(zip(table.names, entire.T, strict=True)), table.units, table.facts, table.joint_names)
+
+
+@cache
+def settings_of(folder, **changed):
+    return Settings(home=folder, **changed)
+
+
+def read(folder, body, kind, options=None, **settings):
+    """Read an upload and check that it leaves no files."""
+    path = folder / "upload"
+    path.write_bytes(body)
+    before = set(folder.iterdir())
+    with open_table(path, kind, options or ReadOptions(), settings_of(folder, **settings)) as table:
+        result = taken(table)
+    assert set(folder.iterdir()) == before, "leftovers"
+    return result
+
+
+def refused(folder, body, kind, options=None, error=ServiceError, **settings):
+    """Read an upload that is rejected; return (field, value, expected), or the message without a detail."""
+    before = set(folder.iterdir())
+    with pytest.raises(error) as caught:
+        read(folder, body, kind, options, **settings)
+    assert set(folder.iterdir()) <= before | {folder / "upload"}, "leftovers"
+    detail = caught.value.detail
+    return (detail[0].field, detail[0].value, detail[0].expected) if detail else caught.value.message

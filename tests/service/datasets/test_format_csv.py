@@ -1,0 +1,147 @@
+"""CSV in many dialects: separators, headers, missing values, text, dates; and errors in it."""
+
+import csv as writer
+import io
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.datasets.options import ReadOptions
+from service.foundation.errors import InvalidDataError, InvalidRequestError
+from tests.service.datasets.reading import read, refused
+
+NAMES = ["t", "q1", "tau1"]
+ROWS = [[0.0, 1.5, -2.0], [0.125, -2.25, 1e-3], [0.25, 1e3, 7.0]]
+
+
+def text(rows=ROWS, names=NAMES, sep=",", end="\n", form=str):
+    return end.join(sep.join(map(form, row)) for row in [names, *rows]) + end
+
+
+def comma(value):
+    return str(value).replace(".", ",")
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        pytest.param(text(), id="plain"),
+        pytest.param(text(sep=";"), id="semicolons"),
+        pytest.param(text(sep=";", form=comma), id="decimal commas"),
+        pytest.param(text(sep="\t", form=comma), id="tabs and decimal commas"),
+        pytest.param(text(sep="     "), id="aligned with blanks"),
+        pytest.param("  " + text(sep="  ", end=" \n "), id="blanks at the ends"),
+        pytest.param(text(sep=" ", end="\r\n"), id="blanks, windows line ends"),
+        pytest.param("# " + text(sep=" "), id="header in a comment"),
+        pytest.param(text(form=lambda cell: f'"{cell}"'), id="everything quoted"),
+        pytest.param("\n\n" + text(end="\n\n") + "\n\n", id="empty lines"),
+        pytest.param("\ufeff" + text(sep=", ", end="\r\n").replace("1.5", "+1.5").rstrip(), id="windows, a plus"),
+        pytest.param("# recorded on Monday\n# at noon\n" + text(names=['"t"', '"q1"', '"tau1"']), id="comments above"),
+    ],
+)
+def test_one_table_in_many_dialects(tmp_path, body):
+    result = read(tmp_path, body.encode(), "csv")
+    assert result.names == tuple(NAMES)
+    np.testing.assert_array_equal(np.column_stack(list(result.columns.values())), ROWS)
+
+
+@pytest.mark.parametrize("sep", [",", ";", "\t"])
+def test_header_of_other_width_than_all_rows_is_an_error(tmp_path, sep):
+    names = ["t", *(f"{quantity}{joint}" for quantity in ("q", "dq", "ddq", "tau") for joint in range(1, 8)), "odd"]
+    rows = [[0.5 * column + row for column in range(29)] for row in range(60)]
+    said = refused(tmp_path, text(rows, names, sep).encode(), "csv", error=InvalidDataError)
+    assert said == ("header", "30 names", "29 names because each of the first 50 rows has 29 values")
+
+
+def test_row_of_other_width_than_the_header_is_an_error(tmp_path):
+    rows = [[*row] for row in ROWS * 4]
+    rows[5] = rows[5][:-1]
+    said = refused(tmp_path, text(rows).encode(), "csv", error=InvalidDataError)
+    assert said == ("row 6", "2 values", "3 values, one per column of the header")
+
+
+def test_dates_become_seconds_and_keep_nanoseconds(tmp_path):
+    stamps = pd.to_datetime(1_700_000_000_000_000_000 + np.array([0, 1, 1_000_000_007]))
+    frame = pd.DataFrame({"stamp": stamps, "q1": [1.0, 2.0, 3.0]})
+    result = read(tmp_path, frame.to_csv(index=False).encode(), "csv")
+    np.testing.assert_allclose(result["stamp"], [0, 1e-9, 1.000000007], rtol=1e-15)
+    assert result.units == {"stamp": "s"}
+    zoned = b"stamp,q1\n2024-01-01T00:00:00Z,1\n2024-01-01T02:00:00.5+01:00,2\n,3\n"
+    np.testing.assert_array_equal(read(tmp_path, zoned, "csv")["stamp"], [0, 3600.5, np.nan])
+
+
+@pytest.mark.parametrize("word", ["", "NaN", "NA", "null", "None", " "])
+def test_words_for_missing_become_nan(tmp_path, word):
+    np.testing.assert_array_equal(read(tmp_path, f"t,q1\n0,1\n1,{word}\n2,3\n".encode(), "csv")["q1"], [1, np.nan, 3])
+
+
+@pytest.mark.parametrize(("reply", "sep"), [("tab", "\t"), ("^", "^"), ("blank", "   ")])
+def test_delimiter_can_be_given(tmp_path, reply, sep):
+    result = read(tmp_path, text(sep=sep).encode(), "csv", ReadOptions(delimiter=reply))
+    assert result.names == tuple(NAMES)
+
+
+@pytest.mark.parametrize("reply", ["ab", "1", '"', "é"])
+def test_an_impossible_delimiter_is_refused(tmp_path, reply):
+    field, _, expected = refused(tmp_path, text().encode(), "csv", ReadOptions(delimiter=reply), InvalidRequestError)
+    assert field == "delimiter"
+    assert "blank" in expected
+
+
+@pytest.mark.parametrize("row", [1, 16_384, 16_385, 49_999])
+def test_error_names_row_and_column_of_a_bad_cell(tmp_path, row):
+    lines = ["t,q1", *(f"{number},{number % 7}" for number in range(1, 50_001))]
+    lines[row] = "5,abc"
+    assert refused(tmp_path, "\n\n".join(lines).encode(), "csv") == (f"q1, row {row}", "abc", "a number")
+    lines[row] = "5"
+    field, value, expected = refused(tmp_path, "\n".join(lines).encode(), "csv")
+    assert (field, value) == (f"row {row}", "1 values")
+    assert "2 values" in expected
+
+
+@pytest.mark.parametrize(
+    ("body", "field", "message"),
+    [
+        (b"\n\n\n", "header", "empty"),
+        (b"0,1,2\n3,4,5\n", "header", "column names"),
+        (b"t,q1,q1\n0,1,2\n", "column 3", "each column only once"),
+        (b"t,q1\x07\n0,1\n", "column 2", "printable"),
+        (b"t,q1\0\n0,1\n", "file", "UTF-8"),
+        (b"q1\n1\n", "header", "separated by"),
+        (b"t,q1\n0,1\n1,1\x002\n", "q1, row 2", "a number"),
+        (b"t,q1\n0,1e400\n1,-inf\n1,x\n", "q1, row 3", "a number"),
+        (b"t,q1\n0,1\n1,0x10\n", "q1, row 2", "a number"),
+        (b"t;q1\n0;1,5\n1;1.234,5\n", "q1, row 2", "a number"),
+        (b"t,q1\n0,1\n\xff,2\n", "file", "UTF-8"),
+        (b"t,q1\n" + b"0,1\n" * 90_000 + b"\xff,2\n", "file", "0xff"),
+        (b't,q1\n0,1\n1,2\n"', "row 3", "2 values"),
+        (b"t," + b"q" * 700_000 + b"\n0,1\n", "header", "at most"),
+        (b"t,q1\n0,1\n1," + b"1" * 3_000_000 + b"\n", "file", "line"),
+        (",".join(f"c{i}" for i in range(30)).encode() + b"\n", "columns", "at most 20"),
+    ],
+)
+def test_damaged_csv_is_rejected_with_its_place(tmp_path, monkeypatch, body, field, message):
+    monkeypatch.setattr("service.datasets.formats.table.MAX_COLUMNS", 20)
+    reply = refused(tmp_path, body, "csv", error=InvalidDataError)
+    assert reply[0] == field
+    assert message in " ".join(reply)
+
+
+@given(
+    rows=st.lists(st.lists(st.floats(allow_nan=False), min_size=3, max_size=3), min_size=1, max_size=20),
+    sep=st.sampled_from([",", ";", "\t", "|", " "]),
+    quoting=st.sampled_from([writer.QUOTE_MINIMAL, writer.QUOTE_NONNUMERIC]),
+)
+def test_output_of_the_csv_module_is_read_back(tmp_path_factory, rows, sep, quoting):
+    out = io.StringIO()
+    writer.writer(out, delimiter=sep, quoting=quoting).writerows([NAMES, *rows])
+    result = read(tmp_path_factory.mktemp("csv"), out.getvalue().encode(), "csv")
+    np.testing.assert_array_equal(np.column_stack(list(result.columns.values())), rows)
+
+
+def test_a_header_alone_is_a_table_of_no_rows(tmp_path):
+    for body in (b"t,q1", b"t,q1\n\n\n"):
+        assert len(read(tmp_path, body, "csv")["t"]) == 0

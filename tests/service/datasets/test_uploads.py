@@ -1,0 +1,184 @@
+"""Recordings in every accepted form become the same data set; what cannot be used is refused and leaves nothing."""
+
+import io
+
+import numpy as np
+import pytest
+
+from lipserve.media_types import MEDIA_TYPES, SUFFIXES
+from service.datasets import store
+from tests.service.data import QUICK, arrays, columns, csv, error, job, npz, post, queue, service_of, stream, upload
+
+TRUE = stream()
+SHORT = stream(samples=50, rate=50.0)
+GOOD = csv(columns(TRUE))
+LIMIT = 200_000
+
+
+def stored(api, dataset):
+    """The samples of a data set as a training job reads them."""
+    service = service_of(api)
+    return store.samples(service.files, store.find(service.database, dataset["id"]))
+
+
+def created(answer):
+    assert answer.status_code == 201, answer.text
+    return answer.json()
+
+
+def nothing_stays(api):
+    """Check that no data set is listed and no file of one lies in the home."""
+    files = service_of(api).files
+    assert api.get("/v1/datasets").json() == {"items": [], "next_cursor": None}
+    assert list(files.uploads.iterdir()) == []
+    assert list(files.datasets.iterdir()) == []
+
+
+def refused(api, body, media_type, status=422, code="invalid_data"):
+    """Upload what has to be refused, check that nothing of it stays; return the error."""
+    problem = error(post(api, body, media_type), status, code)
+    nothing_stays(api)
+    return problem
+
+
+def changed(column, row, text):
+    """The table with another text in one cell, rows counted from 1."""
+    table = columns(TRUE)
+    table[column][row - 1] = text
+    return csv(table)
+
+
+@pytest.fixture(scope="module")
+def reference(api):
+    """The stream as NPZ without anything optional."""
+    return created(post(api, npz(**arrays(TRUE))))
+
+
+def test_npz_is_stored_as_it_was_sent(api, reference):
+    kept = stored(api, reference)
+    assert api.get(f"/v1/datasets/{reference['id']}").json() == reference
+    assert kept.joint_names == ("joint1", "joint2")
+    for name, values in arrays(TRUE).items():
+        np.testing.assert_array_equal(getattr(kept, name), values)
+
+
+@pytest.mark.parametrize(
+    ("file_name", "name", "body"),
+    [("../../etc/stream.csv", "stream.csv", GOOD), ("STREAM.NPZ", "STREAM.NPZ", npz(**arrays(TRUE)))],
+)
+def test_a_form_takes_the_kind_and_the_name_from_the_file_name(api, reference, file_name, name, body):
+    dataset = created(api.post("/v1/datasets", files={"file": (file_name, body)}))
+    assert (dataset["name"], dataset["sha256"]) == (name, reference["sha256"])
+
+
+def test_names_and_convention_of_the_query_come_before_those_of_the_file(api):
+    body = npz(**arrays(TRUE), joint_names=np.array(["shoulder", "elbow"]))
+    assert created(post(api, body))["joint_names"] == ["shoulder", "elbow"]
+    query = {"name": "Möve 1", "torque_convention": "gravity_compensated", "joint_names": "a, b"}
+    dataset = created(post(api, body, **query))
+    assert (dataset["name"], dataset["torque_convention"]) == ("Möve 1", "gravity_compensated")
+    assert dataset["joint_names"] == ["a", "b"]
+
+
+def test_times_are_not_needed_where_nothing_is_derived(api):
+    report = created(post(api, npz(**arrays(TRUE, "q", "dq", "ddq", "tau"))))["report"]
+    assert (report["rate_hz"], report["rows"]) == (None, 80)
+
+
+def bomb():
+    """Small, and 32 MB unpacked."""
+    out = io.BytesIO()
+    np.savez_compressed(out, q=np.zeros((2_000_000, 2)), tau=np.zeros((2_000_000, 2)))
+    assert len(out.getvalue()) < LIMIT
+    return out.getvalue()
+
+
+HALF = np.array(["a", "\ud800"])
+DEGREES = 'q2, row 12 is 90, expected radians or metres within ±12.6. Set units={"q": "deg"} if these are degrees'
+WRONG = {
+    "degrees": (changed("q2", 12, "90"), "text/csv", "q2, row 12", DEGREES),
+    "text": (changed("q1", 1, "x" * 50_000), "text/csv", "q1, row 1", "x" * 200),
+    "no times": (npz(**arrays(TRUE, "q", "tau")), "application/x-npz", "t", "because dq and ddq must be derived"),
+    "too short once filtered": (npz(**arrays(SHORT, "t", "q", "tau")), "application/x-npz", "rows", "24, expected at"),
+    "nine joints": (
+        npz(q=np.zeros((40, 9)), tau=np.zeros((40, 9))),
+        "application/x-npz",
+        "joints",
+        "9, expected 1 to 8",
+    ),
+    "many rows": (npz(q=np.zeros((501, 1)), tau=np.zeros((501, 1))), "application/x-npz", "rows", "at most 500"),
+    "a header of all that is allowed": (b"x" * LIMIT, "text/csv", "header", "at most 65536"),
+    "half a name": (npz(q=TRUE.q, tau=TRUE.tau, joint_names=HALF), "application/x-npz", "joint_names[1]", "printable"),
+    "wrong torques": (npz(q=TRUE.q, tau=TRUE.tau.T), "application/x-npz", "tau", "(80, 2)"),
+}
+
+
+@pytest.mark.parametrize("kind", WRONG)
+def test_what_cannot_be_used_is_refused_with_its_place(strict, kind):
+    body, media_type, field, message = WRONG[kind]
+    problem = refused(strict, body, media_type)
+    assert problem["detail"][0]["field"] == field
+    assert message in problem["message"]
+    assert len(problem["message"]) < 400
+
+
+@pytest.mark.parametrize(
+    ("body", "media_type", "message"),
+    [
+        (lambda: b"x" * (LIMIT + 1), "text/csv", str(LIMIT)),
+        (lambda: (b"x" * 10_000 for _ in range(LIMIT // 10_000 + 1)), "application/x-npz", str(LIMIT)),
+        (bomb, "application/x-npz", "at most 400000"),
+    ],
+    ids=["announced", "in chunks", "bomb"],
+)
+def test_what_is_too_large_is_refused(strict, body, media_type, message):
+    assert message in refused(strict, body(), media_type, 413, "too_large")["message"]
+
+
+def test_a_form_that_is_too_large_is_refused(strict):
+    error(strict.post("/v1/datasets", files={"file": ("a.csv", b"x" * LIMIT)}), 413, "too_large")
+    nothing_stays(strict)
+
+
+def test_media_types_and_endings_that_are_accepted_are_told(strict):
+    message = refused(strict, GOOD, "text/plain", 415, "unsupported_media_type")["message"]
+    assert all(each in message for each in (*MEDIA_TYPES, "multipart/form-data"))
+    answer = strict.post("/v1/datasets", files={"file": ("stream.csv.exe", GOOD)})
+    problem = error(answer, 415, "unsupported_media_type")
+    assert problem["detail"][0]["value"] == "stream.csv.exe"
+    assert all(each in problem["message"] for each in SUFFIXES)
+    nothing_stays(strict)
+
+
+@pytest.mark.parametrize("names", ["a", "a,a", "", "a,b\x7f"])
+def test_bad_joint_names_are_refused(strict, names):
+    problem = error(post(strict, GOOD, "text/csv", joint_names=names), 422, "invalid_data")
+    assert problem["detail"][0]["field"].startswith("joint_names")
+    nothing_stays(strict)
+
+
+@pytest.fixture
+def dataset(strict):
+    """The id of a data set."""
+    return upload(strict, stream())["id"]
+
+
+@pytest.mark.own_files("looks for the file below the home")
+def test_deleted_data_set_is_gone_with_its_file(strict, dataset):
+    file = service_of(strict).files.datasets / f"{dataset}.safetensors"
+    assert file.exists()
+    answer = strict.delete(f"/v1/datasets/{dataset}")
+    assert (answer.status_code, answer.content) == (204, b"")
+    assert not file.exists()
+    error(strict.get(f"/v1/datasets/{dataset}"), 404, "not_found")
+
+
+def test_data_set_of_a_queued_job_is_not_deleted(no_worker, dataset):
+    waiting = queue(no_worker, "m", dataset, options={**QUICK, "posterior_samples": 40})
+    reply = error(no_worker.delete(f"/v1/datasets/{dataset}"), 409, "conflict")
+    assert waiting["id"] in reply["message"]
+    assert no_worker.get(f"/v1/datasets/{dataset}").status_code == 200
+
+    no_worker.post(f"/v1/jobs/{waiting['id']}/cancel")
+    assert job(no_worker, waiting["id"])["state"] == "cancelled"
+    assert no_worker.delete(f"/v1/datasets/{dataset}").status_code == 204

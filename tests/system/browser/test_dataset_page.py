@@ -1,0 +1,175 @@
+"""Page of a data set: recommendations, tabs, common cursor and zoom, range to hold out."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from tests.service.data import stream, upload
+from tests.system.browser.accessibility import audit, expect
+from tests.system.browser.conftest import Dashboard
+from tests.system.browser.visitor import Visitor
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Page
+
+pytestmark = pytest.mark.slow
+
+SAMPLES = stream(samples=200, rate=20.0, seed=31)
+RANGES = "[...document.querySelectorAll('.strip')].map(({layout}) => layout.xaxis.range)"
+CURSORS = "[...document.querySelectorAll('.strip .cursor')].map((each) => each.hidden ? null : each.style.left)"
+AREA = """(plot) => {
+  const {x, y, width, height} = plot.querySelector(".nsewdrag").getBoundingClientRect();
+  return [x, y, width, height];
+}"""
+
+
+@pytest.fixture(scope="module")
+def dataset(dashboard: Dashboard) -> str:
+    """A recording of ten seconds whose report has recommendations."""
+    return str(upload(dashboard.client, SAMPLES, name="ten seconds")["id"])
+
+
+def drawn(page: Page) -> None:
+    """Wait until all plots and their overlays are drawn."""
+    expect(page.locator(".strip .linked")).to_have_count(4)
+
+
+def across(page: Page, plot: int, share: float) -> tuple[float, float]:
+    """Return a point in a plot, px: at a share of its x axis, at half its height."""
+    place = page.locator(".strip").nth(plot)
+    place.scroll_into_view_if_needed()
+    x, y, width, height = place.evaluate(AREA)
+    return x + share * width, y + height / 2
+
+
+def drag(page: Page, plot: int, start: float, end: float) -> None:
+    """Drag with the mouse over a share of a plot's x axis."""
+    page.mouse.move(*across(page, plot, start))
+    page.mouse.down()
+    page.mouse.move(*across(page, plot, (start + end) / 2))
+    page.mouse.move(*across(page, plot, end))
+    page.mouse.up()
+
+
+def test_recommendations_come_first_and_tab_is_in_the_address(visitor: Visitor, dataset: str) -> None:
+    page = visitor.open(f"#/data/{dataset}")
+    drawn(page)
+    advice, tabs = page.get_by_role("region", name="Recommendations"), page.get_by_role("tablist")
+    expect(advice.get_by_role("listitem").first).to_be_visible()
+    first, below = advice.bounding_box(), tabs.bounding_box()
+    assert first is not None
+    assert below is not None
+    assert first["y"] + first["height"] <= below["y"]
+    assert page.evaluate("document.documentElement.scrollHeight") < 2000
+
+    page.get_by_role("tab", name="Signals").focus()
+    steps = (
+        ("ArrowRight", "Timing"),
+        ("End", "Preparation"),
+        ("ArrowRight", "Signals"),
+        ("ArrowLeft", "Preparation"),
+    )
+    for key, name in steps:
+        page.keyboard.press(key)
+        expect(page.get_by_role("tab", name=name, exact=True)).to_be_focused()
+        expect(page.get_by_role("tab", selected=True)).to_have_text(name)
+        expect(page.get_by_role("tabpanel", name=name)).to_be_visible()
+    expect(page).to_have_url(re.compile(r"\?tab=preparation$"))
+    page.reload()
+    visitor.settled()
+    expect(page.get_by_role("tab", selected=True)).to_have_text("Preparation")
+    for name in ("Timing", "Excitation", "Friction"):
+        page.get_by_role("tab", name=name).click()
+        expect(page.get_by_role("tabpanel", name=name).get_by_role("region").first).to_be_visible()
+        assert audit(page) == []
+
+
+def test_all_plots_share_one_cursor(visitor: Visitor, dataset: str) -> None:
+    page = visitor.open(f"#/data/{dataset}")
+    drawn(page)
+    page.mouse.move(*across(page, 2, 0.25))
+    places = visitor.until(lambda: None not in (found := page.evaluate(CURSORS)) and found)
+    assert len(places) == 4
+    assert len(set(places)) == 1
+    assert 24 < float(places[0].rstrip("%")) < 26
+    low, high = page.evaluate(RANGES)[0]
+    row = int(np.abs(SAMPLES.t - (low + 0.25 * (high - low))).argmin())
+    table = page.get_by_role("table", name="Values at the cursor")
+    for joint, name in enumerate(SAMPLES.joint_names):
+        shown = table.get_by_role("row", name=name).get_by_role("cell").all_text_contents()
+        known = [getattr(SAMPLES, each)[row, joint] for each in ("q", "dq", "ddq", "tau")]
+        steps = [np.abs(np.diff(getattr(SAMPLES, each)[:, joint])).max() for each in ("q", "dq", "ddq", "tau")]
+        for text, value, step in zip(shown, known, steps, strict=True):
+            assert float(text) == pytest.approx(value, abs=step + 0.01 * abs(value))
+    slider = page.get_by_role("slider", name="Cursor")
+    slider.focus()
+    slider.press("End")
+    expect(slider).to_have_attribute("aria-valuetext", re.compile("At 9.95 s"))
+    expect(table.get_by_role("row", name=SAMPLES.joint_names[0]).get_by_role("cell").first).to_have_text(
+        re.compile(re.escape(f"{SAMPLES.q[-1, 0]:.2f}"))
+    )
+    assert audit(page) == []
+
+
+def test_all_plots_share_one_zoom(visitor: Visitor, dataset: str) -> None:
+    page = visitor.open(f"#/data/{dataset}")
+    drawn(page)
+    before = page.evaluate(RANGES)
+    drag(page, 0, 0.2, 0.6)
+    visitor.until(lambda: len({tuple(each) for each in page.evaluate(RANGES)}) == 1 and page.evaluate(RANGES) != before)
+    low, high = page.evaluate(RANGES)[3]
+    assert (low, high) == pytest.approx((0.2 * 9.95, 0.6 * 9.95), abs=0.3)
+    page.get_by_role("button", name="Reset zoom").click()
+    visitor.until(lambda: page.evaluate(RANGES) == before)
+
+
+def test_dragged_range_is_held_out_of_the_training(visitor: Visitor, dashboard: Dashboard, dataset: str) -> None:
+    page = visitor.open(f"#/data/{dataset}")
+    drawn(page)
+    page.get_by_label("Drag action").select_option("hold")
+    drag(page, 1, 0.5, 0.75)
+    held = page.get_by_role("group", name="Hold out")
+    expect(held.get_by_role("status")).to_contain_text(re.compile(r"(49|50|51) of 200 samples"))
+    assert page.locator(".strip .stretch:visible").count() == 4
+    assert page.evaluate(RANGES)[0][0] <= 0, "it was zoomed"
+    held.get_by_label("From").fill("5")
+    held.get_by_label("To").fill("7.45")
+    held.get_by_label("To").press("Tab")
+    expect(held.get_by_role("status")).to_contain_text("50 of 200 samples (25\u00a0%)")
+    expect(page).to_have_url(re.compile("hold_out=100-150"))
+    page.reload()
+    visitor.settled()
+    expect(held.get_by_label("From")).to_have_value("5")
+    assert audit(page) == []
+
+    held.get_by_role("link", name="Train with this range held out").click()
+    page.get_by_label("Model name").fill("held-by-hand")
+    expect(page.get_by_label("Which part")).to_have_value("stretches")
+    assert audit(page) == []
+    with page.expect_request("**/v1/jobs") as asked:
+        page.get_by_role("button", name="Start training").click()
+    expect(page.get_by_role("heading", level=1, name="Training held-by-hand")).to_be_visible()
+    job = page.url.rpartition("/")[2]
+    dashboard.client.post(f"/v1/jobs/{job}/cancel")
+    assert asked.value.post_data_json["holdout"] == {"kind": "stretches", "stretches": {dataset: [[100, 150]]}}
+
+
+def test_selected_range_is_offered_only_if_there_is_one(visitor: Visitor, dataset: str) -> None:
+    page = visitor.open(f"#/train?datasets={dataset}")
+    expect(page.get_by_label("Which part").locator("option[value=stretches]")).to_have_count(0)
+
+
+def test_joint_names_are_not_interpreted_as_markup(visitor: Visitor, dashboard: Dashboard) -> None:
+    names = ("<a href='https://elsewhere.example'>one</a>", "<b>two</b>")
+    given = replace(stream(samples=120, rate=20.0, seed=33), joint_names=names)
+    page = visitor.open(f"#/data/{upload(dashboard.client, given, name='markup')['id']}")
+    drawn(page)
+    named = page.evaluate("[...document.querySelectorAll('.strip')].flatMap(({data}) => data.map(({name}) => name))")
+    assert named
+    assert not [name for name in named if "<" in name]
+    expect(page.locator("a[href*='elsewhere']")).to_have_count(0)

@@ -1,0 +1,207 @@
+"""Page of a model: long recordings, empty states, aliases, lineage, predictions, candidates."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from lipcore.robots.dirt import Dirt
+from tests.service.data import QUICK, stream, train, upload
+from tests.system.browser.accessibility import audit, expect
+from tests.system.browser.conftest import Dashboard, Visit
+from tests.system.browser.visitor import DESKTOP, PHONE, Visitor
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Route
+
+pytestmark = pytest.mark.slow
+
+ROWS = 1200
+
+
+@pytest.fixture(scope="module")
+def model(dashboard: Dashboard) -> str:
+    """A model whose aliases no other test moves."""
+    train(dashboard.client, "looked-at", dashboard.dataset["id"], holdout={"share": 0.3})
+    return "looked-at"
+
+
+@pytest.fixture(scope="module")
+def long(dashboard: Dashboard) -> str:
+    """A recording with more rows than a plot shows."""
+    return upload(dashboard.client, stream(samples=ROWS, rate=100.0, seed=4), name="long.npz")["id"]
+
+
+def test_long_recording_is_thinned_until_rows_are_selected(visitor: Visitor, model: str, long: str) -> None:
+    page = visitor.open(f"#/models/{model}?dataset={long}")
+    expect(page.get_by_text("Showing 1\u202f000 of 1\u202f200 samples, evenly spaced")).to_be_visible()
+    page.get_by_label("Joint", exact=True).select_option("joint2")
+    page.get_by_label("Show", exact=True).select_option("residual, measured − predicted")
+    expect(page.get_by_role("img", name=re.compile("residual.* of joint2 along"))).to_be_visible()
+    expect(page.get_by_role("img", name=re.compile("of joint1 along"))).to_have_count(0)
+
+    page.get_by_text("Select rows").click()
+    page.get_by_label("From row").fill("100")
+    page.get_by_label("To row").fill("299")
+    page.get_by_role("button", name="Show these rows").click()
+    expect(page.get_by_text("Showing all 200 samples (rows 100 to 299).")).to_be_visible()
+    expect(page.get_by_role("img", name="200 of 200 rows")).to_be_visible()
+    page.get_by_label("From row").fill("5000")
+    visitor.expect_refusals(422)
+    page.get_by_role("button", name="Show these rows").click()
+    expect(page.get_by_role("alert")).to_contain_text("a row of the data set, 0 to 1199")
+    page.get_by_role("button", name="Show all rows").click()
+    expect(page.get_by_text("Showing 1\u202f000 of 1\u202f200 samples")).to_be_visible()
+    assert audit(page) == []
+
+
+def test_plots_of_all_joints_share_one_cursor(visitor: Visitor, model: str, long: str) -> None:
+    page = visitor.open(f"#/models/{model}?dataset={long}")
+    plots = page.get_by_role("region", name="Measured and predicted torque").locator(".js-plotly-plot")
+    cursors = plots.locator(".linked .cursor")
+    expect(cursors).to_have_count(2)
+    expect(cursors.first).to_be_hidden()
+    plots.last.hover()
+    expect(cursors.first).to_be_visible()
+    places = {each.evaluate("(cursor) => cursor.style.left") for each in cursors.all()}
+    assert len(places) == 1
+
+
+@pytest.mark.parametrize("tab", ["learning", "ask"])
+def test_selected_tab_is_in_view_on_a_phone(windows: Visit, dashboard: Dashboard, model: str, tab: str) -> None:
+    page = windows(dashboard.server.url, size=PHONE, touch=True).open(f"#/models/{model}?tab={tab}")
+    shown = page.locator(".tabs [aria-selected=true]")
+    expect(shown).to_have_attribute("data-name", tab)
+    expect(shown).to_be_in_viewport(ratio=0.95)
+
+
+def test_model_without_matching_recording_asks_for_an_upload(visitor: Visitor) -> None:
+
+    def others(route: Route) -> None:
+        body = route.fetch().json()
+        body["items"] = [each for each in body["items"] if each["joint_names"][0] != "panda_joint1"]
+        route.fulfill(json=body)
+
+    visitor.page.route("**/v1/datasets?*", others)  # other tests upload recordings of Pandas
+    page = visitor.open("#/models/panda-sim")
+    expect(page.get_by_text("has the joints of this model (panda_joint1")).to_be_visible()
+    expect(page.get_by_role("link", name="Upload a recording")).to_be_visible()
+    page.get_by_role("tab", name="Components and friction").click()
+    expect(page.get_by_role("table").filter(has_text="Coulomb")).to_contain_text("joint7")
+    assert audit(page) == []
+
+
+def test_alias_is_created_and_removed(visitor: Visitor, dashboard: Dashboard, model: str) -> None:
+    page = visitor.open(f"#/models/{model}?tab=versions")
+    page.get_by_text("Create or move an alias").click()
+    page.get_by_label("Alias", exact=True).fill("production")
+    page.get_by_role("button", name="Set alias").click()
+    expect(page.get_by_role("row").filter(has_text="production → 1")).to_be_visible()
+    assert dashboard.client.get(f"/v1/models/{model}").json()["aliases"] == {"production": 1}
+    expect(page.get_by_role("button", name="Delete")).to_have_count(0)
+    page.get_by_role("button", name="Remove: production").click()
+    page.get_by_role("dialog").get_by_role("button", name="Remove alias").click()
+    expect(page.get_by_text("Alias production removed.")).to_be_visible()
+    assert dashboard.client.get(f"/v1/models/{model}").json()["aliases"] == {}
+
+
+def test_lineage_links_to_data_set_and_job(visitor: Visitor, dashboard: Dashboard, model: str) -> None:
+    page = visitor.open(f"#/models/{model}?tab=lineage")
+    trained = page.get_by_role("region", name="Trained on")
+    expect(trained.get_by_role("link", name="pendulum.npz")).to_have_attribute(
+        "href", f"#/data/{dashboard.dataset['id']}"
+    )
+    expect(page.get_by_role("columnheader", name="Training data: nMSE")).to_be_visible()
+    expect(page.get_by_role("link", name="a training job")).to_have_attribute("href", re.compile("^#/jobs/job_"))
+    assert audit(page) == []
+
+
+def test_prediction_outside_the_training_range_shows_a_warning(visitor: Visitor, model: str) -> None:
+    page = visitor.open(f"#/models/{model}?tab=ask")
+    page.get_by_role("button", name="Predict", exact=True).click()
+    expect(page.get_by_text("✓ within")).to_have_count(2)
+    page.get_by_label("dq of joint2", exact=True).fill("40")
+    page.get_by_role("button", name="Predict", exact=True).click()
+    expect(page.get_by_text("dq outside")).to_be_visible()
+    expect(page.get_by_text("Do not send this torque to a robot without a check")).to_be_visible()
+    assert audit(page) == []
+
+
+def test_candidate_shows_its_reason_and_can_be_served(visitor: Visitor, dashboard: Dashboard) -> None:
+    good = stream(samples=120, rate=10.0, seed=11)
+    noise = np.random.default_rng(0).standard_normal(good.tau.shape) * (np.arange(120) >= 84)[:, None]
+    first, second = (upload(dashboard.client, each)["id"] for each in (good, replace(good, tau=good.tau + 5 * noise)))
+    train(dashboard.client, "waits", first)
+    job = train(dashboard.client, "waits", second, holdout={"share": 0.3}, promotion="ask")
+    page = visitor.open(f"#/jobs/{job['id']}")
+    expect(page.get_by_text("is a candidate: it failed the held-out check")).to_be_visible()
+    assert audit(page) == []
+
+    page = visitor.open(f"#/models/waits?version=2&dataset={second}&part=held_out")
+    expect(page.get_by_text("overage of the 95 % intervals is below 90 %")).to_be_visible()
+    expect(page.get_by_text("intervals too narrow").first).to_be_visible()
+    page.get_by_role("button", name="Serve version 2").click()
+    page.get_by_role("dialog").get_by_role("button", name="Serve version 2").click()
+    expect(page.get_by_text("Version 2 of waits is now serving.")).to_be_visible()
+    assert audit(page) == []
+
+
+def test_selection_by_auto_is_shown_with_job_and_version(visitor: Visitor, dashboard: Dashboard) -> None:
+    dataset = upload(dashboard.client, stream(samples=120, seed=9, dirt=Dirt()), name="chosen.npz")
+    options = {**QUICK, "posterior_samples": 100, "search_seconds": 1.0, "starts": 1}
+    job = train(dashboard.client, "chosen", dataset["id"], estimator="auto", options=options)
+    chosen = dashboard.client.get("/v1/models/chosen/versions/1").json()["estimator"]
+    for page in (visitor.open(f"#/jobs/{job['id']}"), visitor.open("#/models/chosen?tab=lineage")):
+        card = page.get_by_role("region", name="Selection of the estimator")
+        expect(card.get_by_text("Evaluated on 2 held-out segments")).to_be_visible()
+        expect(card.get_by_role("columnheader", name="nMSE at the edge")).to_be_visible()
+        expect(card.locator("tbody tr")).to_have_count(3)
+        expect(card.locator("strong").first).to_have_text(chosen)
+        visitor.settled()
+        assert audit(page) == []
+
+
+def test_model_page_opens_with_the_held_out_part(visitor: Visitor, dashboard: Dashboard, model: str, long: str) -> None:
+    assert dashboard.client.get("/v1/datasets").json()["items"][0]["id"] != dashboard.dataset["id"], (
+        "a newer one is there"
+    )
+    page = visitor.open(f"#/models/{model}")
+    expect(page.get_by_label("Recording", exact=True)).to_have_value(dashboard.dataset["id"])
+    expect(page.get_by_label("Part", exact=True)).to_have_value("held_out")
+    expect(page.get_by_text("Optimistic figures")).to_have_count(0)
+
+
+def test_coverage_and_verdict_fit_on_a_phone(windows: Visit, dashboard: Dashboard, model: str) -> None:
+    visitor = windows(dashboard.server.url, size=PHONE, touch=True)
+    page = visitor.open(f"#/models/{model}")
+    joints = page.get_by_role("region", name="Accuracy by joint").get_by_role("listitem")
+    expect(joints).to_have_count(2)
+    for joint in joints.all():
+        for part in (joint.get_by_role("img", name="95 % coverage"), joint.locator(".badge")):
+            box = part.bounding_box()
+            assert box is not None
+            assert box["x"] >= 0
+            assert box["x"] + box["width"] <= PHONE[0]
+
+
+@pytest.mark.parametrize("size", [DESKTOP, PHONE])
+def test_click_in_progress_survives_a_change_of_the_header(
+    windows: Visit, dashboard: Dashboard, size: tuple[int, int]
+) -> None:
+    name = f"changing-{size[0]}"
+    for _ in range(2):
+        train(dashboard.client, name, dashboard.dataset["id"])
+    visitor = windows(dashboard.server.url, size=size)
+    page = visitor.open(f"#/models/{name}?version=2&tab=lineage")
+    place = page.get_by_role("link", name="Follow live").bounding_box()
+    assert place is not None
+    page.mouse.move(place["x"] + place["width"] / 2, place["y"] + place["height"] / 2)
+    page.mouse.down()
+    page.get_by_label("Version", exact=True).select_option("1")
+    expect(page.get_by_role("button", name="Serve version 1")).to_be_visible()
+    page.mouse.up()
+    expect(page.get_by_role("heading", level=1, name=f"{name} live")).to_be_visible()

@@ -1,0 +1,8 @@
+"""Fixtures of tests/service that these tests use."""
+
+from tests.service.conftest import (  # noqa: F401 - fixtures
+    _own_files,
+    _warm_processes,
+    home,
+    services_share,
+)
