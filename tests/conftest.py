@@ -20,12 +20,16 @@ SYSTEM = ("tests/system/", "tests/clients/cpp/", "tests/clients/ros2/")
 
 `make test` runs their tests with the marker `journey`, `make test-all` runs all.
 """
+STREAMING = "tests/service/api/stream/"
+"""Group of tests with the fixture `streaming`, a service that takes seconds to start."""
+IN_GROUP = {f"tests/service/inference/test_{name}.py": STREAMING for name in ("external", "fallback")}
+"""Groups of files elsewhere."""
 GROUP_PREFIXES = (
     "tests/system/browser/",
     "tests/system/cluster/",
     "tests/docs/",
     "tests/clients/",
-    "tests/service/api/stream/",
+    STREAMING,
     "tests/service/cli/",
 )
 """Path prefixes of tests that share a slow start, so that each group runs in one process. The slowest come first, as
@@ -58,8 +62,9 @@ def _is_slow(module: Path) -> bool:
 
 
 def group_of(test: str) -> str:
-    """Return the group of a test: its path prefix in GROUP_PREFIXES, else its file."""
-    return next((start for start in GROUP_PREFIXES if test.startswith(start)), test.partition("::")[0])
+    """Return the group of a test: that of IN_GROUP, its path prefix in GROUP_PREFIXES, or its file."""
+    file = test.partition("::")[0]
+    return IN_GROUP.get(file) or next((start for start in GROUP_PREFIXES if test.startswith(start)), file)
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -160,6 +160,7 @@ def test_every_leak_misses_one_target(wrong):
     assert sum(each.met is False for each in hours.targets(_day(**wrong))) == 1
 
 
+@pytest.mark.slow
 def test_a_soak_is_drawn_and_written(tmp_path):
     found = _day(errors={"move: TimeoutError": 1})
     found.write(tmp_path / "soak.json", [])

@@ -58,9 +58,9 @@ def known() -> set[str]:
     """Return every word of the code, with strings, without docstrings and comments; and of files that the code
     reads."""
     words = {path.stem for path in sources(*CODE, "docs", "tests")} | {path.name for path in ROOT.iterdir()}
-    for path in sources(*CODE, "docs", "tests"):
+    for path in sources(*CODE, "docs"):
         words.update(words_of(ast.parse(path.read_text("utf-8"))))
-    for path in sources(*CODE, "deploy", "docs", ends=FILES):
+    for path in [*sources(*CODE, "deploy", "docs", ends=FILES), *sources("tests")]:
         words |= set(WORD.findall(path.read_text("utf-8")))
     for name in ("pyproject.toml", "Makefile", "Dockerfile", "compose.yaml"):
         words |= set(WORD.findall((ROOT / name).read_text("utf-8")))

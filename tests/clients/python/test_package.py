@@ -72,6 +72,7 @@ def test_clients_use_address_and_key_of_the_environment(monkeypatch):
     assert "authorization" not in Client()._http.headers
 
 
+@pytest.mark.slow
 def test_streams_use_the_address_of_the_environment(server, monkeypatch, tmp_path):
     zeros = [0.0] * 7
     monkeypatch.setenv("LIPSERVE_URL", server.url)
@@ -83,6 +84,7 @@ def test_streams_use_the_address_of_the_environment(server, monkeypatch, tmp_pat
         StreamClient("panda-sim")
 
 
+@pytest.mark.slow
 def test_record_as_dict_equals_its_json(server):
     with Client(server.url) as client:
         for record, path in (

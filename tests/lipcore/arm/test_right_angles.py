@@ -117,6 +117,7 @@ def test_undetermined_axes_are_learnt_at_right_angles(monkeypatch: pytest.Monkey
     assert np.log(with_prior).mean() < np.log(without).mean() - np.log(1.5)
 
 
+@pytest.mark.slow
 def test_arm_without_right_angles_is_learnt() -> None:
     geometry, _, robot = arm("RRRR", 7)
     samples = record_motion(robot, 4, 150)

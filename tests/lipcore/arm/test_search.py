@@ -124,6 +124,7 @@ def test_known_geometry_is_tried_first() -> None:
     assert found.points[0].value <= true_value(problem, given) + 1.0
 
 
+@pytest.mark.slow
 def test_search_without_time_returns_an_arm() -> None:
     given = case("RRR")
     model = train(given.samples, given.robot.joint_types, "rigid-body", replace(OPTIONS, search_seconds=1e-6))

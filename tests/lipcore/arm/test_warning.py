@@ -202,6 +202,7 @@ def test_stribeck_friction_is_learnt_if_present(stribeck_model: TorqueModel, mon
     assert nmse_per_joint(stribeck_model, unseen).mean() < 0.8 * nmse_per_joint(without, unseen).mean()
 
 
+@pytest.mark.slow
 def test_stribeck_friction_is_not_learnt_if_absent() -> None:
     smooth = train_slow_arm(0.0)
     assert smooth.fit["friction_terms"] == 3

@@ -57,6 +57,7 @@ def test_nonperiodic_motion_is_not_repeated(course: str) -> None:
     assert found.period is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("course", "passes"), [("sinusoids", 1), ("periodic", 4)])
 def test_repeated_motion_counts_once(course: str, passes: int) -> None:
     """Test forty seconds (four periods) also with noise, after a rest, and as separate episodes."""

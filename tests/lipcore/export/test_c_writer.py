@@ -311,6 +311,7 @@ def test_interval_and_training_range(tmp_path: Path) -> None:
             assert library.lipserve_in_range(*[c_array(row) for row in far]) == 0
 
 
+@pytest.mark.slow
 def test_names_cannot_end_comments_or_strings(tmp_path: Path) -> None:
     names = ("*/ int x; /*", '", 0}; int y; //', "gelenk ü\\\n?/")
     model = replace(train_arm("RRR", 50), joint_names=names)

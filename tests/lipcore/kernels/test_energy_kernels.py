@@ -37,6 +37,7 @@ def test_blocks_equal_automatic_differentiation_for_random_robots(problem: Probl
     assert worst_block_error(problem) < RELATIVE_TOLERANCE
 
 
+@pytest.mark.slow
 @given(problems(max_joints=3))
 def test_energies_equal_automatic_differentiation_for_random_robots(problem: Problem) -> None:
     assert worst_energy_error(problem) < RELATIVE_TOLERANCE

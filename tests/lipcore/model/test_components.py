@@ -157,6 +157,7 @@ def test_inertia_is_consistent_with_energy_and_torque(case: Case) -> None:
     assert np.abs(case.found["inertial"].mean - inertial).max() < 1e-7 * np.abs(inertial).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", [0, 17])
 def test_forward_dynamics_uncertainty_matches_its_linearisation(case: Case, row: int) -> None:
     """Use the joint posterior of the torques in bias and inertia, and the derivative of the solution."""

@@ -84,6 +84,7 @@ def test_push_on_one_joint_is_a_contact(carrier):
     assert "contact" in {tracker.state for _, tracker in trackers}
 
 
+@pytest.mark.slow
 def test_small_payload_must_last_unlike_a_push(carrier):
     held = {round(at, 2): tracker.held for at, tracker in track_payload(carrier, simulate_stream(305, 0.1))}
     taken = min(at for at, each in held.items() if each is not None)
@@ -228,6 +229,7 @@ def test_payload_carries_over_to_another_version(carrier):
     assert (nothing.held, nothing.since) == (None, 3.0)
 
 
+@pytest.mark.slow
 def test_state_changes_at_most_once_a_second(carrier):
     """Knocks of 0.15 s hit another joint every 0.4 s, and no payload explains them."""
     rows = simulate_stream(6, first=2.0, last=12.0)

@@ -84,6 +84,7 @@ def test_rigid_arm_gets_the_rigid_body(auto_training):
     assert 0 < edge_rows < 0.5 * rows
 
 
+@pytest.mark.slow
 def test_explained_arm_trains_no_other_estimator():
     model = train(simulate_arm(), TYPES, options=OPTIONS)
     assert model.estimator.name == model.selection["chosen"] == "rigid-body"
@@ -213,6 +214,7 @@ def test_failed_estimator_is_reported_and_others_continue(monkeypatch):
         train(simulate_arm(), TYPES, options=OPTIONS)
 
 
+@pytest.mark.slow
 def test_few_rows_are_not_held_out():
     model = train(simulate_arm(held_out.OPTIONS.min_rows - 10), TYPES, options=OPTIONS)
     found = model.selection

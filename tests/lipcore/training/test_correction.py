@@ -74,6 +74,7 @@ def test_kernel_matches_its_docstring():
     np.testing.assert_allclose(kernel.gram(params, x, y), expected.reshape(4 * n, 3 * n), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_repeated_error_is_corrected_only_where_seen(local_and_arm):
     local, arm = local_and_arm
     assert corrected_joints(local.fit) == [RIPPLED_JOINT]
@@ -101,6 +102,7 @@ def test_correction_leaves_the_arm_unchanged(local_and_arm):
     np.testing.assert_allclose(local.weights[len(local.basis.outputs) :], arm.weights, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_pass_over_all_rows_changes_only_the_arm(local_and_arm):
     samples, again = simulate_ripple(), simulate_ripple(8.0, start=100.0, seed=1)
     local = train_corrected(samples, statistics="all")
@@ -111,6 +113,7 @@ def test_pass_over_all_rows_changes_only_the_arm(local_and_arm):
     assert rmse_per_joint(local, again)[RIPPLED_JOINT] < 0.3 * rmse_per_joint(local_and_arm[1], again)[RIPPLED_JOINT]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("given", [{"ripple": 0.0}, {"seconds": 2.0}])
 def test_no_correction_without_residual_or_time(given):
     samples = simulate_ripple(**given)
@@ -119,6 +122,7 @@ def test_no_correction_without_residual_or_time(given):
     np.testing.assert_allclose(*(each.predict(samples.q, samples.dq, samples.ddq).tau for each in (local, arm)))
 
 
+@pytest.mark.slow
 def test_lasting_unrepeated_error_is_not_learnt():
     samples = simulate_ripple(ripple=0.0)
     drift = 0.02 * np.sin(2 * np.pi * samples.t / 37.0)
@@ -142,6 +146,7 @@ def test_refit_keeps_corrected_joints_and_widened_intervals():
     assert whole.scale[2] > 2 > refit(part, task).scale[2]
 
 
+@pytest.mark.slow
 def test_refit_of_auto_adds_a_correction():
     samples = simulate_ripple()
     task = Task(samples, TYPES, OPTIONS, robot=RigidBody.from_profile(ARM, samples.joint_names, TYPES))

@@ -113,6 +113,7 @@ def test_wrong_queries_are_rejected_alike(api, trained, body):
     assert reply["detail"][0]["field"]
 
 
+@pytest.mark.slow
 def test_corrupted_bodies_are_answered_alike(api, trained):
     """Replace, delete or double one byte of a correct query, 200 times."""
     rng = random.Random(3)

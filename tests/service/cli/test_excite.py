@@ -61,6 +61,7 @@ def test_a_motion_for_a_saved_model_is_written_drawn_and_told(folder, tmp_path):
     assert "obstacles" in reply
 
 
+@pytest.mark.slow
 def test_without_a_model_a_prior_is_planned_for_within_shares_of_the_limits(tmp_path):
     out = tmp_path / "motion.csv"
     reply = excite("--robot", "asr-twodof", *SHORT, "--range", "0.5", "--scale", "0.4", "--noise", "0.1", "--out", out)

@@ -125,6 +125,7 @@ def test_alarms_are_listed(asked, pupil):
     assert asked("alarms", pupil, "--json") == []
 
 
+@pytest.mark.slow
 def test_every_list_shows_quality(asked, server, recording):
     path = recording(21, samples=120, rate=10.0)
     asked("train", path, "--model", "cli-listed", *QUICKLY, "--promotion", "always")

@@ -129,6 +129,7 @@ def test_job_stores_ids_of_data_sets_given_by_name(server):
     assert ended(server.client, job["id"])["state"] == "succeeded"
 
 
+@pytest.mark.slow
 def test_error_for_other_joint_names_has_a_hint(asked, refused, tmp_path):
     path, samples = tmp_path / "numbered.csv", stream("panda", 40, seed=15)
     path.write_bytes(csv(columns(samples)))
@@ -199,6 +200,7 @@ def test_ctrl_c_in_follow_does_not_cancel_the_job(lipserve, asked, server, long,
     assert asked("jobs", "cancel", job, "--json")["id"] == job
 
 
+@pytest.mark.slow
 def test_job_is_queued_followed_and_listed(refused, asked, recording):
     queued = asked(
         "train", recording(82), "--model", "cli-queued", "--no-wait", *QUICKLY, "--estimator", "se", "--json"
@@ -211,6 +213,7 @@ def test_job_is_queued_followed_and_listed(refused, asked, recording):
     assert "conflict" in refused("jobs", "retry", job)
 
 
+@pytest.mark.slow
 def test_hold_out_defaults_to_the_service_and_zero_disables_it(asked, server, recording):
     path = recording(12, samples=120, rate=10.0)
     job = asked("train", path, "--model", "by-default", *QUICKLY, "--json")

@@ -4,6 +4,7 @@ import io
 import zipfile
 
 import numpy as np
+import pytest
 
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, InvalidRequestError
@@ -55,6 +56,7 @@ def test_time_column_of_every_file_is_kept_once_and_must_agree(tmp_path):
     assert said == ("b.csv: t, row 8", "0.57", "0.07, as in a.csv")
 
 
+@pytest.mark.slow
 def test_blocks_of_any_length_are_joined_row_by_row(tmp_path):
     rows = 30_000
     long, wide = np.arange(rows) * 0.5, RNG.integers(0, 1000, size=(rows, 12)).astype(float)

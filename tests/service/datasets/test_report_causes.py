@@ -235,6 +235,7 @@ def test_names_and_torque_suggest_the_robot(
     assert report.warnings == []
 
 
+@pytest.mark.slow
 def test_friction_is_judged_beside_the_robot_that_names_suggest(tmp_path: Path) -> None:
     """Without the robot's bodies, no such recording tells a constant torque from gravity."""
     names, columns = tuple(f"fer_joint{joint}" for joint in range(1, 8)), recording("panda", *COURSES[0], False)

@@ -125,6 +125,7 @@ def test_impossible_payload_error_names_the_expected_value(api, motion):
     assert refused(com=[0, 1]) == ("payload.com", "a list of three")
 
 
+@pytest.mark.slow
 def test_clients_send_a_payload(server, panda, motion):
     expected = model_with_payload(panda, PAYLOAD).predict(*motion)
 

@@ -81,6 +81,7 @@ def test_rows_too_late_to_be_learnt_are_rejected(learning_service):
     assert late["effective_samples"] == pytest.approx(np.exp(-1.0), rel=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("off", [YEAR_S, -YEAR_S])
 def test_corrected_host_clock_does_not_affect_learning(learning_service, host_clock, off):
     host_clock.offset_s = off

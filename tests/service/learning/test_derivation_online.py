@@ -38,6 +38,7 @@ def derive_whole_recording(rows=None):
     return {**inner, "ddq": found.ddq.tolist()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "cuts",
     [

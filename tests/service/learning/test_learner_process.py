@@ -145,6 +145,7 @@ def test_failed_learner_start_is_retried(own_service, monkeypatch, caplog):
     assert "the learner process could not be started" in caplog.text
 
 
+@pytest.mark.slow
 def test_idle_learner_reports_progress(answering_service):
     answering_service.log_batches(0)
     answering_service.wait_for_model(1)
@@ -153,6 +154,7 @@ def test_idle_learner_reports_progress(answering_service):
     eventually(lambda: process.silent_s == 0.0)
 
 
+@pytest.mark.slow
 def test_state_is_stored_at_shutdown(own_service):
     assert own_service.learner.pid is None  # the learner is started by the first batch
     own_service.log_batches(0, 1, 2)

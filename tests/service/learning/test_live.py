@@ -77,6 +77,7 @@ def test_readers_share_events_and_leave_no_state(learning_service):
     assert not feed._followed
 
 
+@pytest.mark.slow
 def test_live_events_end_when_the_model_is_deleted(learning_service):
     learning_service.create_model("short-lived")
     with follow_model(learning_service.client, "short-lived") as listener:

@@ -26,6 +26,7 @@ def find_overview(client, name):
     return next(each for each in seen if each["name"] == name)
 
 
+@pytest.mark.slow
 def test_recent_window_matches_predictions(learning_service):
     learning_model = learning_service.create_model("glanced-at")
     before = find_overview(learning_service.client, "glanced-at")

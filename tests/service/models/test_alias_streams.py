@@ -7,6 +7,8 @@ from lipserve import ApiError, Client, StreamClient, StreamError
 from tests.service.data import train
 from tests.service.streams import MOTION, TAU, frame, open_stream, read_hello, send_frame
 
+pytestmark = pytest.mark.slow
+
 STREAM = "/v1/models/pendulum/stream"
 
 

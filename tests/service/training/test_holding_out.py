@@ -232,6 +232,7 @@ def test_samples_that_were_not_held_out_are_rejected(api, held_out_model, traine
     )
 
 
+@pytest.mark.slow
 def test_whole_data_sets_are_held_out_like_episodes(api):
     lengths = (40, 60, 80, 50)
     recorded_ = [stream(samples=length, rate=10.0, seed=20 + length) for length in lengths]

@@ -57,6 +57,7 @@ def test_sequential_requests_are_answered(small_server, none_open):
         assert [client.read_answer() for _ in range(3)] == [(200, b"hello")] * 3
 
 
+@pytest.mark.slow
 def test_clients_without_a_request_are_disconnected(impatient_server):
     """All wait at the same time, as each takes a second."""
     with (
@@ -85,6 +86,7 @@ def test_streams_may_last_longer_than_requests(impatient_server):
             assert stream.recv(DEADLINE) == b"still there?"
 
 
+@pytest.mark.slow
 def test_slow_headers_end_like_missing_ones(impatient_server):
     before, answer = impatient_server.app.begun, b""
     with RawConnection(impatient_server.port) as client, suppress(ConnectionError):
@@ -203,6 +205,7 @@ def test_extra_connections_get_an_error_until_one_ends(small_server, none_open):
         assert another.read_answer() == (200, b"hello")
 
 
+@pytest.mark.slow
 def test_connections_far_above_the_limit_are_closed_silently(small_server, none_open):
     clients = []
     try:

@@ -122,6 +122,7 @@ def computing_bag(path):
     return path.read_bytes()
 
 
+@pytest.mark.slow
 def test_computing_bag_does_not_block_others(narrow, tmp_path):
     body = computing_bag(tmp_path / "bag.db3")
     with ThreadPoolExecutor() as pool:

@@ -65,6 +65,7 @@ def test_begun_answers_are_completed_before_closing():
         assert client.read_to_end() == b""
 
 
+@pytest.mark.slow
 def test_answers_that_take_too_long_are_dropped():
     with Serving(drain_s=1) as serving, begin_request(serving) as client:
         serving.server.should_exit = True

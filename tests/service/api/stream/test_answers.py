@@ -134,6 +134,7 @@ def test_echo_returns_each_message(streaming):
             assert connection.recv(DEADLINE) == (message.encode() if isinstance(message, str) else message)
 
 
+@pytest.mark.slow
 def test_streams_follow_the_serving_version_unless_pinned(streaming):
     server, api = streaming.server, streaming.server.client
     train(api, "swapped", streaming.dataset)

@@ -15,6 +15,8 @@ from service.storage.files import Files, FilesUnreachableError, objects
 from service.storage.storage import HomeError, check_home
 from tests.service.data import stream
 
+pytestmark = pytest.mark.slow  # needs S3
+
 
 def put(files, dataset="ds_one"):
     samples = stream(samples=10)
@@ -53,7 +55,6 @@ def single_attempt(monkeypatch):
     monkeypatch.setattr(bucket, "BUCKET", bucket.BucketOptions(attempts=1))
 
 
-@pytest.mark.slow
 def test_unreachable_endpoint_is_detected_and_its_return_too(s3, bucket, tmp_path, single_attempt):
     files = Files(tmp_path, bucket)
     digest = put(files)
