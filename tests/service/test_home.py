@@ -140,6 +140,7 @@ def test_upgrade_keeps_a_model_that_the_user_has_trained(home):
         assert api.get("/v1/models/panda-sim").json()["latest_version"] == 1
 
 
+@pytest.mark.slow
 def test_second_service_on_a_home_is_rejected(second_start):
     _, _, home = second_start
     with (
@@ -176,6 +177,7 @@ def test_new_home_belongs_to_its_owner_alone(tmp_path):
     assert {stat.S_IMODE(file.stat().st_mode) for file in home.glob("lipserve.sqlite3*")} == {0o600}
 
 
+@pytest.mark.slow
 def test_second_server_explains_why_it_exits(server, tmp_path):
     log = tmp_path / "second.log"
     second = Served(["serve", "--port", "0"], {**os.environ, "LIPSERVE_HOME": str(server.home)}, log)

@@ -13,6 +13,8 @@ from tests.service.data import DEADLINE, QUICK, stream, upload
 from tests.service.server import free_port
 from tests.service.streams import MOTION, TAU
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def client(server):
@@ -20,7 +22,6 @@ def client(server):
         yield opened
 
 
-@pytest.mark.slow
 def test_wait_cancel_and_retry_jobs(client, server):
     dataset = upload(server.client, stream())["id"]
     looks = []
@@ -79,7 +80,6 @@ def ask(server, work):
     return asyncio.run(main())
 
 
-@pytest.mark.slow
 def test_async_client_from_files_to_torques(streaming, tmp_path):
     write_recording(tmp_path / "train.npz", stream())
 
@@ -102,7 +102,6 @@ def test_async_client_from_files_to_torques(streaming, tmp_path):
     assert not (tmp_path / "awaited.tar.part").exists()
 
 
-@pytest.mark.slow
 def test_async_client_raises_api_and_connection_errors(streaming, tmp_path):
     async def work(client):
         with pytest.raises(ApiError) as caught:

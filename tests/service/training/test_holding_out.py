@@ -175,6 +175,7 @@ def resting_joint_recording():
     return replace(samples, q=motion[0], dq=motion[1], ddq=motion[2], tau=tau)
 
 
+@pytest.mark.slow
 def test_version_learns_motion_that_only_held_out_rows_have(api):
     dataset, other = (
         upload(api, each)["id"] for each in (resting_joint_recording(), stream(samples=60, rate=10.0, seed=12))
@@ -330,6 +331,7 @@ def test_split_without_training_rows_fails_the_job(api, dataset):
     assert "guard_s is 30.0, expected less" in seen["error"]["message"]
 
 
+@pytest.mark.slow
 def test_refresh_holds_out_the_same_samples(api):
     dataset = upload(api, recording(seed=6))["id"]
     train(api, "refreshed-held", dataset, holdout={"kind": "blocks", "share": 0.3, "blocks": 5})

@@ -32,7 +32,7 @@ from tests.system.histories.rules import ABSENT, alias, find_faulty_answers, is_
 
 MODEL = "arm"
 CLIENTS = 4
-SECONDS = float(os.environ.get("LIPSERVE_HISTORY_S", "3"))
+SECONDS = float(os.environ.get("LIPSERVE_HISTORY_S", "2"))
 """Length of the history: seconds in `make test`, five minutes in `make nightly`, half an hour in `make test-all`."""
 LONG = SECONDS > 60
 SEED = int(os.environ.get("LIPSERVE_HISTORY_SEED", str(time.time_ns() % 10**6) if LONG else "50"))
