@@ -21,6 +21,8 @@ from lipcore.robots.simulation import Simulation
 from lipserve.frames import ANSWER, ERROR, REQUEST
 from tests.service.data import QUICK
 
+pytestmark = pytest.mark.slow
+
 MS = 1_000_000
 
 
@@ -108,7 +110,6 @@ def test_wrong_answer_stops_the_benchmark():
         bad.check(workload)
 
 
-@pytest.mark.slow
 def test_run_measures_all_subjects_in_both_states():
     """A double pendulum, too short for meaningful figures."""
     source = Source(

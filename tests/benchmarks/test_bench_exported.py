@@ -10,8 +10,9 @@ from benchmarks.exported.running import SHIPPED, Options, grids, run, targets
 from benchmarks.workload import BenchError
 from tests.lipcore.export.test_c_writer import needs_compiler
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.slow
+
 @needs_compiler
 def test_a_short_run(tmp_path):
     results = run(Options(SHIPPED, calls=500, queries=300), Console(quiet=True))

@@ -24,6 +24,8 @@ from benchmarks.soak.resources import Look
 from benchmarks.soak.running import Options, Results
 from benchmarks.timing import Timing
 
+pytestmark = pytest.mark.slow
+
 
 def ack(sequence, accepted=25):
     return Ack(sequence, 0, 1, 25, accepted, sequence + 1, False, {})
@@ -104,7 +106,6 @@ def test_every_fault_misses_one_target(wrong):
     assert sum(each.met is False for each in table.targets(_results(**wrong))) == 1
 
 
-@pytest.mark.slow
 def test_a_run_measures_everything():
     fit = {"hyperparameter_samples": 40, "posterior_samples": 100, "max_iterations": 30, "starts": 1}
     found = running.run(Options(8, 12.0, robot="double-pendulum", fit=fit), Console(quiet=True))
@@ -160,7 +161,6 @@ def test_every_leak_misses_one_target(wrong):
     assert sum(each.met is False for each in hours.targets(_day(**wrong))) == 1
 
 
-@pytest.mark.slow
 def test_a_soak_is_drawn_and_written(tmp_path):
     found = _day(errors={"move: TimeoutError": 1})
     found.write(tmp_path / "soak.json", [])
@@ -213,7 +213,6 @@ def test_clock_waits_for_its_followers():
     assert all(at <= now <= at + MAX_LAG_S + 1 for at, now in seen)
 
 
-@pytest.mark.slow
 def test_short_day_has_no_errors():
     found = hours.run(hours.Options(0.1, rate=20), Console(quiet=True))
     assert found.errors == {}
@@ -233,7 +232,6 @@ def test_ratio_is_the_median_of_pairs():
     assert passes._part(1000, seconds, 42.0, 2).targets[-1].met is False
 
 
-@pytest.mark.slow
 def test_all_that_scale_starts_is_measured():
     results = scaling.run(scaling.Options(**scaling.QUICK), Console(quiet=True))
     assert [part.name for part in results.parts] == list(scaling.PARTS)

@@ -15,6 +15,8 @@ from lipcore import TorqueModel
 from lipcore.robots.simulation import Payload, inverse_dynamics
 from tests.service.data import QUICK
 
+pytestmark = pytest.mark.slow
+
 LOAD = Payload(1.5)
 PENDULUM = Scene(robot="double-pendulum", seconds=2.0, change_at=1.0, payload=0.2, viscous=0.05, coulomb=0.02)
 
@@ -115,7 +117,6 @@ def tiny(websocket: bool) -> Options:
     )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("websocket", [False, True])
 def test_a_run_measures_everything(websocket: bool):
     results = run(tiny(websocket), Console(quiet=True))

@@ -258,6 +258,7 @@ def test_code_has_no_mutable_state(make: Callable[[], TorqueModel], tmp_path: Pa
 MAIN = '#include "lipserve_model.h"\nint main(void) { return lipserve_selftest(); }\n'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiler", ["gcc", slow("clang")])
 @pytest.mark.parametrize("name", ["panda", slow("alternatives"), slow("energies of a prismatic joint")])
 def test_compilers_and_sanitizers_report_nothing(name: str, compiler: str, tmp_path: Path) -> None:

@@ -326,6 +326,7 @@ def test_energies_match_the_dense_posterior(small_model: SmallModel, row: int) -
     assert_estimate(found["potential_energy"], row, *expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", few(range(QUERIES), lambda row: row == 0))
 def test_torques_and_inertia_match_the_dense_posterior(small_model: SmallModel, row: int) -> None:
     q, v, a = instant(small_model.query, row)

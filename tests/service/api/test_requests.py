@@ -178,7 +178,8 @@ def log_answer(log, status=200, seconds=0.001, route=HOT, code="", **scope):
     log.log_end({"type": "http", "method": "POST", "path": "/v1/x", **scope}, kind, seconds)
 
 
-def test_request_has_a_line(api, lines):
+def test_request_has_a_line(api, lines, monkeypatch):
+    monkeypatch.setattr(RequestLog, "_count_skipped", lambda *_: 0)  # other tests have caused equal refusals
     answer = api.get("/v1/jobs/nobody?x=secret", headers={"authorization": "Bearer secret"})
     assert answer.status_code in (404, 422)
     (line,) = lines()
@@ -198,7 +199,8 @@ def test_request_has_a_line(api, lines):
 HEALTH = ["/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready", "/metrics"]
 
 
-def test_successful_control_and_monitoring_requests_have_no_line(api, lines):
+def test_successful_control_and_monitoring_requests_have_no_line(api, lines, monkeypatch):
+    monkeypatch.setattr(RequestLog, "_count_skipped", lambda *_: 0)  # as above
     for path in ("/v1/models/panda-sim/predict", "/v1/echo"):
         assert api.post(path, json=QUERY).status_code == 200
     assert [api.get(path).status_code for path in HEALTH] == [200] * len(HEALTH)

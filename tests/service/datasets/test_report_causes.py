@@ -78,6 +78,7 @@ def upload(folder: Path, columns: dict[str, np.ndarray], /, **query: str) -> Dat
     return DatasetReport.model_validate(made)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", few(RECORDINGS, lambda case: case == QUICK))
 def test_nothing_is_wrong_with_a_good_recording(case: tuple[str, str, float, bool], tmp_path: Path) -> None:
     columns, arm = recording(*case), profiles.profile(case[0])
