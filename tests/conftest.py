@@ -1,5 +1,6 @@
 """Settings of the test suite: the tests of `make test`, and which tests share a process in parallel runs."""
 
+import gc
 import re
 from pathlib import Path
 from typing import Any
@@ -88,3 +89,8 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             return group_of(nodeid)
 
     return GroupScheduling(config, log) if config.getvalue("dist") == "loadfile" else None
+
+
+def pytest_collection_finish() -> None:
+    """Keep what was collected from the garbage collector, which would look through it again and again."""
+    gc.freeze()
