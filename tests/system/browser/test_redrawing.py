@@ -176,7 +176,7 @@ def test_live_page_shows_payloads_and_contacts(visitor: Visitor, dashboard: Dash
     last = payload_batches("cell-1")[-1]  # again, now that the payload is estimated
     later = last | {"sequence": last["sequence"] + 1, "t": [each + 0.25 for each in last["t"]]}
     dashboard.client.post("/v1/models/carrier/observations", json=later).raise_for_status()
-    send_payload_batches(dashboard.client, "carrier", "cell-2", mass=0.0, push=30.0)
+    send_payload_batches(dashboard.client, "carrier", "cell-2", mass=0.0, external_torque=30.0)
     page = visitor.open("#/live/carrier")
     carried = page.get_by_role("region", name="Payload", exact=True)
     lifted, touched = (carried.get_by_role("row").filter(has_text=name) for name in ("cell-1", "cell-2"))
