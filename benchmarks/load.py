@@ -19,20 +19,20 @@ class TrainingLoad:
     """A training job that runs while answers are timed; a new job replaces one that has ended.
 
     Attributes:
-        stretches: measured stretches.
-        uncovered: stretches whose job had ended before they did.
-        seconds: duration of all stretches.
+        slices: measured slices.
+        uncovered: slices whose job had ended before they did.
+        seconds: duration of all slices.
         used_s: processor time of the training processes meanwhile; 0 if the system does not report it.
     """
 
     def __init__(self, bed: Bed, options: Mapping[str, Any]) -> None:
         self.client, self.dataset, self.options, self.pid = bed.client, bed.dataset, dict(options), bed.pid
         self.job: str | None = None
-        self.stretches = self.uncovered = 0
+        self.slices = self.uncovered = 0
         self.seconds = self.used_s = 0.0
 
     @contextmanager
-    def stretch(self) -> Iterator[None]:
+    def cover_slice(self) -> Iterator[None]:
         """Make sure that a job runs, and record whether it still runs at the end."""
         if not self._runs():
             self._start()
@@ -40,7 +40,7 @@ class TrainingLoad:
         yield
         self.seconds += time.monotonic() - began
         self.used_s += processor.seconds_below(self.pid) - before
-        self.stretches += 1
+        self.slices += 1
         self.uncovered += not self._runs()
 
     def stop(self) -> None:
@@ -53,14 +53,14 @@ class TrainingLoad:
 
     def notes(self) -> list[str]:
         """Describe the load; empty if there was none."""
-        if not self.stretches:
+        if not self.slices:
             return []
         used = f"used {self.used_s / self.seconds:.0%} of one core" if processor.IS_AVAILABLE else "ran"
         if self.uncovered:
-            ended = f"It ended early in {self.uncovered} of {self.stretches} stretches, which count nevertheless."
+            ended = f"It ended early in {self.uncovered} of {self.slices} slices, which count nevertheless."
         else:
-            ended = f"It ran until the end of each of the {self.stretches} stretches."
-        return [f"Training {used} in the stretches measured while training. {ended}"]
+            ended = f"It ran until the end of each of the {self.slices} slices."
+        return [f"Training {used} during the slices that were measured while training. {ended}"]
 
     def _start(self) -> None:
         self.job = self.client.train("bench-load", [self.dataset], "lip-chain", options=self.options).id

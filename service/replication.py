@@ -155,7 +155,7 @@ class Listener:
 def update_models(learners: Learners, models: Collection[str] | None) -> None:
     """Update serving versions, aliases and deletions of these models; of all models in memory if None.
 
-    Not for the event loop: versions are loaded before they answer.
+    Blocking, as versions are loaded before they answer: use it in a thread.
     """
     known = {model for model, _ in learners.loaded.held()} | learners.monitors().keys()
     here = known if models is None else known & set(models)

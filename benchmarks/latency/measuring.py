@@ -59,5 +59,5 @@ def control_loop(
 
 @contextmanager
 def _under(load: TrainingLoad | None) -> Iterator[None]:
-    with nullcontext() if load is None else load.stretch():
+    with nullcontext() if load is None else load.cover_slice():
         yield

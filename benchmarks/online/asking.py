@@ -27,7 +27,7 @@ _START_TIMEOUT_S = 60.0
 
 
 @dataclass(frozen=True)
-class Asked:
+class LoopFigures:
     """Figures of a loop, times in µs.
 
     Attributes:
@@ -43,7 +43,7 @@ class Asked:
     revisions: tuple[tuple[int, int], ...]
 
 
-class Asker:
+class LoopProcess:
     """A context manager that runs the loop; `finish` ends it and returns its figures."""
 
     def __init__(self, address: Address, model: str, motions: Array, rate: float = RATE) -> None:
@@ -58,11 +58,11 @@ class Asker:
         self._connection.recv()
         return self
 
-    def finish(self) -> Asked:
+    def finish(self) -> LoopFigures:
         """End the loop and return its figures; raise EOFError if its process has ended."""
         self._connection.send(None)
-        asked: Asked = self._connection.recv()
-        return asked
+        figures: LoopFigures = self._connection.recv()
+        return figures
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -115,4 +115,4 @@ def _loop(connection: Connection, address: Address, model: str, motions: Array, 
                 echoes.append(clock() - began)
             index += 1
     found = [Timing.of(np.array(each, dtype=np.int64)) for each in (answers, ticks, echoes)]
-    connection.send(Asked(found[0], found[1], found[2], tuple(revisions)))
+    connection.send(LoopFigures(found[0], found[1], found[2], tuple(revisions)))

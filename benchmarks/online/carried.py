@@ -17,7 +17,7 @@ from lipcore.data.samples import Array, Samples
 
 BATCH, STREAM = 10, "arm"
 AFTER = (0.1, 0.5, 1.0, 3.0)
-"""Times after the pick-up at which the service is judged, s."""
+"""Times after the pick-up at which the service is evaluated, s."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,9 @@ class Outcome:
     acks: list[float] = field(default_factory=list)
 
 
-def judged(exact: Samples, measured: Array, tau: Array, std: Array, noise: Array, scale: Array | float) -> Answers:
+def evaluate_answers(
+    exact: Samples, measured: Array, tau: Array, std: Array, noise: Array, scale: Array | float
+) -> Answers:
     """Return nMSE against the samples' torque, and coverage of the measured torque."""
     nmse = evaluate(exact.tau, tau, std, noise, scale).nmse
     coverage = evaluate(measured, tau, std, noise, scale).coverage
@@ -112,12 +114,12 @@ def judged(exact: Samples, measured: Array, tau: Array, std: Array, noise: Array
     return Answers(tuple(nmse.tolist()), tuple(coverage.tolist()), float(pooled))
 
 
-def judge_served(bed: Bed, model: str, unseen: tuple[Samples, Array]) -> Answers:
-    """Judge the answers of the default model to a test motion."""
+def evaluate_served(bed: Bed, model: str, unseen: tuple[Samples, Array]) -> Answers:
+    """Evaluate the default model on a test motion."""
     exact, measured = unseen
     answer = bed.client.predict(model, exact.q, exact.dq, exact.ddq)
     tau, std, noise = (np.array(each) for each in (answer.tau, answer.tau_std, answer.noise_std))
-    return judged(exact, measured, tau, std, noise, 1.0 if answer.scale is None else np.array(answer.scale))
+    return evaluate_answers(exact, measured, tau, std, noise, 1.0 if answer.scale is None else np.array(answer.scale))
 
 
 def read_payload(client: HttpClient, model: str) -> tuple[str, Figure | None]:
@@ -129,7 +131,7 @@ def read_payload(client: HttpClient, model: str) -> tuple[str, Figure | None]:
 
 
 def stream_case(bed: Bed, model: str, arm: Arm, case: Case) -> Outcome:
-    """Stream a case to a model in real time, with a query before each batch, and judge the service."""
+    """Stream a case to a model in real time, with a query before each batch, and evaluate the service."""
     samples = arm.live(case)
     loaded, free = (arm.unseen(case, carries) for carries in (True, False))
     moments = {round((UP + after) * RATE): after for after in AFTER}
@@ -152,7 +154,7 @@ def stream_case(bed: Bed, model: str, arm: Arm, case: Case) -> Outcome:
             if now < up:
                 continue
             if out is None:
-                out = Outcome(case, judge_served(bed, model, loaded), judge_served(bed, model, free), early=early)
+                out = Outcome(case, evaluate_served(bed, model, loaded), evaluate_served(bed, model, free), early=early)
             if state not in out.states:
                 out.states.append(state)
             if up < now <= down and mass is not None and out.detected is None:
@@ -161,9 +163,9 @@ def stream_case(bed: Bed, model: str, arm: Arm, case: Case) -> Outcome:
                 out.released = (now - down) / RATE
             if now in moments:
                 out.masses[moments[now]] = mass
-                out.answers[moments[now]] = judge_served(bed, model, loaded)
+                out.answers[moments[now]] = evaluate_served(bed, model, loaded)
             if now == down + BATCH:
-                out.first = judge_served(bed, model, free)
+                out.first = evaluate_served(bed, model, free)
     assert out is not None
     return out
 

@@ -78,5 +78,5 @@ def grids(tally: Tally) -> list[Grid]:
         ("batches sent after a later one", str(tally.late)),
         ("rows not learnt", str(tally.refused)),
     ]
-    judged = targets_grid(targets(tally), "")
-    return [Grid("trials", ("", ""), rows), judged]
+    table_of_targets = targets_grid(targets(tally), "")
+    return [Grid("trials", ("", ""), rows), table_of_targets]

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks import processor
 from benchmarks.clients import HttpClient
-from benchmarks.online.asking import Asked, Asker
+from benchmarks.online.asking import LoopFigures, LoopProcess
 from benchmarks.online.bed import Bed
 from benchmarks.online.sending import BATCH_ROWS, Ack, batch_requests, send_all, stream, stream_frames
 from lipcore.data.samples import Array, Samples
@@ -50,18 +50,18 @@ class Flow:
     learner: float
 
 
-def idle(bed: Bed, model: str, motions: Array, seconds: float) -> Asked:
+def idle(bed: Bed, model: str, motions: Array, seconds: float) -> LoopFigures:
     """Run the loop without learning."""
-    with Asker(bed.tcp, model, motions) as asker:
+    with LoopProcess(bed.tcp, model, motions) as loop:
         time.sleep(seconds)
-        return asker.finish()
+        return loop.finish()
 
 
-def live(bed: Bed, model: str, samples: Samples, motions: Array, websocket: bool = False) -> tuple[Asked, Flow]:
+def live(bed: Bed, model: str, samples: Samples, motions: Array, websocket: bool = False) -> tuple[LoopFigures, Flow]:
     """Run the loop while a stream is learnt in real time; websocket: the stream is sent in frames, one a row."""
     period = BATCH_ROWS * float(samples.t[1] - samples.t[0])
     requests = [] if websocket else batch_requests(model, STREAM, samples)
-    with Asker(bed.tcp, model, motions) as asker:
+    with LoopProcess(bed.tcp, model, motions) as loop:
         began, used = time.monotonic(), processor.seconds_below(bed.pid)
         if websocket:
             with StreamClient(model, bed.client.url, stream_id=STREAM) as frames:
@@ -71,22 +71,22 @@ def live(bed: Bed, model: str, samples: Samples, motions: Array, websocket: bool
                 acks = stream(client, requests, period)
         share = (processor.seconds_below(bed.pid) - used) / (time.monotonic() - began)
         learnt = bed.wait_learnt(model, motions[0], max(ack.revision for ack in acks))
-        asked = asker.finish()
+        figures = loop.finish()
     # the rows of the first batch were measured in the period before it was sent
     start = acks[0].sent - round(1e9 * period)
-    return asked, _flow(acks, start, learnt, share, lags(acks, asked.revisions))
+    return figures, _flow(acks, start, learnt, share, lags(acks, figures.revisions))
 
 
-def burst(bed: Bed, model: str, samples: Samples, motions: Array) -> tuple[Asked, Flow]:
+def burst(bed: Bed, model: str, samples: Samples, motions: Array) -> tuple[LoopFigures, Flow]:
     """Run the loop while a stream is sent as fast as the service acknowledges it."""
     requests = batch_requests(model, STREAM, samples, _TIME_SCALE, PUSHED_ROWS)
-    with Asker(bed.tcp, model, motions) as asker, HttpClient(bed.tcp) as client:
+    with LoopProcess(bed.tcp, model, motions) as loop, HttpClient(bed.tcp) as client:
         began, used = time.monotonic(), processor.seconds_below(bed.pid)
         acks = send_all(client, requests)
         learnt = bed.wait_learnt(model, motions[0], max(ack.revision for ack in acks))
         share = (processor.seconds_below(bed.pid) - used) / (time.monotonic() - began)
-        asked = asker.finish()
-    return asked, _flow(acks, acks[0].sent, learnt, share, lags(acks, asked.revisions))
+        figures = loop.finish()
+    return figures, _flow(acks, acks[0].sent, learnt, share, lags(acks, figures.revisions))
 
 
 def lags(acks: Sequence[Ack], revisions: Sequence[tuple[int, int]]) -> list[float]:

@@ -44,7 +44,7 @@ class Quality:
 
 @dataclass(frozen=True)
 class Moment:
-    """A time of the live stream, s, at which predictions are judged."""
+    """A time of the live stream, s, at which predictions are evaluated."""
 
     name: str
     at: float
@@ -60,7 +60,7 @@ class Method:
     seconds: list[float] = field(default_factory=list)
 
 
-def judge(scene: Scene, unseen: Samples, tau: Array, std: Array, noise_std: Array) -> Quality:
+def evaluate_predictions(scene: Scene, unseen: Samples, tau: Array, std: Array, noise_std: Array) -> Quality:
     """Compare predictions, (N, n), with the torques of a test trajectory."""
     exact = evaluate(unseen.tau, tau, std, noise_std)
     noisy = evaluate(scene.measured(unseen), tau, std, noise_std)
@@ -80,13 +80,13 @@ def served(bed: Bed, model: str, label: str, scene: Scene, samples: Samples, mom
     requests = batch_requests(model, STREAM, samples)
     with HttpClient(bed.tcp) as client:
         stream(client, requests, BATCH_ROWS / scene.rate, after)
-    method.found = {name: judge(scene, unseen[name], *answers[name]) for name in unseen}
+    method.found = {name: evaluate_predictions(scene, unseen[name], *answers[name]) for name in unseen}
     return method
 
 
 def not_updated(base: TorqueModel, scene: Scene, moments: Sequence[Moment]) -> Method:
-    """Judge the model as trained."""
-    found = {moment.name: _judged(scene, base, moment.at) for moment in moments}
+    """Evaluate the model as trained."""
+    found = {moment.name: _evaluate_model(scene, base, moment.at) for moment in moments}
     return Method("none", "no update", found)
 
 
@@ -99,7 +99,7 @@ def refitted(
     every: float,
     window: float,
 ) -> Method:
-    """Judge a model trained anew every `every` seconds, on the rows of the last `window` seconds or since the change.
+    """Evaluate a model retrained every `every` seconds, on the rows of the last `window` seconds or since the change.
 
     It knows the time of the change and is ready without delay. Refits that no moment uses are not computed.
     """
@@ -113,7 +113,7 @@ def refitted(
             thinned = chosen.rows(slice(None, None, -(-len(chosen) // REFIT_ROWS)))
             models[at], seconds = train(thinned, scene.arm.joint_types, fit, estimator)
             method.seconds.append(seconds)
-        method.found[moment.name] = _judged(scene, models[at], moment.at)
+        method.found[moment.name] = _evaluate_model(scene, models[at], moment.at)
     return method
 
 
@@ -125,7 +125,7 @@ def fourier(
     fitted: TorqueModel,
     forgetting_s: float,
 ) -> Method:
-    """Judge the sparse spectrum GP, with the history and then batch by batch; `fitted`: `se` on the history."""
+    """Evaluate the sparse spectrum GP, with the history and then batch by batch; `fitted`: `se` on the history."""
     model = FourierModel.start(fitted, forgetting_s, seed=scene.seed)
     # the history is one block, not forgotten before the stream begins, like a trained version
     model = model.learn(rows_of(_at(history, float(samples.t[0]))))
@@ -136,15 +136,15 @@ def fourier(
             model = model.learn(rows_of(rows.rows(slice(start, start + BATCH_ROWS))))
         unseen = scene.unseen(moment.at)
         tau, std = model.predict(unseen.q, unseen.dq, unseen.ddq)
-        method.found[moment.name] = judge(scene, unseen, tau, std, model.noise_std)
+        method.found[moment.name] = evaluate_predictions(scene, unseen, tau, std, model.noise_std)
     method.seconds.append(time.monotonic() - began)
     return method
 
 
-def _judged(scene: Scene, model: TorqueModel, at: float) -> Quality:
+def _evaluate_model(scene: Scene, model: TorqueModel, at: float) -> Quality:
     unseen = scene.unseen(at)
     answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
-    return judge(scene, unseen, answer.tau, answer.tau_std, answer.noise_std)
+    return evaluate_predictions(scene, unseen, answer.tau, answer.tau_std, answer.noise_std)
 
 
 def _between(samples: Samples, moments: Sequence[Moment], rate: float) -> Iterator[tuple[Moment, Samples]]:

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from benchmarks.online.asking import Asked
+from benchmarks.online.asking import LoopFigures
 from benchmarks.online.cost import Cost
 from benchmarks.online.flow import Flow
 from benchmarks.online.quality import Method
@@ -36,9 +36,9 @@ class Results:
 
     facts: dict[str, str]
     model: dict[str, str]
-    idle: Asked | None = None
-    learning: Asked | None = None
-    pushed: Asked | None = None
+    idle: LoopFigures | None = None
+    learning: LoopFigures | None = None
+    pushed: LoopFigures | None = None
     live: Flow | None = None
     burst: Flow | None = None
     costs: list[Cost] = field(default_factory=list)

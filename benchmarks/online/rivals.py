@@ -13,7 +13,7 @@ import lipcore
 from benchmarks.clients import HttpClient
 from benchmarks.online.arms import NOISE, RATE, UP, Arm, Case
 from benchmarks.online.bed import install, serving
-from benchmarks.online.carried import AFTER, BATCH, STREAM, Answers, judge_served, judged
+from benchmarks.online.carried import AFTER, BATCH, STREAM, Answers, evaluate_answers, evaluate_served
 from benchmarks.online.sending import batch_request, send
 from lipcore.data.samples import Array, Samples
 from lipcore.model.torque_model import TorqueModel
@@ -35,7 +35,7 @@ class Rival:
 
 
 def rivals(arm: Arm, model: TorqueModel, case: Case) -> list[Rival]:
-    """Judge all methods on the stream of one case, and the same test motion with the payload."""
+    """Evaluate all methods on the stream of one case, and the same test motion with the payload."""
     samples, unseen = arm.live(case), arm.unseen(case, True)
     return [
         Rival("adapts (payloads=false, on_change=adapt)", dict(_adapting(model, samples, unseen))),
@@ -45,13 +45,13 @@ def rivals(arm: Arm, model: TorqueModel, case: Case) -> list[Rival]:
 
 
 def _each(samples: Samples, answer: Callable[[Samples], Answers | str]) -> dict[float, Answers | str]:
-    """Judge a method on the rows since the pick-up, whose time it knows."""
+    """Evaluate a method on the rows since the pick-up; the time of the pick-up is given."""
     first = round(UP * RATE)
     return {after: answer(samples.rows(slice(first, first + round(after * RATE)))) for after in AFTER}
 
 
 def _adapting(model: TorqueModel, samples: Samples, unseen: Unseen) -> dict[float, Answers]:
-    """Judge the service without payload detection, after it has learnt all rows sent."""
+    """Evaluate the service without payload detection, after it has learnt all rows sent."""
     options = LearningOptions(
         payloads=False, on_change="adapt", forgetting_s=FORGETTING_S, auto_refresh=False, auto_promote=False
     )
@@ -67,23 +67,23 @@ def _adapting(model: TorqueModel, samples: Samples, unseen: Unseen) -> dict[floa
                 if (after := moments.get(start + BATCH)) is not None:
                     motion = np.stack([batch.q[-1], batch.dq[-1], batch.ddq[-1]])
                     bed.wait_learnt(MODEL, motion, ack.revision)
-                    out[after] = judge_served(bed, MODEL, unseen)
+                    out[after] = evaluate_served(bed, MODEL, unseen)
     return out
 
 
 def _refitted(arm: Arm, since: Samples, unseen: Unseen) -> Answers | str:
-    """Judge a model trained on these rows only."""
+    """Evaluate a model trained on these rows only."""
     try:
         model = lipcore.train(since, arm.robot.joint_types, "rigid-body")
     except (ValueError, ArithmeticError, RuntimeError) as error:
         return f"refused: {error}"
     exact, measured = unseen
     answer = model.predict(exact.q, exact.dq, exact.ddq)
-    return judged(exact, measured, *answer.interval)
+    return evaluate_answers(exact, measured, *answer.interval)
 
 
 def _least_squares(robot: Robot, since: Samples, unseen: Unseen) -> Answers:
-    """Judge ridge regression of every link's ten parameters around the URDF's.
+    """Evaluate ridge regression of every link's ten parameters around the URDF's.
 
     It equals recursive least squares with the prior N(π₀, PRIOR² I) and torque Y π with noise of NOISE.
     """
@@ -93,10 +93,10 @@ def _least_squares(robot: Robot, since: Samples, unseen: Unseen) -> Answers:
     precision = rows.T @ rows / NOISE**2 + np.eye(len(usual)) / PRIOR**2
     residual = since.tau.ravel() - rows @ usual
     mean = usual + np.linalg.solve(precision, rows.T @ residual / NOISE**2)
-    asked_for = _regressor(robot, exact)
-    spread = np.einsum("ij,ij->i", asked_for, np.linalg.solve(precision, asked_for.T).T)
-    tau, std = (asked_for @ mean).reshape(exact.tau.shape), np.sqrt(spread).reshape(exact.tau.shape)
-    return judged(exact, measured, tau, std, np.full(robot.n_joints, NOISE), 1.0)
+    queried = _regressor(robot, exact)
+    spread = np.einsum("ij,ij->i", queried, np.linalg.solve(precision, queried.T).T)
+    tau, std = (queried @ mean).reshape(exact.tau.shape), np.sqrt(spread).reshape(exact.tau.shape)
+    return evaluate_answers(exact, measured, tau, std, np.full(robot.n_joints, NOISE), 1.0)
 
 
 def _regressor(robot: Robot, samples: Samples) -> Array:

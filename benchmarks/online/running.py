@@ -49,7 +49,7 @@ class Options:
         history_rate: rate of the training motion, Hz.
         idle_s: length of the loop without learning.
         burst_s: length of the stream that is sent as fast as possible.
-        after: seconds after the change at which predictions are judged.
+        after: seconds after the change at which predictions are evaluated.
         sizes: numbers of samples at which an update is timed.
         forgetting_s: time constant of forgetting.
         refit_every: seconds between refits.
@@ -87,7 +87,7 @@ class Options:
 
     @property
     def moments(self) -> list[Moment]:
-        """Times at which predictions are judged."""
+        """Times at which predictions are evaluated."""
         change = self.scene.change_at
         return [Moment("before the change", change), *(Moment(f"{s:g} s after", change + s) for s in self.after)]
 

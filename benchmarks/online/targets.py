@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from benchmarks.latency.targets import Target
-from benchmarks.online.asking import Asked
+from benchmarks.online.asking import LoopFigures
 from benchmarks.online.results import Results
 
 LEARNING, ADAPTING, REFIT = "learn", "adapt", "refit"
@@ -25,7 +25,7 @@ def targets(results: Results) -> list[Target]:
     ]
 
 
-def tail(results: Results, learning: Asked | None) -> float | None:
+def tail(results: Results, learning: LoopFigures | None) -> float | None:
     """Return p99 of answers while the model learns over p99 while idle."""
     if results.idle is None or learning is None:
         return None

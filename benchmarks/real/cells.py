@@ -85,7 +85,7 @@ class Result(BaseModel):
         return float(np.max(np.divide(self.nmse, self.nmse_mean)))
 
 
-def judge(cell: Cell, split: Split, forecast: Forecast, seconds: float, estimator: str = "") -> Result:
+def evaluate_forecast(cell: Cell, split: Split, forecast: Forecast, seconds: float, estimator: str = "") -> Result:
     """Compare a forecast with the measured torque of a split's test."""
     tau = split.test.tau
     figures = evaluate(tau, forecast.mean, forecast.std, np.zeros(split.test.n_joints))

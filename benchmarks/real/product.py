@@ -84,7 +84,7 @@ class Bed:
 
 @contextmanager
 def open_bed(jobs: int) -> Iterator[Bed]:
-    """Start a service that trains at most `jobs` models at a time; stop it in the end."""
+    """Start a service that trains at most `jobs` models at a time; stop it at the end."""
     with TemporaryDirectory(prefix="lipserve-bench-") as home:
         service = ServiceProcess(0, {"LIPSERVE_HOME": home, "LIPSERVE_TRAINING_WORKERS": str(jobs)})
         try:

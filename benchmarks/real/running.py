@@ -16,7 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.real import mujoco_sysid, rivals
-from benchmarks.real.cells import PRODUCT, Cache, Cell, Result, judge
+from benchmarks.real.cells import PRODUCT, Cache, Cell, Result, evaluate_forecast
 from benchmarks.real.product import Bed, open_bed
 from benchmarks.real.recordings import RECORDINGS, Recording, prepare
 from benchmarks.real.rivals import Forecast, Predict
@@ -122,12 +122,12 @@ def compute_cell(cell: Cell, recording: Recording, split: Split, service: Servic
         bed, types = service(), recording.joint_types(split.train.n_joints)
         robot = recording.robot if cell.told == "URDF" else None
         trained = bed.train(f"{cell.recording}-{cell.split}-{cell.told}".lower(), split.train, types, robot)
-        return judge(cell, split, bed.predict(trained, states), trained.seconds, trained.estimator)
+        return evaluate_forecast(cell, split, bed.predict(trained, states), trained.seconds, trained.estimator)
     known = cell.told == "URDF"
     predict = partial(WITH_BODY[cell.method], recording.body(split.train)) if known else ALONE[cell.method]
     began = time.monotonic()
     forecast = predict(split.train, states)
-    return judge(cell, split, forecast, time.monotonic() - began)
+    return evaluate_forecast(cell, split, forecast, time.monotonic() - began)
 
 
 def _compute_all(

@@ -149,7 +149,7 @@ class Engines:
 
 @contextmanager
 def started(folder: Path) -> Iterator[Engines]:
-    """Start all servers and stop them in the end; raise BenchError if one does not start."""
+    """Start all servers and stop them at the end; raise BenchError if one does not start."""
     require()
     with ExitStack() as stack:
         (folder / "postgres").mkdir()

@@ -89,7 +89,7 @@ class Load:
             time.sleep(float(self.rng.uniform(0, MAX_GAP_S)))
         self.sent += count
 
-    def judge(self, tally: Tally) -> None:
+    def count_losses(self, tally: Tally) -> None:
         """Send all acknowledged batches again and count logged ones, to find lost and duplicate batches."""
         with HttpClient(("127.0.0.1", self.services[0].port)) as http:
             known = sum(send(http, self._request(sequence)).duplicate for sequence in range(self.sent))
@@ -188,7 +188,7 @@ def _trials(load: Load, tally: Tally, strike: Callable[[], Callable[[], None]], 
         tally.faults += 1
         tally.recovered += load.is_same()
         console.print(f"{tally.name}: {tally.recovered} of {tally.faults} recovered", highlight=False)
-    load.judge(tally)
+    load.count_losses(tally)
     return tally
 
 

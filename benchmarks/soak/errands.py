@@ -259,7 +259,7 @@ SLOW: dict[int, tuple[Errand, ...]] = {3600: (train,)}
 
 
 def run(desk: Desk, period: int, errands: tuple[Errand, ...], waited: bool = True) -> None:
-    """Run errands of a period all day; waited: whether the arm waits for them."""
+    """Run errands of a period all day; waited: whether the clock of the arm waits for them."""
     name = f"every {period} s: {errands[0].__name__}"
     for turn, at in enumerate(range(0, desk.day.clock.seconds, period)):
         if not desk.day.clock.follow(name, at + BATCH_S):

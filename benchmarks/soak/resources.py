@@ -69,7 +69,7 @@ class ResourceWatch(PeriodicCall):
         if own is None:
             return
         below = [pid for level in levels(self.pid)[1:] for pid in level]
-        learner = self._found(below)
+        learner = self._find_learner(below)
         main = [self.pid] if learner is None else [self.pid, learner]
         self.looks.append(
             Look(
@@ -84,7 +84,7 @@ class ResourceWatch(PeriodicCall):
             )
         )
 
-    def _found(self, below: Sequence[int]) -> int | None:
+    def _find_learner(self, below: Sequence[int]) -> int | None:
         """Return the learner: the first large descendant of the service, as no job is queued before it starts."""
         if self._learner not in below:
             large = [pid for pid in below if (resident_mib(pid) or 0.0) > LEARNER_MIB]

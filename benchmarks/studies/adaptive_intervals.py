@@ -245,8 +245,8 @@ class Figures:
     max_width: float
 
 
-def judged(method: Callable[[int], Tracker], score: Array, stream: Array) -> Figures:
-    """Judge a method on scores of C joints, (N, C), of the streams with these numbers, (C,)."""
+def evaluate_method(method: Callable[[int], Tracker], score: Array, stream: Array) -> Figures:
+    """Evaluate a method on scores of C joints, (N, C), of the streams with these numbers, (C,)."""
     tracker, scale = method(score.shape[1]), np.empty_like(score)
     for first in range(0, len(score), BATCH):
         rows = slice(first, first + BATCH)
@@ -276,7 +276,7 @@ def show(kind: str, score: Array, stream: Array) -> None:
     """Print the figures of all methods."""
     print(f"| {kind} | minute, % | payload: stream, joint, % | width: median, largest |\n|" + " --- |" * 4)
     for name, method in METHODS.items():
-        found = judged(method, score, stream)
+        found = evaluate_method(method, score, stream)
         coverage = (
             f"{100 * found.min_minute:.1f} to {100 * found.max_minute:.1f} | "
             f"{100 * found.stream:.0f}, {100 * found.joint:.0f}"

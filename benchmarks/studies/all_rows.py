@@ -29,7 +29,7 @@ CANDIDATES = 20_000
 OPTIONS = lipcore.FitOptions(starts=1, max_iterations=60, statistics="chosen")
 
 
-def judge(model: lipcore.TorqueModel, scenes: list[Scene]) -> str:
+def evaluate_model(model: lipcore.TorqueModel, scenes: list[Scene]) -> str:
     """Return mean nMSE and coverage on test trajectories."""
     errors, inside = [], []
     for scene in scenes:
@@ -56,7 +56,7 @@ def main() -> None:
                 chosen = lipcore.train(samples.rows(few), scene.arm.joint_types, "lip-chain", OPTIONS)
                 weight = np.concatenate([stream_weights(part.t) for part in parts])
                 timed, full = (condition(chosen, samples, each) for each in (weight, None))
-                found = " | ".join(judge(model, unseen) for model in (chosen, timed, full))
+                found = " | ".join(evaluate_model(model, unseen) for model in (chosen, timed, full))
                 what = f"{robot}, {speed:g}"
                 print(f"| {what} | {rate:g} Hz, {len(samples)} | {weight.sum():.0f} | {found} |", flush=True)
 

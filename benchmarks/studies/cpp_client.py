@@ -38,7 +38,7 @@ SANITIZED = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover
 
 @contextmanager
 def service(home: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """Start a service and wait until it is ready; kill it in the end."""
+    """Start a service and wait until it is ready; kill it at the end."""
     environment = {**os.environ, "LIPSERVE_HOME": str(home / "home"), "LIPSERVE_UDS": str(home / "socket")}
     with (home / "log").open("ab") as file:
         command = [sys.executable, "-m", "service", "serve", "--port", str(PORT)]

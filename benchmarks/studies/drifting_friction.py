@@ -134,7 +134,7 @@ def body(model: TorqueModel) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Found:
-    """Figures of the last minutes, (n,), and mean and standard deviation of masses and geometry in the end, (p,)."""
+    """Figures of the last minutes, (n,), and mean and standard deviation of masses and geometry at the end, (p,)."""
 
     nmse: Array
     moving: Array

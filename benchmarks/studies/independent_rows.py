@@ -25,7 +25,7 @@ FORGETTING = 30.0
 BLOCK = 1000
 
 
-def judge(scene: Scene, online: OnlineModel, at: float) -> str:
+def evaluate_model(scene: Scene, online: OnlineModel, at: float) -> str:
     """Return mean nMSE and coverage on the test trajectory at a time of the stream."""
     unseen = scene.unseen(at)
     answer = online.model().predict(unseen.q, unseen.dq, unseen.ddq)
@@ -51,7 +51,7 @@ def main() -> None:
                 online = online.learn(rows.take(slice(first, first + BLOCK)))
                 seconds = round((first + BLOCK) / scene.rate)
                 if seconds in (30, 35, 60):
-                    found.append(judge(scene, online, seconds if seconds > 30 else seconds - 1e-3))
+                    found.append(evaluate_model(scene, online, seconds if seconds > 30 else seconds - 1e-3))
             print(f"| {speed:g} | {rate:g} | " + " | ".join(found) + " |", flush=True)
 
 

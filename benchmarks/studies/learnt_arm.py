@@ -146,7 +146,7 @@ def units(robot: Robot, seed: int, dirty: bool) -> list[tuple[Robot, Simulation]
     return out
 
 
-def silent(stream: Simulation) -> Simulation:
+def without_noise(stream: Simulation) -> Simulation:
     """Return the stream without noise."""
     return replace(stream, noise=0.0, dirt=None if stream.dirt is None else replace(stream.dirt, noise=0.0))
 
@@ -177,10 +177,10 @@ def transfer(first: int, last: int, names: list[str]) -> None:
                     "the base alone": base,
                 }
                 for case, (way, model) in product(CASES, models.items()):
-                    held, quiet = (unseen(new, each, case, seed) for each in (of_new, silent(of_new)))
+                    held, quiet = (unseen(new, each, case, seed) for each in (of_new, without_noise(of_new)))
                     found = model.predict(held.q, held.dq, held.ddq).interval
-                    judged = evaluate(held.tau, *found)
-                    cell = judged.nmse, evaluate(quiet.tau, *found).nmse, judged.coverage
+                    figures = evaluate(held.tau, *found)
+                    cell = figures.nmse, evaluate(quiet.tau, *found).nmse, figures.coverage
                     figures.setdefault((case, way), []).append(np.array(cell))
             for (case, way), cells in figures.items():
                 cover = np.array(cells)[:, 2]

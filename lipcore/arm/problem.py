@@ -34,7 +34,8 @@ class PriorWidths:
     scale: float = 2.0
     """Parts of the logarithms of s (`arm.scales`): a factor of seven either way within one standard deviation."""
     unit: float = 0.3
-    """The same for masses and rotor inertias around those of another unit, which differ about as much as expected."""
+    """Parts of the logarithms of s for masses and rotor inertias, if the prior is another unit. The difference to that
+    unit is about as large as expected."""
 
 
 WIDTHS = PriorWidths()
@@ -297,16 +298,17 @@ class Problem:
 
 
 def root_of(precision: Array) -> Array:
-    """Return lower L with L Lᵀ = precision, for eigenvalues of at least one: a Gram matrix plus the prior's part.
+    """Return lower L with L Lᵀ = precision.
 
-    Rounding may make some of them negative, if noise is small and features are similar. These are replaced by one.
+    A precision is a Gram matrix plus the identity of the prior, so its eigenvalues are at least one. Rounding may make
+    some of them negative, if noise is small and features are similar. These are replaced by one.
     Raise LinAlgError for numbers that are not finite.
     """
     lower, failed = lapack.dpotrf(precision, lower=1)
     if not failed and np.isfinite(lower[-1, -1]):
         return np.asarray(lower)
     if not np.isfinite(precision).all():
-        raise LinAlgError("the precision of the weights holds a number that is not finite")
+        raise LinAlgError("the precision of the weights contains a number that is not finite")
     values, vectors = np.linalg.eigh(precision)
     upper = np.asarray(np.linalg.qr((vectors * np.sqrt(np.maximum(values, 1.0))).T, mode="r"))
     return np.ascontiguousarray((upper * np.where(upper.diagonal() < 0, -1.0, 1.0)[:, None]).T)

@@ -186,7 +186,7 @@ def expected_layout(geometry: Geometry, layout: Layout) -> GeometryPrior:
 
 
 def apply_layout(geometry: Geometry, layout: Layout) -> Geometry:
-    """Return the geometry with its axes turned into a layout. The places of all axes, and free axes, stay."""
+    """Return the geometry with its axes turned into a layout. Free axes and the places of axes do not change."""
     turns, places = geometry.placements(np.zeros(geometry.n_joints))
     for joint, direction in enumerate(layout):
         if direction is not None:

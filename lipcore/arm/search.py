@@ -207,7 +207,7 @@ def search(
         if late() and pool.points:
             break
     if not pool.points:
-        raise LinAlgError("no start of the search has an evidence that can be computed")
+        raise LinAlgError("the evidence cannot be computed at any start of the search")
     starts, hops, quiet = pool.descents, 0, 0
     while not late() and quiet < (
         OPTIONS.max_idle_at_noise if _explained(pool.points[0], sensor_noise, problem.floor) else OPTIONS.max_idle

@@ -72,9 +72,10 @@ def stream_weights(time: Array, before: float | None = None, rate: float = INDEP
 
 
 def motion_dimensions(dq: Array) -> float:
-    """Return the number of independently moving joints in velocities (N, n), from 1, if all move together, to n.
+    """Return the number of independent motions in velocities (N, n).
 
-    This is the participation ratio (Σ λ)² / Σ λ² of the eigenvalues of their correlation matrix.
+    It is 1 if all joints move together, n if each moves independently, and 0 if no joint moves. This is the
+    participation ratio (Σ λ)² / Σ λ² of the eigenvalues of the correlation matrix of the velocities.
     """
     spread = dq.std(axis=0)
     moving = spread > 1e-9

@@ -59,7 +59,7 @@ def evaluate(
     on the density. nmse is NaN for a joint whose measured torque is constant. Raise ValueError if shapes differ.
     """
     if mean.shape != tau.shape or std.shape != tau.shape:
-        raise ValueError(f"mean has shape {mean.shape} and std {std.shape}, expected {tau.shape} as tau has")
+        raise ValueError(f"mean has shape {mean.shape} and std {std.shape}, expected {tau.shape}, the shape of tau")
     error = tau - mean
     total = np.sqrt(std**2 + noise_std**2)
     squared = np.mean(error**2, axis=0)

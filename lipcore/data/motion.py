@@ -38,12 +38,12 @@ def motion_arrays(q: ArrayLike, dq: ArrayLike, ddq: ArrayLike) -> tuple[Array, A
     for name, values in (("q", q), ("dq", dq), ("ddq", ddq)):
         array = np.atleast_2d(np.asarray(values, dtype=np.float64))
         if array.ndim != 2 or array.size == 0:
-            raise ValueError(f"{name} has shape {array.shape}, expected (N, n) or (n,), neither of them 0")
+            raise ValueError(f"{name} has shape {array.shape}, expected (N, n) or (n,) with N and n of at least 1")
         check_finite(name, array)
         arrays.append(array)
     for name, array in zip(("dq", "ddq"), arrays[1:], strict=True):
         if array.shape != arrays[0].shape:
-            raise ValueError(f"{name} has shape {array.shape}, expected {arrays[0].shape} as q has")
+            raise ValueError(f"{name} has shape {array.shape}, expected {arrays[0].shape}, the shape of q")
     return arrays[0], arrays[1], arrays[2]
 
 

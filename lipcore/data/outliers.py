@@ -1,8 +1,8 @@
 """Corrupt rows of a recording: magnitudes that no robot reaches, and rows that fit neither their past nor their future.
 
-A flipped bit, a lost packet or a loose plug corrupts a row or two. One such row may spoil a whole fit, because its
-square enters every sum. A sound torque may leap, as friction does at a reversal, or rise within a row as a move begins.
-But it then continues the rows before it or the rows after it; a corrupt value continues neither.
+A flipped bit, a lost packet or a loose plug corrupts one or two rows. One such row may spoil a whole fit, because its
+square enters every sum. A correct torque may jump, as friction does at a reversal, or rise within a row when a move
+begins. But it then continues the rows before it or the rows after it. A corrupt value continues neither.
 """
 
 from __future__ import annotations
@@ -54,16 +54,16 @@ class OutlierOptions:
     """In a shorter episode a row is corrupt if it is this many times as far from the median as all others."""
     max_share: float = 0.02
     max_rows: int = 3
-    """Max corrupt rows, as a share of the recording or a count, whichever is more: more is no accident."""
+    """Max corrupt rows, as a share of the recording or a count, whichever is larger. More rows have another cause."""
     max_usual_changes: float = 4.0
-    """Motion explains a deviation of torque, and torque one of motion, from this many usual changes on. What it
-    explains grows with their square."""
+    """A change of motion by at least this many usual changes explains a deviation of torque, and vice versa. The
+    explained deviation grows with the square of the change."""
     lead: float = 4.0
-    """A corrupt row deviates this many times as much as the next one. A motion sampled so seldom that a move takes
-    one row has many rows that deviate alike."""
+    """A corrupt row deviates this many times as much as the next one. If sampling is so slow that a move takes
+    one row, many rows deviate by similar amounts."""
     turn_factor: float = 20.0
-    """Factor on a torque's allowed deviation at a reversal of its joint: friction leaps, and leaps back if two
-    reversals lie a row apart."""
+    """Factor on a torque's allowed deviation at a reversal of its joint: friction jumps, and jumps back if two
+    reversals lie one row apart."""
     max_rounds: int = 3
     """Max rounds: corrupt rows may hide each other, so the remaining rows are checked again."""
 
@@ -278,8 +278,9 @@ def _change(y: Array) -> Array:
 def deviation(t: Array, y: Array) -> Array:
     """Return the distance of each value from the nearest extrapolation or interpolation of its neighbours, (N,).
 
-    Extrapolations are the line and the level through the two values before, or the two after. Interpolations are the
-    line and the cubic through both sides. t: (N,) s, rising; y: (N,).
+    Each side has two extrapolations: the nearest value itself, and the line through the two nearest values. The
+    interpolations are the line through the two neighbours and the cubic through the four nearest values. t: (N,) s,
+    rising; y: (N,).
     """
     best = np.full(len(y), np.inf)
 
@@ -322,7 +323,7 @@ def _around(each: Array, rows: NDArray[np.int64]) -> Array:
 
 
 def _far(y: Array) -> Mask:
-    """Return which values (N,) are far from the median, compared with all others."""
+    """Return a mask of the values (N,) that are much farther from the median than all others."""
     known = np.isfinite(y)
     return _leading(
         np.where(known, np.abs(y - np.median(y[known])) if known.any() else 0.0, 0.0), 0.0, OPTIONS.far_ratio

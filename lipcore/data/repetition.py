@@ -1,4 +1,4 @@
-"""Repetition of motion: instants with a like state at another time.
+"""Repetition of motion: instants that have a similar state at another time.
 
 Metrics of a held-out part that repeats the training are too good: a model that only remembers predicts it well.
 """
@@ -18,14 +18,14 @@ from lipcore.data.splits import Mask, Numbers
 
 @dataclass(frozen=True)
 class RepetitionOptions:
-    """Limits for two instants to be alike, and for a stretch to repeat another."""
+    """Limits within which two instants are similar, and a stretch repeats another."""
 
     max_near: float = 0.25
     min_near: float = 0.1
-    """Two instants are alike if they are nearer than half the step to the next instant. This distance is limited to
+    """Two instants are similar if their distance is below half the step to the next instant. This limit is kept between
     these shares of the usual distance of two instants."""
     repeated_share: float = 0.5
-    """Min share of instants with a like instant elsewhere in time, for a stretch that repeats."""
+    """A stretch repeats if at least this share of its instants has a similar instant elsewhere in time."""
     block_instants: int = 60
     """Max instants of a block that are compared."""
     part_instants: int = 600
@@ -54,7 +54,7 @@ def features(samples: Samples, joint_types: Sequence[str]) -> Array:
 
 
 def measure_repeated_shares(states: Array, edges: Numbers) -> Array:
-    """Return the share of the instants of each of B blocks with a like instant elsewhere in time: (B,).
+    """Return the share of the instants of each of B blocks with a similar instant elsewhere in time, (B,).
 
     states: (N, k), in order of time; edges: (B + 1,), where blocks begin and end. Elsewhere is neither the block nor
     those beside it, because a motion leaves and enters a block slowly.
@@ -94,7 +94,7 @@ class Repetition(NamedTuple):
     """How much of a part repeats motion of the training."""
 
     share: float
-    """Share of the part's instants with a like instant in the training."""
+    """Share of the part's instants with a similar instant in the training."""
     period: float | None
     """Period of the training's motion, s, None if it has none."""
 
@@ -115,7 +115,7 @@ def repetition(training: Samples, part: Samples, joint_types: Sequence[str]) -> 
 
 
 def measure_repeated_share(known: Array, states: Array) -> float:
-    """Return the share of states (R, k) with a like state among known ones, (N, k), in order of time."""
+    """Return the share of states (R, k) that have a similar state among the known states (N, k), in order of time."""
     limits, shares = _limits(known, np.concatenate([known, states])), []
     rows = _evenly(0, len(states), OPTIONS.part_instants)
     for few in np.array_split(rows, max(1, len(rows) // 100)):
@@ -129,7 +129,8 @@ def measure_distinct_share(samples: Samples, joint_types: Sequence[str]) -> floa
     """Return the share of a recording that remains if repeated motion counts once, from 0 to 1.
 
     samples: at least one row, in order of time within its episodes; joint_types: (n,). An instant that the recording
-    passes k times counts 1 / k. Between two passes the motion leaves it by twice the limit of likeness.
+    passes k times counts 1 / k. Two passes are separate if, between them, the distance exceeds twice the limit of
+    similarity.
     """
     states = features(samples, joint_types)
     limits, passes = _limits(states, states), []
@@ -142,11 +143,11 @@ def measure_distinct_share(samples: Samples, joint_types: Sequence[str]) -> floa
 
 
 def find_period(samples: Samples, joint_types: Sequence[str]) -> float | None:
-    """Return the time after which a motion repeats itself, s; None if there is no one such time.
+    """Return the time after which a motion repeats itself, s; None if there is no single such time.
 
-    The median, over instants, of the time until the motion returns to a state that it left by twice the limit of
-    likeness. At least a quarter of the instants must return, and 60 % of these within 5 % of that time. Tuned on
-    simulated arms (`tests/lipcore/data/test_repetition.py`).
+    It is the median, over instants, of the time until the motion returns to the state. Before that, its distance must
+    exceed twice the limit of similarity. At least a quarter of the instants must return, and 60 % of these within 5 %
+    of that time. Tuned on simulated arms (`tests/lipcore/data/test_repetition.py`).
     """
     states = features(samples, joint_types)
     limits, lags, asked = _limits(states, states), [], 0
@@ -197,5 +198,5 @@ def _squares(states: Array, others: Array) -> Array:
 
 
 def _evenly(first: int, last: int, most: int) -> Numbers:
-    """Return at most `most` rows from `first` to `last`, exclusive."""
+    """Return up to `most` evenly spaced row numbers from `first` to `last`, without `last`."""
     return np.unique(np.linspace(first, last - 1, most).round().astype(np.int64))

@@ -1,8 +1,8 @@
 """Splits of a recording into training rows and held-out rows: whole stretches, never single rows.
 
-Neighbouring samples are nearly equal, and a low-pass spreads each over its neighbours. A model would have as good as
-seen every single row that is held out. Therefore whole episodes or contiguous stretches are held out. Rows next to the
-other side belong to neither.
+Neighbouring samples are nearly equal, and a low-pass spreads each over its neighbours. If single rows were held
+out, training on their neighbours would almost reveal them. Therefore whole episodes or contiguous stretches are held
+out. Rows next to the other side belong to neither side.
 """
 
 from __future__ import annotations
@@ -99,7 +99,9 @@ def split(episode: Numbers, t: Array, how: Split, stretches: Sequence[Sequence[i
     parts = apply_guard(episode, t, order, held, how.guard_s)
     for side, rows in (("held out", parts.held_out), ("to train on", parts.train)):
         if not rows.any():
-            raise SplitError("guard_s", how.guard_s, f"less: all rows {side} are closer than that to the other side")
+            raise SplitError(
+                "guard_s", how.guard_s, f"a smaller value: all rows {side} are closer than that to the other side"
+            )
     return parts
 
 

@@ -71,7 +71,7 @@ def check_base(
         expected = f"{' or '.join(robots[:2])}, as the joints of the base have another order"
         raise BaseMismatchError("estimator", estimator, expected)
     if robot is not None:
-        raise BaseMismatchError("robot", robot, "none if a base is given: its arm is used")
+        raise BaseMismatchError("robot", robot, "no robot together with a base: the base's arm is used")
     if options.geometry == "learn":
         raise BaseMismatchError("options.geometry", "learn", "auto, calibrate or fixed if a base is given")
     if options.prior != "urdf":

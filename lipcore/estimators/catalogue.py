@@ -101,9 +101,9 @@ def check_estimator(
 ) -> None:
     """Check that an estimator can be trained with this robot and these options, before any work is done.
 
-    Raise UnknownEstimatorError. Raise MissingRobotError if the estimator cannot use a robot. Raise ValueError if
-    `options.geometry` needs a robot and there is none. Raise JointMismatchError if the robot's joints are not those of
-    the data, or are in another order.
+    Raise UnknownEstimatorError. Raise MissingRobotError if a robot is given that the estimator cannot use. Raise
+    ValueError if `options.geometry` needs a robot and there is none. Raise JointMismatchError if the robot's joints are
+    not those of the data, or are in another order.
     """
     if name not in ESTIMATOR_CHOICES:
         raise UnknownEstimatorError(f"estimator is {name!r}, expected one of {', '.join(ESTIMATOR_CHOICES)}")

@@ -42,9 +42,9 @@ OPTIONS = NoiseOptions()
 
 
 def white(samples: Samples, stretches: Samples | None = None) -> Array:
-    """Return the white noise of the torque signals, standard deviation (n,) N·m.
+    """Return the standard deviation of the white noise of the torque signals, (n,) N·m.
 
-    stretches: contiguous samples, if `samples` are thinned: their differences would contain motion.
+    stretches: contiguous samples, used if `samples` are thinned, because differences of thinned samples contain motion.
     """
     signals = samples if stretches is None else stretches
     return noise_level([signals.tau[part] for part in signals.episodes()])

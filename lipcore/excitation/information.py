@@ -177,5 +177,5 @@ class Information:
         return np.maximum(np.maximum(self.now - explained, self.floor), 1e-9 * self.now)
 
     def _share(self, after: Array) -> Array:
-        """Return the geometric mean over the references: the largest variances alone would decide an arithmetic one."""
+        """Return the geometric mean over the references. The largest variances would dominate an arithmetic mean."""
         return np.asarray(np.exp(np.log(after / self.now).mean(0)))

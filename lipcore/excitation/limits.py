@@ -95,11 +95,11 @@ class Limits:
     def within(self, position: float = 1.0, motion: float = 1.0, reach: float | None = None) -> Limits:
         """Return a share of these limits: of the range about its middle, and of speed, acceleration and torque.
 
-        reach: max distance from the middle, rad or m. Raise ValueError for shares that are not above 0, 1 at most.
+        reach: max distance from the middle, rad or m. Raise ValueError for shares that are not above 0 and at most 1.
         """
         for name, share in (("position", position), ("motion", motion)):
             if not 0 < share <= 1:
-                raise ValueError(f"the share of {name} is {share!r}, expected a number above 0, 1 at most")
+                raise ValueError(f"the share of {name} is {share!r}, expected a number above 0, at most 1")
         if reach is not None and not 0 < reach < np.inf:
             raise ValueError(f"reach is {reach!r}, expected a positive number")
         half = np.minimum(position * self.half, np.inf if reach is None else reach)

@@ -99,7 +99,7 @@ class Shape:
     def build(cls, limits: Limits, seconds: float, harmonics: int) -> Shape:
         """Return the shape of a motion of `seconds` with K harmonics; raise ValueError for fewer than two harmonics."""
         if harmonics < 2:
-            raise ValueError(f"harmonics is {harmonics}, expected at least 2: one cannot start and end at rest")
+            raise ValueError(f"harmonics is {harmonics}, expected at least 2 for a motion between two rests")
         omega = frequencies(seconds, harmonics)[:, None]
         reach = np.minimum.reduce([limits.half * omega, limits.speed + 0 * omega, limits.acceleration / omega])
         direction = np.stack([reach, reach * omega])

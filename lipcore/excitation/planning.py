@@ -34,7 +34,7 @@ class PlanOptions:
     budget_s: float = 60.0
     """The search ends at the latest then, with the best motion so far."""
     references: int = 100
-    """Motions all over the range at which variance is computed."""
+    """Motions, spread over the range, at which variance is computed."""
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -99,9 +99,9 @@ def plan(
 ) -> Plan:
     """Search for the motion that leaves the least variance; equal arguments give equal motions.
 
-    The objective is the mean logarithm of the remaining share of variance, over joints and motions all over the limits.
-    robot: for torque limits. on_progress: receives iterations and that share (geometric mean). Raise ValueError if
-    joints differ or no motion satisfies the limits.
+    The objective is the mean logarithm of the remaining share of variance, over joints and over motions that
+    are spread over the limits. robot: for torque limits. on_progress: receives iterations and that share (geometric
+    mean). Raise ValueError if joints differ or no motion satisfies the limits.
     """
     options = options or PlanOptions()
     if belief.kernel.n_joints != limits.n_joints:

@@ -126,7 +126,7 @@ class Goal:
         return value + over, self.shape.adjoint(x, self.t, *slopes)
 
     def _over(self, motion: Motion) -> tuple[float, tuple[Array, Array, Array]]:
-        """Return the penalty, and its derivatives over its weight."""
+        """Return the penalty, and its derivatives divided by EXCESS_WEIGHT."""
         if self.check is None:
             none = np.zeros_like(motion.q)
             return 0.0, (none, none, none)

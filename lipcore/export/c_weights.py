@@ -33,9 +33,9 @@ class LinearWeights:
     mean: Array
     """Mean of all weights, the arm's first, (p,)."""
     prior_scaled_root: Array
-    """Q Λ with prior variances Λ of the weights, whose covariance is (Q Λ)ᵀ Q Λ, (p, p)."""
+    """Q Λ, (p, p), with the prior variances Λ of the weights. The covariance of the weights is (Q Λ)ᵀ Q Λ."""
     shared: Array
-    """Q, (p, m): m torques of a nonlinear term, with covariances c with a query's, add Q c to Q Λ Φᵀ."""
+    """Q, (p, m), for the m torques of a nonlinear term. If c is their covariance with a query, add Q c to Q Λ Φᵀ."""
     factor: float
     """Factor on the weights' deviations."""
 
@@ -62,7 +62,7 @@ class LinearWeights:
         expand: T, (p, p_b).
         """
         size = expand.shape[1]
-        # reversed for an upper root; without the product, because its condition number is the square
+        # columns are reversed to get an upper root; QR avoids the product, which has the squared condition number
         turn, made = np.linalg.qr((self.prior_scaled_root @ expand)[:, ::-1])
         shared = turn.T @ self.shared
         return self.factor * made[::-1, ::-1].T, self.factor * shared[:size][::-1]

@@ -43,7 +43,7 @@ WIDE = 8
 VECTORS = 16
 """Queries of the self-test, half of them with PAYLOAD."""
 PAYLOAD = Body(1.3, np.array([0.02, -0.03, 0.11]), np.diag([0.004, 0.005, 0.003]))
-"""Payload of half of the self-test."""
+"""Payload in half of the queries of the self-test."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ def _tables(model: TorqueModel, learnt: LinearWeights) -> dict[str, str]:
 
 
 def _texts(model: TorqueModel, origin: ModelOrigin) -> dict[str, str]:
-    """Return all words of both files; names are arbitrary, and must not end a comment or a string."""
+    """Return the texts of both files. Names are arbitrary, so they are escaped for comments and strings."""
     names = [name.encode() for name in model.joint_names]
     limits = model.training_range
     joints = []
@@ -212,7 +212,7 @@ def _rest(rest: NonlinearTerm | None, shared: Array) -> dict[str, str]:
 
 
 def _stack(model: TorqueModel) -> str:
-    """Return the stack of a call in kB: of its links, and of covariances and products of energies."""
+    """Return the stack of a call in kB. It contains the links, and covariances and products of energies."""
     n, outputs = model.n_joints, len(model.posterior.basis.outputs)
     return str(round(2 * n + (8e-3 * n * outputs + 0.6 * n**2 if outputs else 0.0)))
 

@@ -182,7 +182,7 @@ def _gravity_comments(geometry: Geometry) -> list[str]:
 
 
 def _reach(geometry: Geometry, bodies: Array, joints: ArmJoints) -> Array:
-    """Return the max distance of masses beyond each joint from it, (n,) m."""
+    """Return a bound on the distance from each joint to the centres of mass of the bodies that it moves, (n,) m."""
     steps = np.linalg.norm(geometry.translation, axis=1)
     slides = [kind == "prismatic" for kind in geometry.joint_types]
     steps = steps + np.maximum(np.abs(joints.lower), np.abs(joints.upper)) * slides

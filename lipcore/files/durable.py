@@ -16,7 +16,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path, mode: int = 0o777) -> None:
-    """Make a folder of this mode, with missing folders above it, and sync its name; raise OSError.
+    """Make a folder with this mode and its missing parents, and sync its name; raise OSError.
 
     The name of an existing folder is synced, too: the process that made it may have ended before.
     """
@@ -26,6 +26,6 @@ def make_folder(folder: Path, mode: int = 0o777) -> None:
     folder.mkdir(mode, exist_ok=True)
     try:
         sync_folder(folder.parent)
-    except PermissionError:  # another user has made it in a folder that is closed to this one
+    except PermissionError:  # another user made it in a folder that this user cannot open
         if made:
             raise

@@ -1,6 +1,6 @@
 """The schema of a model's manifest. Every entry is checked before it is used.
 
-The manifest itself stays plain data: it is stored again as it was read.
+The manifest remains plain data: it is stored again as it was read.
 """
 
 from dataclasses import dataclass
@@ -58,13 +58,13 @@ class Limits:
 
 
 DEFAULT_LIMITS = Limits()
-"""Limits above all that training can make, for local stores."""
+"""Limits for local stores, above everything that training can produce."""
 
 
 class Fit(TypedDict, total=False):
     """Report of a fit: see `lipcore.estimators.hyperparameters.FitReport` and `lipcore.arm.learning`.
 
-    Unknown names, as of other releases, may only have numbers and truth values; the same applies to `Compact`.
+    Unknown names, as of other releases, may only have numbers and booleans; the same applies to `Compact`.
     """
 
     objective: float
@@ -256,4 +256,4 @@ def _check_names(manifest: dict[str, Any]) -> None:
     for where, known in (("fit", Fit), ("compact", Compact)):
         for name, value in manifest[where].items():
             if name not in known.__annotations__ and not isinstance(value, bool | int | float):
-                raise StrictJsonError(f"{where}.{name} is {quote(value)}, expected a number or a truth value")
+                raise StrictJsonError(f"{where}.{name} is {quote(value)}, expected a number or a boolean")

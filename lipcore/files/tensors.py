@@ -50,7 +50,7 @@ def read_tensors(payload: bytes, n: int, limits: Limits) -> dict[str, Array]:
         try:
             # copied, because a read-only array is another type to compiled code
             value = tensors[name] = values.reshape(each.shape).copy()
-        except ValueError as error:  # empty, but of lengths that no array can have
+        except ValueError as error:  # no elements, but lengths too large for an array
             raise _bad(f"tensor {quote(name)} cannot be read: {error}") from None
         if name != OUTPUTS and not np.isfinite(value).all():
             raise _bad(f"tensor {name!r} is not made of finite float64 numbers")

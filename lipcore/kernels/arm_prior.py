@@ -77,7 +77,7 @@ class Arm:
         if sorted(self.order.tolist()) != list(range(n)):
             raise ValueError(f"order is {self.order.tolist()}, expected each joint from 0 to {n - 1} once")
         if not ((self.unit > 0).all() and (self.widths > 0).all()):
-            raise ValueError("unit and widths hold numbers that are not above zero, expected standard deviations")
+            raise ValueError("unit and widths are standard deviations, expected only positive numbers")
 
     @property
     def n_joints(self) -> int:

@@ -52,9 +52,9 @@ class Geometry:
             if value.shape != shape or not np.isfinite(value).all():
                 raise ValueError(f"{name} has shape {value.shape}, expected finite numbers of shape {shape}")
         if not np.allclose(self.rotation @ self.rotation.mT, np.eye(3), atol=1e-6):
-            raise ValueError("rotation holds a matrix that is no rotation")
+            raise ValueError("rotation contains a matrix that is not a rotation")
         if not np.allclose(np.linalg.norm(self.axis, axis=1), 1.0, atol=1e-6):
-            raise ValueError("axis holds a vector that is not of length one")
+            raise ValueError("axis contains a vector that is not of length one")
 
     @classmethod
     def from_robot(cls, robot: RigidBody, gravity: bool = True) -> Geometry:

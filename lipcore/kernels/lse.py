@@ -65,7 +65,10 @@ class LagrangianSEKernel(PairKernel):
         return block - on_diagonal(k * ((omega + both) * c + d))
 
     def initial(self, motion: Motion, tau: Array) -> dict[str, Array]:
-        """Start with the spread of every input, times √(2 n) because distances add up, and with the measured power."""
+        """Return the start: length scales are the spreads of the inputs times √(2 n), and power is that of the torque.
+
+        The factor √(2 n) is there because the distances of the 2 n inputs add up.
+        """
         circle = np.hypot(spread(np.cos(motion.q)), spread(np.sin(motion.q)))
         position = np.where(self._revolute(), circle, spread(motion.q))
         inputs = (2 * self.n_joints) ** 0.5

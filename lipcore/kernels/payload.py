@@ -22,7 +22,7 @@ class PayloadKernel(LinearKernel):
     If the geometry θ is learnt, the change of the payload's torque with a step of θ belongs to the arm's own weights:
     they are linearised with the payload in their parameters (`ArmKernel`).
 
-    Weights: π (10,). arm: θ and the order of its joints; room: prior variance of π, (10,).
+    Weights: π (10,). arm: θ and the order of its joints; room: prior variances of π, (10,).
     """
 
     def __init__(self, arm: Arm, room: Array) -> None:

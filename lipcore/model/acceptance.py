@@ -116,7 +116,7 @@ def _check_error(figures: HeldOutFigures) -> Acceptance:
 
 
 def _check_coverage(figures: HeldOutFigures) -> Acceptance:
-    """Check that the intervals have a coverage of `min_coverage`, within the sampling error of so few errors."""
+    """Check that the intervals have a coverage of `min_coverage`, within sampling error."""
     each = zip(figures.coverage, figures.coverage_high, figures.independent, strict=True)
     joints = [texts.describe_joint_coverage(*joint) for joint in each]
     narrow = _list_joints(figures.joint_names, joints, figures.coverage_high < OPTIONS.min_coverage)

@@ -212,5 +212,5 @@ def _check(model: TorqueModel, motion: Motion, names: Sequence[str], tau: Array 
         expected = "a torque for forward_dynamics" if tau is None else "None without forward_dynamics"
         raise ValueError(f"tau is {'None' if tau is None else 'given'}, expected {expected}")
     if tau is not None and tau.shape != motion.q.shape:
-        raise ValueError(f"tau has shape {tau.shape}, expected {motion.q.shape} as q has")
+        raise ValueError(f"tau has shape {tau.shape}, expected {motion.q.shape}, the shape of q")
     return [name for name in COMPONENTS if name in names]

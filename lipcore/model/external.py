@@ -13,10 +13,11 @@ from lipcore.kernels.fast.compile import compiled
 
 @dataclass(frozen=True)
 class External:
-    """External torque of N instants of n joints, with its tests. It is no safety function: see docs/safety.md."""
+    """External torque of n joints at N instants, with its tests. It is not a safety function: see docs/safety.md."""
 
     rows: Array
-    """All values below, side by side in this order, (N, 3 n + 2); the last two only if a covariance was given."""
+    """All values below, side by side in this order, (N, 3 n + 2). The last two columns exist only if a covariance
+    was given."""
 
     @property
     def tau(self) -> Array:
@@ -43,7 +44,10 @@ class External:
 
     @property
     def p(self) -> Array:
-        """P(χ²_n > T), (N,). It is that of one instant: errors of neighbouring instants are similar."""
+        """P(χ²_n > T), (N,).
+
+        It applies to one instant alone. Do not multiply it over neighbouring instants: their errors are similar.
+        """
         return self.rows[:, -1]
 
     @property
@@ -64,7 +68,7 @@ def external(
     T = eᵀ C⁻¹ e with C = S (K + Σ) S, S = diag(scale), Σ = diag(noise_std²): the diagonal of C is s².
 
     tau, mean, std: (N, n), std of the function; noise_std: (n,); scale: (n,), factor on the half width of intervals,
-    None for 1; covariance: K, (N, n, n), of the function between the joints; without it there are neither T nor p.
+    None for 1; covariance: K, (N, n, n), of the function between the joints; without it, T and p are not computed.
     Values outside the range of numbers become inf or NaN.
     """
     count, n = tau.shape
@@ -113,7 +117,7 @@ def _compare(
 
 @compiled
 def _chi_square_tail(statistic: float, freedom: int) -> float:
-    """Return P(χ² with so many degrees of freedom > statistic), a finite sum.
+    """Return P(χ² > statistic) for `freedom` degrees of freedom, a finite sum.
 
     With x half the statistic and n the degrees of freedom: e⁻ˣ Σ xᵏ / k! over k from 0 to n/2 − 1 if n is even,
     erfc(√x) + e⁻ˣ Σ xᵏ⁻¹ᐟ² / Γ(k + ½) over k from 1 to (n − 1)/2 if it is odd.

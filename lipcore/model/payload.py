@@ -129,7 +129,7 @@ class Carrier:
 
     @cached_property
     def memory(self) -> Memory:
-        """Training memory: the probability of arms with another geometry, given the samples of the posterior."""
+        """Training memory: with it, the probability of arms with another geometry is computed."""
         n, limits = self.model.n_joints, self.model.training_range
         count = int(np.ceil(1.5 * self.term.size / n))  # one and a half times as many torques as the arm has weights
         draw = np.random.default_rng(0).uniform
@@ -252,7 +252,7 @@ class LinearisedCarrier:
 
     @cached_property
     def estimator(self) -> Estimator:
-        """The model's terms, the arm's with the payload in its parameters, the payload's, and those of other arms."""
+        """The model's terms, with the payload in the arm's parameters, plus terms of the payload and of other arms."""
         estimator, arm = self.carrier.model.estimator, self.carrier.term
         terms = {name: self._arm if each is arm else each for name, each in estimator.terms.items()}
         more = {} if self._others is None else {"others": self._others}
@@ -260,7 +260,7 @@ class LinearisedCarrier:
 
     @cached_property
     def basis(self) -> Basis:
-        """Basis with the variables w, π divided by the root of its room, and those of other arms."""
+        """Basis with the variables w, π / √room, and those of other arms."""
         basis = self.carrier.model.posterior.basis
         own = np.diag(np.sqrt(self._payload.variances(basis.params)))
         linear = [self._arm if each is self.carrier.term else each for each in basis.linear]

@@ -71,7 +71,7 @@ def selection(chosen: str, reason: str, table: list[Candidate], held_out: HeldOu
 def unevaluated_candidate(estimator: str, seconds: float, error: Exception | None = None) -> Candidate:
     """Return the record of an estimator that was not evaluated.
 
-    It was trained in so many seconds, or failed with an error.
+    seconds: duration of its training; error: the error with which it failed, None if it did not fail.
     """
     return Candidate(
         estimator=estimator,

@@ -97,7 +97,7 @@ def derive(t: Array, dq: Array, half: int) -> DerivedAccelerations:
     if half < 1:
         raise ValueError(f"half is {half}, expected at least 1")
     if dq.ndim != 2 or t.shape != dq.shape[:1]:
-        raise ValueError(f"dq has shape {dq.shape}, expected (N, n) with N = {len(t)} as t has")
+        raise ValueError(f"dq has shape {dq.shape}, expected (N, n) with N = {len(t)}, the length of t")
     rate = rate_of(t)
     width = 2 * half + 1
     offsets = np.arange(-half, half + 1, dtype=np.float64)
@@ -125,7 +125,7 @@ class Derivation:
 
     @property
     def delay_s(self) -> float:
-        """Return by how much later than its row an acceleration is known, s."""
+        """Return the delay from a row to its acceleration, s."""
         return self.half / self.rate
 
     @staticmethod

@@ -27,7 +27,8 @@ class AdaptiveOptions:
     some minutes was 98 %."""
     share: float = 0.7
     min_rows: int = 5
-    """If this share of so many rows or more lies outside, the scale jumps to a value that contains the batch."""
+    """If a batch has at least `min_rows` rows and at least this share lies outside, the scale jumps to a value that
+    contains the batch."""
     margin: float = 1.5
     """Factor on the max error of such a batch: the errors of a new payload continue to grow with the motion."""
     max_step: float = 0.25

@@ -37,7 +37,9 @@ class Rows:
             object.__setattr__(self, "weight", np.ones(len(self.q)))
         for name in ("dq", "ddq", "tau"):
             if getattr(self, name).shape != self.q.shape:
-                raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {self.q.shape} as q has")
+                raise ValueError(
+                    f"{name} has shape {getattr(self, name).shape}, expected {self.q.shape}, the shape of q"
+                )
         for name in ("time", "code", "weight"):
             if getattr(self, name).shape != self.q.shape[:1]:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, expected {self.q.shape[:1]}")

@@ -251,7 +251,7 @@ def _check_shapes(t: Array | None, q: Array, dq: Array, ddq: Array | None, tau: 
         raise ValueError(f"q has shape {q.shape}, expected (N, n)")
     for name, array in (("dq", dq), ("ddq", ddq), ("tau", tau)):
         if array is not None and array.shape != q.shape:
-            raise ValueError(f"{name} has shape {array.shape}, expected {q.shape} as q has")
+            raise ValueError(f"{name} has shape {array.shape}, expected {q.shape}, the shape of q")
     if t is not None and t.shape != q.shape[:1]:
         raise ValueError(f"t has shape {t.shape}, expected {q.shape[:1]}")
     if limits.torque is not None and limits.torque.shape != q.shape[1:]:

@@ -28,12 +28,12 @@ ACCEPTED_CODES = (Code.LEARNT, Code.STATIONARY, Code.PAYLOAD)
 
 @dataclass(frozen=True)
 class JudgeOptions:
-    """Options that the owner of a model has set."""
+    """Options that a user has set for a model."""
 
     enabled: bool = True
     """Whether rows are learnt."""
     on_change: Literal["hold", "adapt", "learn"] = "hold"
-    """What a change of the robot does: pause learning, adapt to it, or continue."""
+    """Reaction to a change of the robot: pause learning, adapt to it, or continue."""
     contact_threshold: float = 8.0
     """Min standard deviations of a contact."""
     adaptive_intervals: bool = True
@@ -49,7 +49,7 @@ class Judgement:
     record: Record | None
     """Record of the rows that count for quality; None if there are none."""
     logged: LoggedJudgement
-    """What the log stores besides these two."""
+    """What the log stores besides `rows` and `record`."""
     stream: StreamRecord
     """Record of the stream after the batch."""
     model: ModelRecord

@@ -97,7 +97,7 @@ class OnlineModel:
         return replace(self, before=self.before and self.before.detached(drifts), now=self.now.detached(drifts))
 
     def change(self, at: float) -> OnlineModel:
-        """Start a new regime at an event time: the mean stays, its uncertainty is reset.
+        """Start a new regime at an event time: keep the mean and reset its uncertainty.
 
         It starts after the latest row learnt, if that is later: a row belongs to one regime for good.
         """
@@ -206,7 +206,7 @@ class OnlineModel:
         return add_to(statistics, features, posterior.row_variance(motion) + open_, residual, weights)
 
     def _aged(self, reference: float, since: float) -> OnlineModel:
-        """Return the same knowledge with the weights of a later reference time; its sums are overwritten."""
+        """Return this model with the weights of a later reference time. The sums of this model are overwritten."""
         age = reference - max(self.reference, since)
         walk = _begin_walk(self.walk, since)
         if self.forgetting_s is None or age <= 0:

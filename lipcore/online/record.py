@@ -180,7 +180,7 @@ def _deviation(tau: Array, mean: Array, std: Array, noise_std: Array) -> Array:
         raise ValueError(f"tau has shape {tau.shape}, expected (N, n)")
     for name, array in (("mean", mean), ("std", std)):
         if array.shape != tau.shape:
-            raise ValueError(f"{name} has shape {array.shape}, expected {tau.shape} as tau has")
+            raise ValueError(f"{name} has shape {array.shape}, expected {tau.shape}, the shape of tau")
     if noise_std.shape not in (tau.shape, tau.shape[1:]):
         raise ValueError(f"noise_std has shape {noise_std.shape}, expected {tau.shape[1:]} or {tau.shape}")
     for name, array in (("tau", tau), ("mean", mean), ("std", std), ("noise_std", noise_std)):
@@ -188,7 +188,7 @@ def _deviation(tau: Array, mean: Array, std: Array, noise_std: Array) -> Array:
             raise ValueError(f"{name} has values that are not finite")
     total = np.sqrt(std**2 + noise_std**2)
     if not (total > 0).all():
-        raise ValueError("std and noise_std are both 0, expected an interval of some width")
+        raise ValueError("std and noise_std are both 0, expected at least one of them above 0")
     return np.asarray(total)
 
 

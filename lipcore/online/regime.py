@@ -1,4 +1,4 @@
-"""Store what is known of a robot between two changes: sums of its rows, per epoch if its friction drifts."""
+"""Store what was learnt about a robot between two changes: sums of its rows, per epoch if its friction drifts."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ class Regime:
         return solve(self.sums(walk), self.centre, first)
 
     def folded(self, walk: Walk | None, kept: int = WALK.kept) -> Regime:
-        """Return the same knowledge with at most `kept` epochs: the friction of the others is eliminated for good."""
+        """Return this regime with at most `kept` epochs. The friction of the others is integrated out."""
         regime = self
         while walk is not None and len(regime.epochs) > kept:
             first = regime.epochs[0]
@@ -129,7 +129,7 @@ class Regime:
         return regime
 
     def closed(self, walk: Walk | None, at: int) -> Regime:
-        """Return the same knowledge without epochs, about epoch `at`, in sums that can be overwritten."""
+        """Return this regime with all epochs folded, at epoch `at`, with sums that can be overwritten."""
         regime = self.folded(walk, 0)
         statistics = copied(regime.statistics) if regime.shared else regime.statistics
         return replace(regime, statistics=statistics, at=at, shared=False)

@@ -38,7 +38,7 @@ class BasePrediction:
     """Predictions of the version as trained, which learns nothing, for some of the P predicted rows."""
 
     rows: NDArray[np.int64]
-    """Their places among these rows, (M,)."""
+    """Places of the M compared rows among the P rows, (M,)."""
     share: float
     """Number of rows that each of them represents."""
     mean: Array
@@ -71,8 +71,8 @@ class StreamAnswers:
     factor: Array | None = None
     """Factor on half the width of its intervals, (N, n)."""
     other_load: bool = False
-    """Whether they were made with another payload than is known now: one that was not noticed yet, or is gone. The rows
-    are then judged with the payload known now."""
+    """Whether they were made with another payload than the one known now: a pickup or release was detected later. The
+    rows are then judged with the payload known now."""
 
     def take(self, rows: NDArray[np.bool_]) -> StreamAnswers:
         """Return the predictions for the chosen rows, a mask (N,)."""
@@ -86,7 +86,7 @@ class PredictedBatch:
 
     rows: Rows
     own: slice
-    """Which rows belong to this batch. The others waited for it."""
+    """Rows of this batch. The others are of an earlier batch and were waiting for this one."""
     answerable: NDArray[np.bool_]
     """Rows with a finite prediction, at rest or not, (N,)."""
     predicted: NDArray[np.bool_]
@@ -96,7 +96,7 @@ class PredictedBatch:
     std: Array
     """Its standard deviation, (P, n) N·m."""
     bare: Array
-    """`std` without the floor that past errors put under it, (P, n)."""
+    """`std` without the floor from past errors, (P, n)."""
     noise_std: Array
     """Standard deviation of the noise, (n,) N·m."""
     version: int

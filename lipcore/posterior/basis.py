@@ -15,10 +15,10 @@ from lipcore.posterior.linalg import block_diagonal, cholesky, solve_lower
 
 @dataclass(frozen=True)
 class Basis:
-    """m torques of the nonlinear term, chosen among those of S inducing samples, and all weights of the linear terms.
+    """m torques of the nonlinear term, chosen among those of S inducing samples, and all p weights of the linear terms.
 
-    These M = m + p variables u have the prior covariance B Bᵀ, and φ(x) = B⁻¹ cov(u, f(x)). In whitened form they are
-    independent with variance one. The torque is φᵀ w plus a remainder of variance k(x, x) − φᵀφ.
+    Together, these M = m + p variables u have the prior covariance B Bᵀ, and φ(x) = B⁻¹ cov(u, f(x)). In whitened form
+    they are independent with variance one. The torque is φᵀ w plus a remainder of variance k(x, x) − φᵀφ.
     """
 
     term: PairKernel | None
@@ -43,7 +43,7 @@ class Basis:
         term, linear = split(kernel)
         places = len(inducing) * kernel.n_joints
         if outputs.ndim != 1 or len(np.unique(outputs)) != len(outputs) or (term is None and len(outputs)):
-            raise ValueError(f"outputs has shape {outputs.shape}, expected distinct places of torques")
+            raise ValueError(f"outputs has shape {outputs.shape}, expected (m,) distinct places of torques")
         if len(outputs) and not (int(outputs.min()) >= 0 and int(outputs.max()) < places):
             raise ValueError(f"outputs reaches from {outputs.min()} to {outputs.max()}, expected 0 to {places - 1}")
         roots = [np.diag(np.sqrt(each.variances(params))) for each in linear]
@@ -63,7 +63,7 @@ class Basis:
             if each is linear:
                 return slice(start, start + size)
             start += size
-        raise ValueError("the linear term is none of this basis")
+        raise ValueError("the linear term does not belong to this basis")
 
     def features(self, query: Motion) -> Array:
         """Return φ(x) = B⁻¹ cov(u, f(x)) for the torques of N queries, (M, N n) (eq. 24 of docs/method.md)."""

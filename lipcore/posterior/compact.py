@@ -111,12 +111,12 @@ class CompactPosterior(Posterior):
     ) -> CompactPosterior:
         """Return the posterior of the torques, given the posterior of the whitened variables.
 
-        solution: its `first` variables are those of the nonlinear term; noise_variance: (n,) (N·m)²; floor: (n,)
-        (N·m)²; misfit: None for no misfit.
+        solution: its `first` leading variables belong to the nonlinear term; noise_variance: (n,) (N·m)²;
+        floor: (n,) (N·m)²; misfit: None for no misfit.
         """
         assert solution.first == len(basis.outputs)
         weights = solve_lower(basis.root, solution.mean, transposed=True)
-        # not from QᵀQ itself, because B⁻¹ is badly conditioned
+        # computed from Q and not from QᵀQ, because B⁻¹ is badly conditioned
         root = solve_lower_right(solution.root, basis.root)
         floor = np.zeros_like(noise_variance) if floor is None else floor
         misfit = Misfit.none(len(noise_variance)) if misfit is None else misfit
@@ -162,7 +162,7 @@ class CompactPosterior(Posterior):
         (N n, K). Raise ValueError for another term.
         """
         if term is not self.basis.term:
-            raise ValueError("the term is none of this posterior")
+            raise ValueError("the term does not belong to this posterior")
         inducing = covariance(self.basis.inducing)[self.basis.outputs]
         return np.concatenate([inducing, np.zeros((len(self.basis) - len(inducing), inducing.shape[1]))])
 

@@ -36,7 +36,7 @@ class Conformal:
     """Number of blocks."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values that no blocks can have."""
+        """Raise ValueError for values that `fit_conformal` cannot return."""
         object.__setattr__(self, "scale", tuple(self.scale))
         object.__setattr__(self, "guaranteed", tuple(self.guaranteed))
         if not all(1.0 <= each <= MAX_SCALE for each in self.scale):
@@ -47,7 +47,7 @@ class Conformal:
             raise ValueError(f"blocks is {self.blocks}, expected at least 1")
 
     def widened(self, factors: Sequence[float]) -> Conformal:
-        """Return the same with scales times factors, (n,), at least 1."""
+        """Return these factors with the scales multiplied by `factors`, (n,), at least 1."""
         return replace(self, scale=tuple(np.multiply(self.scale, factors).tolist()))
 
 
@@ -110,10 +110,10 @@ def _guard_rows(samples: Samples, first: int, last: int) -> slice:
 
 
 def _quantile(score: Array, rows: NDArray[np.int64]) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Return the scale and the guaranteed level of each joint, from scores (N, n) of B blocks with so many `rows` each.
+    """Return the scale and the guaranteed level of each joint, from scores (N, n) of B blocks of `rows` (B,) rows.
 
-    F_b(s) is the share of a block's scores up to s. The scale is the least s >= 1 with Σ F_b(s) / (B + 1) >= LEVEL. If
-    there is none, it is the least s with Σ F_b(s) / B >= LEVEL. The guaranteed level is Σ F_b(s) / (B + 1) at that s.
+    F_b(s) is the share of a block's scores up to s. The scale is the min s >= 1 with Σ F_b(s) / (B + 1) >= LEVEL. If
+    there is none, it is the min s with Σ F_b(s) / B >= LEVEL. The guaranteed level is Σ F_b(s) / (B + 1) at that s.
     """
     count, weight = len(rows), np.repeat(1 / rows, rows)
     needed = LEVEL * (count + 1 if LEVEL * (count + 1) <= count else count)

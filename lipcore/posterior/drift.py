@@ -34,8 +34,8 @@ class Drift:
 
             A' = D (A − A G Q^½ S⁻¹ Q^½ Gᵀ A) D,   S = I + Q^½ Gᵀ A G Q^½,
 
-        and h alike. centre: (M,) of the prior. A is read from its lower triangle. Raise NotPositiveDefiniteError for
-        statistics that no samples can have.
+        and the same for h. centre: (M,), mean of the prior. A is read from its lower triangle. Raise
+        NotPositiveDefiniteError for statistics that no samples can have.
         """
         sums = Statistics(statistics.a.copy(), statistics.b, statistics.samples)
         mirror(sums.a)

@@ -75,9 +75,9 @@ class Evaluator:
         usual: tuple[Array, Array] | None = None,
     ) -> None:
         if (term is None) != (inducing is None):
-            raise ValueError("term and inducing: expected both of them or neither")
+            raise ValueError("expected both term and inducing, or neither")
         if term is None and not linear:
-            raise ValueError("neither term nor linear: expected at least one of them")
+            raise ValueError("term is None and linear is empty, expected at least one term")
         self.n_joints = n = linear[0].n_joints if term is None else term.n_joints
         self._cross = None if term is None or inducing is None else term.cross(params, inducing)
         samples = 0 if self._cross is None else self._cross.size
@@ -268,7 +268,7 @@ def _check(outputs: Indices, torques: int, weights: Array, root: Array, linear_w
     if outputs.ndim != 1 or np.any((outputs < 0) | (outputs >= torques)):
         raise ValueError(f"outputs are {outputs}, expected numbers from 0 to {torques - 1}")
     if size == 0:
-        raise ValueError("neither outputs nor linear weights: expected at least one of them")
+        raise ValueError("there are no outputs and no linear weights, expected at least one of them")
     if weights.shape != (size,):
         raise ValueError(f"weights have shape {weights.shape}, expected ({size},)")
     if root.shape != (size, size):

@@ -51,7 +51,7 @@ class Factor:
 def cholesky(matrix: Array) -> Factor:
     """Return the Cholesky factor of a symmetric matrix. Raise NotPositiveDefiniteError if the jitter policy fails."""
     if not np.isfinite(matrix).all():
-        raise NotPositiveDefiniteError("the covariance matrix holds a value that is not finite")
+        raise NotPositiveDefiniteError("the covariance matrix contains a value that is not finite")
     scale = float(matrix.diagonal().mean()) if len(matrix) else 0.0
     for relative in JITTERS:
         lower = lower_root(matrix, relative * scale)
@@ -124,7 +124,7 @@ def eigen(matrix: Array) -> tuple[Array, Array]:
     is read from its lower triangle. Raise NotPositiveDefiniteError for a number that is not finite.
     """
     if not np.isfinite(matrix).all():
-        raise NotPositiveDefiniteError("a symmetric matrix holds a number that is not finite")
+        raise NotPositiveDefiniteError("a symmetric matrix contains a number that is not finite")
     try:
         values, vectors = np.linalg.eigh(matrix)
     except np.linalg.LinAlgError:

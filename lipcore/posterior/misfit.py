@@ -80,18 +80,18 @@ class Misfit:
         return np.stack([self.rest, self.slow, self.lasting, self.speed, self.acceleration])
 
     def of_joints(self, joints: NDArray[np.int64]) -> Misfit:
-        """Return the same with the joints in another order. joints: (n,), their places in this one."""
+        """Return this misfit with the joints in another order. joints: (n,), their places in this misfit."""
         return Misfit.unpacked(self.packed()[:, joints])
 
     def with_friction(self, coulomb: Array) -> Misfit:
-        """Return the same with at least `rest_share` of the squared Coulomb torques, (n,) N·m, as variance at rest.
+        """Return this misfit with a variance at rest of at least `rest_share` × `coulomb`², (n,) N·m.
 
-        It applies to joints that never moved, too.
+        This also applies to joints that never moved.
         """
         return replace(self, rest=np.maximum(self.rest, OPTIONS.rest_share * coulomb**2))
 
     def with_rest(self, other: Misfit) -> Misfit:
-        """Return the same with the variance at rest, and its speed, of another misfit if that variance is larger."""
+        """Return this misfit, with `rest` and `slow` of another misfit for joints whose `rest` is larger there."""
         larger = other.rest > self.rest
         rest, slow = np.where(larger, other.rest, self.rest), np.where(larger, other.slow, self.slow)
         return replace(self, rest=rest, slow=slow)

@@ -47,7 +47,7 @@ class Filters:
 
     @property
     def shortest(self) -> int:
-        """Return the min samples of a part of which some remain."""
+        """Return the min length of a part, in samples. Of a shorter part, no sample remains."""
         least = MIN_SAMPLES if self.cutoff is not None else 3 if self.derived else 1
         return max(least, sum(self.edges) + 1)
 
@@ -80,7 +80,7 @@ def resolve_filters(rate: float, given: tuple[str, ...], recipe: Recipe) -> Filt
     missing = list_derived(given)
     asked_rate = recipe.rate_hz
     if asked_rate is not None and asked_rate > rate * (1 + RATE_TOLERANCE):
-        raise PreparationError("rate", f"{asked_rate:g} Hz", f"at most the recording's, {rate:g} Hz")
+        raise PreparationError("rate", f"{asked_rate:g} Hz", f"at most the recording's rate, {rate:g} Hz")
     thins = asked_rate is not None and asked_rate < rate * (1 - RATE_TOLERANCE)
     filtered = should_low_pass(given, recipe)
     cutoff = recipe.cutoff_hz if filtered else None

@@ -40,15 +40,15 @@ class Stretch:
     """One contiguous part of a recording."""
 
     rows: slice
-    """Its rows among those that are kept."""
+    """Its rows among the kept rows of the recording."""
     at: Array | None
-    """Even times, s, at which it is interpolated, None if its own are even."""
+    """Evenly spaced times, s, at which it is interpolated; None if its own times are evenly spaced."""
     inner: slice
     """Its samples without the ends that are cut off."""
     positions: NDArray[np.int64] | Array | None
-    """Positions among `inner` that are returned, None for all."""
+    """Positions of the returned samples among `inner`; None if all are returned."""
     out: slice
-    """Its samples among those returned."""
+    """Its samples among the returned ones."""
 
     def on_clock(self, values: Array, times: Array) -> Array:
         """Return the samples of this part on its even clock. values, times: (N,), of the kept rows."""
@@ -174,7 +174,7 @@ def plan(
     """Return the plan of the recipe for a recording of N rows.
 
     t: (N,) s, rising within an episode, None if not recorded; episode: (N,) numbers, None if there is only one;
-    missing: (N,) mask of rows with an unknown time or value; given: the recorded ones of q, dq, ddq, tau; corrupt: (N,)
+    missing: (N,) mask of rows with an unknown time or value; given: recorded ones of q, dq, ddq, tau; corrupt: (N,)
     mask of other rows to leave out before a filter spreads them (`lipcore.data.outliers`).
 
     Raise PreparationError if the recording does not allow the recipe.

@@ -34,11 +34,11 @@ class Recipe:
     """When the low-pass is used."""
     form: Form = "acausal"
     rate_hz: float | None = None
-    """Rate of the samples that are returned, None for the recording's."""
+    """Rate of the returned samples; None for the rate of the recording."""
     trim_s: float | None = None
-    """Time cut off at both ends of every part; None cuts what the filter spoils, one period of its cut-off."""
+    """Time cut off at both ends of every part; None cuts one period of the cut-off, which the filter distorts."""
     gap_steps: float = 1.5
-    """A step of time longer than this many usual ones splits a recording. If signals are low-passed, it must also be
+    """A time step longer than this many usual steps splits a recording. If signals are low-passed, it must also be
     longer than 0.3 periods of the cut-off."""
     jitter: float = 0.25
     """Max deviation of a step from the usual one, as a share of it, on an even clock. An uneven clock is resampled."""
@@ -52,7 +52,7 @@ class Recipe:
             if value is not None and not least < value < float("inf"):
                 raise ValueError(f"{name} is {value!r}, expected a number above {least:g}")
         if self.trim_s is not None and not 0 <= self.trim_s < float("inf"):
-            raise ValueError(f"trim_s is {self.trim_s!r}, expected seconds, at least 0")
+            raise ValueError(f"trim_s is {self.trim_s!r}, expected at least 0 s")
 
     def to_json(self) -> dict[str, Any]:
         """Return the settings by name."""

@@ -49,7 +49,7 @@ def clock_of(t: Array, episode: Array, gap_steps: float, jitter: float, bridge_s
     step = np.diff(t)
     within = np.diff(episode) == 0
     if not within.any():
-        raise PreparationError("episode", "another one for every sample", "episodes of several samples")
+        raise PreparationError("episode", "different for every sample", "episodes of several samples")
     usual = float(np.median(step[within]))
     if usual < 1 / MAX_RATE:
         raise PreparationError("t", f"in steps of {usual:g}", f"seconds, in steps of at least {1 / MAX_RATE:g}")
@@ -66,7 +66,7 @@ def clock_of(t: Array, episode: Array, gap_steps: float, jitter: float, bridge_s
 
 
 def grid(first: float, last: float, rate: float) -> Array:
-    """Return times from `first` on, s, one over `rate` apart, none later than `last`."""
+    """Return times from `first` to `last` at most, s, spaced by 1 / `rate`."""
     count = int((last - first) * rate + 1e-6) + 1
     return np.asarray(first + np.arange(count) / rate)
 

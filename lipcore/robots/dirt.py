@@ -28,7 +28,7 @@ SCALED_AMOUNTS = ("friction", "stiction", "viscous", "load", "position", "warmth
 
 @dataclass(frozen=True)
 class Dirt:
-    """Amounts of the imperfections. Defaults are an industrial arm's, whose torque is measured by its currents.
+    """Amounts of the imperfections. The defaults describe an industrial arm that measures torque by its motor currents.
 
     Torques are in units of the joint's usual torque.
     """
@@ -75,7 +75,7 @@ class Dirt:
                 raise ValueError(f"{each.name} of the dirt is {value}, expected {kind}")
 
     def scaled(self, level: float) -> Dirt:
-        """Return these amounts multiplied by `level`: 0 is a perfect arm, 1 this one."""
+        """Return these amounts multiplied by `level`: 0 is a perfect arm, 1 is this arm."""
         return replace(self, **{name: level * getattr(self, name) for name in SCALED_AMOUNTS})
 
     def torque(self, t: Array, q: Array, dq: Array, tau: Array, usual: Array, rng: np.random.Generator) -> Array:
@@ -100,7 +100,7 @@ class Dirt:
         return np.asarray(out + usual * self.noise * draw_coloured_noise(rng, tau.shape, t[1] - t[0], self.noise_hz))
 
     def motion(self, t: Array, q: Array) -> tuple[Array, Array, Array]:
-        """Return position as counted, and velocity and acceleration derived from counts, (N, n) each. q: (N, n)."""
+        """Return the position as the encoder reports it, and velocity and acceleration derived from it, (N, n)."""
         rate = 1.0 / (t[1] - t[0])
         counted = q if self.encoder == 0 else self.encoder * np.round(q / self.encoder)
         smooth = low_pass(counted, rate, self.motion_hz)

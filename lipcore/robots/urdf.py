@@ -224,7 +224,7 @@ def _reduce(full: Any, free: Sequence[str]) -> Any:
     names = tuple(model.names)
     if sorted(names[1:]) != sorted(free):
         raise UrdfError(
-            f"locking left the joints {', '.join(names[1:])}, expected {', '.join(free)}: is a name used twice?"
+            f"locking left the joints {', '.join(names[1:])}, expected {', '.join(free)}. A name may be used twice"
         )
     for index in range(1, model.njoints):
         parent = model.parents[index]

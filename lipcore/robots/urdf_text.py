@@ -63,7 +63,7 @@ class UrdfJoint:
 
 @dataclass(frozen=True)
 class UrdfText:
-    """A checked URDF. joints: all of them; plain: links with their inertias and joints written anew, for Pinocchio."""
+    """A checked URDF. joints: all joints; plain: links with inertias and joints, rewritten for Pinocchio."""
 
     robot: str
     joints: tuple[UrdfJoint, ...]
@@ -131,7 +131,7 @@ def _check_tree(links: Sequence[str], joints: Sequence[UrdfJoint]) -> None:
     for name in reached:
         reached += below[name]
     if missing := sorted(set(links) - set(reached)):
-        raise UrdfError(f"the joints that lead to link {missing[0]!r} are a closed loop, expected a tree")
+        raise UrdfError(f"the joints that lead to link {missing[0]!r} form a closed loop, expected a tree")
 
 
 class _Scanner:
@@ -163,7 +163,7 @@ class _Scanner:
         raise UrdfError("the URDF declares a document type or an entity (<!DOCTYPE>, <!ENTITY>), which is not accepted")
 
     def _checked(self, tag: str, attributes: dict[str, str]) -> dict[str, str]:
-        """Return the used attributes of an element, in plain numbers."""
+        """Return those attributes of an element that are used, with checked numbers in plain notation."""
         if tag in ("link", "joint"):
             kind = {"type": attributes.get("type", "")[:40]} if tag == "joint" else {}
             return {"name": _name(attributes.get("name", ""), f"a {tag}")} | kind
@@ -174,7 +174,7 @@ class _Scanner:
             if (text := attributes.get(name)) is not None:
                 numbers = _numbers(text, count, MAX_VALUES.get(tag, 1e4), f"<{tag} {name}> of {where}")
                 kept[name] = " ".join(repr(each) for each in numbers)
-                moves = tag == "axis" and top.get("type") in MOVABLE  # a fixed joint's is often 0 0 0
+                moves = tag == "axis" and top.get("type") in MOVABLE  # the axis of a fixed joint is often 0 0 0
                 if moves and not 1e-3 <= (length := float(np.hypot.reduce(numbers))) <= 1e3:
                     raise UrdfError(
                         f"<axis xyz> of {where} is {text[:80]!r}, of length {length:g}, expected a direction"

@@ -26,7 +26,7 @@ class HeldOutSamples:
         return np.asarray(self._errors(answer).mean(axis=0))
 
     def edge_nmse(self, answer: TorqueDistribution) -> Array:
-        """Return the same for the rows at the edge, over the variance of all rows, (n,); NaN if there are none."""
+        """Return the mean squared error of the edge over the variance of all rows, (n,); NaN without edge rows."""
         errors = self._errors(answer)[self.edge]
         return errors.mean(axis=0) if len(errors) else np.full(self.samples.n_joints, np.nan)
 
@@ -41,8 +41,8 @@ def choose_estimator(held_out: HeldOutSamples, answers: Mapping[str, TorqueDistr
     """Return the name of the estimator to train on all samples, and the reason.
 
     The first is chosen unless a later one is surely better: its log density is higher beyond chance (95 %), and its
-    error is no larger, neither on all rows nor at the edge. LOCAL replaces an arm alone unless it is worse: it exists
-    only if its own samples have shown a gain, and it changes nothing away from them. answers: predictions of the
+    error is not larger, on all rows and at the edge. LOCAL replaces an arm alone unless it is worse. The reason: it
+    exists only if its own samples have shown a gain, and it changes nothing away from them. answers: predictions of the
     samples by at least one estimator, the simplest first.
     """
     first, *others = answers

@@ -26,7 +26,7 @@ SHARD = 2048
 class ShardStatistics:
     """Sums over some samples for a model, as plain arrays for transfer between processes.
 
-    Add them in one fixed order for equal bits.
+    Add them in one fixed order for bit-identical sums.
     """
 
     a: Array
@@ -85,7 +85,7 @@ def sum_samples(
 def with_statistics(model: TorqueModel, sums: ShardStatistics, count: int) -> TorqueModel:
     """Return the model with the posterior of `count` samples with these sums, instead of those of its fit.
 
-    Hyperparameters and basis stay. A local correction stays too: the sums are those of the arm alone.
+    Hyperparameters and basis do not change. Nor does a local correction, because the sums are those of the arm alone.
     """
     posterior = model.posterior
     statistics = Statistics(unpack_symmetric("a", sums.a), sums.b, sums.weight)

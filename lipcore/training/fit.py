@@ -37,9 +37,9 @@ def fit_estimator(
 ) -> TorqueModel:
     """Train one estimator on the samples of a task.
 
-    name: one of `lipcore.estimators.catalogue.ESTIMATORS`; learnt: rigid bodies learnt from these samples before, from
-    which estimators without them read the uncertainty of friction at rest; geometries: first starts of a search, base
-    to tip; corrected: joints that an earlier fit has corrected. Raise ValueError like `check_estimator`,
+    name: one of `lipcore.estimators.catalogue.ESTIMATORS`; learnt: rigid bodies learnt from these samples before.
+    Estimators without rigid bodies read the uncertainty of friction at rest from them; geometries: first starts of a
+    search, base to tip; corrected: joints that an earlier fit has corrected. Raise ValueError like `check_estimator`,
     FitCancelledError, or NotPositiveDefiniteError.
     """
     samples, types, options = task.samples, task.joint_types, task.options
@@ -68,7 +68,7 @@ def fit_estimator(
             report |= correction.report()
         conformal = fit_conformal(compression.posterior, used, variance)
     else:
-        # without the noise: the residual of rigid bodies belongs to the other term
+        # the start excludes the noise: what rigid bodies leave unexplained belongs to the other term
         params = {} if learnt is None else learnt.params
         start = {key: value for key, value in params.items() if key != "noise.log_std"}
         fewer = options if learnt is None else independent_samples(options, learnt)
@@ -112,9 +112,9 @@ def compact(
 
     The estimator has a nonlinear term. The entries are the jitter of the exact posterior, (N·m)², and the number of
     effective samples. used: samples of the task's recordings; rigid: misfit of the arm that was learnt from them. A
-    torque has the variance of `Misfit.of_row`, estimated from contiguous samples. They show less friction at rest than
-    the arm, because a nonlinear term follows its few samples there. Raise NotPositiveDefiniteError if the exact
-    posterior cannot be computed.
+    torque has the variance of `Misfit.of_row`, estimated from contiguous samples. Its variance of
+    friction at rest is that of the arm if that is larger: a nonlinear term fits its few samples there too closely.
+    Raise NotPositiveDefiniteError if the exact posterior cannot be computed.
     """
     options, factor = task.options, calibrate(estimator.name).function_std_factor
     compression, jitter = compress_samples(

@@ -54,7 +54,7 @@ class HoldOut:
 
 
 def hold_out(samples: Samples, joint_types: Sequence[str]) -> HoldOut:
-    """Hold about a quarter of the samples out: blocks at the edge of the data, and blocks from all over the recording.
+    """Hold about a quarter of the samples out: blocks at the edge of the data, and blocks spread over the recording.
 
     If there are fewer than six blocks, one is held out, and none is at the edge. There is also none at the edge if all
     groups of blocks that repeat each other are too large. Raise SplitError if there are too few samples.

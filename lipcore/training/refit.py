@@ -39,8 +39,8 @@ def _widen(model: TorqueModel, factors: Sequence[float]) -> TorqueModel:
 def refit(model: TorqueModel, task: Task) -> TorqueModel:
     """Return the model trained on the samples of a task, starting from the result of its own training.
 
-    An arm starts at the geometries of the model, without a search. Its correction stays. If `auto` chose an arm alone,
-    it is corrected if only all rows together show that motion repeats. The other estimators keep their arm and
+    An arm starts at the geometries of the model, without a search. Its correction is kept. If `auto` chose an arm
+    alone, it is corrected if only all rows together show that motion repeats. The other estimators keep their arm and
     hyperparameters, and their basis and posterior are computed again. `selection`, the report of the search and the
     factors of `widen_intervals` are kept.
 

@@ -72,11 +72,11 @@ def answer_of(scope: Scope, error: ServiceError) -> JSONResponse:
 
 
 async def refuse(error: ServiceError, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer an HTTP or WebSocket request with an error, for middleware, whose exceptions have no handler."""
+    """Answer an HTTP or WebSocket request with an error. Middleware needs it: no handler sees its exceptions."""
     answer = answer_of(scope, error)
     if scope["type"] == "websocket":
         await receive()  # the request to connect
-    # Starlette sends the right messages for both, if the server supports denial responses of WebSockets
+    # works for both protocols if the server supports WebSocket denial responses
     await answer(scope, receive, send)
 
 
@@ -121,7 +121,7 @@ def _explain(item: dict[str, Any]) -> Problem:
 
 
 async def _cut_off(request: Request, error: Exception) -> JSONResponse:
-    """Answer a client that disconnected while sending its body, so that it does not count as a failure here."""
+    """Answer a client that disconnected while it sent its body; else it counts as a failure of the service."""
     return answer_of(request.scope, invalid_request("body", "incomplete", "the whole body"))
 
 

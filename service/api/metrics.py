@@ -24,14 +24,14 @@ from service.telemetry.readiness import Readiness
 
 
 class System(Collector):
-    """Metrics of one service and its processes. Not for the event loop.
+    """Metrics of one service and its processes. Blocking: use it in a thread.
 
     The service's own process has the usual `process_…` metrics of Prometheus.
     """
 
     build = MetricKind("gauge", "lipserve_build_info", "Always 1; the label is the version of LIPServe", ("version",))
     parts = MetricKind(
-        "gauge", "lipserve_ready", "1 if a part of the service works, 0 if /health/ready reports it", ("part",)
+        "gauge", "lipserve_ready", "1 if a part of the service works, 0 if /health/ready reports a fault", ("part",)
     )
     used = MetricKind("gauge", "lipserve_disk_used_bytes", "Size of the files in the home folder, by kind", ("what",))
     free = MetricKind("gauge", "lipserve_disk_free_bytes", "Free bytes on the disk of the home folder")
@@ -86,13 +86,13 @@ class Traffic(Collector):
     duration = MetricKind(
         "histogram",
         "lipserve_request_duration_seconds",
-        "Time from a request's arrival to the start of its answer, s; for a stream, until it was accepted",
+        "Time from the arrival of a request to the start of its answer, s; for a stream, to its acceptance",
         ("method", "route", "model"),
     )
     requests = MetricKind(
         "counter",
         "lipserve_requests_total",
-        "Requests that were answered; 101: a stream, 499: the client went away before",
+        "Requests that were answered; 101: a stream, 499: client disconnected",
         ("method", "route", "status"),
     )
     errors = MetricKind(
@@ -103,7 +103,7 @@ class Traffic(Collector):
     frames = MetricKind(
         "histogram",
         "lipserve_stream_frame_duration_seconds",
-        "Time from the arrival of a stream's frame until its answer was ready, s; without frames that failed",
+        "Time from the arrival of a stream's frame until its answer is ready, s; failed frames do not count",
         ("model",),
     )
     late = MetricKind(
@@ -154,7 +154,7 @@ def _grouped(
     return [(group, merge_durations(groups[group])) for group in sorted(groups)]
 
 
-EXAMPLE = """# HELP lipserve_requests_total Requests that were answered; 101: a stream, 499: the client went away before
+EXAMPLE = """# HELP lipserve_requests_total Requests that were answered; 101: a stream, 499: client disconnected
 # TYPE lipserve_requests_total counter
 lipserve_requests_total{method="POST",route="/v1/models/{model}/predict",status="200"} 86400.0
 # HELP lipserve_quality_coverage Share of measurements inside the 95 % interval, noise included

@@ -129,7 +129,7 @@ def _add_errors(document: dict[str, Any], rules: Rules) -> None:
 def _add(path: str, method: str, operation: dict[str, Any], rules: Rules) -> None:
     """Add the common errors to an operation's responses."""
     kinds: list[type[ServiceError]] = [
-        errors.InvalidRequestError,  # of an unknown query parameter
+        errors.InvalidRequestError,  # for an unknown query parameter
         *(errors.ForbiddenError, errors.RateLimitedError, ServiceError, errors.NotReadyError),
     ]
     if rules.table[method.upper(), path].scope is not None:

@@ -101,7 +101,7 @@ def _body(payload: str | None, inertia: str | None) -> dict[str, Any] | None:
 def _as_many(option: str, text: str, expected: str) -> list[float]:
     given = numbers(option, text)
     if len(given) != len(expected.split(",")):
-        raise CommandError(f"{option} is {text!r}, expected {expected}")
+        raise CommandError(f"{option} must have the form {expected}, got {text!r}")
     return given
 
 

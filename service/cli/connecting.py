@@ -108,16 +108,16 @@ def aliases(context: typer.Context) -> Names:
 
 def _model(context: typer.Context) -> dict[str, Any]:
     name = context.params.get("model")
-    record = _asked(context, f"/v1/models/{quote(name, safe='')}") if name else None
+    record = _get_or_none(context, f"/v1/models/{quote(name, safe='')}") if name else None
     return record if isinstance(record, dict) else {"aliases": {}}
 
 
 def _listed(context: typer.Context, path: str, name: Callable[[dict[str, Any]], tuple[str, str]]) -> Names:
-    listed = _asked(context, path)
+    listed = _get_or_none(context, path)
     return [name(each) for each in listed["items"]] if isinstance(listed, dict) else []
 
 
-def _asked(context: typer.Context, path: str) -> Any:
+def _get_or_none(context: typer.Context, path: str) -> Any:
     url = url_of(context.params.get("url"))
     try:
         return ask(url, path)
@@ -207,7 +207,7 @@ def recording_of(data: str) -> Path | None:
         return path
     if path.is_dir() or (path.suffix.lower() in SUFFIXES and path.name != data):
         raise CommandError(
-            f"data is {data!r}, expected a recording, or the id or name of a data set",
+            f"{data!r} is neither a recording nor the id or name of a data set",
             "`lipserve data list` shows the data sets",
         )
     return None
@@ -295,27 +295,27 @@ def _waited(client: Client, job: str, show: Callable[[Job], None], patience: flo
     """Wait for a job to end and return it; if the service restarts, wait for it, because the job continues."""
     from lipserve import ApiError, ServiceUnreachableError  # noqa: PLC0415 - as above
 
-    gone: float | None = None
+    lost_at: float | None = None
 
-    def look(seen: Job) -> None:
-        nonlocal gone
-        if gone is not None:
-            gone = None
+    def report(seen: Job) -> None:
+        nonlocal lost_at
+        if lost_at is not None:
+            lost_at = None
             note("the service is reachable again")
         show(seen)
 
     while True:
         try:
-            return client.wait(job, look)
+            return client.wait(job, report)
         except (ApiError, ServiceUnreachableError) as error:
             # the service is starting or stopping, or a proxy answers instead
             if isinstance(error, ApiError) and error.status not in (429, 502, 503, 504):
                 raise
             now = time.monotonic()
-            if gone is None:
-                gone = now
+            if lost_at is None:
+                lost_at = now
                 note(f"{error}; {job} continues when the service is back: waiting up to {patience:.0f} s")
-            if now - gone >= patience:
+            if now - lost_at >= patience:
                 hint = f"the job may continue: run `lipserve jobs follow {job}` when the service is back"
                 raise CommandError(f"the service has been unreachable for {patience:.0f} s", hint) from error
             time.sleep(min(PAUSE, patience))

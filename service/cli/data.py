@@ -74,7 +74,9 @@ def add(
     ] = None,
     form: Annotated[str | None, _preparation("Filter type: acausal (default), or causal as on a live stream.")] = None,
     rate: Annotated[float | None, _preparation("Rate of the samples, Hz.")] = None,
-    gap: Annotated[float | None, _preparation("A pause longer than this many steps is a gap. Default: 1.5.")] = None,
+    gap: Annotated[
+        float | None, _preparation("A pause longer than this many median time steps is a gap. Default: 1.5.")
+    ] = None,
     trim: Annotated[float | None, _preparation("Time to cut off at both ends of every part, s.")] = None,
     url: Url = DEFAULT_URL,
     as_json: Json = False,

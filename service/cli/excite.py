@@ -57,13 +57,13 @@ def find(given: str | None, model: TorqueModel | None) -> Arm:
     """
     if given is None:
         if model is None:
-            raise ValueError("give --robot or --model: the limits of the robot are needed")
+            raise ValueError("give --robot or --model: the plan needs the limits of the robot")
         return _of_model(model)
     if not given.endswith(".urdf"):
         return _named(given, model)
     path = Path(given)
     if (size := path.stat().st_size) > MAX_URDF_BYTES:
-        raise ValueError(f"{given} has {size} bytes, expected at most {MAX_URDF_BYTES}")
+        raise ValueError(f"{given} has {size} bytes; the maximum is {MAX_URDF_BYTES}")
     profile = profiles.from_urdf(path.read_text(encoding="utf-8"), path.stem)
     names = profile.joint_names
     if model is not None and set(model.joint_names) <= set(names):  # other joints, such as grippers, do not move
@@ -123,8 +123,8 @@ def _check(profile: Profile, own: Sequence[str], called: Sequence[str]) -> None:
     known = profile.official_names(called)
     if len(own) != len(called) or (known is not None and known != tuple(own)):
         raise ValueError(
-            f"robot {profile.name!r} has the joints {', '.join(own)}; the model has {', '.join(called)}, expected the "
-            "same joints in the same order"
+            f"robot {profile.name!r} has the joints {', '.join(own)}; the model has {', '.join(called)}: "
+            "both need the same joints in the same order"
         )
 
 
@@ -194,14 +194,12 @@ def excite(
     ] = None,
     seconds: Annotated[float, typer.Option(help="Duration of the motion, s.")] = 50.0,
     rate: Annotated[float, typer.Option(help="Sample rate, Hz.")] = 100.0,
-    position: Annotated[float, typer.Option("--range", help="Share of each joint's range to use, at most.")] = 0.95,
-    reach: Annotated[float | None, typer.Option(help="Max distance from the middle of the range, rad (m).")] = None,
-    scale: Annotated[
-        float, typer.Option(help="Share of the speed, acceleration and torque limits to use, at most.")
-    ] = 0.9,
+    position: Annotated[float, typer.Option("--range", help="Max share of each joint's range to use.")] = 0.95,
+    reach: Annotated[float | None, typer.Option(help="Max distance from the middle of the range, rad or m.")] = None,
+    scale: Annotated[float, typer.Option(help="Max share of the speed, acceleration and torque limits to use.")] = 0.9,
     noise: Annotated[
         float | None,
-        typer.Option(help="Std of the torque noise without a model, N·m. Default: 1 % of the torque's."),
+        typer.Option(help="Std of the torque noise, N·m, if there is no model. Default: 1 % of the torque's std."),
     ] = None,
     estimator: Annotated[
         str, typer.Option(help=f"Estimator to plan for without a model: one of {', '.join(ESTIMATORS)}.")
@@ -320,8 +318,8 @@ def summary(made: Plan, known: str) -> str:
         ended += ", stopped by --budget"
     return (
         f"{options.seconds:g} s at {options.rate:g} Hz, {made.series.harmonics} harmonics, planned for {known}; "
-        f"{ended}. Random: the paper's sums of 50 sinusoids, mean of {RANDOM_MOTIONS} draws, at their own frequencies "
-        f"and (fast) at {FAST_SPEED:g} times these. The motion starts and ends at rest at q = {start}."
+        f"{ended}. Random: mean of {RANDOM_MOTIONS} draws of the paper's sums of 50 sinusoids. Random, fast: the same "
+        f"sums at {FAST_SPEED:g} times their frequencies. The motion starts and ends at rest at q = {start}."
     )
 
 

@@ -43,14 +43,14 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
     if not jobs:
         echo("no jobs yet: `lipserve train FILE --model NAME` queues one")
         return
-    from service.cli.tables import judged  # noqa: PLC0415 - takes long to import; help needs none
+    from service.cli.tables import quality_cells  # noqa: PLC0415 - takes long to import; help needs none
 
     figures = ("held-out nMSE", "coverage")
     table = Table(Column("id", no_wrap=True), "model", "estimator", "state", "done", "version", *figures, "queued")
     for job in jobs:
         version = "-" if job.version is None else str(job.version)
         at = job.created_at[:16].replace("T", " ")
-        cells = (job.estimator, job.state, percent(job.progress.fraction), version, *judged(job.quality), at)
+        cells = (job.estimator, job.state, percent(job.progress.fraction), version, *quality_cells(job.quality), at)
         table.add_row(job.id, escape(job.model), *cells)
     out.print(table)
 
@@ -99,7 +99,7 @@ def _print(job: Job, as_json: bool) -> None:
     made = "" if job.version is None else f", version {job.version}"
     echo(f"{job.id}  {job.model} ({job.estimator}): {job.state}{made}")
     at = job.progress
-    left = "" if not at.remaining_s else f", about {at.remaining_s:.0f} s left at most"
+    left = "" if not at.remaining_s else f", up to {at.remaining_s:.0f} s left"
     echo(f"  {at.stage}, {percent(at.fraction)} after {at.elapsed_s:.0f} s{left}; data sets {', '.join(job.datasets)}")
     for change in job.history:
         echo(f"  {change.at[:19].replace('T', ' ')}  {change.state}: {change.message}")
@@ -189,7 +189,7 @@ def train(
         options["prior"] = prior
     urdf = None if robot is None or not robot.endswith(".urdf") else Path(robot)
     if urdf is not None and not urdf.is_file():
-        raise CommandError(f"--robot is {robot!r}, expected a profile such as panda, the id of a URDF, or a .urdf file")
+        raise CommandError(f"--robot is {robot!r}, but this file does not exist")
     request = {
         "estimator": estimator,
         "joint_types": names(joint_types),
@@ -233,8 +233,8 @@ def train(
         return
     if made is None:
         return
-    judged = made.promotion
-    waits = judged is not None and not judged.answers
+    check = made.promotion
+    waits = check is not None and not check.answers
     echo(f"{model} version {job.version} trained: {'candidate, not serving' if waits else 'now serving'}")
     if made.selection is not None:
         print_selection(made.selection)

@@ -38,8 +38,8 @@ def create(
     rate: Annotated[
         float | None,
         typer.Option(
-            help="Max requests per second, instead of LIPSERVE_MAX_REQUESTS_PER_S. Bursts: ten seconds' worth, at most "
-            "LIPSERVE_MAX_REQUEST_BURST. A stream counts as one request."
+            help="Max requests per second, instead of LIPSERVE_MAX_REQUESTS_PER_S. A burst may contain the requests "
+            "of ten seconds, max LIPSERVE_MAX_REQUEST_BURST. A stream counts as one request."
         ),
     ] = None,
     file: Annotated[
@@ -50,7 +50,7 @@ def create(
 ) -> None:
     """Create a key and print it to standard output. It cannot be shown again."""
     if days is not None and not 0 < days <= MAX_DAYS:
-        raise ValueError(f"days is {days:g}, expected more than 0 and at most {MAX_DAYS:g}")
+        raise ValueError(f"--days must be more than 0 and at most {MAX_DAYS:g}, got {days:g}")
     expires = None if days is None else datetime.now(UTC) + timedelta(days=days)
     with _database() as (database, settings):
         scopes = [part.strip() for given in scope for part in given.split(",")]

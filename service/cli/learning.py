@@ -198,7 +198,7 @@ def decide(
 ) -> None:
     """Resume paused learning: decide how to handle a change of the robot or a stream that does not fit."""
     if decision not in DECISIONS:
-        raise CommandError(f"decision is {decision!r}, expected {' or '.join(DECISIONS)}")
+        raise CommandError(f"the decision must be {' or '.join(DECISIONS)}, got {decision!r}")
     with connected(url) as client:
         decided = client.decide(model, cast(Literal["adapt", "ignore"], decision), replay)
     print_result(decided, as_json, f"{model}: learning resumed; {counted(decided.rows, 'rejected row')} learnt")

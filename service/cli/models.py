@@ -41,7 +41,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
     if not models:
         echo("no models yet: `lipserve train FILE --model NAME` makes one")
         return
-    from service.cli.tables import judged  # noqa: PLC0415 - slow import, not needed for help
+    from service.cli.tables import quality_cells  # noqa: PLC0415 - slow import, not needed for help
 
     table = Table("model", "serving", "held-out nMSE", "coverage", "versions", "estimator", "aliases", "created")
     for model in models:
@@ -50,7 +50,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
         table.add_row(
             escape(model.name),
             str(model.serving_version or "none"),
-            *judged(None if serving is None else serving.quality),
+            *quality_cells(None if serving is None else serving.quality),
             str(len(model.versions)),
             "-" if serving is None else serving.estimator,
             escape(aliases),
@@ -63,7 +63,7 @@ def list_(limit: Limit = 50, url: Url = DEFAULT_URL, as_json: Json = False) -> N
 def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json: Json = False) -> None:
     """Print a model with its versions, and details of one version (default: the serving version)."""
     from lipserve import ApiError  # noqa: PLC0415 - slow import, not needed for help
-    from service.cli.tables import judged  # noqa: PLC0415 - as above
+    from service.cli.tables import quality_cells  # noqa: PLC0415 - as above
 
     with connected(url) as client:
         record = client.model(model)
@@ -89,7 +89,7 @@ def show(model: Model, version: Version = None, url: Url = DEFAULT_URL, as_json:
         passed = None if each.promotion is None else each.promotion.passed
         check = {True: "yes", False: "no", None: "not checked"}[passed]
         table.add_row(
-            str(each.version), *judged(each.quality), check, each.estimator, at, escape(", ".join(named)) or "-"
+            str(each.version), *quality_cells(each.quality), check, each.estimator, at, escape(", ".join(named)) or "-"
         )
     out.print(table)
     _print_version(detail)
@@ -102,10 +102,10 @@ def promote(
     """Make a version the serving version; with --alias, point that alias to it instead."""
     with connected(url) as client:
         moved = client.set_alias(model, alias, _which(version))
-        judged = client.version(model, moved.version).promotion
+        check = client.version(model, moved.version).promotion
     _moved(model, moved, as_json)
-    if not as_json and judged is not None and not judged.passed:
-        print_warnings([f"version {moved.version} did not pass the promotion check: {judged.reason}"])
+    if not as_json and check is not None and not check.passed:
+        print_warnings([f"version {moved.version} did not pass the promotion check: {check.reason}"])
 
 
 @app.command()
@@ -119,7 +119,7 @@ def rollback(
     url: Url = DEFAULT_URL,
     as_json: Json = False,
 ) -> None:
-    """Undo the last promotion (again: the one before it), or online learning after a revision."""
+    """Undo the last promotion (if repeated, the one before it), or online learning after a revision."""
     with connected(url) as client:
         if revision is None:
             _moved(model, client.rollback_alias(model, alias), as_json)
@@ -254,19 +254,26 @@ def import_(
     """
     with connected(url) as client:
         made = client.import_model(path, name, cast("PromotionOption | None", promotion))
-    what, judged = f"{made.model} version {made.version} imported", made.promotion
-    assert judged is not None
+    what, decision = f"{made.model} version {made.version} imported", made.promotion
+    assert decision is not None
     promote = f"`lipserve models promote {made.model} {made.version}` makes it the serving version"
     print_result(
         made,
         as_json,
-        f"{what}: now serving" if judged.answers else f"{what}: candidate, not serving: {judged.reason}; {promote}",
+        f"{what}: now serving" if decision.answers else f"{what}: candidate, not serving: {decision.reason}; {promote}",
     )
 
 
 @app.command()
 def delete(
-    model: Model, version: Version = None, yes: Yes = False, url: Url = DEFAULT_URL, as_json: Json = False
+    model: Model,
+    version: Annotated[
+        int | None,
+        typer.Option(help="Delete only this version. Default: the whole model.", autocompletion=connecting.versions),
+    ] = None,
+    yes: Yes = False,
+    url: Url = DEFAULT_URL,
+    as_json: Json = False,
 ) -> None:
     """Permanently delete a model with its versions and observations, or one version that is not in use."""
     what = f"model {model} with all its versions and observations" if version is None else f"{model} version {version}"
@@ -315,13 +322,13 @@ def print_held_out(version: VersionRecord) -> None:
 
 def print_promotion(version: VersionRecord) -> None:
     """Print whether a version passed the promotion check, and why; nothing for refreshed or shipped versions."""
-    judged = version.promotion
-    if judged is None:
+    check = version.promotion
+    if check is None:
         return
-    if judged.passed:
-        echo(f"  promotion check passed: {judged.reason}")
+    if check.passed:
+        echo(f"  promotion check passed: {check.reason}")
     else:
-        print_warnings([judged.reason])
+        print_warnings([check.reason])
 
 
 def _print_guarantee(conformal: dict[str, Any]) -> None:

@@ -32,9 +32,7 @@ def open_(
 ) -> None:
     """Print the address of the dashboard or of a model's page."""
     if url.startswith(UNIX):
-        raise CommandError(
-            f"url is {url!r}, expected http://…: browsers cannot use Unix sockets", "`lipserve serve --port 8000`"
-        )
+        raise CommandError(f"browsers cannot open {url}: give an http:// address", "`lipserve serve --port 8000`")
     try:
         ask(url, "/health/live")
     except (OSError, HTTPException, ValueError) as error:

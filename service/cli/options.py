@@ -112,7 +112,7 @@ def numbers(option: str, text: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError:
-        raise CommandError(f"{option} is {text!r}, expected numbers separated by commas") from None
+        raise CommandError(f"{option} must be numbers separated by commas, got {text!r}") from None
 
 
 def names(text: str | None) -> list[str] | None:
@@ -126,7 +126,7 @@ def pairs(option: str, given: Sequence[str] | None) -> dict[str, str]:
     for text in given or ():
         name, equals, value = text.partition("=")
         if not equals or not value:
-            raise ValueError(f"{option} is {text!r}, expected NAME=VALUE")
+            raise ValueError(f"{option} must have the form NAME=VALUE, got {text!r}")
         values[name.strip()] = value.strip()
     return values
 

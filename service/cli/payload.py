@@ -76,7 +76,7 @@ def payload(
 def _matrix(values: Sequence[float]) -> list[list[float]]:
     """Return the symmetric matrix of ixx, ixy, ixz, iyy, iyz, izz; raise CommandError."""
     if len(values) != 6:
-        raise CommandError(f"--inertia has {len(values)} numbers, expected 6: ixx,ixy,ixz,iyy,iyz,izz")
+        raise CommandError(f"--inertia must be six numbers, ixx,ixy,ixz,iyy,iyz,izz; got {len(values)}")
     xx, xy, xz, yy, yz, zz = values
     return [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
 

@@ -88,8 +88,8 @@ class Tally:
         """Return the figures for JSON; errors and coverage are None without answers.
 
         rmse is in N·m, over all joints. coverage is that of the 95 % interval. Answers are computed before the model
-        learns from their rows. `late` goes by the service's clock; `received_late` by this one, so it includes the
-        network.
+        learns from their rows. `late` is measured by the service's clock, `received_late` by this machine's,
+        so it includes the network.
         """
         p50, p99 = (np.percentile(self._trips, (50, 99)) * 1e3).tolist() if self.rows else (None, None)
         return {
@@ -137,13 +137,13 @@ def learnt_figures(learnt: StreamLearnt) -> dict[str, Any]:
 
 def refused_figures(refusals: Sequence[StreamRefusal]) -> list[dict[str, Any]]:
     """Return torques that were not logged, for JSON; consecutive ones with the same message are merged."""
-    told: list[dict[str, Any]] = []
+    merged: list[dict[str, Any]] = []
     for each in refusals:
-        if told and (told[-1]["through"] + 1, told[-1]["message"]) == (each.first, each.message):
-            told[-1]["through"] = each.through
+        if merged and (merged[-1]["through"] + 1, merged[-1]["message"]) == (each.first, each.message):
+            merged[-1]["through"] = each.through
         else:
-            told.append({"first": each.first, "through": each.through, "code": each.code, "message": each.message})
-    return told
+            merged.append({"first": each.first, "through": each.through, "code": each.code, "message": each.message})
+    return merged
 
 
 MIN_ROWS = 10
@@ -177,7 +177,7 @@ class Motion:
         """
         if len(joint_names) != len(self.joint_names):
             raise CommandError(
-                f"the motion has {len(self.joint_names)} joints ({', '.join(self.joint_names)}), expected the model's "
+                f"the motion has {len(self.joint_names)} joints ({', '.join(self.joint_names)}), but the model has "
                 f"{len(joint_names)}: {', '.join(joint_names)}"
             )
         if set(joint_names) != set(self.joint_names):

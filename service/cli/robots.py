@@ -64,7 +64,7 @@ def add(
 ) -> None:
     """Upload a URDF for use with recordings and training."""
     if path.suffix != ".urdf":
-        raise CommandError(f"path is {str(path)!r}, expected a .urdf file")
+        raise CommandError(f"{str(path)!r} is not a .urdf file")
     with connected(url) as client:
         robot = client.upload_robot(path)
     print_result(robot, as_json, f"{path.name} uploaded as {robot.id}: `lipserve train … --robot {robot.id}`")

@@ -47,7 +47,7 @@ def write_recording(path: Path, samples: Samples) -> None:
         formats = ["%.17g", "%d", *["%.17g"] * (4 * samples.n_joints)]
         np.savetxt(path, table, fmt=formats, delimiter=",", header=",".join(header), comments="")
     else:
-        raise ValueError(f"file is {path.name!r}, expected the ending .csv or .npz")
+        raise ValueError(f"the output file must end with .csv or .npz, got {path.name!r}")
 
 
 def described(

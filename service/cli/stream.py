@@ -71,7 +71,8 @@ def stream(
         float | None,
         typer.Option(
             min=0,
-            help="Deadline of an answer, ms: it is `late` by the service's clock, `received late` by this machine's. "
+            help="Deadline of an answer, ms. An answer is `late` if it misses the deadline by the service's clock, and "
+            "`received late` if it misses it by this machine's clock. "
             "Default: one step of the motion.",
         ),
     ] = None,
@@ -108,7 +109,7 @@ def stream(
         raise CommandError("give either a recording or --simulate ROBOT", f"`lipserve stream {model} --simulate panda`")
     if file is not None:
         if not file.is_file():
-            raise CommandError(f"file is {str(file)!r}, expected a recording")
+            raise CommandError(f"the recording {str(file)!r} does not exist")
         played = recorded(file, seconds)
     else:
         samples = max(2, round((seconds or 60.0) * rate))
@@ -193,7 +194,7 @@ class MisfitMonitor:
         print_error(Explained(f"{text}: learning is paused", hint))
 
     def _report_own_misfit(self) -> bool:
-        """Report that this stream does not fit either, while learning is paused; return whether it was reported."""
+        """Print an error if learning is paused and this stream does not fit; return whether it was printed."""
         alarms = islice(self._client.alarms(self._model), 20)
         own = (each.evidence for each in alarms if each.evidence.get("stream_id") == self._source)
         evidence = next((each for each in own if each.get("kind") == "opening"), None)

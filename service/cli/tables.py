@@ -47,7 +47,7 @@ def evaluation_table(result: Evaluation) -> Table:
     return figures_table(result.title, result.joint_names, figures)
 
 
-def judged(quality: HeldOutQuality | None) -> tuple[str, str]:
+def quality_cells(quality: HeldOutQuality | None) -> tuple[str, str]:
     """Return the joints' mean held-out nMSE and mean coverage as cells of a list."""
     if quality is None:
         return NOTHING, NOTHING

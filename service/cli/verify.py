@@ -101,7 +101,7 @@ def _datasets(database: Database, files: Files) -> Iterator[_Finding]:
     with database.session() as session:
         rows = list(session.scalars(select(DatasetRow)))
     for row in rows:
-        yield row.id, _gone(DatasetRow, row.seq), _reason(_read_dataset, files, row)
+        yield row.id, _deletion_check(DatasetRow, row.seq), _reason(_read_dataset, files, row)
 
 
 def _read_dataset(files: Files, row: DatasetRow) -> None:
@@ -115,7 +115,7 @@ def _robots(database: Database, files: Files) -> Iterator[_Finding]:
         rows = list(session.scalars(select(RobotRow).options(undefer(RobotRow.urdf))))
     for row in rows:
         same = hashlib.sha256(row.urdf.encode()).hexdigest() == row.sha256
-        yield row.id, _gone(RobotRow, row.seq), None if same else "the sha256 of its URDF has changed"
+        yield row.id, _deletion_check(RobotRow, row.seq), None if same else "the sha256 of its URDF has changed"
 
 
 def _versions(database: Database, files: Files) -> Iterator[_Finding]:
@@ -123,7 +123,7 @@ def _versions(database: Database, files: Files) -> Iterator[_Finding]:
         rows = list(session.scalars(select(VersionRow)))
     for row in rows:
         reason = _reason(_read_version, files, row)
-        yield f"{row.version} of model {row.model!r}", _gone(VersionRow, (row.model, row.version)), reason
+        yield f"{row.version} of model {row.model!r}", _deletion_check(VersionRow, (row.model, row.version)), reason
 
 
 def _read_version(files: Files, row: VersionRow) -> None:
@@ -142,7 +142,7 @@ def _snapshots(database: Database, files: Files) -> Iterator[_Finding]:
         if base is None or base[0] != key:  # one model in memory at a time
             base = key, _base(files, versions.get(key))
         reason = _reason(_read_snapshot, files, row, base[1])
-        yield f"{row.id} of version {row.version} of model {row.model!r}", _gone(SnapshotRow, row.seq), reason
+        yield f"{row.id} of version {row.version} of model {row.model!r}", _deletion_check(SnapshotRow, row.seq), reason
 
 
 def _base(files: Files, row: VersionRow | None) -> lipcore.TorqueModel | None:
@@ -168,7 +168,7 @@ def _observations(database: Database, files: Files) -> Iterator[_Finding]:
         if not rows:
             return
         for row in rows:
-            yield f"{row.number} of model {row.model!r}", _gone(EventRow, row.seq), _reason(_read_event, row)
+            yield f"{row.number} of model {row.model!r}", _deletion_check(EventRow, row.seq), _reason(_read_event, row)
         last = rows[-1].seq
 
 
@@ -189,7 +189,8 @@ def _reason(read: Callable[..., None], *arguments: Any) -> str | None:
     return None
 
 
-def _gone(table: type[Any], key: object) -> Callable[[Session], bool]:
+def _deletion_check(table: type[Any], key: object) -> Callable[[Session], bool]:
+    """Return a function that checks whether a row has been deleted."""
     return lambda session: session.get(table, key) is None
 
 

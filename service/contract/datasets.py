@@ -135,7 +135,7 @@ class WholeExcitation(BaseModel):
     parameters: int = Field(
         description="Number of base parameters: combinations of inertial parameters that affect torque"
     )
-    rank: int = Field(description="Number of base parameters excited more than 1 % as much as by random motion")
+    rank: int = Field(description="Number of base parameters with an excitation above 1 % of that of random motion")
     condition: float | None = Field(description="Condition number of the base regressor, columns scaled to equal norm")
     weakest: Share = Field(description="Excitation of the least excited one divided by that of random motion")
     weakest_body: str = Field(description="Joint that moves the body with the least excited parameters")

@@ -56,7 +56,7 @@ class HotDecoder(Generic[Model]):
         """Number of quotes in a body with the required arrays only; None if other fields are required."""
 
     def decode(self, body: bytes) -> Any:
-        """Return an object with the fields of the model and undecoded arrays for `request`, or None."""
+        """Return the decoded fields for `request`; None if the body may be invalid. Arrays may be undecoded."""
         try:
             value = self._decoder.decode(body)
             if body.count(b'"') == self._min_quotes:

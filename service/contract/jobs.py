@@ -36,7 +36,8 @@ class Options(BaseModel):
         description="Starting points of the search; the one with the best evidence is continued",
     )
     tied: bool = Field(
-        _DEFAULTS.tied, description="For `lip`: links share kernel shapes; false is the form of the paper"
+        _DEFAULTS.tied,
+        description="For `lip`: all links share kernel shapes. False: each link has its own, as in the paper",
     )
     prior: Literal["urdf", "zero"] = Field(
         "urdf", description="For rigid bodies: prior inertial parameters, from the URDF or zero"

@@ -14,7 +14,7 @@ from service.contract.payload import LivePayload
 from service.foundation.errors import invalid_request
 
 REPLAYABLE = tuple(code for code in CODES if code not in ("learnt", "non_finite", "edge", "late"))
-"""Codes whose rows are complete, so that they can still be learnt."""
+"""Codes of complete rows, which can still be learnt."""
 Nullable = list[float | None]
 
 AlarmKind = Literal["change", "payload", "novelty", "linearisation", "refresh", "promotion", "clock"]
@@ -232,7 +232,7 @@ class LearningStatus(BaseModel):
     lag_s: float = Field(description="Time since the arrival of the first row that responses do not contain yet, s")
     events: int = Field(description="Number of the newest event of the log")
     novel_share: float | None = Field(
-        description="Share of the latest samples outside the basis; null until rows are learnt"
+        description="Share of the latest samples that the model's basis does not represent; null until rows are learnt"
     )
     linearisation_error: list[float] | None = Field(
         None,
@@ -376,7 +376,7 @@ class LiveStatus(BaseModel):
     held: Held | None = Field(description="Why learning is paused until a decision; null if it is not")
     failure: str | None = Field(description="Why learning fails; null if it does not")
     novel_share: float | None = Field(
-        description="Share of the latest samples outside the basis; null until rows are learnt"
+        description="Share of the latest samples that the model's basis does not represent; null until rows are learnt"
     )
     novel: list[LiveNovelty]
     counts: dict[str, int] = Field(

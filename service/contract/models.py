@@ -18,7 +18,7 @@ ALIAS = r"^[a-z][a-z0-9._-]{0,63}$"
 VERSION = r"^[a-z0-9][a-z0-9._-]{0,63}(:[1-9][0-9]{0,8}|@[a-z][a-z0-9._-]{0,63})?$"
 """A version in one text: `model:3`, `model@alias`, or `model` for the serving version."""
 AliasName = Annotated[str, StringConstraints(pattern=ALIAS)]
-"""Lower-case letters, digits, dots, underscores and hyphens after a letter, unlike a version number."""
+"""A letter, then lower-case letters, digits, dots, underscores and hyphens: never a version number."""
 
 
 class SelectionCandidate(BaseModel):
@@ -43,13 +43,13 @@ class SelectionHeldOut(BaseModel):
     """Part that `auto` held out for the choice; the chosen estimator was then trained on it too."""
 
     rows: int
-    blocks: int = Field(description="Number of contiguous stretches of these rows")
+    blocks: int = Field(description="Number of contiguous ranges of these rows")
     repeats: bool = Field(
         description="Whether all motion of the recording repeats itself, so that figures are too good, except at the "
         "edge"
     )
     edge_rows: int = Field(0, description="Rows at the edge of the data, whose states are furthest from all others")
-    edge_blocks: int = Field(0, description="Number of contiguous stretches of the rows at the edge")
+    edge_blocks: int = Field(0, description="Number of contiguous ranges of the rows at the edge")
 
 
 class Selection(BaseModel):
@@ -75,7 +75,7 @@ class Promotion(BaseModel):
 
     @classmethod
     def of(cls, found: Acceptance, serving: int | None, option: PromotionOption = "ask") -> Promotion:
-        """Decide whether a version serves: if it has passed, or if its owner always wants it."""
+        """Decide whether a version serves: if it has passed the check, or if its owner always promotes."""
         passed, reason = found.passed, found.reason
         if not passed and option == "always":
             reason += "; it serves, because `promotion` is always"
@@ -266,7 +266,7 @@ class Holdout(BaseModel):
 
 
 class HeldOutSet(BaseModel):
-    """Held-out part of one data set, in enough detail to find the same samples again."""
+    """Held-out part of one data set, with all that is needed to select the same samples again."""
 
     model_config = ConfigDict(strict=True)
 
@@ -294,7 +294,7 @@ class Interval(BaseModel):
 
 
 class Reliability(BaseModel):
-    """Reliability curve: `observed` equals `nominal` if uncertainty is right, and is below if it is too small."""
+    """Reliability curve: `observed` is below `nominal` if the stated uncertainty is too small, else equal or above."""
 
     nominal: list[float] = Field(description="Nominal probabilities of the intervals")
     observed: list[list[float]] = Field(
@@ -306,7 +306,7 @@ class Stretches(BaseModel):
     """Distribution of the error over the recording: nMSE by stretch, for a box plot."""
 
     kind: Literal["episodes", "equal"] = Field(
-        description="`episodes` if there are 5 to 200, else `equal`: ten stretches of equal length"
+        description="`episodes` if there are 5 to 200, else `equal`: ten segments of equal length"
     )
     samples: list[int] = Field(description="Compared samples of each stretch, in row order")
     nmse: list[list[float | None]] = Field(

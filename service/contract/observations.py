@@ -36,7 +36,8 @@ class LearningOptions(BaseModel):
         ge=FORGETTING_S[0],
         le=FORGETTING_S[1],
         allow_inf_nan=False,
-        description="Age at which a sample counts 1/e of a new one, s of event time; null: nothing is forgotten",
+        description="Time constant of forgetting, s of event time: a sample of this age has the weight 1/e. "
+        "Null: nothing is forgotten",
     )
     friction_walk_s: float | None = Field(
         None,
@@ -48,9 +49,9 @@ class LearningOptions(BaseModel):
     )
     on_change: Literal["hold", "adapt", "learn"] = Field(
         "hold",
-        description="Reaction to a detected change of the robot, or to a stream whose first second is outside the 95 % "
-        "interval. `hold`: learning, also of that second, is paused until the owner decides. `adapt`: a new regime "
-        "begins. `learn`: learning continues as before",
+        description="Reaction if the robot has changed, or if the first second of a stream is outside the 95 % "
+        "interval. `hold`: learning is paused until the owner decides; that second is not learnt. `adapt`: a new "
+        "regime begins. `learn`: learning continues as before",
     )
     torque_limits: list[TorqueLimit] | None = Field(
         None,

@@ -27,7 +27,7 @@ class SketchedJoint(BaseModel):
 
 
 class ArmSketch(BaseModel):
-    """Geometry for a drawing of an arm, joints from base to tip. `parameters` of the version has all of it."""
+    """Geometry for a drawing of an arm, joints from base to tip. The version's `parameters` have the full geometry."""
 
     gravity: Three
     joints: list[SketchedJoint]

@@ -330,7 +330,7 @@ class CompareResponse(BaseModel):
     samples: int = Field(description="Samples of the data set")
     samples_used: int = Field(description="Compared samples, evenly thinned above the limit")
     blocks: int = Field(
-        description="Blocks for standard errors: stretches of one second, or episodes if there are enough"
+        description="Blocks for standard errors: segments of one second, or episodes if there are enough"
     )
     versions: list[VersionFigures] = Field(description="The two versions in the order of the request")
     differences: JointDifferences

@@ -33,7 +33,7 @@ class RobotPage(BaseModel):
 
 
 class ProfileJoint(RobotJoint):
-    """A joint and its limits; null if it has none or none is known."""
+    """A joint and its limits. A limit is null if the joint has none or it is unknown."""
 
     aliases: list[str] = Field(description="Other names of the joint in recordings")
     turns_freely: bool = Field(description="Whether the joint turns endlessly, so that it has no range")

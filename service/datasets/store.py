@@ -140,7 +140,7 @@ def preview(storage: Storage, dataset: str, quantities: Sequence[str], points: i
 
 
 def page(database: Database, part: Page, upload_sha256: str | None = None) -> DatasetPage:
-    """List data sets, newest first. upload_sha256: only those whose uploaded file has this hash."""
+    """List data sets, newest first. upload_sha256: list only uploads of a file with this hash."""
     of_file = () if upload_sha256 is None else (DatasetRow.report["upload_sha256"].as_string() == upload_sha256,)
     with database.session() as session:
         rows, following = read_page(session, DatasetRow, part, *of_file)

@@ -68,7 +68,7 @@ class NotFoundError(ServiceError):
 
 
 class ConflictError(ServiceError):
-    """The request conflicts with the present state of what it names: the message says how."""
+    """The request conflicts with the present state of a resource; the message says why."""
 
     status, code = 409, "conflict"
 
@@ -176,7 +176,7 @@ def problem(field: str, value: object, expected: str, message: str | None = None
 
 
 def readable(text: str) -> str:
-    """Escape characters that a terminal or log does not show: control and bidirectional characters, half surrogates."""
+    """Escape characters that a terminal or log does not show: control and bidirectional characters, lone surrogates."""
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)

@@ -99,7 +99,7 @@ def _to_array(name: str, value: Any, nullable: bool) -> NDArray[np.float64]:
     rows = []
     for index, row in enumerate(value):
         if not isinstance(row, list) or len(row) != width:
-            raise invalid_request(f"{name}[{index}]", row, f"a list of {width} numbers, as {name}[0] has")
+            raise invalid_request(f"{name}[{index}]", row, f"a list of {width} numbers, the length of {name}[0]")
         rows.append(numbers(f"{name}[{index}]", row, nullable))
     return np.array(rows).reshape(len(rows), width)
 
@@ -108,7 +108,7 @@ BINARY: dict[str, Any] = {"type": "string", "format": "binary"}
 
 
 def upload_body(description: str, content: dict[str, Any], file: str) -> dict[str, Any]:
-    """Return the OpenAPI description of an upload's body: by media type, or a form with one file."""
+    """Return the OpenAPI description of an upload: the body is the file, or a form with one file."""
     form = {"type": "object", "required": ["file"], "properties": {"file": {**BINARY, "description": file}}}
     every = {**content, "multipart/form-data": {"schema": form}}
     return {"requestBody": {"required": True, "description": description, "content": every}}

@@ -104,8 +104,8 @@ class Settings(BaseSettings):
 
     keys: Literal["auto", "on"] = Field(
         "auto",
-        description="When requests need API keys: `auto`, unless the service listens on loopback only; `on`, always. "
-        "Set `on` behind a reverse proxy.",
+        description="Whether requests need API keys. `auto`: they do unless the service listens on loopback only. "
+        "`on`: they always do. Set `on` behind a reverse proxy.",
     )
     trusted_proxies: str = Field(
         "127.0.0.1",
@@ -114,8 +114,8 @@ class Settings(BaseSettings):
     )
     promotion: Literal["ask", "always"] = Field(
         "ask",
-        description="Whether a trained version serves at once: `ask`, if it does well on its held-out data, else it "
-        "waits under the alias `candidate`; `always`, in any case. A job may choose otherwise.",
+        description="When a trained version starts serving. `ask`: at once if it does well on held-out data, else it "
+        "becomes a candidate (alias `candidate`). `always`: at once. A job may choose otherwise.",
     )
 
     log_level: Literal["critical", "error", "warning", "info", "debug"] = Field(
@@ -124,7 +124,9 @@ class Settings(BaseSettings):
     log_format: Literal["console", "json"] = Field(
         "console", description="Format of the log: `console` for people, `json` with one object a line."
     )
-    log_slow_s: Seconds = Field(0.25, description="Duration from which a query of a control loop is logged.")
+    log_slow_s: Seconds = Field(
+        0.25, description="Min duration of a query of a control loop for which it is logged as slow."
+    )
     opentelemetry: bool = Field(
         False,
         description="Send a trace of each request to OTEL_EXPORTER_OTLP_ENDPOINT. Needs `lipserve[opentelemetry]`.",
@@ -133,7 +135,7 @@ class Settings(BaseSettings):
     max_upload_bytes: Bytes = Field(256 * MiB, description="Max size of an uploaded recording.")
     max_unpacked_bytes: Bytes = Field(1024 * MiB, description="Max size of a recording after unpacking.")
     parser_memory_bytes: Bytes = Field(
-        1024 * MiB, description="Max memory for reading one upload, programs aside. Not limited on macOS."
+        1024 * MiB, description="Max memory for the data of one upload while it is read. Not limited on macOS."
     )
     parser_s: Seconds = Field(
         600.0, description="Max time for reading one upload. Half as much processor time is allowed."
@@ -172,8 +174,8 @@ class Settings(BaseSettings):
     )
     max_connections: Count = Field(
         512,
-        description="Max connections, streams included. Beyond it idle ones are closed, and if none is idle, new ones "
-        "are refused. /health is still answered.",
+        description="Max connections, streams included. Beyond it, idle connections are closed; if none is idle, new "
+        "ones are refused. /health is still answered.",
     )
     max_connections_per_client: Count = Field(
         128,
@@ -182,8 +184,8 @@ class Settings(BaseSettings):
     )
     max_requests_per_s: Rate | None = Field(
         None,
-        description="Max rate of requests of an API key without a rate of its own, or of an address if there are no "
-        "keys. If not set, not limited.",
+        description="Max request rate of an API key that has no own rate; of an address if there are no keys. If not "
+        "set, there is no limit.",
     )
     max_request_burst: Count = Field(1000, description="Max requests that a client with a limited rate sends at once.")
     keep_alive_s: Annotated[int, Unit("s")] = Field(
@@ -193,7 +195,7 @@ class Settings(BaseSettings):
     )
     stop_notice_s: Delay = Field(
         0.0,
-        description="Time for which a service that is told to stop still answers, but reports that it is not ready.",
+        description="Time for which a stopping service still answers. It already reports that it is not ready.",
     )
 
     max_home_bytes: Bytes | None = Field(None, description="Quota of the home. If not set, not limited.")
@@ -209,18 +211,18 @@ class Settings(BaseSettings):
         description="Age up to which observations are kept. A stream without a payload that is silent for as long is "
         "deleted.",
     )
-    max_snapshots: int = Field(20, ge=2, description="Snapshots kept of a version: how far a rollback reaches.")
+    max_snapshots: int = Field(20, ge=2, description="Max snapshots of a version. More let a rollback reach further.")
     publish_every_s: Seconds = Field(
         0.5, description="Min time between two revisions of a version. A snapshot is stored every 60 times as long."
     )
 
     max_loaded_models: Count = Field(
-        4, description="Versions that the service, and as many that the learner process, keep in memory."
+        4, description="Max versions in memory, in the service and in the learner process each."
     )
-    max_concurrent_predictions: Count = Field(2, description="Predictions that are computed at the same time.")
+    max_concurrent_predictions: Count = Field(2, description="Max predictions that are computed at the same time.")
     learner_niceness: Niceness = Field(
         0,
-        description="Niceness of the learner process. With 10, answers on a busy machine contained rows 16 s late.",
+        description="Niceness of the learner process. With 10, rows reached the answers 16 s late on a busy machine.",
     )
     training_workers: Count = Field(1, description="Training processes.")
     statistics_workers: Count = Field(

@@ -19,7 +19,7 @@ from service.models.loaded import LoadedModels, ServedModel
 
 
 def compare(loaded: LoadedModels, model: str, request: schema.CompareRequest) -> schema.CompareResponse:
-    """Compare two versions on a data set. Not for the event loop.
+    """Compare two versions on a data set. Blocking: use it in a thread.
 
     Raise InvalidRequestError, NotFoundError, DamagedDataError or UnreadableVersionError.
     """

@@ -189,7 +189,7 @@ Rows = NDArray[np.int64]
 
 
 def trace(loaded: LoadedModels, model: str, request: schema.TraceRequest) -> schema.TraceResponse:
-    """Predict along a data set or its held-out part. Not for the event loop.
+    """Predict along a data set or its held-out part. Blocking: use it in a thread.
 
     Raise InvalidRequestError, NotFoundError or DamagedDataError.
     """

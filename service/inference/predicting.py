@@ -192,8 +192,9 @@ def predict_now(
 
 
 def predict(loaded: LoadedModels, model: str, request: PredictRequest, served: ServedModel | None = None) -> Struct:
-    """Return a PredictResponse to the queries; raise InvalidRequestError or NotFoundError. Not for the event loop.
+    """Return a PredictResponse to the queries. Blocking: use it in a thread.
 
+    Raise InvalidRequestError or NotFoundError.
     `served` is the version if the caller has found it.
     """
     served = served or loaded.get(model, request.version, request.alias)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 
 def describe_too_little(blocks: int, block_s: float, least: int) -> str:
-    """Return the verdict that data are too short. blocks: their stretches of `block_s` seconds, or episodes."""
+    """Return the verdict that data are too short. blocks: number of segments of `block_s` seconds, or of episodes."""
     return (
-        f"The data are too short for a verdict: {blocks} stretches of {block_s:g} s, or episodes; at least {least} are "
-        "needed. Record longer, or more episodes."
+        f"The data are too short for a verdict: they have {blocks} segments of {block_s:g} s (or episodes), and at "
+        f"least {least} are needed. Record longer, or record more episodes."
     )
 
 
@@ -28,7 +28,7 @@ def describe_no_difference(first: int, second: int, amount: str) -> str:
 
 
 def describe_equal_errors(amount: str) -> str:
-    """Return that errors do not differ."""
+    """State that errors do not differ."""
     return f"Their mean nMSE differs by {amount}, which is not significant."
 
 
@@ -55,5 +55,5 @@ def describe_learnt_online(version: int, revision: int) -> str:
 
 
 def describe_unknown_repetition(error: object) -> str:
-    """Return the warning that training data cannot be read."""
+    """Return the warning that training data cannot be read, so that repetition is unknown."""
     return f"It is unknown whether these samples repeat the training motion: {error}."

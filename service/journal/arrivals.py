@@ -17,7 +17,7 @@ from service.storage.database import EventRow, StreamRow, now
 
 StreamKind = Literal["batches", "frames"]
 MAX_RANGES = 1000
-"""Gaps that are stored for a stream. The lowest are dropped first: they are the least likely to be filled."""
+"""Max stored gaps of a stream. The lowest are dropped first, as they are the least likely to be filled."""
 MIN_SILENT_S = 10.0
 """Seconds without a batch after which a stream may be deleted to make room for a new one."""
 
@@ -42,7 +42,7 @@ class NewBatch:
 
 @dataclass(frozen=True)
 class Gaps:
-    """The sequences that a stream lacks."""
+    """The sequences of a stream that are missing."""
 
     first: int
     """Lowest sequence that has arrived."""
@@ -131,7 +131,7 @@ def _make_room(session: Session, model: str, most: int, received: float) -> None
 
 
 def check_kind(source: StreamRow | None, kind: StreamKind) -> None:
-    """Raise ConflictError if a stream carries the other kind: one sequence cannot count both."""
+    """Raise ConflictError if a stream is of the other kind: a sequence counts either batches or frames."""
     if source is not None and source.kind != kind:
         name = f"stream {source.stream_id!r} of model {source.model!r}"
         raise ConflictError(f"{name} consists of {source.kind}, not {kind}: use another stream_id")

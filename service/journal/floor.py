@@ -13,13 +13,13 @@ from lipcore.online.record import Record, error_floor
 from service.storage.database import Database, EventRow
 
 WINDOW_S = 2.0
-"""Seconds before the newest batch whose batches count."""
+"""Length of the window before the newest batch from which batches count, s."""
 MIN_ROWS = 200
 """Min rows that count: older batches are added until there are so many."""
 
 
 def error_floor_of(database: Database, model: str, version: int, through: int, n_joints: int) -> Array:
-    """Return the lower bound (n,) of the function variance, (N·m)², that the errors up to event `through` prove.
+    """Return the lower bound (n,) of the function variance, (N·m)², from the errors up to event `through`.
 
     The batches are those of the last `WINDOW_S` before the newest batch, and older ones until there are `MIN_ROWS`
     rows.
@@ -51,7 +51,7 @@ def error_floor_of(database: Database, model: str, version: int, through: int, n
             rows += record["rows"]
         events.close()
     total = Record.empty(n_joints)
-    if rows:  # in one average and only two figures: this runs twice a second
+    if rows:  # only two figures, in one average, because this runs twice a second
         figures = np.array([[record["squared"], record["noise"]] for record in records])
         squared, noise = np.average(figures, axis=0, weights=[record["rows"] for record in records])
         total = replace(total, rows=rows, squared=squared, noise=noise)

@@ -231,7 +231,7 @@ def memory(session: Session, model: str, number: int) -> Memory:
 
 
 def start_of(session: Session, model: str, version: int) -> int:
-    """Return the number of the last event that a version contains by training."""
+    """Return the number of the last event that the training of a version used; 0 if it used none."""
     return fetch(session, _START, model=model, version=version).scalar() or 0
 
 

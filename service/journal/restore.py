@@ -47,7 +47,7 @@ _NOT_UNDONE = (
     EventRow.void.is_(False),
 )
 _SIZES = select(EventRow.rows).where(*_NOT_UNDONE).order_by(EventRow.number).limit(PAGE_EVENTS)
-_EVENTS = (  # reports and records are large and not learnt
+_EVENTS = (  # without reports and records, which are large and not learnt
     select(EventRow)
     .where(*_NOT_UNDONE)
     .order_by(EventRow.number)
@@ -63,12 +63,12 @@ class RestoredState:
     model: str
     version: int
     start: int
-    """Last event that the version contains by training."""
+    """Last event that the training of the version used; 0 if it used none."""
     online: OnlineModel
     number: int
     """Last event that `online` contains."""
     seen: int
-    """Event up to which undoing is taken into account."""
+    """Last event whose undoing is taken into account."""
     torn: bool = False
     """Whether the newest snapshot is unreadable. If so, gaps of the log are skipped."""
 
@@ -162,7 +162,7 @@ def _count_page(sizes: Iterable[int]) -> int:
 
 
 def _fold_events(online: OnlineModel, events: Sequence[EventRow], novel: NovelRowsCallback | None) -> OnlineModel:
-    """Fold the events of a page, one after the other."""
+    """Apply the events of a page to the online model, in order."""
     rows = {event.number: log.learning_rows(event) for event in events if event.payload is not None}
     teaches = any(len(each.learnt) for each in rows.values())
     online = online.detached() if teaches else online

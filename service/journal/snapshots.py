@@ -26,7 +26,7 @@ def save(
 ) -> str | None:
     """Store a version's state after event `number` durably, delete snapshots beyond `most`, and return the id.
 
-    seen: the event up to which undoing is taken into account. Return None and store nothing if the version has been
+    seen: last event whose undoing is taken into account. Return None and store nothing if the version has been
     deleted, or if events in the state have been undone since.
     """
     snapshot = new_id("snap")
@@ -140,7 +140,7 @@ def retain(database: Database, settings: Settings, model: str, now: float) -> in
 
 
 def find_newest_contained(session: Session, model: str) -> int:
-    """Return the number of the newest event that the serving version contains by training or in a snapshot."""
+    """Return the number of the newest event that training of the serving version used or that a snapshot contains."""
     version = registry.serving_version(session, model)
     if version is None:
         return 0

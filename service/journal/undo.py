@@ -58,7 +58,7 @@ def must_fold_again(session: Session, model: str, version: int, seen: int, throu
 
     It must if it contains events that have been undone since and can be made without them.
 
-    Events that the version contains by training stay.
+    Events that the training of the version used stay.
     """
     later = (EventRow.model == model, EventRow.number > seen, EventRow.kind.in_(("unlearn", "rollback")))
     start = log.start_of(session, model, version)
@@ -72,9 +72,9 @@ def must_fold_again(session: Session, model: str, version: int, seen: int, throu
 
 
 def can_fold_again(session: Session, model: str, version: int, first: int) -> bool:
-    """Return whether the state of a version can be made again without the events from `first` on.
+    """Return whether the state of a version can be reconstructed without the events from `first` on.
 
-    That needs all events since the newest snapshot before `first`, or since the training.
+    This needs all events since the newest snapshot before `first`, or since the training.
     """
     before = (SnapshotRow.model == model, SnapshotRow.version == version, SnapshotRow.number < first)
     base = session.scalar(select(func.max(SnapshotRow.number)).where(*before))

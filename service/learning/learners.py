@@ -49,8 +49,8 @@ MAX_LAG_S = 30.0
 class IngestThreads:
     """A few threads that ingest batches: those of one model in order, without blocking other models.
 
-    The threads have the priority of the thread that answers. At a lower priority, a busy machine stopped them while
-    they held the interpreter's and the database's locks: the p99 of answers was 46 ms instead of 8 ms.
+    The threads have the priority of the thread that answers. At a lower priority, a busy machine suspends them while
+    they hold locks of the interpreter and the database: the p99 of answers was 46 ms instead of 8 ms.
     """
 
     def __init__(self) -> None:
@@ -65,8 +65,8 @@ class IngestThreads:
     async def run(self, model: str, work: Callable[..., Result], *args: Any, arrived: float | None = None) -> Result:
         """Run work on a model's log in the next free thread, in order of arrival.
 
-        arrived: time of its first row by `perf_counter`, now if None. Raise BusyError if too many batches wait. For the
-        event loop.
+        arrived: time at which the first row arrived, by `perf_counter`; None: now. Raise BusyError if too many batches
+        wait. Call it in the event loop.
         """
         waiting = sum(map(len, self._arrived.values())) - MAX_THREADS
         if waiting >= MAX_WAITING_BATCHES:
@@ -75,7 +75,7 @@ class IngestThreads:
         self._arrived[model] = [*self._arrived.get(model, ()), arrived]
         try:
             async with self._turns.setdefault(model, asyncio.Lock()):
-                # what has begun is finished, even if the request was cancelled
+                # work that has started is finished, even if the request is cancelled
                 run = copy_context().run  # log lines name the request
                 done = asyncio.get_running_loop().run_in_executor(self._threads, run, work, *args)
                 return await asyncio.shield(done)
@@ -88,7 +88,7 @@ class IngestThreads:
                 del self._arrived[model], self._turns[model]
 
     def close(self) -> None:
-        """Finish the batches that have begun and reject more."""
+        """Finish the running batches and reject further ones."""
         self._threads.shutdown(cancel_futures=True)
 
 
@@ -123,9 +123,12 @@ class Lag:
 class Learners:
     """Learning of all models, safe from several threads. Close it before the database.
 
-    process: the learner process. weighing: follows the payloads of streams. threads: ingest batches. live: the feed for
-    readers who follow models. on_published: called with each publication, in the reader's thread, after its revision
-    serves; fill it before the first batch.
+    - process: the learner process.
+    - weighing: follows the payloads of streams.
+    - threads: ingest batches.
+    - live: feed for clients that follow models.
+    - on_published: functions called with each publication once its revision serves, in the thread that reads from the
+      learner process. Add them before the first batch.
     """
 
     def __init__(self, loaded: LoadedModels) -> None:
@@ -146,34 +149,37 @@ class Learners:
         self.weighing = self._log.weighing
 
     def close(self) -> None:
-        """Finish the batches that have begun and end the processes. The learner stores its state."""
+        """Finish the running batches and end the processes. The learner stores its state."""
         self.threads.close()
         self.weighing.close()
         self.process.close()
 
     def observe(self, model: str, request: ObservationRequest) -> ObservationResponse:
-        """Log an observation batch, see `observations.observe_batch`. Not for the event loop."""
+        """Log an observation batch, see `observations.observe_batch`. Blocking: use it in a thread."""
         return observe_batch(self._log, model, request)
 
     def observe_frames(self, frames: Frames) -> FramesResult:
-        """Log frames of a stream, see `frames.observe_frames`. Not for the event loop."""
+        """Log frames of a stream, see `frames.observe_frames`. Blocking: use it in a thread."""
         return observe_frames(self._log, frames)
 
     def monitor(self, model: str) -> Monitor:
         """Return the monitor of a model, up to date with batches that other services have logged.
 
-        Raise NotFoundError or UnreadableVersionError. Not for the event loop.
+        Raise NotFoundError or UnreadableVersionError. Blocking: use it in a thread.
         """
         monitor = self._monitor(self.loaded.get(model, None))
         self._log.follow(monitor, model)
         return monitor
 
     def turn(self, model: str) -> AbstractContextManager[None]:
-        """Lock a model's log, see `ObservationLog.turn`; raise as `monitor` does. Not for the event loop."""
+        """Lock a model's log, see `ObservationLog.turn`; raise as `monitor` does. Blocking: use it in a thread."""
         return self._log.turn(self._monitor(self.loaded.get(model, None)), model)
 
     def follow(self, models: Collection[str] | None = None) -> None:
-        """Update the monitors of these models from the log, of all models in memory if None. Not for the event loop."""
+        """Update the monitors of these models from the log; None: of all models in memory.
+
+        Blocking: use it in a thread.
+        """
         if models is None:
             self.load_monitors()
         else:
@@ -188,7 +194,7 @@ class Learners:
     def load_monitors(self) -> dict[str, Monitor]:
         """Return the monitors that exist and those of models in memory that have streams, by model.
 
-        No model is loaded, because that would unload another. Not for the event loop.
+        No model is loaded, because that would unload another. Blocking: use it in a thread.
         """
         with self.database.session() as session:
             learning = list(session.scalars(select(StreamRow.model).distinct()))
@@ -208,7 +214,7 @@ class Learners:
             self._status = {key: status for key, status in self._status.items() if key[0] != model}
 
     def check_process(self, lasting: FaultAge) -> tuple[PartState, str]:
-        """Return the readiness of the learner process. Not for the event loop.
+        """Return the readiness of the learner process. Blocking: use it in a thread.
 
         Rows that wait are only a warning: one version that cannot learn does not affect other models or answers.
         """
@@ -247,7 +253,7 @@ class Learners:
         return behind, any(before.get(key) == revision for key, revision in self._revisions.items())
 
     def lag(self, served: ServedModel) -> Lag:
-        """Return how far the answers of a version lag behind. Not for the event loop."""
+        """Return how far the answers of a version lag behind. Blocking: use it in a thread."""
         model = served.name
         with self.database.session() as session:
             contained = log.start_of(session, model, served.version) + served.revision

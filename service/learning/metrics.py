@@ -21,7 +21,7 @@ def _quality(figure: str, meaning: str) -> MetricKind:
 
 
 class LearningCollector(Collector):
-    """The metrics of all models of one service that learn. Not for the event loop."""
+    """The metrics of all models of one service that learn. Blocking: use it in a thread."""
 
     nmse = _quality(
         "nmse", "Mean squared error / variance of the measured torque; every row is predicted before it is learnt"
@@ -29,11 +29,16 @@ class LearningCollector(Collector):
     coverage = _quality("coverage", "Share of measurements inside the 95 % interval, noise included")
     nlpd = _quality("nlpd", "Mean negative log predictive density, nats")
     revision = MetricKind("gauge", "lipserve_revision", "Revision that predictions contain", ("model", "version"))
-    novel = MetricKind("gauge", "lipserve_novel_share", "Share of the latest samples outside the basis", ("model",))
+    novel = MetricKind(
+        "gauge",
+        "lipserve_novel_share",
+        "Share of the latest samples that the model's basis does not represent",
+        ("model",),
+    )
     scale = MetricKind(
         "gauge",
         "lipserve_interval_scale",
-        "Factor on the half width of returned intervals; 1: as the model states",
+        "Factor on the half width of returned intervals; 1: as the model predicts",
         ("model", "joint"),
     )
     streams = MetricKind("gauge", "lipserve_streams", "Streams of the model", ("model",))

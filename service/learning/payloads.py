@@ -22,7 +22,7 @@ from service.models.loads import StreamPayload
 from service.storage.database import EventRow
 
 MAX_BATCHES = 40
-"""Batches of a stream that are read again to restore its payload."""
+"""Max batches of a stream that are read from the log to restore its payload."""
 PAYLOAD_CODES = [Code.LEARNT, Code.PAYLOAD]
 """Codes of rows that show a payload."""
 

@@ -42,9 +42,9 @@ class RefreshRule:
     """The limits that trigger an automatic refresh, and the pause between two."""
 
     novelty_share: float = 0.2
-    """Share of the last `NOVELTY_ROWS` rows beyond the basis."""
+    """Share of the last `NOVELTY_ROWS` rows that the model's basis does not represent."""
     linearisation_error: float = 0.5
-    """Linearisation error of a learnt arm; 1 is as large as the stated error."""
+    """Linearisation error of a learnt arm, divided by the stated error."""
     pause_s: float = 600.0
     """Min seconds between two refreshes."""
 
@@ -75,7 +75,7 @@ def queue_refresh(database: Database, queue: JobQueue, published: Publication) -
 
     Nothing is queued while learning is paused or a refresh runs. A pause must have passed since the last refresh; it
     doubles with every refresh of the same version. If a refresh is impossible or switched off, an alarm reports that
-    once a version. Not for the event loop.
+    once a version. Blocking: use it in a thread.
     """
     reasons = list(_find_reasons(published))
     if not reasons:

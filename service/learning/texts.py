@@ -52,7 +52,7 @@ def describe_put_down(stream_id: str) -> str:
 
 
 def describe_novelty(version: str, share: float, rows: int) -> str:
-    """Return the reason for a refresh that rows lie outside of the basis."""
+    """Return the reason for a refresh: the basis does not represent the latest rows."""
     return f"{percent(share)} of the last {rows} samples are outside the motions that {version} can learn"
 
 
@@ -77,15 +77,15 @@ def describe_refresh_failure(reason: str, error: str) -> str:
 
 
 def describe_process_gone(seconds: float) -> str:
-    """Return that the learner process does not run."""
+    """State that the learner process does not run."""
     return f"has not run for {seconds:.0f} s: observations are stored, but not learnt"
 
 
 def describe_process_silent(seconds: float) -> str:
-    """Return that the learner process makes no progress."""
+    """State that the learner process makes no progress."""
     return f"has made no progress for {seconds:.0f} s: observations are stored, but not learnt"
 
 
 def describe_lag(events: int, seconds: float) -> str:
-    """Return that the learner process is behind."""
+    """State that the learner process is behind."""
     return f"runs, but {events} events are waiting and none was learnt for {seconds:.0f} s"

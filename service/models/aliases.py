@@ -28,8 +28,8 @@ def put(loaded: LoadedModels, model: str, alias: str, request: AliasRequest) -> 
 
     The version is loaded and warm before the alias moves. Queries follow by one assignment; queries in flight keep
     their version. Raise InvalidRequestError unless exactly one of version and alias is given, NotFoundError,
-    UnreadableVersionError, and ConflictError beyond MAX_ALIASES or for a version of another robot. Not for the event
-    loop.
+    UnreadableVersionError, and ConflictError beyond MAX_ALIASES or for a version of another robot. Blocking: use it
+    in a thread.
     """
     if (request.version is None) == (request.alias is None):
         given = "neither" if request.version is None else "both"
@@ -42,7 +42,7 @@ def rollback(loaded: LoadedModels, model: str, alias: str) -> Alias:
     """Undo the last move of an alias, removals included. A second call undoes the move before it.
 
     Raise NotFoundError if the alias never existed, UnreadableVersionError, and ConflictError if the alias pointed to
-    nothing before or to a deleted version. Not for the event loop.
+    nothing before or to a deleted version. Blocking: use it in a thread.
     """
     with loaded.database.session() as session:
         move = _last(session, model, alias)
@@ -65,7 +65,7 @@ def remove(loaded: LoadedModels, model: str, alias: str) -> None:
 
 
 def _move(loaded: LoadedModels, model: str, alias: str, version: int, taken_back: AliasMoveRow | None = None) -> Alias:
-    """Move an alias to a version that is loaded. If `taken_back` is given, it must still be the alias's last move."""
+    """Move an alias to a loaded version. `taken_back`: the move to undo, which must be the last one of the alias."""
     number = None if taken_back is None else taken_back.seq
     with loaded.moving:
         with loaded.database.transaction() as session:

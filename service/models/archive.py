@@ -43,7 +43,7 @@ class ArchiveFile:
 def export(
     loaded: LoadedModels, model: str, version: int | None, alias: str | None, learnt: bool, as_c: bool = False
 ) -> ArchiveFile:
-    """Archive a version, or the serving version if none is named. Not for the event loop.
+    """Archive a version, or the serving version if none is named. Blocking: use it in a thread.
 
     If `learnt`, include what the version has learnt online; else export it as trained. If `as_c`, write the C source
     and header of `lipcore.export.c_writer`. Everything is checked before the first byte is sent. Raise NotFoundError,

@@ -37,7 +37,7 @@ logger = logging.getLogger(__name__)
 
 
 def add(loaded: LoadedModels, upload: Path, name: str | None, promotion: PromotionOption | None = None) -> Version:
-    """Import an archive as a new version and return it. Not for the event loop.
+    """Import an archive as a new version and return it. Blocking: use it in a thread.
 
     `name` is the model's name; the default is the name in the archive. `promotion` decides whether the version serves;
     the default is the setting. With the option `ask`, the version serves only if it is the model's first and passes the

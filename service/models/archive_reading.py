@@ -40,7 +40,7 @@ _KINDS = {
 
 
 MAX_JSON_BYTES = 64 * 1024
-"""Maximum size of the members that only describe other members, bytes."""
+"""Maximum size of an archive member that describes other members, bytes."""
 MAX_MANIFEST_BYTES = 1024 * 1024
 MAX_ARCHIVE_BYTES, MAX_URDF_BYTES = 128 * 1024 * 1024, 2 * 1024 * 1024
 """Maximum size of a version's archive, and of a URDF in it or uploaded, bytes."""

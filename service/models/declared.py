@@ -40,7 +40,7 @@ class DeclaredPayloads:
             return model
 
     def model(self, payload: Numbers) -> TorqueModel:
-        """Return the model with a payload; make it if it is not kept. Not for the event loop.
+        """Return the model with a payload; make it if it is not kept. Blocking: use it in a thread.
 
         Raise NoArmError if the version has no rigid bodies, ValueError if the payload is not a possible body.
         """

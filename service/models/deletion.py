@@ -41,7 +41,7 @@ OF_MODEL = (AliasMoveRow, AliasRow, ServingRow, LearnerRow, LearningRow, StreamR
 
 
 def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
-    """Delete a version permanently; its number is not used again. Not for the event loop.
+    """Delete a version permanently; its number is not used again. Blocking: use it in a thread.
 
     Raise NotFoundError. Raise ConflictError, naming the reason, if an alias points to the version, if it serves or if
     it is the model's only one. Raise it too while a job refreshes the version or starts from it.
@@ -65,7 +65,7 @@ def delete_version(loaded: LoadedModels, model: str, version: int) -> None:
 
 
 def delete_refreshed(loaded: LoadedModels, model: str) -> None:
-    """Delete the versions made by automatic refreshes that nothing needs. Not for the event loop.
+    """Delete the versions made by automatic refreshes that nothing needs. Blocking: use it in a thread.
 
     Kept are the newest MAX_REFRESHED, every version in use and the one that a rollback of `serving` returns to.
     """
@@ -82,7 +82,7 @@ def delete_refreshed(loaded: LoadedModels, model: str) -> None:
 
 
 def delete_model(loaded: LoadedModels, model: str) -> None:
-    """Delete a model with its versions, aliases, log, streams, snapshots and alarms. Not for the event loop.
+    """Delete a model with its versions, aliases, log, streams, snapshots and alarms. Blocking: use it in a thread.
 
     A later model of the same name continues the version numbers. Raise NotFoundError, or ConflictError while a job of
     the model, or a job that starts from one of its versions, waits or runs.
@@ -94,9 +94,9 @@ def delete_model(loaded: LoadedModels, model: str) -> None:
                 raise not_found("model", model)
             for job in _active_jobs(session):
                 if job.model == model:
-                    raise ConflictError(f"{job.id} of model {model!r} is {job.state}: cancel it or wait for its end")
+                    raise ConflictError(f"{job.id} of model {model!r} is {job.state}: cancel it or wait until it ends")
                 if (job.request.get("base") or "").partition(":")[0] == model:
-                    raise ConflictError(f"{job.id} starts from model {model!r}: cancel it or wait for its end")
+                    raise ConflictError(f"{job.id} starts from model {model!r}: cancel it or wait until it ends")
             versions = list(session.scalars(select(VersionRow).where(VersionRow.model == model)))
             snapshots = list(session.scalars(select(SnapshotRow.id).where(SnapshotRow.model == model)))
             _note_deletion(session, row, [each.version for each in versions])
@@ -123,9 +123,9 @@ def _check_unused(session: Session, model: str, version: int) -> None:
         raise ConflictError(f"{name} is its only version: delete the model instead")
     for job in _active_jobs(session):
         if job.model == model and (job.request.get("refresh") or {}).get("version") == version:
-            raise ConflictError(f"{job.id} refreshes {name}: cancel it or wait for its end")
+            raise ConflictError(f"{job.id} refreshes {name}: cancel it or wait until it ends")
         if job.request.get("base") == f"{model}:{version}":
-            raise ConflictError(f"{job.id} starts from {name}: cancel it or wait for its end")
+            raise ConflictError(f"{job.id} starts from {name}: cancel it or wait until it ends")
 
 
 def _active_jobs(session: Session) -> list[JobRow]:

@@ -115,7 +115,7 @@ def git_commit(checkout: Path) -> str | None:
     if not (checkout / ".git").exists():  # an installed package may lie inside another project's checkout
         return None
     command = ["git", "--no-optional-locks", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    try:  # a checkout on a slow disk loses its commit, not its training
+    try:  # on a slow disk, training continues without the commit
         answer = subprocess.run(  # noqa: S603 - a fixed command
             command, cwd=checkout, capture_output=True, text=True, timeout=5.0, check=True
         )

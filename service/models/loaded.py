@@ -82,7 +82,7 @@ class LoadedModels:
         self._deleted: set[Key] = set()
         self._lock = threading.Lock()
         self.moving = threading.Lock()
-        """Lock for one change at a time: an alias is moved or a version deleted, first in the database, then here."""
+        """Lock for moves of aliases and deletions of versions. Its holder changes the database, then this object."""
         self.waiters = RevisionWaiters()
         """Queries that wait for a revision."""
         self._loading: dict[Key, threading.Lock] = {}
@@ -123,7 +123,7 @@ class LoadedModels:
         return (model, version) in self._deleted
 
     def get(self, model: str, version: int | None, alias: str | None = None) -> ServedModel:
-        """Return a version, or the version of an alias; load it if necessary. Not for the event loop.
+        """Return a version, or the version of an alias; load it if necessary. Blocking: use it in a thread.
 
         Without both, return the serving version. Raise NotFoundError or UnreadableVersionError.
         """
@@ -197,20 +197,20 @@ class LoadedModels:
                 deleted(model)
 
     def announce(self, models: Collection[str]) -> None:
-        """Load the versions of these models that now serve. Not for the event loop."""
+        """Load the versions of these models that now serve. Blocking: use it in a thread."""
         known = self._snapshot.serving  # other models are loaded by their first query
         for model, serving in registry.serving(self.database, [each for each in models if each in known]).items():
             if serving.change > known[model].change:
                 self.adopt(model)
 
     def changed(self, model: str) -> None:
-        """Follow a job's changes to a model: its serving version and its aliases. Not for the event loop."""
+        """Follow a job's changes to a model: its serving version and its aliases. Blocking: use it in a thread."""
         with self.moving:
             self.repoint(registry.pointers(self.database, [model]), [model])
         self.adopt(model)
 
     def adopt(self, model: str) -> None:
-        """Load the version of a model that now serves, and answer with it. Not for the event loop."""
+        """Load the version of a model that now serves, and answer with it. Blocking: use it in a thread."""
         for serving in registry.serving(self.database, [model]).values():
             self._adopt(model, serving)
 
@@ -221,7 +221,7 @@ class LoadedModels:
             return True
         except (UnreadableVersionError, OSError) as error:  # the earlier version keeps answering
             logger.error("%s", error)
-        except NotFoundError:  # deleted after another version started to serve, which that change loads
+        except NotFoundError:  # deleted: another version serves and is loaded separately
             logger.info("version %d of model %s was deleted before it served", serving.version, model)
         return False
 
@@ -267,7 +267,7 @@ class LoadedModels:
     def revise(self, name: str, version: int, revision: int, learnt: Revision) -> bool:
         """Apply a revision to a version, now or once it is loaded; return whether answers changed.
 
-        Ignore it if an equal or higher revision is present. Not for the event loop; it computes next to nothing.
+        Ignore it if an equal or higher revision is present. Fast, but it may wait for a lock: use it in a thread.
         """
         key = (name, version)
         with self._revising:  # one at a time, so that the highest revision wins
@@ -317,9 +317,9 @@ class LoadedModels:
             if (learnt := self._revisions.get(key)) is not None:  # published while this was loaded
                 self.revise(*key, *learnt)
                 served = self._snapshot.served.get(key, served)
-            # keeps the version out of later collections, which would stop all answers while they scan it. A version
-            # that is dropped later is freed all the same, as a model is in no reference cycle. Besides it, only a few
-            # hundred objects of current requests are frozen
+            # later garbage collections skip frozen objects: a scan of the version would stop all answers. A dropped
+            # version is still freed, because a model is in no reference cycle. Only a few hundred objects of current
+            # requests are frozen with it
             gc.collect()
             gc.freeze()
             with self._lock:
@@ -379,7 +379,7 @@ class LoadedModels:
         """
         key = (served.name, served.version)
         with self._lock:
-            if key in self._deleted:  # deleted while it was loaded: only requests made before get it
+            if key in self._deleted:  # deleted while it was loaded: only earlier requests get it
                 return served
             if key not in self._used:  # a new revision of a loaded version does not count as use
                 self._used[key] = next(self._clock)

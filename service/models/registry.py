@@ -130,8 +130,8 @@ def check_robot(session: Session, model: str, kind: RobotKind) -> None:
     if first is not None and found is not None:
         field, own, others = found
         raise ConflictError(
-            f"model {model!r} is of another robot: {field} of its version {first.version} is {own}, that of this one "
-            f"is {others}. Choose another name"
+            f"model {model!r} is of another robot: its version {first.version} has {field} {own}; this one has "
+            f"{others}. Choose another name"
         )
 
 
@@ -281,7 +281,7 @@ def find_named(database: Database, text: str) -> VersionRow:
 
 
 def no_alias(database: Database, model: str, alias: str) -> NotFoundError:
-    """Return the error for a missing alias: names the model if that is missing too."""
+    """Return the error for a missing alias, or for the model if that is missing too."""
     with database.session() as session:
         return not_found("alias", alias) if has_model(session, model) else not_found("model", model)
 

@@ -17,14 +17,14 @@ class Factor:
     """Width factors of one stream."""
 
     values: Array
-    """Factors of the stream's own answers, (n,)."""
+    """Factors for queries of this stream, (n,)."""
     others: Array
-    """Factors of answers to others, (n,), from accepted observations only."""
+    """Factors for queries without a stream, (n,); computed from accepted observations only."""
     received: float
-    """Unix time of the batch that they come from, s."""
+    """Unix time of arrival of the batch that set the factors, s."""
     doubted: bool = False
-    """Whether the stream disagreed with the version from its first second on and nobody has confirmed it. Its factors
-    then apply to its own answers only.
+    """Whether the stream disagrees with the version since its first second and nobody has confirmed the stream. Its
+    factors then apply only to its own queries.
     """
 
 

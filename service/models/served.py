@@ -33,18 +33,18 @@ Alias = tuple[str, str]
 
 @dataclass(frozen=True)
 class ServedModel:
-    """One version in memory, immutable: its answers stay the same whatever is learnt or dropped meanwhile.
+    """One immutable version in memory. Its answers do not change if the model learns or the version is dropped.
 
-    Only interval widths and payloads follow the streams at once, through `scales` and `payloads`. All revisions share
+    Only interval widths and payloads change with the streams, through `scales` and `payloads`. All revisions share
     these two.
     """
 
     name: str
     version: int
     model: TorqueModel
-    """The version at this revision."""
+    """The model with all updates up to `revision`."""
     base: TorqueModel
-    """The version as trained."""
+    """The model as trained, without online updates."""
     datasets: frozenset[str]
     """Ids and hashes of the data sets that it has learnt from."""
     scales: Scales
@@ -72,18 +72,18 @@ class ServedModel:
 
     @cached_property
     def declared_payloads(self) -> DeclaredPayloads:
-        """Models with the payloads that queries declare instead of those of the streams."""
+        """Models for queries that declare their own payload."""
         return DeclaredPayloads(self.model)
 
     @cached_property
     def noise_std(self) -> list[float]:
-        """Standard deviation of the measurement noise, (n,) N·m, as answers contain it."""
+        """Standard deviation of the measurement noise in answers, (n,) N·m."""
         numbers: list[float] = self.model.noise_std.tolist()
         return numbers
 
     @cached_property
     def guaranteed(self) -> list[float] | None:
-        """Guaranteed coverage of its intervals, (n,), from held-out blocks of the training; None without guarantee."""
+        """Guaranteed coverage of the intervals, (n,), from held-out blocks of the training; None: no guarantee."""
         return None if self.base.conformal is None else list(self.base.conformal.guaranteed)
 
 
@@ -100,7 +100,7 @@ class LearntState:
 
 
 class LearntStates(Protocol):
-    """Source of what versions have learnt; every method returns None or nothing if that is nothing.
+    """Source of what versions have learnt online. Methods return None or an empty result if a version learnt nothing.
 
     `base` is the version as trained.
     """
@@ -171,7 +171,7 @@ class RevisionWaiters:
 async def wait_for_revision(
     loaded: LoadedModels, model: str, version: int | None, alias: str | None, revision: int
 ) -> ServedModel:
-    """Return the version that answers once it has reached a revision. For the event loop, which is not blocked.
+    """Wait until a version has reached a revision and return it. Use it in the event loop; it does not block.
 
     Raise RevisionNotReachedError after `min_revision_wait_s`, NotFoundError or UnreadableVersionError at once.
     """

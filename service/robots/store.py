@@ -92,7 +92,7 @@ def delete(database: Database, robot: str) -> None:
             raise not_found("robot", robot)
         for job in session.scalars(select(JobRow).where(JobRow.state.in_(ACTIVE))):
             if job.request.get("robot") == robot:
-                raise ConflictError(f"robot {robot!r} is in use by {job.id}: cancel it or wait for its end")
+                raise ConflictError(f"robot {robot!r} is in use by {job.id}: cancel it or wait until it ends")
         session.delete(row)
 
 
@@ -128,11 +128,11 @@ def profile_of(database: Database, robot: str) -> Profile:
 
 
 def _of_profile(robot: str, joint_names: Sequence[str], joint_types: Sequence[str]) -> RigidBody:
-    urdf = profile_urdf(robot)  # if it is missing, the error tells how to install it
+    urdf = profile_urdf(robot)  # raises an error with the install command if it is missing
     official_names = profiles.profile(robot).official_names(joint_names)
     if official_names is None or (official_names == ROBOTS[robot].free and all(map(is_number, joint_names))):
         return RigidBody.from_profile(robot, joint_names, joint_types)
-    # the data have fewer joints, or another driver's joint names: the remaining joints are locked
+    # the data have fewer joints or other joint names than the profile: joints without data are locked
     return replace(RigidBody.from_urdf(urdf, joint_names, joint_types, official_names, robot), matched="name")
 
 
@@ -149,7 +149,7 @@ _NUMBERS = {
     **{"lower": "lower", "upper": "upper", "max_speed": "speed", "max_acceleration": "acceleration"},
     **{"max_torque": "torque", "torque_constant": "torque_constants"},
 }
-"""Profile attribute for each numeric field of the API."""
+"""Attribute of `Profile` by numeric field of the API."""
 
 
 def _show_profile(profile: Profile) -> RobotProfile:

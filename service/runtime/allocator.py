@@ -16,8 +16,8 @@ from collections.abc import Mapping
 from enum import IntEnum
 
 HEAPS = 1
-"""One heap, so that all threads reuse freed memory. With two, more memory stays free in between, and no query is
-faster: Python's threads take turns anyway."""
+"""Number of heaps. With one heap, all threads reuse freed memory. A second heap needs more memory and makes no query
+faster, because Python runs one thread at a time."""
 BLOCK_BYTES = 1024 * 1024
 """Bytes from which a block is requested from the system and returned to it at once; also the max kept free memory."""
 
@@ -60,5 +60,5 @@ def give_back() -> None:
 
 def _give_back_often() -> None:
     while True:
-        time.sleep(60.0)  # it locks a heap for a millisecond
+        time.sleep(60.0)  # `malloc_trim` locks a heap for a millisecond
         give_back()

@@ -68,18 +68,20 @@ def run(
     folder: Path | None = None,
     field: str = "file",
 ) -> T:
-    """Call `module:function` in a confined process; return its result as the type `returns`. Not for the event loop.
+    """Call `module:function` in a confined process; return its result as the type `returns`.
+
+    Blocking: use it in a thread.
 
     - function: its module is imported before the fork; the module's function `warm`, if any, is called then.
     - returns: the type that the result is checked against.
-    - arguments: plain values, data classes of them, paths, small arrays, and settings. Of settings, only those for
-      readers are sent.
+    - arguments: plain values, data classes of them, paths, small arrays, and settings. Only the settings that
+      readers need are sent.
     - settings: contain the limits.
     - folder: the function may write here. It may read paths among the arguments.
     - field: name of the file in errors.
 
     Raise the function's error if it is one of `ERRORS`, MissingExtraError or OSError. Raise InvalidDataError if it
-    crashed or reached a limit, TooLargeError if that is a limit of size, UnexpectedReaderError for any other error.
+    crashed or reached a limit, TooLargeError if the limit is one of size, UnexpectedReaderError for any other error.
     """
     limits = settings.parser_memory_bytes, cpu_s(settings), settings.parser_s, settings.max_unpacked_bytes
     paths = [os.fspath(each) for each in arguments if isinstance(each, Path)]
@@ -211,7 +213,7 @@ class _Spawner:
                 if control is None:
                     raise ConnectionError
                 socket.send_fds(control, [b"c"], [theirs.fileno()])
-            except ConnectionError:  # it ended, as it does after a time without calls
+            except ConnectionError:  # the process ended because no call arrived for long
                 socket.send_fds(self._start(), [b"c"], [theirs.fileno()])
             return ours, self._process
 

@@ -101,7 +101,7 @@ class Cluster:
         self.gpus = sum(bool(each.get(GPU)) for each in takes)
 
     def _reach(self) -> None:
-        """Raise an error if nothing listens at the address: a client would retry for long, and log it."""
+        """Raise an error if nothing listens at the address; without this check, a client retries and logs for long."""
         parts = urlsplit(self.address)
         try:
             socket.create_connection((parts.hostname or "", parts.port or 8786), LOOK_S).close()

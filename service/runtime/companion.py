@@ -44,7 +44,7 @@ COMPANION = CompanionOptions()
 BEAT, BEAT_S = "beat", 1.0
 """Message of the process after a step, and the min seconds between two of them."""
 Work = dict[Hashable, list[Any]]
-"""Items of work by subject, in order."""
+"""Items of work of each subject, in the order in which they are processed."""
 
 
 class Companion:
@@ -85,7 +85,7 @@ class Companion:
 
     @property
     def silent_s(self) -> float:
-        """Seconds without progress of the process; 0 if it makes progress, or there is none."""
+        """Seconds without progress of the process; 0 if it makes progress or does not run."""
         progress = self._progress
         return 0.0 if progress is None else progress.silent_s
 
@@ -209,7 +209,7 @@ class Companion:
 
 
 def receive_work(connection: Connection, seconds: float) -> Work | None:
-    """Return the work that arrives within `seconds`, None if the process has to end. Called in the process.
+    """Return the work that arrives within `seconds`; None if the process has to end. Called in the companion process.
 
     Raise EOFError if the service is gone.
     """

@@ -123,7 +123,7 @@ class Processes(Executor):
                 process.kill()
 
     def _processes(self) -> list[BaseProcess]:
-        # there is no public way to them: `kill_workers` of Python 3.14 may wait
+        # no public attribute has the processes; `kill_workers` of Python 3.14 may wait
         return list((self._pool._processes or {}).values())
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
@@ -183,7 +183,7 @@ def set_worker_settings(settings: Settings) -> None:
 
 
 def choose_settings(sent: Settings | None) -> Settings:
-    """Return the settings for a shard: those of the cluster worker (home, database, files), or those that were sent."""
+    """Return the settings for a shard: on a cluster worker its own home, database and files, else the settings sent."""
     if _placed is not None:
         return _placed
     if sent is None:

@@ -49,8 +49,7 @@ class ProcessOptions:
     policy: Literal["other", "idle"] = "other"
     """Scheduling policy, Linux only: "idle" runs if nothing else needs the CPU, "other" is the usual one.
 
-    On two CPUs neither "idle" nor more niceness kept training out of serving's way as well as a CPU reserved for
-    serving.
+    On two CPUs, a CPU reserved for serving protected its latency from training better than "idle" or more niceness.
     """
     cpus: frozenset[int] | None = None
     """CPUs it may use, None for all."""

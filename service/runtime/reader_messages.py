@@ -31,9 +31,9 @@ class Call(msgspec.Struct):
     arguments: msgspec.Raw
     """Encoded array of the arguments."""
     read: list[str]
-    """Files and folders that it may read."""
+    """Files and folders that the function may read."""
     write: list[str]
-    """Files and folders that it may write."""
+    """Files and folders that the function may write."""
     memory: int
     """Max bytes of memory beyond those of the process."""
     cpu_s: int
@@ -41,7 +41,7 @@ class Call(msgspec.Struct):
     wall_s: float
     """Max time, s."""
     file: int
-    """Max bytes of a file that it writes."""
+    """Max bytes of each file that the function writes."""
 
 
 class Failure(msgspec.Struct):

@@ -48,11 +48,11 @@ _LIMITS = {EFBIG: "size", EMFILE: "files"}
 
 def serve(descriptor: int) -> None:
     """Pass each call to a process forked for it, until the other end closes or no call arrives for 600 s."""
-    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no process waits for the watching ones
-    protections(), own_files()  # cached before the fork, as they take a while
+    signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the kernel removes ended watching processes
+    protections(), own_files()  # slow: cached before the fork
     known = set[str]()
     with socket.socket(fileno=descriptor) as control, suppress(TimeoutError):
-        control.settimeout(600.0)  # then it ends; the next call starts another process
+        control.settimeout(600.0)  # then this process ends, and the next call starts another one
         ready = _ahead(control)
         while descriptors := socket.recv_fds(control, 1, 1)[1]:
             with socket.socket(fileno=descriptors[0]) as connection, suppress(EOFError, ConnectionError):
@@ -119,11 +119,11 @@ def _watch(calls: socket.socket) -> None:
 
 
 def _see_to(pid: int, answer: int, output: int, connection: socket.socket, wall_s: float) -> None:
-    """Send the outcome of a process after its answer or its end; kill it if its time is over."""
+    """Send the outcome of a process once it has answered or ended; kill it at its time limit."""
     until = time.monotonic() + wall_s
     content, written, in_time = _collected(answer, output, connection, until)
     if content is not None:
-        os.kill(pid, signal.SIGKILL)  # it is done, and its own exit would take milliseconds
+        os.kill(pid, signal.SIGKILL)  # it has answered; a normal exit takes milliseconds
         send(connection, msgspec.msgpack.encode(Outcome(0, False, written, content)))
         os.waitpid(pid, 0)
         return

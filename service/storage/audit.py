@@ -111,7 +111,7 @@ async def clean_hourly(database: Database, settings: Settings) -> AsyncIterator[
 
 async def _clean(database: Database, settings: Settings) -> None:
     while True:
-        await asyncio.sleep(3600.0)  # wait first: a host that starts with a wrong clock has corrected it by then
+        await asyncio.sleep(3600.0)  # wait first, so that a host with a wrong clock at its start has corrected it
         try:
             await to_thread.run_sync(clean, database, settings)
         except Exception as error:

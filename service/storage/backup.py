@@ -54,10 +54,10 @@ class BackupError(ValueError):
 
 @dataclass(frozen=True)
 class Backup:
-    """Content of a backup; fields without a note count rows."""
+    """Content of a backup. Fields without a docstring are numbers of rows."""
 
     at: str
-    """Its moment, ISO 8601 in UTC."""
+    """Time of the backup, ISO 8601 in UTC."""
     size: int
     """Bytes of its files."""
     datasets: int
@@ -218,7 +218,7 @@ def _restored(home: Path, opened: IO[bytes]) -> Backup:
                 path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
                 sums[name] = {"size": info.size, "sha256": _extract(content, path)}
     except (tarfile.TarError, EOFError, json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise BackupError(f"the file is no backup, or is damaged: {error}") from error
+        raise BackupError(f"the file is not a backup, or it is damaged: {error}") from error
     _check(about, sums)
     for key in {_key(name) for name in sums.keys() - about["files"].keys()}:  # deleted while the backup was made
         remove(home / key)
@@ -251,7 +251,7 @@ def _extract(content: IO[bytes], path: Path) -> str:
 def _check(about: Any, sums: dict[str, dict[str, Any]]) -> None:
     """Raise BackupError unless all files of the manifest are there and unchanged."""
     if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise BackupError(f"the file is no backup, or is cut off: it has no {MANIFEST} at its end")
+        raise BackupError(f"the file is not a backup, or it is incomplete: {MANIFEST} is missing at its end")
     if about.get("format_version") != FORMAT_VERSION:
         message = f"the backup has format_version {about.get('format_version')!r}, expected {FORMAT_VERSION}"
         raise BackupError(f"{message}: it was made by a later release of LIPServe")

@@ -14,9 +14,9 @@ from service.foundation.errors import StorageFullError
 from service.foundation.settings import Settings
 
 MEASURE_S = 10.0
-"""Seconds between two measurements of the home: the database and other processes write to it too."""
+"""Seconds between two measurements of the size of the home, to which other processes write too."""
 RECHECK_S = 1.0
-"""Seconds after which a home that seems full is measured again, as files may have been deleted."""
+"""Seconds after which the size of a full home is measured again, as files may have been deleted."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Disk:
         self._used, self._measured = 0, -float("inf")
 
     def require(self, size: int = 0) -> None:
-        """Check that there is space for `size` bytes; raise StorageFullError. Not for the event loop."""
+        """Check that there is space for `size` bytes; raise StorageFullError. Blocking: use it in a thread."""
         if self.usage().shortage(size) is None:
             return
         reason = self.usage(RECHECK_S).shortage(size)
@@ -82,7 +82,7 @@ class Disk:
         self._used += size  # a lost update of another thread is corrected by the next measurement
 
     def usage(self, age: float = MEASURE_S) -> Usage:
-        """Return used and free space. Not for the event loop.
+        """Return used and free space. Blocking: use it in a thread.
 
         The home is measured again if the last measurement is at least `age` old, s.
         """

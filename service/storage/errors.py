@@ -44,7 +44,7 @@ def translate_error(error: BaseException) -> ServiceError | None:
 
 
 def is_undecided(error: BaseException) -> bool:
-    """Return whether a failed transaction may be stored all the same, so that its files must be kept.
+    """Return whether a failed transaction may have been stored, so that its files must be kept.
 
     A commit that could not be synced is complete in SQLite's log. The next start finds it there, unless another commit
     replaced it.

@@ -33,7 +33,7 @@ _SECONDS = cast(func.extract("epoch", func.clock_timestamp()), Float)
 class Replicas:
     """A service among those that share its database; a thread sends its heartbeats until it is closed.
 
-    - id: of this service. It stays the same after a restart on the same home, so that the service finds its own jobs.
+    - id: id of this service. It stays the same after a restart on the same home, so that it finds its own jobs.
     - beat_s: time between two heartbeats, s.
     - reconcile_s: time between two searches for jobs without an owner, s.
     """
@@ -63,8 +63,8 @@ class Replicas:
             with self.database.session() as session:
                 session.execute(delete(ReplicaRow).where(ReplicaRow.id == self.id))
                 session.commit()
-        except Exception:  # as after a kill: the others wait until it counts as lost
-            logger.warning("could not tell the other services that this one stops", exc_info=True)
+        except Exception:  # then the others wait until this one counts as lost
+            logger.warning("could not notify the other services that this one stops", exc_info=True)
 
     def others(self, session: Session) -> list[str]:
         """Return the ids of the other live services."""

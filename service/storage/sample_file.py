@@ -23,7 +23,7 @@ _HEADER = 8
 """Bytes of the header's length; the header is padded to a multiple of it, so that numbers are aligned."""
 
 ArrayOf = Callable[[str], NDArray[Any]]
-"""Returns one of ARRAYS by name: t (N,), episode (N,) integers, the others (N, n)."""
+"""Returns the array of a name in ARRAYS: t (N,), episode (N,) integers, the others (N, n)."""
 PartOf = Callable[[NDArray[np.int64], NDArray[np.float64]], NDArray[np.bool_]]
 """Selects samples (N,) by their episodes (N,) and times (N,)."""
 
@@ -87,7 +87,7 @@ def count_rows(path: Path) -> int:
 class Reader:
     """An open file whose rows are read in parts, even after the file is deleted. Safe from several threads.
 
-    Nothing is mapped into memory: only the requested rows are there, however large the file.
+    The file is not mapped into memory; only the requested rows are in memory.
     """
 
     def __init__(self, path: Path) -> None:

@@ -151,7 +151,7 @@ def _damage(settings: Settings) -> str | None:
     """Return the first fault of the database, None if there is none."""
     database = Database.of(settings, WAIT_S)
     try:
-        with database.transaction():  # a read-only database is useless too
+        with database.transaction():  # fails if the database is read-only
             pass
         return next(iter(database.adapter.damage()), None)
     finally:
@@ -165,7 +165,7 @@ def _unusable(home: Path, error: OSError) -> str:
 def _unusable_files(settings: Settings, error: OSError) -> str:
     expected = "a folder that is mounted and that the service may write to"
     if (settings.files_url or "").startswith("s3:"):
-        expected = "a bucket in which the AWS_ variables or a role allow to list, read, write and delete"
+        expected = "a bucket in which the service may list, read, write and delete (AWS_ variables or a role)"
     return f"files_url is {settings.files_url!r}, expected {expected}: {error.strerror or error}"
 
 

@@ -37,9 +37,9 @@ def new_request_id() -> str:
 
 
 def read_request_id(headers: Iterable[tuple[bytes, bytes]]) -> str | None:
-    """Return the id that a request brings: up to 64 letters, digits and `._-`. Return None if it brings no such id.
+    """Return the id in the header of a request: up to 64 letters, digits and `._-`. Return None if it has no such id.
 
-    Any other content of the header would get into logs and responses.
+    Other characters must not get into logs and responses.
     """
     for name, value in headers:
         if name == REQUEST_ID:
@@ -57,7 +57,7 @@ REQUEST_LOG_PREFIXES = ("Exception in ASGI application", '%s - "WebSocket %s"', 
 _CONTROL = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160))} | {
     code: f"\\u{code:04x}" for code in (0x2028, 0x2029, *range(0x200E, 0x2010), *range(0x202A, 0x202F))
 }
-"""Escapes of characters that must not stand in a line: control characters, line ends, marks of text direction."""
+"""Escapes of characters that must not be in a log line: control characters, line ends, marks of text direction."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def configure(options: LogOptions | None) -> None:
     handler.setFormatter(_formatter(options.form))
     root, level = logging.getLogger(), options.level.upper()
     root.handlers[:] = [handler]
-    # no debug lines of libraries: those of WebSockets contain headers, and with them the keys
+    # libraries log no debug lines: those of WebSockets contain headers, and headers contain API keys
     of_libraries = max(logging.getLevelName(level), logging.INFO)
     root.setLevel(of_libraries)
     for name in ("service", "lipcore"):
@@ -98,7 +98,9 @@ def configure(options: LogOptions | None) -> None:
         logger.handlers.clear()
         logger.propagate = True
         logger.setLevel(of_libraries)  # uvicorn traces to a logger without a level of its own
-    logging.getLogger("alembic").setLevel(max(of_libraries, logging.WARNING))  # at info it logs its own parts
+    logging.getLogger("alembic").setLevel(
+        max(of_libraries, logging.WARNING)
+    )  # its info lines describe only its own setup
     failures = logging.getLogger("uvicorn.error")
     if not any(isinstance(each, _RequestLogFilter) for each in failures.filters):
         failures.addFilter(_RequestLogFilter())

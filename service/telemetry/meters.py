@@ -50,7 +50,7 @@ class Kind(NamedTuple):
     model: str
     """Name of the model; empty if there is none."""
     status: int
-    """Status of the response; 499 if the client disconnected before it."""
+    """Status of the response; 499 if the client disconnected before the response started."""
     code: str
     """Code of the error; empty if there is none."""
 
@@ -135,7 +135,7 @@ class MetricKind:
 
     kind: Literal["counter", "gauge", "histogram"]
     name: str
-    """Name in queries; a counter's ends with `_total`."""
+    """Name of the metric in Prometheus queries; the name of a counter ends with `_total`."""
     meaning: str
     """Meaning in words, with the unit."""
     labels: tuple[str, ...] = ()

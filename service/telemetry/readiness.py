@@ -16,8 +16,8 @@ from service.contract.states import PartState
 class StopState:
     """Stages of a stop.
 
-    begun: the stop was requested; the service reports it and may still answer. closing: set when new connections are
-    refused; long responses, such as events, end now.
+    - begun: whether the stop was requested. The service reports that it is not ready, but may still answer.
+    - closing: set once new connections are refused; long responses, such as event streams, then end.
     """
 
     def __init__(self) -> None:
@@ -53,9 +53,9 @@ class Check:
 class Readiness:
     """Checks the parts of a service at most once every MAX_REPORT_AGE_S.
 
-    Safe from several threads, but not for the event loop.
+    Safe from several threads. Blocking: use it in a thread.
 
-    probes: by name of their part. clock: monotonic, s.
+    probes: probe of each part, by the name of the part. clock: monotonic time, s.
     """
 
     def __init__(
@@ -85,10 +85,11 @@ class Readiness:
         try:
             return Check(name, *look(partial(self._lasting, name)))
         except Exception as error:  # a part that raises any error does not work
-            reason = getattr(error, "strerror", None) or error  # without paths: readers of this need no key
+            reason = getattr(error, "strerror", None) or error  # without paths: this report is public
             return Check(name, "failed", f"{type(error).__name__}: {reason}")
 
     def _lasting(self, part: str, wrong: bool, what: str = "") -> float | None:
+        """Return how long a fault of a part has lasted, s; None if it is gone. See `FaultAge`."""
         if not wrong:
             self._wrong_since.pop((part, what), None)
             return None

@@ -90,7 +90,7 @@ class DatasetSplits:
     """Masks over the rows of each data set, (N,): learnt and held-out rows."""
 
     train: list[Mask | None]
-    """Learnt rows of each data set; None means all."""
+    """Rows of each data set that are used for training; None: all."""
     held_out: list[Mask | None]
     """Held-out rows of each data set; None means none."""
     lineage: HoldoutLineage | None
@@ -121,7 +121,7 @@ def check(rows: Sequence[DatasetRow], asked: Holdout, min_samples: int) -> None:
 
 
 def _check_stretches(rows: Sequence[DatasetRow], asked: Holdout) -> None:
-    """Raise InvalidRequestError unless stretches are rows of the data sets, in order and disjoint."""
+    """Raise InvalidRequestError unless stretches are disjoint ranges of rows of the data sets, in order."""
     if (asked.stretches is None) != (asked.kind != "stretches"):
         message = "`holdout.stretches` is required if `holdout.kind` is stretches, and not allowed otherwise."
         raise invalid_request("holdout.stretches", asked.stretches, "rows, only for kind stretches", message)
@@ -132,7 +132,7 @@ def _check_stretches(rows: Sequence[DatasetRow], asked: Holdout) -> None:
             raise invalid_request(field, name, f"one of the data sets to train on: {', '.join(known)}")
         borders = [border for stretch in stretches for border in stretch]
         if any(a >= b for a, b in stretches) or borders != sorted(borders) or borders[-1] > known[name]:
-            expected = f"stretches in order, each a first row and a larger last row, at most {known[name]}"
+            expected = f"ranges [first, last] in increasing order, with first < last and last at most {known[name]}"
             raise invalid_request(field, stretches, expected)
 
 

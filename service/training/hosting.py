@@ -54,8 +54,8 @@ class VersionsDifferError(RuntimeError):
 def host(version: str, job: str) -> None:
     """Run a job on this worker, then further waiting jobs that it can run.
 
-    `version` is that of the calling service. The loop is necessary as the cluster assigns tickets to workers before
-    they are free.
+    `version` is the version of the calling service. The loop is necessary because the cluster assigns jobs to workers
+    that are not free yet.
     """
     if version != __version__:
         raise VersionsDifferError(f"the worker has version {__version__}, the service {version}: install the same one")
@@ -68,7 +68,7 @@ def host(version: str, job: str) -> None:
 
 @cache
 def _host() -> Host:
-    """Return the host of this worker. Its training process stays for the next job, as a start takes seconds."""
+    """Return the host of this worker. It keeps its training process for the next job, as a start takes seconds."""
     settings = choose_settings(None)
     return Host(settings, Database.of(settings), worker.run)
 
@@ -257,7 +257,7 @@ async def _work(settings: Settings, scheduler: str, resources: dict[str, float],
 
 
 async def _be_member(settings: Settings, scheduler: str, resources: dict[str, float], name: str | None) -> None:
-    """Be a member of the cluster until the scheduler is gone or this is cancelled."""
+    """Stay in the cluster until the scheduler is gone or this task is cancelled."""
     logging.getLogger("distributed").setLevel(logging.WARNING)  # its import set another level
     options = {"distributed.worker.profile.enabled": False, "distributed.worker.daemon": False}
     with dask.config.set(options):

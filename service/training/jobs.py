@@ -311,7 +311,7 @@ def refresh(
     retry_of: str | None = None,
     named: RequestIdentity | None = None,
 ) -> Job:
-    """Queue a refresh of the serving version and return its job. Not for the event loop.
+    """Queue a refresh of the serving version and return its job. Blocking: use it in a thread.
 
     `retry_of` is the job that it repeats; `named` identifies the request if the client named it. Raise NotFoundError,
     BusyError if the queue is full, ConflictError if a refresh of the model is queued or runs, or if there are no data
@@ -378,8 +378,9 @@ def refreshes_of(model: str) -> Select[JobRow]:
 def retry(queue: JobQueue, job: str, named: RequestIdentity | None = None) -> Job:
     """Queue a job that repeats a failed or cancelled one. A repeated refresh uses the current serving version and log.
 
-    `named` identifies the request, which runs only once. Raise NotFoundError, ConflictError if the job has not failed
-    or its inputs were deleted, InvalidRequestError if a limit is lower now, BusyError if the queue is full.
+    `named` identifies the request: a repeated request returns the first job. Raise NotFoundError; ConflictError if the
+    job has not failed or its inputs were deleted; InvalidRequestError if the job exceeds a limit that is lower now;
+    BusyError if the queue is full.
     """
     row = find(queue.database, job)
     if (before := done_before(queue.database, named)) is not None:

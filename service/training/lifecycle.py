@@ -29,7 +29,7 @@ def enter(row: JobRow, state: JobState, message: str) -> None:
     """Set a job's state and add an entry with time and reason. An end is stamped; a waiting job has no progress."""
     at = now()
     entries = [*(row.history or []), {"at": at, "state": state, "message": message}]
-    # the first entry tells how it was queued; of the others the newest are kept
+    # keep the first entry, which says how the job was queued, and the newest others
     row.history = entries if len(entries) <= MAX_ENTRIES else [entries[0], *entries[1 - MAX_ENTRIES :]]
     row.state = state
     if state == QUEUED:
@@ -204,12 +204,12 @@ class JobOutcome:
     """The result of settling a job."""
 
     again: bool = False
-    """Whether it waits for a process again, to start after `pause_s`."""
+    """Whether the job is queued again, to start after `pause_s`."""
     pause_s: float = 0.0
     made: tuple[str, int] | None = None
-    """Model and version that it has made."""
+    """Model and version that the job created; None if it created none."""
     problem: str | None = None
-    """Why no process could be started for it."""
+    """Why no process could be started for the job; None if one was started."""
 
 
 class Settler:

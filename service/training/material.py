@@ -262,7 +262,7 @@ def _candidates(table: Table, logged: Samples | None) -> tuple[Samples, Samples 
 
 
 def _aged(row: DatasetRow, within: Scope) -> float:
-    """Return the weight of a data set's samples if the model forgets; their age counts from the upload."""
+    """Return the weight of a data set's samples under forgetting; their age is the time since the upload."""
     weights = refresh_data.age_weights(np.array([datetime.fromisoformat(row.created_at).timestamp()]), within)
     return 1.0 if weights is None else float(weights[0])
 

@@ -25,7 +25,7 @@ OUTCOMES = (SUCCEEDED, FAILED, CANCELLED)
 
 
 class JobMetrics(Collector):
-    """Metrics of the training jobs in the database. Not for the event loop."""
+    """Metrics of the training jobs in the database. Blocking: use it in a thread."""
 
     jobs = MetricKind("gauge", "lipserve_jobs", "Training jobs that wait or run", ("state",))
     finished = MetricKind("counter", "lipserve_jobs_finished_total", "Training jobs that have ended", ("outcome",))

@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PlannedFit:
-    """A fit and the pass over all rows that may follow it."""
+    """A fit, and the pass over all rows if one follows."""
 
     data: TrainingData
     joint_types: tuple[JointType, ...]
@@ -64,7 +64,7 @@ class PlannedFit:
     def last(self, settings: Settings, judged: TorqueModel, held_out: Samples, heartbeat: Heartbeat) -> TorqueModel:
         """Refit the judged model to all rows. If that fails, return the judged model with the error in its report.
 
-        `held_out` are the rows that it was judged on, of which its intervals must cover 95 %.
+        `held_out` are the rows on which the model was judged. Its intervals are widened until they cover 95 % of them.
         """
         heartbeat.plan(PACE.last_fit_rows, self.pass_rows)
         heartbeat.stage(LAST_FIT)

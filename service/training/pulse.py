@@ -61,7 +61,9 @@ class RemainingTime:
                 self._ends = clock + at.elapsed * (1 - at.fraction) / at.fraction
             return
         if at.stage == SEARCH:
-            if self._first is None or at.iteration <= self._first[1]:  # or a new search: the arm's is first
+            if (
+                self._first is None or at.iteration <= self._first[1]
+            ):  # the first search, or the next one: an arm has its own
                 self._first = (clock, at.iteration)
             elif at.iteration >= PACE.min_iterations:
                 began, before = self._first

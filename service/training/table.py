@@ -20,7 +20,7 @@ from service.storage.sample_file import Reader
 from service.training.holding_out import RowTimes
 
 STRETCHES, STRETCH = 40, 500
-"""Maximum number of contiguous stretches that estimate the white noise of a thinned recording, and rows of each."""
+"""Maximum number of contiguous segments that estimate the white noise of a thinned recording, and rows of each."""
 
 
 @dataclass(frozen=True)

@@ -19,47 +19,47 @@ LINGERS = "the training process was not free after the end of the job"
 
 
 def describe_started(attempt: int, most: int) -> str:
-    """Return that an attempt at a job has started."""
+    """State that an attempt at a job has started."""
     return f"started: attempt {attempt} of at most {most}"
 
 
 def describe_queued(retry_of: str | None) -> str:
-    """Return that a job was queued."""
+    """State that a job was queued."""
     return "queued" if retry_of is None else f"queued to repeat {retry_of}"
 
 
 def describe_unstoppable(seconds: float) -> str:
-    """Return that a process ignored its cancellation."""
+    """State that a process ignored its cancellation."""
     return f"the training process did not stop within {seconds:g} s and was killed"
 
 
 def describe_not_ready(seconds: float) -> str:
-    """Return that no process started in time."""
+    """State that no process started in time."""
     return f"no training process was ready within {seconds:g} s"
 
 
 def describe_no_progress(seconds: float) -> str:
-    """Return that a process was killed without progress."""
+    """State that a process was killed without progress."""
     return f"the training process made no progress for {seconds:g} s and was killed"
 
 
 def describe_too_long(seconds: float) -> str:
-    """Return that a job reached its time limit."""
+    """State that a job reached its time limit."""
     return f"it reached the time limit of a job, {seconds:g} s (LIPSERVE_MAX_JOB_S)"
 
 
 def describe_start_failure(error: object) -> str:
-    """Return that no process could be started."""
+    """State that no process could be started."""
     return f"a training process could not be started: {error}"
 
 
 def describe_process_failure(error: object) -> str:
-    """Return that a process failed."""
+    """State that a process failed."""
     return f"the training process failed: {error}"
 
 
 def describe_cluster_wait(gpu: bool) -> str:
-    """Return that a job waits for the cluster."""
+    """State that a job waits for the cluster."""
     return f"waiting for a worker of the cluster{' with a GPU' if gpu else ''}"
 
 
@@ -83,32 +83,32 @@ def describe_refresh(version: int, reason: str, better: bool, promoted: bool) ->
 
 
 def describe_changed_serving(serving: int) -> str:
-    """Return that another version has become the serving version since the comparison."""
+    """State that another version has become the serving version since the comparison."""
     return f"not compared with version {serving}, which became the serving version meanwhile"
 
 
 def describe_other_robot(name: str) -> str:
-    """Return that the serving version is of another robot."""
+    """State that the serving version is of another robot."""
     return f"{name} is of another robot"
 
 
 def describe_unreadable(name: str) -> str:
-    """Return that the serving version cannot be read."""
+    """State that the serving version cannot be read."""
     return f"not compared with {name}, which cannot be read"
 
 
 def describe_learnt_held_out(name: str) -> str:
-    """Return that the serving version has learnt the held-out rows."""
+    """State that the serving version has learnt the held-out rows."""
     return f"not compared with {name}, which was trained on the held-out rows"
 
 
 def describe_too_short(name: str) -> str:
-    """Return that the held-out rows are too few for a comparison."""
+    """State that the held-out rows are too few for a comparison."""
     return f"not compared with {name}, because too few rows are held out"
 
 
 def describe_too_few_logged(name: str) -> str:
-    """Return that the logged rows are too few for a comparison."""
+    """State that the logged rows are too few for a comparison."""
     return f"not compared with {name}, because too few rows are logged"
 
 
@@ -119,7 +119,7 @@ def describe_density(how: str, name: str, difference: float, half_width: float) 
 
 
 def describe_larger_errors(name: str, difference: float, half_width: float) -> str:
-    """Return that errors are larger than those of the serving version."""
+    """State that errors are larger than those of the serving version."""
     return f"its errors are larger than those of {name} (mean nMSE {difference:+.2g} ± {half_width:.1g})"
 
 

@@ -52,7 +52,7 @@ class TakenBackError(RuntimeError):
 def run(settings: Settings, job: str) -> None:
     """Run one queued job to its end. Every outcome is written to its row; a failed fit raises nothing.
 
-    Raise StorageError if the outcome could not be written or required data not be read.
+    Raise StorageError if the outcome cannot be written or required data cannot be read.
     """
     token = job_id.set(job)
     database, files = _database(settings), Files.of(settings, PATIENCE_S)

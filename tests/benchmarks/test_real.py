@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from benchmarks.real import mujoco_sysid, report, rivals, running
-from benchmarks.real.cells import PRODUCT, Cache, Cell, Result, judge
+from benchmarks.real.cells import PRODUCT, Cache, Cell, Result, evaluate_forecast
 from benchmarks.real.product import open_bed
 from benchmarks.real.recordings import Recording
 from benchmarks.real.rivals import Forecast
@@ -140,7 +140,7 @@ def toy(recording="toy", split="other", told="nothing", method="mean", error=0.5
 def test_figures_compare_errors_and_widths_with_what_was_measured():
     test = replace(still(1.0), tau=np.tile([1.0, -1.0], 50)[:, None])
     split = Split(replace(still(2.0), tau=np.full((200, 1), 3.0)), test)
-    found = judge(toy().cell, split, Forecast(test.tau + 0.5, np.full((100, 1), 1.0)), 2.0)
+    found = evaluate_forecast(toy().cell, split, Forecast(test.tau + 0.5, np.full((100, 1), 1.0)), 2.0)
     assert found.nmse == pytest.approx([0.25])
     assert found.nmse_mean == pytest.approx([10.0])
     assert found.worst == pytest.approx(0.025)

@@ -121,7 +121,7 @@ def test_wheel_of_the_service_serves_model_pages_and_guide(server):
     answer = server.client.post("/v1/models/panda-sim/predict", json={"q": zeros, "dq": zeros, "ddq": zeros})
     assert len(answer.json()["tau"]) == len(zeros)
     assert server.client.get("/openapi.json").json()["info"]["version"] == __version__
-    for page, shown in {"/": "LIPServe", "/guide/operations/": "Leave it running"}.items():
+    for page, shown in {"/": "LIPServe", "/guide/operations/": "Operate the service"}.items():
         assert shown in server.client.get(page).text
     assert server.client.get("/guide/screenshots/live.webp").headers["content-type"] == "image/webp"
 
@@ -150,7 +150,7 @@ def test_wheel_of_the_client_works_alone(server, dist, tmp_path):
     assert (len(seen["joints"]), seen["event"]) == (7, "LiveStatus")
     assert set(seen["names"]) - MORE == DEPENDENCIES | {"lipserve-client"}
     assert set(seen["modules"]).isdisjoint(SERVER)
-    assert seen["missing"] == "bars need Rich: pip install 'lipserve-client[progress]'"
+    assert seen["missing"] == "Progress bars need Rich: pip install 'lipserve-client[progress]'"
     assert (packages / "lipserve/py.typed").is_file()
     size = sum(each.stat().st_size for each in packages.rglob("*") if each.is_file())
     assert size < MAX_CLIENT_MB * 1_000_000

@@ -12,7 +12,7 @@ import httpx
 
 from lipserve import sending
 from lipserve.call import Answer, Call, Page, bound
-from lipserve.methods import POLL_SECONDS, Calls, Followed, Listed, One, looking
+from lipserve.methods import POLL_SECONDS, Calls, Followed, Listed, One, reporting
 from lipserve.records.jobs import Job
 from lipserve.records.learning import Learning
 from lipserve.stream import AsyncStreamClient
@@ -90,8 +90,8 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
     ) -> Job:
         """Wait until a job has ended, and return it; see `Client.wait`."""
         name = job if isinstance(job, str) else job.id
-        with looking(on_progress, progress) as ended:
-            while not ended(seen := await self.job(name)):
+        with reporting(on_progress, progress) as report:
+            while not report(seen := await self.job(name)):
                 await asyncio.sleep(POLL_SECONDS)
         return seen
 
@@ -114,9 +114,9 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
             try:
                 answer = await self._exchange(call)
             except httpx.TransportError as error:
-                pause: float | None = attempts.lost(error)
+                pause: float | None = attempts.after_error(error)
             else:
-                pause = attempts.answered(answer)
+                pause = attempts.after_answer(answer)
             if pause is None:
                 return sending.result_of(call, answer)
             await asyncio.sleep(pause)
@@ -128,14 +128,14 @@ class AsyncClient(Calls, makers={One: _async, Listed: _listed, Followed: _follow
             try:
                 async with self._http.stream(**sending.request_of(call)) as response:
                     body = b"" if response.is_success else await response.aread()
-                    pause = attempts.answered(sending.answer_of(response, body))
+                    pause = attempts.after_answer(sending.answer_of(response, body))
                     if pause is None:
                         begun, events = True, sending.Events()
                         async for line in response.aiter_lines():
                             if (event := events.take(line)) is not None:
                                 yield sending.result_of(call, event)
             except httpx.TransportError as error:
-                pause = attempts.lost(error, begun)
+                pause = attempts.after_error(error, begun)
             if pause is not None:
                 await asyncio.sleep(pause)
 

@@ -86,20 +86,20 @@ class Route:
     paths: tuple[str, ...]
     repeatable: bool
 
-    def __call__(self, read: Callable[[Answer], T], *, names: Mapping[str, Any], **asked: Any) -> Call[T]:
+    def __call__(self, read: Callable[[Answer], T], *, names: Mapping[str, Any], **fields: Any) -> Call[T]:
         """Return the call.
 
         Args:
             read: Converts the answer to the result.
             names: Values of the names in braces; None if a name is not given.
-            **asked: Other fields of `Call`. `params` that are None are omitted.
+            **fields: Other fields of `Call`. `params` that are None are omitted.
         """
         given = {name: str(value) for name, value in names.items() if value is not None}
         path = next(path for path in self.paths if set(_NAMES.findall(path)) == set(given))
         filled = path.format_map({name: quote(value, safe="") for name, value in given.items()})
-        params = {name: value for name, value in asked.pop("params", {}).items() if value is not None}
+        params = {name: value for name, value in fields.pop("params", {}).items() if value is not None}
         return Call(
-            method=self.method, path=filled, read=read, params=params, **{"repeatable": self.repeatable, **asked}
+            method=self.method, path=filled, read=read, params=params, **{"repeatable": self.repeatable, **fields}
         )
 
 

@@ -224,8 +224,8 @@ def destination(url: str, model: str, **query: int | str | None) -> Destination:
     """Return the destination of a model's stream at http://host:port. query: None values are omitted."""
     parts = urlsplit(url)
     secure = parts.scheme in ("https", "wss")
-    asked = urlencode({name: value for name, value in query.items() if value is not None})
-    path = f"/v1/models/{quote(model, safe='')}/stream" + (f"?{asked}" if asked else "")
+    encoded = urlencode({name: value for name, value in query.items() if value is not None})
+    path = f"/v1/models/{quote(model, safe='')}/stream" + (f"?{encoded}" if encoded else "")
     address = f"{'wss' if secure else 'ws'}://{parts.netloc}{path}"
     return Destination(address, parts.hostname or "127.0.0.1", parts.port or (443 if secure else 80))
 

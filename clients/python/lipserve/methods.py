@@ -158,18 +158,18 @@ class Calls:
 
 
 @contextmanager
-def looking(on_progress: Callable[[Job], None] | None, progress: bool) -> Iterator[Callable[[Job], bool]]:
+def reporting(on_progress: Callable[[Job], None] | None, progress: bool) -> Iterator[Callable[[Job], bool]]:
     """Yield a function that reports a job's state to callback and progress bar, and returns whether it has ended."""
     with ExitStack() as stack:
-        looks = [] if on_progress is None else [on_progress]
+        listeners = [] if on_progress is None else [on_progress]
         if progress:
             from lipserve.progress import job_bar  # noqa: PLC0415 - Rich is optional
 
-            looks.append(stack.enter_context(job_bar()))
+            listeners.append(stack.enter_context(job_bar()))
 
-        def ended(seen: Job) -> bool:
-            for look in looks:
-                look(seen)
-            return seen.state not in ACTIVE
+        def report(job: Job) -> bool:
+            for listener in listeners:
+                listener(job)
+            return job.state not in ACTIVE
 
-        yield ended
+        yield report

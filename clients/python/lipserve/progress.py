@@ -49,7 +49,7 @@ def job_bar(console: Console | None = None) -> Iterator[Callable[[Job], None]]:
             text = f"{at.stage} {at.iteration}/{at.max_iterations}{objective}" if at.iteration else at.stage
             text = text if at.estimator is None else f"{at.estimator}: {text}"
             if at.remaining_s:
-                text += f", about {at.remaining_s:.0f} s left at most"
+                text += f", up to {at.remaining_s:.0f} s left"
             bar.update(task, description=text, completed=at.fraction)
             if not console.is_terminal and (at.elapsed_s - printed >= PLAIN_EVERY or seen.state not in ACTIVE):
                 printed = at.elapsed_s

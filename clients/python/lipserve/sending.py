@@ -87,12 +87,17 @@ CHUNK = 1 << 18
 
 def request_of(call: Call[Any]) -> dict[str, Any]:
     """Return the arguments of httpx for a call, without the content of a file."""
-    asked: dict[str, Any] = {"method": call.method, "url": call.path, "params": call.params, "headers": call.headers}
+    arguments: dict[str, Any] = {
+        "method": call.method,
+        "url": call.path,
+        "params": call.params,
+        "headers": call.headers,
+    }
     if call.json is not None:
-        asked["json"] = call.json
+        arguments["json"] = call.json
     if call.timeout is not None:
-        asked["timeout"] = call.timeout
-    return asked
+        arguments["timeout"] = call.timeout
+    return arguments
 
 
 def answer_of(response: httpx.Response, body: bytes = b"") -> Answer:
@@ -172,7 +177,7 @@ class Attempts:
         self._made = 0
         self._lost = False
 
-    def lost(self, error: httpx.TransportError, begun: bool = False) -> float:
+    def after_error(self, error: httpx.TransportError, begun: bool = False) -> float:
         """Return the pause before the next attempt, s; raise ServiceUnreachableError if there is none.
 
         Calls that time out are not repeated, because this would add load. begun: whether events had arrived.
@@ -193,7 +198,7 @@ class Attempts:
         self._lost = True
         return self._pause()
 
-    def answered(self, answer: Answer) -> float | None:
+    def after_answer(self, answer: Answer) -> float | None:
         """Return the pause before the next attempt, s, or None if the answer is final; raise ApiError."""
         self._reach.reached = True
         if answer.status < 400:

@@ -73,9 +73,9 @@ class _Stream(StreamSide):
         self.timeout, self._url = timeout, address.base
         self._unix = address.unix if unix is None else Path(unix)
         self._exchange = Exchange(stream_id, first_sequence)
-        asked = {"version": version, "alias": alias, "stream_id": stream_id}
-        asked |= {"scale": 1 if scale else None, "payload": 1 if payload else None}
-        self._destination = destination(address.base, model, **asked)
+        query = {"version": version, "alias": alias, "stream_id": stream_id}
+        query |= {"scale": 1 if scale else None, "payload": 1 if payload else None}
+        self._destination = destination(address.base, model, **query)
         self._options: dict[str, Any] = {
             "compression": None,
             "open_timeout": self._patience,
@@ -113,7 +113,7 @@ class _Stream(StreamSide):
         if not answer.late:
             self._last = answer
             return answer
-        return answer if self._last is None else self._held()
+        return answer if self._last is None else self._last_marked_late()
 
     def _late(self, sequence: int, deadline: float, error: StreamError) -> StreamAnswer:
         """Return the last answer in time, instead of one that missed its deadline; raise StreamError without one."""
@@ -122,9 +122,9 @@ class _Stream(StreamSide):
         self._exchange.given_up(sequence)
         if not deadline or self._last is None:
             raise unanswered(deadline or self.timeout) from error
-        return self._held()
+        return self._last_marked_late()
 
-    def _held(self) -> StreamAnswer:
+    def _last_marked_late(self) -> StreamAnswer:
         assert self._last is not None
         return replace(self._last, late=True, late_answers=self._exchange.late_answers)
 

@@ -12,7 +12,7 @@ import httpx
 
 from lipserve import sending
 from lipserve.call import Answer, Call, Page, bound
-from lipserve.methods import POLL_SECONDS, Calls, Followed, Listed, One, looking
+from lipserve.methods import POLL_SECONDS, Calls, Followed, Listed, One, reporting
 from lipserve.records.jobs import Job
 from lipserve.records.learning import Learning
 from lipserve.stream import StreamClient
@@ -107,8 +107,8 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
             progress: Show a progress bar (needs the extra `progress`).
         """
         name = job if isinstance(job, str) else job.id
-        with looking(on_progress, progress) as ended:
-            while not ended(seen := self.job(name)):
+        with reporting(on_progress, progress) as report:
+            while not report(seen := self.job(name)):
                 time.sleep(POLL_SECONDS)
         return seen
 
@@ -127,9 +127,9 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
             try:
                 answer = self._exchange(call)
             except httpx.TransportError as error:
-                pause: float | None = attempts.lost(error)
+                pause: float | None = attempts.after_error(error)
             else:
-                pause = attempts.answered(answer)
+                pause = attempts.after_answer(answer)
             if pause is None:
                 return sending.result_of(call, answer)
             time.sleep(pause)
@@ -144,7 +144,7 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
         while not begun:
             try:
                 with self._http.stream(**sending.request_of(call)) as response:
-                    pause = attempts.answered(
+                    pause = attempts.after_answer(
                         sending.answer_of(response, b"" if response.is_success else response.read())
                     )
                     if pause is None:
@@ -153,7 +153,7 @@ class Client(Calls, makers={One: _sync, Listed: _listed, Followed: _followed}):
                             if (event := events.take(line)) is not None:
                                 yield sending.result_of(call, event)
             except httpx.TransportError as error:
-                pause = attempts.lost(error, begun)
+                pause = attempts.after_error(error, begun)
             if pause is not None:
                 time.sleep(pause)
 

@@ -40,7 +40,7 @@ def arm_rows(
     table: Array,
     out: Array,
 ) -> None:
-    """Write the features of one query, (10 n + n + g, n): ∂τ/∂π, ddq of each joint (its rotor) and ∂τ/∂θ."""
+    """Write the features of one query, (10 n + n + g, n): ∂τ/∂π, ddq of each joint for its rotor, and ∂τ/∂θ."""
     n = constants.shape[0]
     kinematics(constants, gravity, motion, order, work)
     masses(constants, order, work, table, out)

@@ -26,8 +26,8 @@ class DepartureOptions:
     """
 
     stated: float = 1.0
-    """Max error of the trained version's mean, in standard deviations of its function. These persist; those of the
-    noise average out."""
+    """Max error of the trained version's mean, in standard deviations of its function. Errors of the mean
+    persist; errors of the noise average out."""
     slack: float = 0.5
     """Mean standardised error that is ignored in addition."""
     max_error: float = 1.0

@@ -29,11 +29,11 @@ class DetectorOptions:
     min_reference_s: float = 10.0
     min_reference_rows: int = 200
     ratio: float = 4.0
-    """Bound of squared errors over earlier ones and over stated ones: 30 standard errors of the mean of 200 independent
-    rows."""
+    """Bound on the mean squared error over the earlier one and over the stated one. 30 standard errors of the mean
+    of 200 independent rows."""
     deviations: float = 5.0
-    """Bound in the Gaussian that the tail of the bucket means is mapped to: one chance in 3 million if `ratio` is too
-    low."""
+    """Bound on the bucket means, mapped to a Gaussian by their tail probability. By chance, one in 3 million exceeds it
+    if `ratio` is too low."""
     prior_variation: float = 0.5
     prior_buckets: int = 10
     """Assumed variation of the buckets' means, and the number of buckets that it counts for."""
@@ -72,7 +72,7 @@ class Change:
     """A change of the robot: errors have grown."""
 
     at: float
-    """Event time since when, s."""
+    """Event time since which errors have grown, s."""
     joints: tuple[int, ...]
     """The joints affected."""
     before: Record
@@ -293,7 +293,7 @@ def _variation(buckets: Sequence[Bucket]) -> Array:
 
 
 def _mean(buckets: Sequence[Bucket]) -> Array:
-    """Return the standardised errors of all rows of the buckets, and no other sum, as it runs twice a second."""
+    """Return the standardised errors of all rows of the buckets. It runs twice a second, so it sums nothing else."""
     rows = [bucket.record.rows for bucket in buckets]
     return np.asarray(np.average([bucket.record.standardised for bucket in buckets], axis=0, weights=rows))
 

@@ -88,7 +88,7 @@ class Draw:
     noise: Array | None
 
     def is_usable(self, size: int) -> bool:
-        """Whether its noise has this size, as draws of the same revision do."""
+        """Return whether its noise has this size. Draws of one revision have noise of equal size."""
         return self.noise is None or len(self.noise) == size
 
 
@@ -178,7 +178,7 @@ class Training:
         return cls(carrier, (motion, carrier.rest(motion)))
 
     def at(self, place: ArmWithPayload) -> Point:
-        """Return the point of an arm; its payload stays as it is."""
+        """Return the point of an arm, with its payload unchanged."""
         memory, size = self.carrier.memory, len(place.w)
         features, torque = rows_of(linearised_around(self.carrier, place, np.zeros(PARAMETERS)), *self.virtual)
 
@@ -195,7 +195,7 @@ class Training:
     def start_draw(self, number: int, draw: np.random.Generator) -> Generator[None, None, Draw]:
         """Return one of the arms that the training allows, with any payload; yield after each step.
 
-        If the last axis is open, it points in one of six directions, from which a valley is sought.
+        If the last axis is unidentified, the draw starts with it in one of six directions.
         """
         carrier = self.carrier
         geometry = carrier.term.arm.geometry.moved(carrier.step)

@@ -47,13 +47,13 @@ class TrackedPayload:
     since: float
     """Event time since when, s."""
     declared: bool
-    """Whether its owner declared it; else it was noticed."""
+    """Whether a user declared it; otherwise it was detected."""
     rows: Rows
-    """Rows that it is estimated from."""
+    """Rows from which it is estimated."""
     before: Rows
-    """Rows before it."""
+    """Rows before the payload."""
     every: int
-    """One of so many rows is stored."""
+    """One in `every` rows is stored."""
     count: int
     """Number of rows with the payload."""
     due: float
@@ -109,7 +109,7 @@ class TrackedPayload:
     def from_other_version(values: Mapping[str, Any], since: float, carrier: Carrier) -> TrackedPayload:
         """Return the payload that another version wrote with `to_json`.
 
-        The last link of each version has its own frame: the payload has this mass and lies nearby. Rows tell where.
+        The last link of each version has its own frame. The mass is the same, the place is similar. Rows determine it.
         """
         covariance = np.array(values["covariance"]) + np.diag(FRAME_STD**2)
         prior, nothing = PayloadPrior(np.array(values["eta"]), inverse(covariance)), no_rows(carrier.model.n_joints)
@@ -185,7 +185,7 @@ class TrackedPayload:
 
 
 def spread_places(first: int, last: int, most: int) -> NDArray[np.int64]:
-    """Return at most so many places from `first` to before `last`, both ends included."""
+    """Return up to `most` evenly spaced places from `first` to `last` − 1, both included."""
     return np.unique(np.linspace(first, last - 1, min(most, last - first)).round().astype(np.int64))
 
 

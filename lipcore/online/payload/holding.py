@@ -25,11 +25,11 @@ class TrackerOptions:
     """Cells that are judged, and how long states last."""
 
     sparse: tuple[int, ...] = (2, 4)
-    """One of so many cells is compared, if something that looks like a contact lasts."""
+    """If a suspected contact lasts, one in this many cells is compared."""
     together: int = 3
     together_in_bulk: int = 6
-    """Cells of one batch that are judged together, and of a batch with more cells than the second number. An instant
-    within the last cells is still found."""
+    """Cells of one batch that are judged together: `together`, or `together_in_bulk` for batches with more cells than
+    that. An instant within the last cells is still found."""
     cell_rows: int = 5
     """Max rows of a cell, evenly spread: a robot moves little within a cell, at any sampling rate."""
     max_stds: float = 2.5
@@ -158,7 +158,7 @@ class PayloadTracker:
         if len(cells) <= WINDOW.min_before:
             return watch if watch.held is None else watch._estimate_from(carrier, parts)
         window = CellWindow.of(self.around, cells[-WINDOW.cells :])
-        # an arm without a known payload may have had one since before the first cell
+        # an arm without a known payload may have carried one since before the first cell
         gains = window.gains((*WINDOW.after, WINDOW.cells) if self.held is None else WINDOW.after)
         watch = replace(watch, probabilities=probabilities(gains))
         return (

@@ -231,9 +231,9 @@ class CellWindow:
         return whitened.T @ whitened, whitened.T @ self.residual
 
     def gains(self, after: Sequence[int] = WINDOW.after) -> dict[int, dict[Kind, float]]:
-        """Return the nats by which each hypothesis explains the cells better than nothing, by the number of its cells.
+        """Return the nats by which each hypothesis explains the cells better than nothing, by number of last cells.
 
-        after: numbers of cells to check. At least `min_before` cells must come before, or none.
+        after: numbers of last cells to check. At least `min_before` cells must come before them, or none.
         """
         n, count = len(self.cells[0].q), len(self.cells)
         payload = np.stack([each.features[-PARAMETERS:] for each in self.cells], axis=1)  # (10, N, n)

@@ -287,7 +287,7 @@ def _compute_widening(std: Array, off: Sequence[Array]) -> Array:
 def _find_alternatives(
     carrier: Carrier, at: Point, root: Array, found: Sequence[_DrawResult]
 ) -> tuple[tuple[Alternative, ...], bool]:
-    """Return arms all over the posterior if that is far from linear, the most likely one first; and whether it is.
+    """Return arms spread over the posterior if it is far from linear, the most likely first; and whether it is.
 
     Few rows leave a curved valley open, along which centre of mass and geometry compensate each other. The linear
     posterior is tangent to it at one place.

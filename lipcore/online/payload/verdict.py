@@ -31,7 +31,8 @@ class VerdictOptions:
     any torques; those of a payload are only as exact as the arm's geometry."""
     lasting_cells: int = 6
     lasting_share: float = 0.8
-    """An event of so many cells, 0.3 s, is no knock, and a smaller share suffices; after twice as long, its square."""
+    """An event that lasts `lasting_cells`, 0.3 s, is not a knock: the share `lasting_share` suffices. After twice that
+    time, the square of this share suffices."""
     at_once_nats: float = 3000.0
     precise: float = 0.1
     """Min nats of a payload before it lasts, and the max standard deviation of its log mass then. An external torque
@@ -53,14 +54,14 @@ Gains = Mapping[int, Mapping[Kind, float]]
 
 
 def find_pickup(window: CellWindow, gains: Gains, carried: Array | None = None, every: int = 1) -> int | None:
-    """Return for how many cells the arm has had a new payload; None if the cells show none.
+    """Return the number of cells since the arm picked up a new payload; None if the cells show none.
 
-    carried: parameters of the known payload, (10,); every: the window contains one of so many cells.
+    carried: parameters of the known payload, (10,); every: the window contains one in `every` cells.
     """
     after = max(gains, key=lambda each: gains[each]["payload"])
     contact = gains[after]["contact"]
     best = gains[after]["payload"]
-    # at once, the rows decide together with the arm's geometry; see `PayloadTracker._pick_up`
+    # few rows suffice here, because `PayloadTracker._pick_up` checks them with the arm's geometry
     near = after >= VERDICT.lasting_cells or (carried is None and best >= VERDICT.at_once_nats)
     share = VERDICT.lasting_share**every if near and after < len(window.cells) else VERDICT.alike_share
     sure, certain = (
@@ -76,7 +77,7 @@ def find_pickup(window: CellWindow, gains: Gains, carried: Array | None = None, 
         return None
     if carried is None:
         mass, std = window.mass(after)
-        if mass < VERDICT.positive * std:  # a mass is gone that was there in training, or was not noticed
+        if mass < VERDICT.positive * std:  # a mass was removed: one of the training, or one not detected
             return None
     real = window.of_body(after, np.zeros(PARAMETERS) if carried is None else carried)
     return after if shows(real) and min(best, real) - window.past_contact() >= VERDICT.better_nats else None

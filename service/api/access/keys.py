@@ -30,7 +30,7 @@ from service.storage.files import new_id
 
 PREFIX = "lip_"
 MIN_REQUESTS_PER_S, MAX_REQUESTS_PER_S = 1e-3, 1e6
-"""Range of the rate limit of a key."""
+"""Allowed range of the rate limit of a key, requests per s."""
 IMPORTED_KEY = re.compile(rf"{PREFIX}[A-Za-z0-9_-]{{43,200}}")
 """Pattern of an imported key: at least 43 base64 characters, which hold 32 bytes like our own keys."""
 REFRESH_S = 1.0
@@ -107,7 +107,7 @@ def create(
         if scope not in SCOPES:
             raise ValueError(f"scope is {scope!r}, expected one of {', '.join(SCOPES)}")
     if given is not None and not IMPORTED_KEY.fullmatch(given):
-        raise ValueError(f"a key must be {PREFIX} and 43 to 200 random letters, digits, - or _")
+        raise ValueError(f"a key must be {PREFIX} followed by 43 to 200 random letters, digits, - or _")
     if max_requests_per_s is not None and not MIN_REQUESTS_PER_S <= max_requests_per_s <= MAX_REQUESTS_PER_S:
         raise ValueError(
             f"rate is {max_requests_per_s:g}, expected {MIN_REQUESTS_PER_S:g} to {MAX_REQUESTS_PER_S:g} requests per s"
@@ -251,7 +251,7 @@ class Keyring:
             rows = await to_thread.run_sync(list_keys, database, limiter=self._thread)
         except Exception as error:
             if not self._failing:
-                logger.warning("API keys cannot be read, keeping the known ones: %s", error)
+                logger.warning("API keys cannot be read; the known ones stay valid: %s", error)
             self._failing = True
         else:
             self._failing = False
@@ -280,7 +280,7 @@ class Keyring:
             for end in ends:
                 try:
                     end()
-                except Exception:  # close the others all the same
+                except Exception:  # still close the others
                     logger.exception("a stream of API key %s could not be closed", key.id)
 
     async def _note_used(self, database: Database, seconds: float) -> None:

@@ -34,12 +34,12 @@ class ClientPatience:
     header_bytes: int = 64 * 1024
     """Max size of the request line and headers."""
     body_s: float = 20.0
-    """For a body, plus one second for every `body_bytes_per_s` received."""
+    """Max wait for a body, s, plus one second for every `body_bytes_per_s` received."""
     body_bytes_per_s: int = 1000
     answer_s: float = 30.0
-    """Until the client reads a part of its answer."""
+    """Max wait until the client reads a part of its answer, s."""
     frame_s: float = 10.0
-    """Until the client reads an answer of a stream."""
+    """Max wait until the client reads an answer of a stream, s."""
 
 
 PATIENCE = ClientPatience()
@@ -81,7 +81,7 @@ class BodyLimit:
     ) -> None:
         self.app, self.limits = app, dict(limits)
         self.seconds, self.bytes_per_s, self.at_once = seconds, bytes_per_s, at_once
-        self._waited_for: Counter[str] = Counter()  # bodies, by client
+        self._waited_for: Counter[str] = Counter()  # number of bodies being received, by client
         self._due: dict[asyncio.Task[Any], float | None] = {}  # deadline of each wait; None: it was cancelled
         self._looking: asyncio.AbstractEventLoop | None = None
 

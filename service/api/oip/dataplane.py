@@ -67,7 +67,10 @@ async def infer(
 
 
 def metadata(loaded: LoadedModels, served: ServedModel) -> schema.ModelMetadata:
-    """Return the tensors of a version and the versions of its model; raise NotFoundError. Not for the event loop."""
+    """Return the tensors of a version and the versions of its model. Blocking: use it in a thread.
+
+    Raise NotFoundError.
+    """
     model = served.model
     inputs = [schema.TensorMetadata(name=each, shape=[-1, model.n_joints]) for each in schema.INPUTS]
     inputs.append(schema.TensorMetadata(name=schema.TORQUE, shape=[-1, model.n_joints], parameters={"optional": True}))

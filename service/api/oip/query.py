@@ -239,7 +239,10 @@ def _torques(model: TorqueModel, motion: Array, names: frozenset[str]) -> dict[s
 
 
 def infer(served: ServedModel, decode: Callable[[], Message], settings: Settings) -> Reply:
-    """Decode a request and answer it; raise what `decode` raises, or InvalidRequestError. Not for the event loop."""
+    """Decode a request and answer it. Blocking: use it in a thread.
+
+    Raise what `decode` raises, or InvalidRequestError.
+    """
     message = decode()
     return respond(served, message, read_task(served, message, settings))
 

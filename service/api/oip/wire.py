@@ -46,11 +46,11 @@ class Message:
         self.request, self._body, self._offset = request, body, offset
 
     def check(self) -> None:
-        """Check that the number of bytes after the JSON is what the inputs announce; raise InvalidRequestError."""
+        """Raise InvalidRequestError unless as many bytes follow the JSON as the inputs announce."""
         sizes = (each.parameters.binary_data_size or 0 for each in self.request.inputs if each.parameters)
         announced, present = sum(sizes), len(self._body) - self._offset
         if announced != present:
-            expected = f"{announced} bytes, the sum of every binary_data_size"
+            expected = f"{announced} bytes, the sum of all binary_data_size"
             message = f"{present} bytes follow the JSON, expected {expected}. {HEADER} gives the length of the JSON."
             raise invalid_request("the binary data", f"{present} bytes", expected, message)
 

@@ -66,7 +66,7 @@ def list_robots(storage: StorageDep, page: PageQuery) -> RobotPage:
 @router.get("/profiles", summary="List robot profiles")
 @needs(READ)
 def profiles() -> ProfileList:
-    """Return the joints, limits and meaning of the effort column of every robot known by name.
+    """Return the joints, the limits and the meaning of the effort column of every built-in robot.
 
     Uploads may name any of them as their `robot`. Training jobs may name those that have a URDF.
     """

@@ -27,7 +27,7 @@ class LimitedConnection(Protocol):
 
 
 class ConnectionLimit:
-    """The connections of one server, in the order in which they are closed. For the event loop.
+    """The connections of one server, in the order in which they are closed. Use it in the event loop.
 
     First come connections without any request, then idle ones after an answer, then those whose clients do not read
     their answer; the oldest of each kind first. A connection that is being answered is never closed.
@@ -50,7 +50,7 @@ class ConnectionLimit:
     def admit(self, connection: LimitedConnection, present: Collection[Any]) -> tuple[int, str]:
         """Make room for a new connection; `present` are all connections, including this one.
 
-        Return by how many connections a limit is exceeded, 0 if there is room now, and the reason.
+        Return the number of connections above a limit (0 if there is room now) and the reason.
         """
         self._fresh[connection] = None
         beyond, why = self._beyond_own(connection, present)

@@ -179,7 +179,7 @@ class GuardedProtocol(HttpToolsProtocol):
             self._watch_reading()
 
     def _count_unread(self) -> int:
-        """Return the bytes not sent yet, including the kernel's buffer, which can hide a slow reader for long."""
+        """Return the number of unsent bytes. It includes the kernel's buffer, which can hide a slow reader for long."""
         waiting = self.transport.get_write_buffer_size()
         with suppress(OSError, ValueError):  # a kernel without this call, a closed socket
             number = self.transport.get_extra_info("socket").fileno()
@@ -187,7 +187,7 @@ class GuardedProtocol(HttpToolsProtocol):
         return waiting
 
     def _refuse(self, status: HTTPStatus, code: str, message: str) -> None:
-        """Answer bytes that did not become a request, and close."""
+        """Answer bytes that are not a valid request with an error, and close the connection."""
         body = ErrorResponse(error=ErrorBody(code=code, message=message)).model_dump()
         content = json.dumps(body).encode()
         head = b"content-type: application/json\r\ncontent-length: %d\r\nconnection: close\r\n\r\n" % len(content)

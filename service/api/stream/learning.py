@@ -48,7 +48,7 @@ class LearningFrame(NamedTuple):
 class FrameLearning:
     """Logs the frames of one connection in blocks, one at a time and in order, while later frames wait.
 
-    `send` sends a text to the client. For the event loop; blocks are logged in a thread.
+    `send` sends a text to the client. Use it in the event loop; blocks are logged in a thread.
     """
 
     def __init__(self, learners: Learners, stream_id: str, send: Callable[[str], Awaitable[None]]) -> None:

@@ -102,7 +102,9 @@ def interpret_torque(
     wrong = next((unit for unit in units if unit is not None and is_current(unit) != (effort == "current")), None)
     if wrong is not None and effort != "current":
         raise invalid_data(
-            f"unit of {family.pattern}", wrong, f"a unit of torque because effort is {effort}. Or set effort=current"
+            f"unit of {family.pattern}",
+            wrong,
+            f"a unit of torque because effort is {effort}. Set effort=current if it is current",
         )
     if wrong is not None and unit_factor("tau", wrong) not in (None, 1.0):
         raise invalid_data(f"unit of {family.pattern}", wrong, "A or mA because effort is current")
@@ -189,7 +191,10 @@ _MAX_LISTED = 6
 
 @dataclass(frozen=True)
 class Families:
-    """The column families of a file. positions: the family that defines the joints; given: those the user named."""
+    """The column families of a file.
+
+    positions: family that defines the joints. given: families that the user named, by quantity.
+    """
 
     names: Sequence[str]
     positions: Family
@@ -211,7 +216,7 @@ class Families:
         return out
 
     def notes(self, chosen: dict[str, Family]) -> list[str]:
-        """Return sentences on other columns that could be read."""
+        """Return notes for the user on other columns that could be read instead."""
         out = []
         for quantity, family in chosen.items():
             others = [each.pattern for each in self.others if each.quantity == quantity and each is not family]
@@ -245,7 +250,7 @@ class Families:
             if not covering:
                 listed = ", ".join(each.pattern for each in torques[:_MAX_LISTED])
                 raise invalid_data(
-                    "effort", self.options.read.effort, f"the effort that {listed} holds by its name or unit"
+                    "effort", self.options.read.effort, f"the effort that the name or unit of {listed} indicates"
                 )
         best = best_ranked(covering)
         if quantity != "tau" and best[0].rank == Rank.CANONICAL:

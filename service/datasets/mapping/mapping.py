@@ -15,7 +15,7 @@ from service.foundation.errors import InvalidDataError, invalid_data, invalid_re
 from service.foundation.text import counted
 
 MAX_LISTED = 8
-"""Max columns that a sentence names."""
+"""Max columns that a message lists."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ def _notes(
     times: Sequence[Source],
     episode: Source | None,
 ) -> list[str]:
-    """Return sentences on columns whose names or units are not the documented ones."""
+    """Return notes on columns that do not have the documented names or units."""
     out = []
     for quantity, row in quantities.items():
         if chosen[quantity].rank != Rank.CANONICAL:

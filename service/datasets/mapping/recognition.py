@@ -40,13 +40,13 @@ class Rank(IntEnum):
     """The documented names, q1…."""
     MEASURED = 1
     PLAIN = 2
-    """Neither measured nor commanded by name."""
+    """Names without a word for measured or commanded."""
     COMMANDED = 3
 
 
 @dataclass(frozen=True)
 class NameReading:
-    """One interpretation of a column's name. joint: "" if none is named; kind: of word, see QUANTITY_WORDS."""
+    """One interpretation of a column's name. joint: "" if it has none; kind: kind of word, see QUANTITY_WORDS."""
 
     quantity: str
     kind: str

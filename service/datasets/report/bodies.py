@@ -112,7 +112,7 @@ class Bodies:
         return out
 
     def parts(self, signals: Signals) -> tuple[Array, Array]:
-        """Return the torque of gravity, and of inertia and velocities, (R, n) each."""
+        """Return the torque of gravity, and the torque of accelerations and velocities, (R, n) each."""
         rest = self.torque(*signals[:3], (0.0, 0.0, 0.0))
         return self.torque(*signals[:3], self._arm.geometry.gravity) - rest, rest
 

@@ -195,7 +195,7 @@ class _Case:
         if not (opposite & (signs[:, :2].min(1) < 0)).any():
             return None
         if opposite[signs[:, 0] != 0].all() and (signs[:, 1:] >= 0).all():
-            return None  # only gravity is opposite, as of an arm that hangs upside down
+            return None  # only gravity has the opposite sign: the arm hangs upside down
         if opposite.sum() > 1 and (opposite | (signs == 0).all(1)).all():
             opposite[:] = True  # the other joints show no sign
         inverted = [name for name, wrong in zip(self.upload.names, opposite, strict=True) if wrong]

@@ -88,7 +88,10 @@ def make_remedy(
     options: dict[str, str] | None = None,
     only_if: str | None = None,
 ) -> Remedy:
-    """Return a fault with its correction, options as on the command line. only_if: condition of the correction."""
+    """Return a fault with its correction.
+
+    options: upload options, as on the command line. only_if: condition under which the correction is right.
+    """
     if options is not None:
         text = with_upload(text, format_flags(options), only_if)
     return Remedy(cause=cause, joints=list(joints), text=text, options=options)

@@ -35,7 +35,7 @@ def missing_values(missing: int, rows: int) -> str:
 
 
 def beyond_limits(quantities: str, shares: Mapping[str, float]) -> str:
-    """Warn of samples beyond limits. shares: of samples, by joint."""
+    """Warn of samples beyond limits. shares: share of such samples, by joint."""
     return (
         f"{quantities} of {list_names(shares)} exceed the robot's limits, in up to {percent(max(shares.values()), 1)} "
         "of the samples. Check the robot, the order of the joints and the units."
@@ -98,7 +98,7 @@ def negative_friction(joints: Sequence[str]) -> str:
     """Report negative friction."""
     return (
         f"The friction of {list_names(joints)} is negative: it would drive the joint. Possible causes: an inverted "
-        "torque sign, torque that is ahead of its motion, or derivatives that were filtered too much."
+        "torque sign, torque recorded earlier than its motion, or derivatives that were filtered too much."
     )
 
 
@@ -121,7 +121,9 @@ def opposite_sign(joints: Sequence[str], robot: str) -> str:
 
 def unexpected_gravity(joints: Sequence[str], factors: Iterable[float], robot: str) -> str:
     """Report gravity in torque that should lack it. factors: gravity of each joint, times that of the robot."""
-    return f"The torque of {list_names(joints)} contains gravity {_times(factors, robot)} but was read as without it."
+    return (
+        f"The torque of {list_names(joints)} contains gravity {_times(factors, robot)} but was read as without gravity."
+    )
 
 
 def missing_gravity(joints: Sequence[str], factors: Iterable[float], robot: str) -> str:

@@ -74,7 +74,7 @@ def unlearn(learners: Learners, model: str, stream_id: str, sequence: int) -> sc
 
 
 def _check_fold(session: Session, model: str, version: int, batch: EventRow) -> None:
-    """Raise ConflictError if the state of a version cannot be made again without a batch."""
+    """Raise ConflictError if the state of a version cannot be reconstructed without a batch."""
     if not undo.can_fold_again(session, model, version, batch.number):
         name = f"batch {batch.sequence} of stream {batch.stream_id!r}"
         raise ConflictError(
@@ -104,7 +104,7 @@ def rollback(learners: Learners, model: str, request: schema.RollbackRequest) ->
     """Roll back to a revision of the serving version, or to another version.
 
     Raise InvalidRequestError unless the request names exactly one of the two, or if the revision is not older than the
-    newest. Raise NotFoundError, and ConflictError if the state cannot be made again.
+    newest. Raise NotFoundError, and ConflictError if the state cannot be reconstructed.
     """
     if (request.revision is None) == (request.version is None):
         given = "neither" if request.revision is None else "both"

@@ -33,11 +33,11 @@ HOUR_S = 3600.0
 DECIMALS = 3
 """Decimals of the innovations."""
 POSTURE_SHARE = 0.3
-"""Position of the default posture within the training range, 0 to 1."""
+"""Default position of each joint in the drawing: 0 is the start of its training range, 1 the end."""
 
 
 def list_models(learners: Learners, part: Page) -> OverviewPage:
-    """Return a page of models with their overview, newest first. No model is loaded. Not for the event loop."""
+    """Return a page of models with their overview, newest first. No model is loaded. Blocking: use it in a thread."""
     now = time.time()
     with learners.database.session() as session:
         rows, following = read_page(session, ModelRow, part)
@@ -99,7 +99,7 @@ def sketch_arm(manifest: dict[str, Any]) -> ArmSketch | None:
 
 
 def summarise_recent(window: Window, now: float) -> RecentQuality:
-    """Return the figures of a window before a Unix time, s, and their course."""
+    """Return the figures of the window that ends at Unix time `now`, s, and their history."""
     record = window.record(now)
     figures = record.metrics()
     return RecentQuality(

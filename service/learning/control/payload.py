@@ -176,7 +176,7 @@ def _stream_payload(stream_id: str, watch: PayloadTracker, tip: Tip | None) -> S
 
 
 def _payload_body(found: Estimate, tip: Tip | None) -> PayloadBody:
-    """Return mean and standard deviation of a payload's figures. Those of its inertia come from seeded draws."""
+    """Return the mean and standard deviation of a payload's figures. The std of the inertia comes from random draws."""
     mass, std = found.mass
     com, spread = found.eta[1:4], found.covariance[1:4, 1:4]
     drawn = np.random.default_rng(0).multivariate_normal(found.eta, found.covariance, INERTIA_DRAWS)

@@ -33,7 +33,7 @@ MAX_GAPS = 20
 
 
 def read_learning(learners: Learners, model: str) -> schema.Learning:
-    """Return how a model learns and its status; raise NotFoundError. Not for the event loop."""
+    """Return how a model learns and its status; raise NotFoundError. Blocking: use it in a thread."""
     served = learners.loaded.get(model, None)
     version = served.version
     latest, lag = learners.status(model, version), learners.lag(served)
@@ -64,7 +64,7 @@ def read_learning(learners: Learners, model: str) -> schema.Learning:
 def read_quality(learners: Learners, model: str) -> schema.Quality:
     """Return how well a model predicts each row before it is learnt, for each window of `WINDOWS_S`.
 
-    Raise NotFoundError. Not for the event loop.
+    Raise NotFoundError. Blocking: use it in a thread.
     """
     served = learners.loaded.get(model, None)
     now = time.time()
@@ -152,7 +152,7 @@ def find_batch(session: Session, model: str, stream_id: str, sequence: int) -> E
         return event
     source = log.stream(session, model, stream_id)
     if source is not None and is_forgotten(source, sequence):
-        raise NotFoundError(f"batch {sequence} of stream {stream_id!r} is no longer in the log, if it was ever sent")
+        raise NotFoundError(f"batch {sequence} of stream {stream_id!r} is not in the log: it was deleted or never sent")
     raise not_found("batch", f"{sequence} of stream {stream_id}")
 
 
@@ -202,7 +202,7 @@ def read_newest_revision(session: Session, model: str, version: int) -> int:
 
 
 def list_reachable(session: Session, model: str, version: int) -> list[Range]:
-    """Return the ranges [first, last] of revisions whose state can be made again, in rising order.
+    """Return the ranges [first, last] of revisions whose state can be reconstructed, in rising order.
 
     A state needs the version as trained or a snapshot, and all events since. Events that a rollback has undone are not
     learnt again, so their states are lost.

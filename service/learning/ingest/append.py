@@ -68,10 +68,13 @@ class Arrival(NamedTuple):
 
 
 class ObservationLog:
-    """Appends observations to the logs of models; safe from several threads, not for the event loop.
+    """Appends observations to the logs of models; safe from several threads. Blocking: use it in a thread.
 
-    monitor: returns the monitor of a served model; monitors: returns the existing ones. wake: tells the learner process
-    that a model's log has grown. show: called with each durable batch. weighing: follows payloads.
+    - monitor: returns the monitor of a served model.
+    - monitors: returns the existing monitors by model.
+    - wake: notifies the learner process that a model's log has grown.
+    - show: called with each durable batch.
+    - weighing: follows payloads.
     """
 
     def __init__(

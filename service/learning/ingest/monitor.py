@@ -140,7 +140,7 @@ class Monitor:
         self.record = self.record.moved(step)
 
     def _add_logged(self, event: EventRow, recent: bool) -> LoggedJudgement | None:
-        """Add a batch with its logged judgement and return that; None if the batch has other joints.
+        """Add a batch with its logged judgement; return the judgement, None if the batch has other joints.
 
         recent: whether the batch is within the detector's memory.
         """

@@ -70,7 +70,7 @@ class Follower:
         self.snapshot_every_s = SNAPSHOT_PERIODS * settings.publish_every_s
         with database.session() as session:
             self.start = log.start_of(session, model, version)
-        # loads the snapshot only: pages are learnt one by one, and other versions advance in between
+        # load the snapshot only. Pages are learnt one by one later, so that other versions advance in between
         self.known = restore(database, files, model, version, base, pages=0)
         self.novelty = Novelty(NOVELTY_ROWS)
         self.woken, self.behind = True, True
@@ -128,7 +128,7 @@ class Follower:
 
     @property
     def snapshot_due(self) -> float:
-        """When the state is to be stored; infinity if it is stored."""
+        """Time at which the state must be stored; infinity if it is stored already."""
         if self.number == self._stored:
             return np.inf
         return self._stored_at + self.snapshot_every_s

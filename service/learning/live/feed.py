@@ -35,13 +35,13 @@ logger = logging.getLogger(__name__)
 MAX_NOVELTY_ROWS = 20
 """Max rows of a stream that are tested for one status: 14 ms of a thread at a thousand inducing outputs."""
 MAX_FOLLOWERS = 20
-"""Max readers of live feeds. More are answered 429."""
+"""Max clients of live feeds. Further clients are answered 429."""
 ROWS_PER_S = 50
-"""Rows a second that readers are shown. All rows are counted."""
+"""Max rows per second that a client gets. All rows are counted."""
 
 
 MAX_POSITION = 1e6
-"""Max position of a robot, rad or m. A row beyond it, or one that is not finite, is not a position."""
+"""Max position of a robot, rad or m. Rows with a larger or non-finite position are ignored."""
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,10 @@ class Reader:
 
 
 class FollowedModel:
-    """A model that has readers. waiting: batches that are not shown yet. over: whether its last reader has left."""
+    """A model with readers.
+
+    waiting: batches that are not shown yet. over: whether the last reader has disconnected.
+    """
 
     def __init__(self, model: str, read_status: ReadStatus, rows_per_s: float) -> None:
         self.model, self._read_status, self._rows_per_s = model, read_status, rows_per_s

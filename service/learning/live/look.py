@@ -20,7 +20,7 @@ COUNTS = (*CODES, "batches", "duplicates")
 
 
 class StatusReader:
-    """Reads the status of one model; not for the event loop."""
+    """Reads the status of one model. Blocking: use it in a thread."""
 
     def __init__(self, learners: Learners, meters: Meters, model: str) -> None:
         self.learners, self.model = learners, model

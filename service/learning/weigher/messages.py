@@ -11,7 +11,7 @@ from lipcore.online.payload.holding import PayloadTracker
 Stream = tuple[str, int, str]
 """A model, its serving version and one of its streams."""
 MAX_STREAMS = 1000
-"""Streams that the process stores. It drops the one that was silent longest, and asks for it again."""
+"""Max streams in the process. It drops the stream that was silent longest, and requests it when it sends again."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class WatchUpdate:
 
     stream: Stream
     watch: PayloadTracker
-    """The payload, without the rows that show it."""
+    """Outline of the payload's tracker, without its rows."""
     received: float
     """Unix time at which the latest rows arrived, s."""
     event: int

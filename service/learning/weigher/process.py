@@ -25,8 +25,9 @@ def weigher_place(settings: Settings) -> ProcessOptions:
 class WeigherProcess(Companion):
     """The weigher process.
 
-    It starts with the service if a version in memory has an arm, else with the first rows of one. epoch: how often a
-    process was started; a new one has no streams. on_message: see `Companion`.
+    It starts with the service if a version in memory has an arm, else with the first rows for such a version.
+
+    epoch: number of process starts; a new process has no streams. on_message: see `Companion`.
     """
 
     def __init__(self, settings: Settings, on_message: Callable[[Message], None]) -> None:

@@ -71,7 +71,7 @@ class Weighing:
     def expect(self) -> None:
         """Prepare the process for streams of the serving versions.
 
-        A process that starts with their first rows is seconds late.
+        A process that starts only when their first rows arrive is seconds late.
         """
         for model, version in self.loaded.held():
             served = self.loaded.peek(model)
@@ -133,7 +133,7 @@ class Weighing:
             return
         try:
             self._log_payload(monitor, served, message)
-        except ServiceError as error:  # answers use the payload all the same, and the next batch's report contains it
+        except ServiceError as error:  # answers use the payload anyway, and the report of the next batch contains it
             logger.error("could not log the payload of stream %r of model %r: %s", stream_id, model, error)
 
     def _forget_sent(self, stream: Stream) -> None:

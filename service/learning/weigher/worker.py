@@ -66,7 +66,7 @@ def run(settings: Settings, connection: Connection) -> None:
 
 
 WARM_UP_ROWS, WARM_UP_RATE_HZ = 60, 100.0
-"""Number and rate of the rows that `Weigher.expect` makes up."""
+"""Number and rate of the artificial rows of `Weigher.expect`."""
 
 
 class Versions:
@@ -126,7 +126,7 @@ class Weigher:
         return np.inf if self._next_refined() is None else max(0.0, -self._credit() / REFINING_SHARE)
 
     def expect(self, model: str, version: int) -> None:
-        """Prepare for streams of a version: load it, and estimate one payload, so that everything is compiled."""
+        """Load a version and estimate the payload of artificial rows, so that all code is compiled before a stream."""
         try:
             carrier = self._carrier((model, version), ())
             limits, n, draw = carrier.model.training_range, carrier.model.n_joints, np.random.default_rng(0).uniform

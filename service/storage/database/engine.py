@@ -115,7 +115,10 @@ class Sqlite:
         """Return the faults of `integrity_check` and broken references; takes several times as long as `damage`."""
         with self.engine.connect() as connection:
             rows = list(connection.execute(text("PRAGMA foreign_key_check")))
-        return [*self._faults("integrity_check", most), *(f"a row of {r[0]} refers to no row of {r[2]}" for r in rows)]
+        return [
+            *self._faults("integrity_check", most),
+            *(f"a row of {r[0]} refers to a missing row of {r[2]}" for r in rows),
+        ]
 
     def _faults(self, check: str, most: int) -> list[str]:
         with self.engine.connect() as connection:
@@ -208,9 +211,9 @@ class Database:
     """Sessions on one database; safe to share between threads.
 
     - timeout_s: max wait for another writer, s.
-    - url: of a PostgreSQL server, None for SQLite below the home.
+    - url: address of a PostgreSQL server; None: SQLite in the home.
     - connections: max open connections to PostgreSQL.
-    - origin: random id of this object in the notices to others.
+    - origin: random id of this object in notices to other services.
     """
 
     def __init__(

@@ -35,8 +35,8 @@ KEEPALIVE_OPTIONS: dict[str, Any] = {
     "keepalives_count": 3,
     "tcp_user_timeout": 25_000,
 }
-"""Options that detect a server lost without notice, as on a silent network, within half a minute. The system's own
-times are 15 minutes and two hours."""
+"""Options that detect within half a minute that the server cannot be reached. The default timeouts of the system are
+15 minutes and two hours."""
 LISTENER_OPTIONS: dict[str, Any] = {"application_name": "lipserve notices", "connect_timeout": 5, **KEEPALIVE_OPTIONS}
 
 
@@ -95,7 +95,7 @@ class Postgresql:
         with self.engine.connect() as connection:
             connection.execute(text(f"SET LOCAL lock_timeout = {max(1, round(1000 * seconds))}"))
             if connection.scalar(text("SELECT pg_is_in_recovery()")):
-                raise OSError("the PostgreSQL server is a standby, which cannot be written")
+                raise OSError("the PostgreSQL server is a read-only standby")
             _take(connection, "pg_advisory_xact_lock_shared", WRITERS, ALL_MODELS)
 
     def settle(self) -> None:

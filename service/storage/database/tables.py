@@ -166,9 +166,9 @@ class AliasMoveRow(Base):
     model: Mapped[str] = mapped_column(ForeignKey("models.name"))
     alias: Mapped[str] = mapped_column(String(64))
     version: Mapped[int | None]
-    """Version it moved to, None if the alias was removed."""
+    """New target; None if the alias was removed."""
     before: Mapped[int | None]
-    """Version it moved from, None if the alias was new."""
+    """Old target; None if the alias was new."""
     takes_back: Mapped[int | None]
     """`seq` of the move that this one undid."""
     at: Mapped[str]
@@ -189,7 +189,7 @@ class ServingRow(Base):
 
 
 class LearnerRow(Base):
-    """State of a version's learning: it contains events up to number `start` by training, later ones by updates.
+    """State of a version's learning: training used the events up to number `start`, online updates the later ones.
 
     A version without such a row starts at 0.
     """

@@ -125,4 +125,6 @@ def _of_store(missing: str | None = None) -> Iterator[None]:
         # an error of this host's disk while an object was fetched
         if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
             raise
-        raise unreachable(f"the store refuses ({type(error).__name__}: {error.strerror or error})") from None
+        raise unreachable(
+            f"the store rejects the request ({type(error).__name__}: {error.strerror or error})"
+        ) from None

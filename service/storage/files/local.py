@@ -33,7 +33,7 @@ def check_sha256(path: Path, sha256: str) -> None:
 def write_durably(path: Path, write: Callable[[IO[bytes]], Result], draft: Path | None = None) -> Result:
     """Write a file that survives a power cut, whole or not at all; return the result of `write`.
 
-    draft: temporary path of the unfinished file; beside it by default.
+    draft: path of the unfinished file; by default in the same folder.
     """
     draft = path.with_suffix(".draft") if draft is None else draft
     try:

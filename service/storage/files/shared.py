@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 Result = TypeVar("Result")
 
 GRACE_S = 600.0
-"""Min seconds since its last use for which a copy is kept: a caller that has its path may still open it."""
+"""Seconds for which an unused copy is kept, because a caller that has its path may still open it."""
 DAY_S = 86400.0
 """Age from which an object without a row counts as left over, s: before, its row may not be written yet."""
 SUFFIX = ".safetensors"
@@ -82,7 +82,7 @@ class SharedFiles:
         (self._cache / key).unlink(missing_ok=True)
 
     def version(self, name: str, again: bool = False) -> Path:
-        """Return the folder of a copy of a version, fetched if needed; see `file`."""
+        """Return the folder of the local copy of a version; fetch it if needed. See `file`."""
         target = self.versions / name
         if not again and _used(target):
             return target
@@ -91,7 +91,7 @@ class SharedFiles:
             if self._fetch(name, folder):
                 if again and target.exists():
                     target.rename(draft / "damaged")
-                with suppress(OSError):  # another process was faster
+                with suppress(OSError):  # another process has fetched it meanwhile
                     folder.rename(target)
         self._trim()
         return target

@@ -109,11 +109,11 @@ def test_saved_arm_loads_unchanged(kind: str, learnt_model: TorqueModel, samples
 
 Edit = Callable[[dict[str, Array]], object]
 INVALID_EDITS: dict[str, tuple[Edit, str]] = {
-    "no rotation": (lambda t: t["arm/rotation"].__imul__(2), "no rotation"),
+    "no rotation": (lambda t: t["arm/rotation"].__imul__(2), "not a rotation"),
     "no axis": (lambda t: t["arm/axis"].fill(0), "not of length one"),
     "missing": (lambda t: t.pop("arm/unit"), "'arm/unit' is missing"),
     "order": (lambda t: t["arm/order"].fill(0), "expected each joint once"),
-    "widths": (lambda t: t["arm/widths"].fill(0), "not above zero"),
+    "widths": (lambda t: t["arm/widths"].fill(0), "positive numbers"),
     "parameters": (lambda t: t.update({"arm/parameters": t["arm/parameters"][:2].copy()}), "parameters has shape"),
     "rotor": (lambda t: t.update({"arm/rotor": t["arm/rotation"][0, 0, :2].copy()}), "rotor has shape"),
     "steps": (lambda t: t.update({"arm/expected": t["arm/expected"][:1].copy()}), "expected has shape"),
@@ -267,7 +267,7 @@ MALFORMED_REPORTS: dict[str, Callable[[Any], None]] = {
     r"parameters.geometry.joints\[2\]: Object contains unknown field `mesh`": lambda r: r["geometry"]["joints"][
         2
     ].update(mesh="file"),
-    r"parameters.geometry: rotation holds a matrix": lambda r: r["geometry"]["joints"][0]["rotation"][0].reverse(),
+    r"parameters.geometry: rotation contains a matrix": lambda r: r["geometry"]["joints"][0]["rotation"][0].reverse(),
     r"parameters.rotor.std is": lambda r: r["rotor"].update(std=[0.1]),
     r"parameters.inertia.bodies\[1\].mean.first_moment\[0\] is": lambda r: r["inertia"]["bodies"][1]["mean"].update(
         first_moment=[None, 0, 0]

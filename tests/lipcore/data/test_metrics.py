@@ -79,7 +79,7 @@ def test_nmse_of_a_constant_torque_is_nan(constant: float) -> None:
 
 @pytest.mark.parametrize(("mean", "std"), [((3, 2), (4, 2)), ((4, 2), (4, 1)), ((4,), (4, 2))])
 def test_mismatched_shapes_are_named(mean: tuple[int, ...], std: tuple[int, ...]) -> None:
-    with pytest.raises(ValueError, match=r"expected \(4, 2\) as tau has"):
+    with pytest.raises(ValueError, match=r"expected \(4, 2\), the shape of tau"):
         evaluate(np.zeros((4, 2)), np.zeros(mean), np.zeros(std), np.ones(2))
 
 
@@ -261,7 +261,7 @@ def test_no_rows_make_the_empty_record() -> None:
     ("place", "value", "message"),
     [
         (0, np.zeros(2), r"tau has shape \(2,\), expected \(N, n\)"),
-        (1, np.zeros((3, 1)), r"mean has shape \(3, 1\), expected \(3, 2\) as tau has"),
+        (1, np.zeros((3, 1)), r"mean has shape \(3, 1\), expected \(3, 2\), the shape of tau"),
         (2, np.full((3, 2), np.nan), "std has values that are not finite"),
         (3, np.ones(3), r"noise_std has shape \(3,\), expected \(2,\)"),
         (3, np.zeros(2), "std and noise_std are both 0"),

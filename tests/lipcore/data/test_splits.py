@@ -155,7 +155,12 @@ def test_guard_ends_at_pauses_and_clock_restarts():
     [
         (1, 50, Split("episodes"), "episodes is 1, expected at least 2"),
         (1, 50, Split("blocks", blocks=51), "blocks is 51, expected at most the number of rows, 50"),
-        (1, 50, Split("last", guard_s=10.0), "guard_s is 10.0, expected less: all rows held out are closer than that"),
+        (
+            1,
+            50,
+            Split("last", guard_s=10.0),
+            "guard_s is 10.0, expected a smaller value: all rows held out are closer",
+        ),
         (1, 50, Split("last", 0.99, guard_s=0.02), "all rows to train on are closer than that"),
         (1, 1, Split("last"), "rows is 1, expected at least 2"),
     ],

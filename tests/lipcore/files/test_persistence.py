@@ -206,7 +206,7 @@ def test_wrong_manifest_entry_is_named(folder: Path, changes: dict[str, Any], me
         ("inducing/ddq", np.zeros((59, 2)), r"inducing/ddq has shape \(59, 2\)"),
         ("inducing/q", None, "lacks the tensor 'inducing/q'"),
         ("inducing/outputs", np.zeros(2), "'inducing/outputs' is of type 'F64', expected I64"),
-        ("inducing/outputs", np.array([0, 0]), "expected distinct places of torques"),
+        ("inducing/outputs", np.array([0, 0]), "distinct places of torques"),
         ("inducing/outputs", np.array([0, 5000]), "outputs reaches from 0 to 5000"),
         ("misfit", np.zeros((3, 2)), r"'misfit' has shape \(3, 2\), expected \(5, 2\)"),
         ("misfit", -np.ones((5, 2)), "'misfit' has a number below zero"),

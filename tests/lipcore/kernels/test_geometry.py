@@ -134,7 +134,7 @@ def test_invalid_geometry_is_rejected() -> None:
     good = random_geometry("RR", 13)
     parts = {name: getattr(good, name) for name in ("rotation", "translation", "axis", "gravity")}
     for name, value, message in (
-        ("rotation", 2 * good.rotation, "no rotation"),
+        ("rotation", 2 * good.rotation, "not a rotation"),
         ("rotation", good.rotation[:1], "rotation has shape"),
         ("translation", np.full((2, 3), np.nan), "translation has shape"),
         ("axis", 3 * good.axis, "not of length one"),

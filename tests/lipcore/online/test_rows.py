@@ -138,7 +138,7 @@ def test_wrong_clock_costs_at_most_one_batch() -> None:
     ("change", "message"),
     [
         ({"q": np.zeros(N)}, r"q has shape \(8,\), expected \(N, n\)"),
-        ({"dq": np.zeros((N, 3))}, r"dq has shape \(8, 3\), expected \(8, 2\) as q has"),
+        ({"dq": np.zeros((N, 3))}, r"dq has shape \(8, 3\), expected \(8, 2\), the shape of q"),
         ({"ddq": np.zeros((7, 2))}, "ddq has shape"),
         ({"tau": np.zeros((N, 1))}, "tau has shape"),
         ({"t": np.zeros(7)}, r"t has shape \(7,\), expected \(8,\)"),

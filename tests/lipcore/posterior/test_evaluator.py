@@ -268,4 +268,4 @@ def test_invalid_arguments_are_named() -> None:
     assert f"expected ({anchors}, {anchors})" in refused(root=np.zeros((anchors, anchors - 1)))
     assert "above the diagonal" in refused(root=np.ones((anchors, anchors)))
     assert "term and inducing" in refused(inducing=None)
-    assert "neither term nor linear" in refused(term=None, inducing=None, linear=[])
+    assert "term is None and linear is empty" in refused(term=None, inducing=None, linear=[])

@@ -292,7 +292,7 @@ def test_indefinite_statistics_are_rejected(chain: Case) -> None:
 
 def test_terms_of_another_model_are_rejected(chain: Case) -> None:
     other = fit_case("lip").model.estimator.terms
-    with pytest.raises(ValueError, match="none of this posterior"):
+    with pytest.raises(ValueError, match="not belong to this posterior"):
         chain.model.posterior.mean(chain.unseen, other["energy"])
-    with pytest.raises(ValueError, match="none of this basis"):
+    with pytest.raises(ValueError, match="not belong to this basis"):
         chain.model.posterior.mean(chain.unseen, other["friction"])

@@ -114,7 +114,7 @@ def test_mismatched_joint_list_is_shown(listed: tuple[str, ...]) -> None:
         (robot(link("a"), link("b"), joint("j", "a", "b").replace("<limit", "<no")), "Pinocchio cannot read"),
         (robot(link("a"), link("b"), link("c"), joint("j", "a", "b")), "no joint leads to the links 'a' and 'c'"),
         (robot(link("a"), link("a")), "two links are called 'a'"),
-        (robot(link("a"), link("b"), joint("j", "b", "b")), "lead to link 'b' are a closed loop"),
+        (robot(link("a"), link("b"), joint("j", "b", "b")), "lead to link 'b' form a closed loop"),
         (robot(link("a"), link("b"), joint("j", "b", "b"), joint("k", "a", "a")), "closed loop"),
         (ARM.replace('axis xyz="0 1 0"', 'axis xyz="0 0 0"'), "axis xyz> of joint 'j1' is '0 0 0', of length 0"),
         (ARM.replace('axis xyz="0 1 0"', 'axis xyz="1e300 0 0"'), "expected 3 numbers of at most 10000"),

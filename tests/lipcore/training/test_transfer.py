@@ -132,7 +132,7 @@ PANDA = RobotKind(("a", "b"), ("revolute", "prismatic"), "gravity_included")
             "estimator",
             "as the joints of the base have another order",
         ),
-        ({"robot": "panda"}, "robot", "'panda', expected none if a base is given"),
+        ({"robot": "panda"}, "robot", "'panda', expected no robot together with a base"),
         ({"options": FitOptions(geometry="learn")}, "options.geometry", "'learn', expected auto, calibrate or fixed"),
         ({"options": FitOptions(prior="zero")}, "options.prior", "'zero', expected the default"),
     ],

@@ -31,14 +31,14 @@ def leave_dead_socket(path):
         other.bind(str(path))
 
 
-def refused(path):
+def bind_rejected(path):
     with pytest.raises(SocketError) as caught:
         UnixSocket(path, 0o660)
     assert repr(str(path)) in str(caught.value)
     return str(caught.value)
 
 
-def connects(path):
+def can_connect(path):
     with socket.socket(socket.AF_UNIX) as client:
         return client.connect_ex(str(path)) == 0
 
@@ -57,9 +57,9 @@ def test_socket_has_its_mode_whatever_the_umask(path, mode):
 
 def test_socket_of_a_dead_service_is_replaced(path):
     leave_dead_socket(path)
-    assert not connects(path)
+    assert not can_connect(path)
     opened = UnixSocket(path, 0o660)
-    assert connects(path)
+    assert can_connect(path)
     opened.close()
 
 
@@ -71,15 +71,15 @@ def test_live_socket_is_left_alone(path, full):
         other.listen(0 if full else 9)
         if full:
             first.connect(str(path))
-        assert "Another service listens at" in refused(path)
-        assert full or connects(path)
+        assert "Another service listens at" in bind_rejected(path)
+        assert full or can_connect(path)
     assert path.is_socket()
 
 
 def test_socket_of_another_kind_is_left_alone(path):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other:
         other.bind(str(path))
-        assert "does not answer" in refused(path)
+        assert "does not answer" in bind_rejected(path)
         assert path.is_socket()
 
 
@@ -92,7 +92,7 @@ def test_other_files_are_left_alone(path, tmp_path, kind):
             leave_dead_socket(tmp_path / "target")
         path.symlink_to(tmp_path / "target")
     before = path.lstat()
-    assert "exists and is not a socket" in refused(path)
+    assert "exists and is not a socket" in bind_rejected(path)
     assert path.lstat() == before
 
 
@@ -100,7 +100,7 @@ def test_other_files_are_left_alone(path, tmp_path, kind):
 def test_impossible_path_is_reported(tmp_path, folder):
     if len(folder) > 100:
         (tmp_path / folder).mkdir()
-    assert re.search("No such file or directory|too long", refused(tmp_path / folder / "lip.sock"))
+    assert re.search("No such file or directory|too long", bind_rejected(tmp_path / folder / "lip.sock"))
 
 
 @pytest.mark.slow
@@ -137,7 +137,7 @@ def test_socket_of_a_successor_is_not_removed(path):
     path.unlink()
     successor = UnixSocket(path, 0o660)
     opened.close()
-    assert connects(path)
+    assert can_connect(path)
     successor.close()
 
 

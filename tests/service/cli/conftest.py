@@ -33,7 +33,7 @@ def lipserve(monkeypatch, capsys):
 
 
 @pytest.fixture
-def asked(lipserve, server):
+def run_command(lipserve, server):
     """Run a command against the shared service; return its output, with --json as parsed JSON."""
 
     def run(*arguments):
@@ -45,7 +45,7 @@ def asked(lipserve, server):
 
 
 @pytest.fixture
-def refused(lipserve, server):
+def run_rejected_command(lipserve, server):
     """Run a command that the shared service rejects; return its error output."""
 
     def run(*arguments):

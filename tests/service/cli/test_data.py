@@ -68,64 +68,64 @@ def test_simulated_recordings_have_the_joint_names_of_the_robot(tmp_path, robot)
 
 
 @pytest.mark.slow
-def test_same_recording_gives_the_same_data_set(asked, recording, tmp_path):
+def test_same_recording_gives_the_same_data_set(run_command, recording, tmp_path):
     path = recording(75, "twice.csv")
-    first = asked("data", "add", path, "--json")
+    first = run_command("data", "add", path, "--json")
     again = tmp_path / "elsewhere" / "twice.csv"
     again.parent.mkdir()
     again.write_bytes(path.read_bytes())
-    assert asked("data", "add", again, "--json")["id"] == first["id"]
-    assert asked("data", "add", path, "--cutoff", 3, "--filtering", "always", "--json")["id"] != first["id"]
-    assert asked("data", "add", path, "--name", "another", "--json")["id"] != first["id"]
-    asked("data", "delete", first["id"], "--yes")
-    assert asked("data", "add", path, "--json")["id"] != first["id"]  # what was deleted is stored anew
+    assert run_command("data", "add", again, "--json")["id"] == first["id"]
+    assert run_command("data", "add", path, "--cutoff", 3, "--filtering", "always", "--json")["id"] != first["id"]
+    assert run_command("data", "add", path, "--name", "another", "--json")["id"] != first["id"]
+    run_command("data", "delete", first["id"], "--yes")
+    assert run_command("data", "add", path, "--json")["id"] != first["id"]  # what was deleted is stored anew
 
 
 @pytest.mark.slow
-def test_file_is_found_as_its_existing_data_set(lipserve, asked, refused, server, recording):
+def test_file_is_found_as_its_existing_data_set(lipserve, run_command, run_rejected_command, server, recording):
     path = recording(90, "read-before.csv", samples=60)
-    made = asked("data", "add", path, "--name", "otherwise", "--joint-names", "shoulder,elbow", "--json")
-    job = asked("train", path, "--model", "cli-of-file", "--estimator", "se", "--no-wait", "--json")
+    made = run_command("data", "add", path, "--name", "otherwise", "--joint-names", "shoulder,elbow", "--json")
+    job = run_command("train", path, "--model", "cli-of-file", "--estimator", "se", "--no-wait", "--json")
     assert job["datasets"] == [made["id"]]
     server.client.post(f"/v1/jobs/{job['id']}/cancel")
     assert ended(server.client, job["id"])["state"]
     code, _, err = lipserve("data", "add", path, "--name", "plain", "--url", server.url)
     assert code == 0, err
-    message, hint = refused("evaluate", "panda-sim", path).splitlines()
+    message, hint = run_rejected_command("evaluate", "panda-sim", path).splitlines()
     assert (
         "read-before.csv was uploaded before and read in 2 different ways: give the id of one data set: ds_" in message
     )
     assert f"{made['id']} (no robot, " in message
     assert "`lipserve data show ID`" in hint
-    asked("data", "delete", "plain", "--yes")
-    assert "are shoulder, elbow" in refused("evaluate", "panda-sim", path)
+    run_command("data", "delete", "plain", "--yes")
+    assert "are shoulder, elbow" in run_rejected_command("evaluate", "panda-sim", path)
 
 
 @pytest.mark.slow
-def test_data_sets_can_be_given_by_name(asked, refused, arm, recording):
+def test_data_sets_can_be_given_by_name(run_command, run_rejected_command, arm, recording):
     path = recording(76, "by-name.csv")
-    made = asked("data", "add", path, "--name", "by name", "--json")
-    assert asked("data", "show", "by name", "--json") == made
-    assert asked("evaluate", arm[0], "by name", "--json")["dataset"] == made["id"]
-    other = asked("data", "add", path, "--name", "by name", "--cutoff", 3, "--filtering", "always", "--json")
-    message = refused("data", "delete", "by name", "--yes")
+    made = run_command("data", "add", path, "--name", "by name", "--json")
+    assert run_command("data", "show", "by name", "--json") == made
+    assert run_command("evaluate", arm[0], "by name", "--json")["dataset"] == made["id"]
+    other = run_command("data", "add", path, "--name", "by name", "--cutoff", 3, "--filtering", "always", "--json")
+    message = run_rejected_command("data", "delete", "by name", "--yes")
     assert f"Use one of their ids: {other['id']}, {made['id']}" in message
-    asked("data", "delete", made["id"], "--yes")
-    assert asked("data", "delete", "by name", "--yes", "--json") == {"deleted": ["by name"]}
-    assert "no dataset 'by name'" in refused("evaluate", arm[0], "by name")
+    run_command("data", "delete", made["id"], "--yes")
+    assert run_command("data", "delete", "by name", "--yes", "--json") == {"deleted": ["by name"]}
+    assert "no dataset 'by name'" in run_rejected_command("evaluate", arm[0], "by name")
 
 
-def test_upload_errors_name_command_line_options(refused, recording, tmp_path):
+def test_upload_errors_name_command_line_options(run_rejected_command, recording, tmp_path):
     path = recording(77, "in-degrees.csv", samples=60)
     samples = stream(seed=77, samples=60)
     turned = replace(samples, q=np.degrees(samples.q) * 50)
     write_recording(path, turned)
-    message = refused("data", "add", path)
+    message = run_rejected_command("data", "add", path)
     assert "Set --unit q=deg if these are degrees, or --unit q=rad if the joint turns this far (invalid_data" in message
-    hint = refused("train", path, "--model", "never").splitlines()[-1]
+    hint = run_rejected_command("train", path, "--model", "never").splitlines()[-1]
     assert f"upload it with `lipserve data add {path}`, which has options for reading" in hint
     write_recording(path, replace(samples, q=samples.q * [1.0, 0.0]))
-    assert "Leave out locked joints with --drop joint2 (invalid_data" in refused("data", "add", path)
+    assert "Leave out locked joints with --drop joint2 (invalid_data" in run_rejected_command("data", "add", path)
 
 
 @pytest.fixture
@@ -137,52 +137,52 @@ def flat(tmp_path):
     return [tmp_path / f"{name}.txt" for name in ("positions", "velocities", "torques")], samples
 
 
-def test_join_makes_one_data_set_of_several_files(asked, refused, flat):
+def test_join_makes_one_data_set_of_several_files(run_command, run_rejected_command, flat):
     files, samples = flat
-    made = asked("data", "add", *files, "--join", "--dt", 0.02, "--filtering", "never", "--json")
+    made = run_command("data", "add", *files, "--join", "--dt", 0.02, "--filtering", "never", "--json")
     assert (made["name"], made["report"]["rows_uploaded"]) == ("positions+velocities+torques", 60)
     assert made["report"]["derived"] == ["ddq"]
     assert made["report"]["ranges"]["tau"]["max"] == pytest.approx(samples.tau.max(0), rel=0.05)
     options = ("--join", "--dt", 0.02, "--filtering", "never", "--json")
-    assert asked("data", "add", *files, *options)["id"] == made["id"]
-    message, hint = refused("data", "add", *files, "--dt", 0.02).splitlines()
+    assert run_command("data", "add", *files, *options)["id"] == made["id"]
+    message, hint = run_rejected_command("data", "add", *files, "--dt", 0.02).splitlines()
     assert "Or set --columns t,q1..q7,tau1..tau7 (invalid_data" in message
     assert hint == "hint: if the files are parts of one recording, add --join"
     files[2].write_text("\n".join(files[2].read_text().splitlines()[:50]))
-    assert "torques.txt is a table of 50 rows, expected 60 rows, like positions.txt" in refused(
+    assert "torques.txt is a table of 50 rows, expected 60 rows, like positions.txt" in run_rejected_command(
         "data", "add", *files, "--join"
     )
 
 
-def test_columns_option_names_tables_without_header(asked, refused, tmp_path):
+def test_columns_option_names_tables_without_header(run_command, run_rejected_command, tmp_path):
     samples = stream(seed=79, samples=60, rate=50.0)
     path, table = tmp_path / "bare.csv", np.column_stack([samples.t, samples.q, samples.dq, samples.ddq, samples.tau])
     np.savetxt(path, table, delimiter=",")
-    made = asked("data", "add", path, "--columns", "t,q1..q2,dq1..dq2,ddq1..2,tau1,tau2", "--json")
+    made = run_command("data", "add", path, "--columns", "t,q1..q2,dq1..dq2,ddq1..2,tau1,tau2", "--json")
     assert made["report"]["rows"] == 60
     assert made["report"]["ranges"]["q"]["max"] == pytest.approx(samples.q.max(0))
-    assert "--columns is 3 names, expected 9" in refused("data", "add", path, "--columns", "t,q1..q2")
-    assert "--columns is q5..q1, expected a range" in refused("data", "add", path, "--columns", "q5..q1")
+    assert "--columns is 3 names, expected 9" in run_rejected_command("data", "add", path, "--columns", "t,q1..q2")
+    assert "--columns is q5..q1, expected a range" in run_rejected_command("data", "add", path, "--columns", "q5..q1")
 
 
-def test_upload_prints_its_report(asked, recording):
+def test_upload_prints_its_report(run_command, recording):
     path = recording(72, "two-joints.csv", samples=600, rate=100.0)
     options = ("--joint-names", "shoulder,elbow", "--filtering", "always", "--rate", 50)
-    text = asked("data", "add", path, *options)
+    text = run_command("data", "add", path, *options)
     for part in ("two-joints.csv", "low-passed at 4 Hz", "shoulder", "Coulomb"):
         assert part in text
 
 
-def test_added_data_set_is_listed_shown_and_deleted(asked, refused, recording):
+def test_added_data_set_is_listed_shown_and_deleted(run_command, run_rejected_command, recording):
     paths = [recording(84, name) for name in ("a.csv", "b.csv")]
     options = ("--name", "monday", "--column", "q={joint}/position", "--unit", "t=s")
-    added = asked("data", "add", paths[0], *options, "--json")
+    added = run_command("data", "add", paths[0], *options, "--json")
     assert added["name"] == "monday"
-    assert next(line for line in asked("data", "list").splitlines() if added["id"] in line).count("monday") == 1
-    assert asked("data", "show", added["id"], "--json") == added
-    assert added in asked("data", "list", "--json")
-    made = [each["id"] for each in asked("data", "add", *paths, "--json")]
-    assert asked("data", "delete", *made, "--yes", "--json") == {"deleted": made}
-    assert f"no dataset '{made[0]}'" in refused("data", "show", made[0])
-    assert "effort" in refused("data", "add", paths[0], "--effort", "volts")
-    assert "--unit is 'deg'" in refused("data", "add", paths[0], "--unit", "deg")
+    assert next(line for line in run_command("data", "list").splitlines() if added["id"] in line).count("monday") == 1
+    assert run_command("data", "show", added["id"], "--json") == added
+    assert added in run_command("data", "list", "--json")
+    made = [each["id"] for each in run_command("data", "add", *paths, "--json")]
+    assert run_command("data", "delete", *made, "--yes", "--json") == {"deleted": made}
+    assert f"no dataset '{made[0]}'" in run_rejected_command("data", "show", made[0])
+    assert "effort" in run_rejected_command("data", "add", paths[0], "--effort", "volts")
+    assert "--unit must have the form NAME=VALUE" in run_rejected_command("data", "add", paths[0], "--unit", "deg")

@@ -45,7 +45,7 @@ def read(path):
 
 
 @pytest.mark.slow
-def test_a_motion_for_a_saved_model_is_written_drawn_and_told(folder, tmp_path):
+def test_motion_for_a_saved_model_is_written_plotted_and_described(folder, tmp_path):
     out, plot = tmp_path / "motion.csv", tmp_path / "motion.png"
     reply = excite("--model", folder, "--robot", "double-pendulum", *SHORT, "--out", out, "--plot", plot)
     header, t, q, dq, ddq = read(out)
@@ -62,7 +62,7 @@ def test_a_motion_for_a_saved_model_is_written_drawn_and_told(folder, tmp_path):
 
 
 @pytest.mark.slow
-def test_without_a_model_a_prior_is_planned_for_within_shares_of_the_limits(tmp_path):
+def test_motion_without_a_model_stays_within_shares_of_the_limits(tmp_path):
     out = tmp_path / "motion.csv"
     reply = excite("--robot", "asr-twodof", *SHORT, "--range", "0.5", "--scale", "0.4", "--noise", "0.1", "--out", out)
     assert "planned for a rigid-body prior" in reply
@@ -75,7 +75,7 @@ def test_without_a_model_a_prior_is_planned_for_within_shares_of_the_limits(tmp_
 
 
 @pytest.mark.slow
-def test_a_served_model_is_fetched_as_it_is(server):
+def test_fetched_model_predicts_like_the_served_one(server):
     dataset = upload(server.client, stream())["id"]
     train(server.client, "to-excite", dataset)
     result = fetch("to-excite", server.url)
@@ -85,7 +85,7 @@ def test_a_served_model_is_fetched_as_it_is(server):
     np.testing.assert_allclose(result.predict(**query).tau_std[0], answer["tau_std"], rtol=1e-6)
 
 
-def test_the_robot_is_told_by_the_joints_of_the_model():
+def test_robot_is_found_by_the_joints_of_the_model():
     samples = simulate(load_robot("panda"), Simulation(n_samples=20), 0)
     model = lipcore.train(samples, ("revolute",) * 7, "lip-chain", lipcore.FitOptions(**QUICK, starts=1))
     result = find(None, model)
@@ -94,7 +94,7 @@ def test_the_robot_is_told_by_the_joints_of_the_model():
     assert result.limits.joint_names == samples.joint_names
 
 
-def test_a_robot_of_a_urdf_moves_the_joints_of_the_model(folder, tmp_path):
+def test_robot_of_a_urdf_has_the_joints_of_the_model(folder, tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_bytes(urdf(kind="revolute", joints=("joint1", "joint2")))
     model = lipcore.load(folder)
@@ -123,7 +123,7 @@ def test_a_robot_of_a_urdf_moves_the_joints_of_the_model(folder, tmp_path):
         (("--model", "nobody", "--url", f"http://127.0.0.1:{free_port()}"), "start one with `lipserve serve`"),
     ],
 )
-def test_mistakes_are_explained(folder, tmp_path, monkeypatch, arguments, message):
+def test_invalid_arguments_are_explained(folder, tmp_path, monkeypatch, arguments, message):
     (tmp_path / "empty").mkdir()
     (tmp_path / "folder").symlink_to(folder)
     monkeypatch.chdir(tmp_path)

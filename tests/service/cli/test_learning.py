@@ -91,67 +91,69 @@ def pupil(server, arm):
 
 
 @pytest.mark.slow
-def test_learning_is_shown_set_and_undone(asked, refused, server, pupil):
+def test_learning_is_shown_set_and_undone(run_command, run_rejected_command, server, pupil):
     quality = server.client.get(f"/v1/models/{pupil}/quality").json()
-    text = asked("learning", "show", pupil)
+    text = run_command("learning", "show", pupil)
     assert "revision 2 of 2: learning is active" in text
     rows = quality["windows"][-1]["rows"]
     assert f"prediction of {rows} rows of the last 3600 s, before learning from them" in text
-    assert asked("learning", "show", pupil, "--json")["quality"]["revision"] == 2
-    assert "revision 2 of 2 serving" in asked("models", "show", pupil)
+    assert run_command("learning", "show", pupil, "--json")["quality"]["revision"] == 2
+    assert "revision 2 of 2 serving" in run_command("models", "show", pupil)
 
-    text = asked("learning", "set", pupil, "contact_threshold=100", "on_change=learn", "auto_refresh=false")
+    text = run_command("learning", "set", pupil, "contact_threshold=100", "on_change=learn", "auto_refresh=false")
     assert "on_change = learn" in text
     options = server.client.get(f"/v1/models/{pupil}/learning").json()["options"]
     assert (options["contact_threshold"], options["auto_refresh"], options["payloads"]) == (100.0, False, True)
-    assert "forgetting_s" in refused("learning", "set", pupil, "forgetting_s=0.1")
+    assert "forgetting_s" in run_rejected_command("learning", "set", pupil, "forgetting_s=0.1")
 
-    found = asked("learning", "batches", pupil, "--json")
+    found = run_command("learning", "batches", pupil, "--json")
     assert [each["sequence"] for each in found] == [1, 0]
-    assert "learnt" in asked("learning", "batches", pupil, "--stream", "arm")
-    assert f"no batches of {pupil}" in asked("learning", "batches", pupil, "--stream", "nobody")
-    seen = asked("learning", "batch", pupil, "arm", 1)
+    assert "learnt" in run_command("learning", "batches", pupil, "--stream", "arm")
+    assert f"no batches of {pupil}" in run_command("learning", "batches", pupil, "--stream", "nobody")
+    seen = run_command("learning", "batch", pupil, "arm", 1)
     assert f"{found[0]['accepted']} of {found[0]['rows']} rows accepted" in seen
-    assert len(asked("learning", "batch", pupil, "arm", 1, "--rows", "--json")["observed"]["q"]) == found[0]["rows"]
-    assert "batch 1 of arm unlearnt" in asked("learning", "unlearn", pupil, "arm", 1, "--yes")
-    assert "unlearnt" in asked("learning", "batch", pupil, "arm", 1)
-    assert "has been unlearnt" in refused("learning", "replay", pupil, "arm", 1)
-    assert f"stream arm of {pupil} deleted" in asked("learning", "forget", pupil, "arm", "--yes")
-    assert asked("learning", "show", pupil, "--json")["learning"]["status"]["streams"] == []
+    assert (
+        len(run_command("learning", "batch", pupil, "arm", 1, "--rows", "--json")["observed"]["q"]) == found[0]["rows"]
+    )
+    assert "batch 1 of arm unlearnt" in run_command("learning", "unlearn", pupil, "arm", 1, "--yes")
+    assert "unlearnt" in run_command("learning", "batch", pupil, "arm", 1)
+    assert "has been unlearnt" in run_rejected_command("learning", "replay", pupil, "arm", 1)
+    assert f"stream arm of {pupil} deleted" in run_command("learning", "forget", pupil, "arm", "--yes")
+    assert run_command("learning", "show", pupil, "--json")["learning"]["status"]["streams"] == []
 
 
-def test_alarms_are_listed(asked, pupil):
-    assert f"no alarms of {pupil}" in asked("alarms", pupil)
-    assert asked("alarms", pupil, "--json") == []
+def test_alarms_are_listed(run_command, pupil):
+    assert f"no alarms of {pupil}" in run_command("alarms", pupil)
+    assert run_command("alarms", pupil, "--json") == []
 
 
 @pytest.mark.slow
-def test_every_list_shows_quality(asked, server, recording):
+def test_every_list_shows_quality(run_command, server, recording):
     path = recording(21, samples=120, rate=10.0)
-    asked("train", path, "--model", "cli-listed", *QUICKLY, "--promotion", "always")
+    run_command("train", path, "--model", "cli-listed", *QUICKLY, "--promotion", "always")
     quality = server.client.get("/v1/models/cli-listed").json()["versions"][0]["quality"]
     error = f"{sum(quality['nmse']) / 2:.2e}"
     inside = percent(sum(quality["coverage"]) / 2)
     for command in (("models", "list"), ("models", "show", "cli-listed"), ("jobs", "list")):
-        row = next(line for line in asked(*command).splitlines() if error in line)
+        row = next(line for line in run_command(*command).splitlines() if error in line)
         assert inside in row
 
 
-def test_robots_are_added_listed_shown_and_deleted(asked, refused, tmp_path):
+def test_robots_are_added_listed_shown_and_deleted(run_command, run_rejected_command, tmp_path):
     urdf = tmp_path / "one.urdf"
     urdf.write_text(
         '<robot name="one"><link name="a"/><link name="b"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" '
         'ixy="0" ixz="0" iyz="0"/></inertial></link><joint name="j" type="revolute"><parent link="a"/>'
         '<child link="b"/><axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="5" velocity="2"/></joint></robot>'
     )
-    robot = asked("robots", "add", urdf, "--json")["id"]
-    text = asked("robots", "list")
+    robot = run_command("robots", "add", urdf, "--json")["id"]
+    text = run_command("robots", "list")
     assert robot in text
     assert "panda" in text
-    shown = asked("robots", "show", robot)
+    shown = run_command("robots", "show", robot)
     assert "sha256" in shown
     assert "-1" in next(line for line in shown.splitlines() if " j " in line)
-    assert "7 joints" in asked("robots", "show", "panda")
-    assert f"{robot} deleted" in asked("robots", "delete", robot, "--yes")
-    assert "no robot" in refused("robots", "show", robot)
-    assert "expected a .urdf file" in refused("robots", "add", Path(__file__))
+    assert "7 joints" in run_command("robots", "show", "panda")
+    assert f"{robot} deleted" in run_command("robots", "delete", robot, "--yes")
+    assert "no robot" in run_rejected_command("robots", "show", robot)
+    assert "is not a .urdf file" in run_rejected_command("robots", "add", Path(__file__))

@@ -10,78 +10,80 @@ from service.cli.models import print_of_joints, print_selection
 from tests.service.models.versions import JOINTS, WARNING
 
 
-def test_models_are_listed_and_shown(asked, arm):
+def test_models_are_listed_and_shown(run_command, arm):
     name, _ = arm
-    assert name in [each["name"] for each in asked("models", "list", "--json")]
-    assert name in asked("models", "list")
-    assert len(asked("models", "list", "--limit", 1, "--json")) == 1
-    shown = asked("models", "show", name, "--json")
+    assert name in [each["name"] for each in run_command("models", "list", "--json")]
+    assert name in run_command("models", "list")
+    assert len(run_command("models", "list", "--limit", 1, "--json")) == 1
+    shown = run_command("models", "show", name, "--json")
     assert shown["model"]["latest_version"] >= 2
     assert shown["version"]["version"] == shown["model"]["serving_version"]
-    text = asked("models", "show", name, "--version", 1)
+    text = run_command("models", "show", name, "--version", 1)
     assert "version 1: se, 2 joints: joint1, joint2" in text
     assert "no data were held out" in text
 
 
-def test_promotion_can_be_rolled_back(asked, arm):
+def test_promotion_can_be_rolled_back(run_command, arm):
     name, _ = arm
-    assert asked("models", "promote", name, 1, "--json")["version"] == 1
-    assert f"serving → {name} version 2" in asked("models", "promote", name, 2)
-    assert asked("models", "rollback", name, "--json")["version"] == 1
-    asked("models", "promote", name, 2)
-    assert "version 1" in asked("models", "promote", name, 1, "--alias", "night")
-    assert asked("models", "promote", name, "night", "--alias", "day", "--json")["version"] == 1
-    assert asked("predict", name, "--q", "0.1,0.2", "--alias", "day", "--json")["version"] == 1
-    assert f"day → {name} version 1" in asked("models", "alias", name, "day")
-    asked("models", "alias", name, "day", 2)
-    assert asked("models", "alias", name, "day", "--json")["version"] == 2
-    asked("models", "alias", name, "day", "--remove")
+    assert run_command("models", "promote", name, 1, "--json")["version"] == 1
+    assert f"serving → {name} version 2" in run_command("models", "promote", name, 2)
+    assert run_command("models", "rollback", name, "--json")["version"] == 1
+    run_command("models", "promote", name, 2)
+    assert "version 1" in run_command("models", "promote", name, 1, "--alias", "night")
+    assert run_command("models", "promote", name, "night", "--alias", "day", "--json")["version"] == 1
+    assert run_command("predict", name, "--q", "0.1,0.2", "--alias", "day", "--json")["version"] == 1
+    assert f"day → {name} version 1" in run_command("models", "alias", name, "day")
+    run_command("models", "alias", name, "day", 2)
+    assert run_command("models", "alias", name, "day", "--json")["version"] == 2
+    run_command("models", "alias", name, "day", "--remove")
 
 
-def test_versions_are_compared(asked, arm):
+def test_versions_are_compared(run_command, arm):
     name, dataset = arm
-    compared = asked("models", "compare", name, dataset, 1, 2, "--json")
+    compared = run_command("models", "compare", name, dataset, 1, 2, "--json")
     assert [each["version"] for each in compared["versions"]] == [1, 2]
-    text = asked("models", "compare", name, dataset, 1, 2)
+    text = run_command("models", "compare", name, dataset, 1, 2)
     assert compared["verdict"] in text
     assert "warning: " in text  # both were trained on it
 
 
-def test_archive_is_exported_imported_and_deleted(asked, arm, refused, tmp_path):
+def test_archive_is_exported_imported_and_deleted(run_command, arm, run_rejected_command, tmp_path):
     name, _ = arm
     path = tmp_path / "arm.tar"
-    assert asked("models", "export", name, path, "--version", 1, "--json")["bytes"] == path.stat().st_size
-    made = asked("models", "import", path, "--name", "cli-imported", "--json")
+    assert run_command("models", "export", name, path, "--version", 1, "--json")["bytes"] == path.stat().st_size
+    made = run_command("models", "import", path, "--name", "cli-imported", "--json")
     assert (made["model"], made["version"]) == ("cli-imported", 1)
-    assert "permanently?" in refused("models", "delete", "cli-imported")  # nobody has answered the question
-    asked("models", "delete", "cli-imported", "--yes")
-    assert "no model 'cli-imported'" in refused("models", "show", "cli-imported")
+    assert "permanently?" in run_rejected_command(
+        "models", "delete", "cli-imported"
+    )  # nobody has answered the question
+    run_command("models", "delete", "cli-imported", "--yes")
+    assert "no model 'cli-imported'" in run_rejected_command("models", "show", "cli-imported")
 
 
-def test_version_is_exported_as_c(asked, refused, arm, robot_arm, tmp_path):
+def test_version_is_exported_as_c(run_command, run_rejected_command, arm, robot_arm, tmp_path):
     folder = tmp_path / "made" / "c"
-    written = asked("models", "export", robot_arm, "--c", folder, "--version", 1, "--json")
+    written = run_command("models", "export", robot_arm, "--c", folder, "--version", 1, "--json")
     assert sorted(written.values()) == sorted(map(str, folder.iterdir()))
     assert f'#define LIPSERVE_MODEL "{robot_arm}"' in (folder / "lipserve_model.h").read_text()
-    assert "cc -O2 -c" in asked("models", "export", robot_arm, "--c", folder, "--version", 1)
-    assert "estimator is 'se', expected one of rigid-body" in refused(
+    assert "cc -O2 -c" in run_command("models", "export", robot_arm, "--c", folder, "--version", 1)
+    assert "estimator is 'se', expected one of rigid-body" in run_rejected_command(
         "models", "export", arm[0], "--c", tmp_path / "none", "--version", 1
     )
     assert not (tmp_path / "none").exists()
-    assert "give an archive to write or --c FOLDER, not both" in refused(
+    assert "give an archive to write or --c FOLDER, not both" in run_rejected_command(
         "models", "export", robot_arm, "x.tar", "--c", folder
     )
-    assert "give an archive to write or --c FOLDER\n" in refused("models", "export", robot_arm)
+    assert "give an archive to write or --c FOLDER\n" in run_rejected_command("models", "export", robot_arm)
 
 
-def test_estimated_arm_is_shown(asked, refused, robot_arm):
-    text = asked("models", "show", robot_arm, "--version", 1)
+def test_estimated_arm_is_shown(run_command, run_rejected_command, robot_arm):
+    text = run_command("models", "show", robot_arm, "--version", 1)
     assert f"warning: {WARNING}" in text
     parts = ("joint frames", "rotor kg·m²", "mass, first moment", "shift 2", "mirror image", "-0.05 ± 0.01")
     assert [part for part in parts if part not in text] == []
-    assert "mirror image" not in asked("models", "show", robot_arm)
-    assert describe(asked("models", "urdf", robot_arm, "--version", 1)).joint_names == JOINTS
-    assert "has no rigid bodies" in refused("models", "urdf", robot_arm)
+    assert "mirror image" not in run_command("models", "show", robot_arm)
+    assert describe(run_command("models", "urdf", robot_arm, "--version", 1)).joint_names == JOINTS
+    assert "has no rigid bodies" in run_rejected_command("models", "urdf", robot_arm)
 
 
 @pytest.mark.parametrize(
@@ -96,8 +98,8 @@ def test_estimated_arm_is_shown(asked, refused, robot_arm):
         (("stream", "cli-arm"), "`lipserve stream cli-arm --simulate panda`"),
     ],
 )
-def test_errors_have_hints(refused, arm, arguments, hint):
-    assert f"hint: {hint}" in refused(*arguments)
+def test_errors_have_hints(run_rejected_command, arm, arguments, hint):
+    assert f"hint: {hint}" in run_rejected_command(*arguments)
 
 
 def judged(estimator, nmse, **given):

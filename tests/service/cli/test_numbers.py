@@ -47,7 +47,7 @@ def test_commands_use_counted_for_numbers_of_things(path):
     assert MANY.findall(path.read_text("utf-8")) == []
 
 
-def test_report_uses_singular_and_plural(asked, recording):
-    text = asked("data", "add", recording(74, "counted.csv"))
+def test_report_uses_singular_and_plural(run_command, recording):
+    text = run_command("data", "add", recording(74, "counted.csv"))
     assert "in 1 episode, at" in text
     assert "; 0 gaps" in text

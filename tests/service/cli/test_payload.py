@@ -13,13 +13,13 @@ def carrier(server):
     return "cli-carrier"
 
 
-def test_payload_is_declared_shown_and_removed(server, asked, carrier):
-    assert f"no payload estimates of {carrier} yet" in asked("payload", carrier)
+def test_payload_is_declared_shown_and_removed(server, run_command, carrier):
+    assert f"no payload estimates of {carrier} yet" in run_command("payload", carrier)
     for stream_id in ("cell-1", "cell-2"):
         (first, *_) = payload_batches(stream_id, 0.0)
         assert server.client.post(f"/v1/models/{carrier}/observations", json=first).status_code == 200
     declare = ("payload", carrier, "--mass", 1.5, "--com", "0,0.02,0.12")
-    text = asked(*declare, "--stream", "cell-1")
+    text = run_command(*declare, "--stream", "cell-1")
     for line in (
         "stream cell-1: payload 1.50 ± 0.03 kg, declared",
         "0.000 ± 0.005, 0.020 ± 0.005, 0.120 ± 0.005 m",
@@ -27,20 +27,20 @@ def test_payload_is_declared_shown_and_removed(server, asked, carrier):
         "kilograms are only as accurate as lengths",
     ):
         assert line in text
-    asked("payload", carrier, "--mass", 12, "--com", "0,0,0.1", "--stream", "cell-2")
-    table = asked("payload", carrier)
+    run_command("payload", carrier, "--mass", 12, "--com", "0,0,0.1", "--stream", "cell-2")
+    table = run_command("payload", carrier)
     rows = [line for line in table.splitlines() if "cell-" in line]
     assert [("1.50 ± 0.03 kg" in row, "12.00 ± 0.24 kg" in row) for row in rows] == [(True, False), (False, True)]
-    shown = asked("payload", carrier, "--stream", "cell-2", "--json")
+    shown = run_command("payload", carrier, "--stream", "cell-2", "--json")
     assert [each["stream_id"] for each in shown["streams"]] == ["cell-2"]
-    assert "stream cell-2: payload none" in asked("payload", carrier, "--remove", "--stream", "cell-2")
-    assert asked("payload", carrier, "--json")["streams"][0]["payload"]["mass"]["mean"] == pytest.approx(1.5)
-    assert f"declared for all streams of {carrier}: 2.00 ± 0.04 kg" in asked(
+    assert "stream cell-2: payload none" in run_command("payload", carrier, "--remove", "--stream", "cell-2")
+    assert run_command("payload", carrier, "--json")["streams"][0]["payload"]["mass"]["mean"] == pytest.approx(1.5)
+    assert f"declared for all streams of {carrier}: 2.00 ± 0.04 kg" in run_command(
         "payload", carrier, "--mass", 2, "--com", "0,0,0.1", "--inertia", "0.01,0,0,0.01,0,0.01"
     )
-    assert "payload 2.00" in asked("payload", carrier, "--stream", "cell-2")
-    asked("payload", carrier, "--remove")
-    gone = asked("payload", carrier, "--json")
+    assert "payload 2.00" in run_command("payload", carrier, "--stream", "cell-2")
+    run_command("payload", carrier, "--remove")
+    gone = run_command("payload", carrier, "--json")
     assert (gone["default"], [each["payload"] for each in gone["streams"]]) == (None, [None, None])
 
 
@@ -49,16 +49,19 @@ def test_payload_is_declared_shown_and_removed(server, asked, carrier):
     [
         (("--mass", 1), "--mass and --com must be given together"),
         (("--remove", "--mass", 1), "give either --remove or --mass, not both"),
-        (("--mass", 1, "--com", "0,0,0", "--inertia", "1,2"), "--inertia has 2 numbers, expected 6"),
+        (
+            ("--mass", 1, "--com", "0,0,0", "--inertia", "1,2"),
+            "--inertia must be six numbers, ixx,ixy,ixz,iyy,iyz,izz; got 2",
+        ),
         (("--mass", 1, "--com", "0,0,0", "--inertia", "9,0,0,1,0,1"), "No body has this mass and inertia"),
         (("--mass", -1, "--com", "0,0,0"), "mass"),
     ],
 )
-def test_invalid_payloads_are_rejected(refused, carrier, options, message):
-    assert message in refused("payload", carrier, *options)
+def test_invalid_payloads_are_rejected(run_rejected_command, carrier, options, message):
+    assert message in run_rejected_command("payload", carrier, *options)
 
 
-def test_model_without_arm_explains_missing_payload_estimate(asked, refused, arm):
+def test_model_without_arm_explains_missing_payload_estimate(run_command, run_rejected_command, arm):
     name, _ = arm
-    assert f"payloads of {name} are not estimated: estimator se has no arm" in asked("payload", name)
-    assert "train with rigid-body" in refused("payload", name, "--mass", 1, "--com", "0,0,0")
+    assert f"payloads of {name} are not estimated: estimator se has no arm" in run_command("payload", name)
+    assert "train with rigid-body" in run_rejected_command("payload", name, "--mass", 1, "--com", "0,0,0")

@@ -85,7 +85,10 @@ def test_misfitting_stream_is_reported_and_not_learnt(lipserve, server, steady):
     code, out, err = lipserve("learning", "decide", steady, "ignore", "--replay", "--url", server.url)
     assert (code, "learning resumed" in out) == (0, True)
     assert "learning is active" in lipserve("learning", "show", steady, "--url", server.url)[1]
-    assert "expected adapt or ignore" in lipserve("learning", "decide", steady, "go", "--url", server.url)[2]
+    assert (
+        "the decision must be adapt or ignore, got 'go'"
+        in lipserve("learning", "decide", steady, "go", "--url", server.url)[2]
+    )
 
 
 def settled(server, model):
@@ -117,43 +120,43 @@ def test_fitting_stream_is_learnt_without_warning(lipserve, server, steady):
     assert lipserve("alarms", steady, "--url", server.url)[1] == f"no alarms of {steady}\n"
 
 
-def test_recording_is_played(asked, refused, arm, recording):
+def test_recording_is_played(run_command, run_rejected_command, arm, recording):
     path = recording(85, "motion.csv", samples=20, rate=40.0)
-    text = asked("stream", arm[0], path)
+    text = run_command("stream", arm[0], path)
     assert "total   20 rows; round trip p50 " in text
     assert " late, " in text
     assert "(95 % interval)" in text
-    mismatch = "the motion has 2 joints (joint1, joint2), expected the model's 7"
-    assert mismatch in refused("stream", "panda-sim", path)
+    mismatch = "the motion has 2 joints (joint1, joint2), but the model has 7"
+    assert mismatch in run_rejected_command("stream", "panda-sim", path)
 
 
 def test_ctrl_c_ends_stream_and_prints_figures(lipserve, arm, server, monkeypatch):
-    asked, send = [], StreamClient.send
+    sent, send = [], StreamClient.send
 
-    def ask_and_press(self, *arguments, **options):
-        asked.append(arguments)
-        if len(asked) == 5:
+    def send_and_interrupt(self, *arguments, **options):
+        sent.append(arguments)
+        if len(sent) == 5:
             signal.raise_signal(signal.SIGINT)
         return send(self, *arguments, **options)
 
-    monkeypatch.setattr(StreamClient, "send", ask_and_press)
+    monkeypatch.setattr(StreamClient, "send", send_and_interrupt)
     before = signal.getsignal(signal.SIGINT)
     code, out, _ = lipserve("stream", arm[0], "--simulate", "double-pendulum", "--url", server.url, "--json")
-    assert (code, len(asked)) == (130, 5)
+    assert (code, len(sent)) == (130, 5)
     assert lines(out)[-1]["summary"]["rows"] == 5
     assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_stream_closed_by_the_service_prints_figures(lipserve, arm, server, monkeypatch):
-    asked, send = [], StreamClient.send
+    sent, send = [], StreamClient.send
 
-    def ask_or_end(self, *arguments, **options):
-        asked.append(arguments)
-        if len(asked) == 5:
+    def send_or_close(self, *arguments, **options):
+        sent.append(arguments)
+        if len(sent) == 5:
             raise StreamError("the service closed the stream: the service stops", "closed")
         return send(self, *arguments, **options)
 
-    monkeypatch.setattr(StreamClient, "send", ask_or_end)
+    monkeypatch.setattr(StreamClient, "send", send_or_close)
     code, out, err = lipserve("stream", arm[0], "--simulate", "double-pendulum", "--url", server.url, "--json")
     assert (code, lines(out)[-1]["summary"]["rows"]) == (1, 4)
     assert "error: the service closed the stream: the service stops (closed)" in err

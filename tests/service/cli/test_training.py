@@ -15,10 +15,10 @@ from tests.service.server import Server, free_port
 ENDLESSLY = options_of_train(ENDLESS)
 
 
-def test_train_evaluate_and_predict_from_a_recording(asked, server, recording):
+def test_train_evaluate_and_predict_from_a_recording(run_command, server, recording):
     path = recording(11, samples=120, rate=10.0)
     types = ("--joint-types", "revolute, revolute", "--hold-out", 0.25, "--hold-out-by", "blocks")
-    text = asked("train", path, "--model", "from-cli", *types, *QUICKLY)
+    text = run_command("train", path, "--model", "from-cli", *types, *QUICKLY)
     assert "from-cli version 1 trained: now serving" in text
     held = server.client.get("/v1/models/from-cli/versions/1").json()["lineage"]["holdout"]
     assert (held["split"]["kind"], held["split"]["share"]) == ("blocks", 0.25)
@@ -31,57 +31,59 @@ def test_train_evaluate_and_predict_from_a_recording(asked, server, recording):
     assert "promotion check passed: the error is at most" in text
 
     dataset = held["datasets"][0]["id"]
-    text = asked("evaluate", "from-cli", dataset, "--held-out")
+    text = run_command("evaluate", "from-cli", dataset, "--held-out")
     assert f"on {held['samples']} held-out samples of {dataset}" in text
     assert f"{held['rmse'][0]:.4f}" in text
-    assert asked("evaluate", "from-cli", dataset, "--json")["part"] == "all"
-    assert "training data: figures are too optimistic" in asked("evaluate", "from-cli", dataset)
-    assert not asked("evaluate", "from-cli", recording(83), "--json")["in_training"]
+    assert run_command("evaluate", "from-cli", dataset, "--json")["part"] == "all"
+    assert "training data: figures are too optimistic" in run_command("evaluate", "from-cli", dataset)
+    assert not run_command("evaluate", "from-cli", recording(83), "--json")["in_training"]
 
-    answer = asked("predict", "from-cli", "--q", "0.1,-0.2", "--json")
+    answer = run_command("predict", "from-cli", "--q", "0.1,-0.2", "--json")
     query = {"q": [0.1, -0.2], "dq": [0.0, 0.0], "ddq": [0.0, 0.0]}
     assert answer == server.client.post("/v1/models/from-cli/predict", json=query).json()
-    text = asked("predict", "from-cli", "--q", "0.1,-0.2")
+    text = run_command("predict", "from-cli", "--q", "0.1,-0.2")
     assert "joint1" in text
     assert f"{answer['tau'][1]:.4f}" in text
 
 
-def test_components_are_printed(asked, refused, server):
+def test_components_are_printed(run_command, run_rejected_command, server):
     q, names = [0.0, -0.5, 0.0, -2.0, 0.0, 1.5, 0.7], ["gravity", "inertia_matrix", "potential_energy"]
     query = {"q": q, "dq": [0.0] * 7, "ddq": [0.0] * 7, "components": names}
     expected = server.client.post("/v1/models/panda-sim/predict", json=query).json()["components"]
     command = ("predict", "panda-sim", "--q", ",".join(map(str, q)), "--components", ", ".join(names))
-    text = asked(*command)
+    text = run_command(*command)
     assert f"{expected['gravity']['mean'][1]:.4f} ± {expected['gravity']['std'][1]:.4f}" in text
     inertia = expected["inertia_matrix"]
     assert f"{inertia['mean'][2][3]:.4f} ± {inertia['std'][2][3]:.4f}" in text
     assert f"{expected['potential_energy']['mean']:.4f}" in text
-    assert asked(*command, "--json")["components"] == expected
-    assert "`tau` is used only for forward_dynamics" in refused(*command, "--tau", "0,0,0,0,0,0,0")
+    assert run_command(*command, "--json")["components"] == expected
+    assert "`tau` is used only for forward_dynamics" in run_rejected_command(*command, "--tau", "0,0,0,0,0,0,0")
 
 
-def test_predict_with_payload_options(asked, refused, server):
+def test_predict_with_payload_options(run_command, run_rejected_command, server):
     inertia = [[0.02, 0.001, 0.002], [0.001, 0.03, 0.003], [0.002, 0.003, 0.04]]
     payload = {"mass": 2.0, "com": [0.0, 0.01, 0.1], "inertia": inertia}
     query = {"q": [0.1] * 7, "dq": [0.0] * 7, "ddq": [1.0] * 7, "payload": payload}
     expected = server.client.post("/v1/models/panda-sim/predict", json=query).json()
     motion = ("--q", ",".join(["0.1"] * 7), "--ddq", ",".join(["1"] * 7))
     command = ("predict", "panda-sim", *motion, "--payload", "2,0,0.01,0.1")
-    assert asked(*command, "--payload-inertia", "0.02,0.001,0.002,0.03,0.003,0.04", "--json") == expected
-    assert asked(*command, "--json")["tau"] != expected["tau"]
-    text = refused(*command, "--payload-inertia", "1,0,0,1,0,3")
+    assert run_command(*command, "--payload-inertia", "0.02,0.001,0.002,0.03,0.003,0.04", "--json") == expected
+    assert run_command(*command, "--json")["tau"] != expected["tau"]
+    text = run_rejected_command(*command, "--payload-inertia", "1,0,0,1,0,3")
     assert "expected no principal moment above the sum of the other two" in text
 
 
-def test_errors_of_the_service_are_printed(refused, recording, tmp_path):
-    message, hint = refused("predict", "nobody", "--q", "1").splitlines()
+def test_errors_of_the_service_are_printed(run_rejected_command, recording, tmp_path):
+    message, hint = run_rejected_command("predict", "nobody", "--q", "1").splitlines()
     assert message == "error: no model 'nobody' (not_found, 404)"
     assert hint.startswith("hint: existing models: ")
     assert "panda-sim" in hint
     bad = tmp_path / "bad.csv"
     bad.write_text("t,q1,speed1\n0,0,0\n")
-    assert "column tau1 is missing" in refused("train", bad, "--model", "m")
-    assert "--hold-out-by is rows" in refused("train", recording(12), "--model", "m", "--hold-out-by", "rows")
+    assert "column tau1 is missing" in run_rejected_command("train", bad, "--model", "m")
+    assert "--hold-out-by is rows" in run_rejected_command(
+        "train", recording(12), "--model", "m", "--hold-out-by", "rows"
+    )
 
 
 WRONG = {
@@ -97,16 +99,16 @@ WRONG = {
 
 
 @pytest.mark.parametrize("message", WRONG)
-def test_rejected_training_uploads_nothing(refused, server, recording, message):
+def test_rejected_training_uploads_nothing(run_rejected_command, server, recording, message):
     before = server.client.get("/v1/datasets", params={"limit": 1}).json()["items"]
-    assert message in refused("train", recording(13), "--model", "never", *WRONG[message])
+    assert message in run_rejected_command("train", recording(13), "--model", "never", *WRONG[message])
     assert server.client.get("/v1/datasets", params={"limit": 1}).json()["items"] == before
 
 
-def test_unknown_data_set_uploads_nothing(refused, server, recording):
+def test_unknown_data_set_uploads_nothing(run_rejected_command, server, recording):
     before = server.client.get("/v1/datasets", params={"limit": 1}).json()["items"]
-    assert "no dataset 'gone.csv'" in refused("train", recording(13), "gone.csv", "--model", "never")
-    assert "--model is Never!" in refused("train", recording(13), "--model", "Never!")
+    assert "no dataset 'gone.csv'" in run_rejected_command("train", recording(13), "gone.csv", "--model", "never")
+    assert "--model is Never!" in run_rejected_command("train", recording(13), "--model", "Never!")
     assert server.client.get("/v1/datasets", params={"limit": 1}).json()["items"] == before
 
 
@@ -130,21 +132,21 @@ def test_job_stores_ids_of_data_sets_given_by_name(server):
 
 
 @pytest.mark.slow
-def test_error_for_other_joint_names_has_a_hint(asked, refused, tmp_path):
+def test_error_for_other_joint_names_has_a_hint(run_command, run_rejected_command, tmp_path):
     path, samples = tmp_path / "numbered.csv", stream("panda", 40, seed=15)
     path.write_bytes(csv(columns(samples)))
-    message = refused("evaluate", "panda-sim", path)
+    message = run_rejected_command("evaluate", "panda-sim", path)
     assert "are joint1, joint2" in message
     assert "those of the model are panda_joint1, panda_joint2" in message
     assert "If they are the same joints, upload the recording with --robot panda. (invalid_request" in message
-    answer = asked("evaluate", "panda-sim", path, "--robot", "panda", "--json")
+    answer = run_command("evaluate", "panda-sim", path, "--robot", "panda", "--json")
     assert answer["joint_names"] == list(samples.joint_names)
-    assert "--robot can only be used with a recording" in refused(
+    assert "--robot can only be used with a recording" in run_rejected_command(
         "evaluate", "panda-sim", answer["dataset"], "--robot", "panda"
     )
     two = tmp_path / "two.csv"
     two.write_bytes(csv(columns(stream(seed=16))))
-    assert "same joints" not in refused("evaluate", "panda-sim", two)
+    assert "same joints" not in run_rejected_command("evaluate", "panda-sim", two)
 
 
 @pytest.fixture
@@ -192,53 +194,55 @@ def test_ctrl_c_before_the_answer_cancels_the_job(lipserve, server, long, monkey
     assert ended(server.client, torn["id"])["state"] == "cancelled"
 
 
-def test_ctrl_c_in_follow_does_not_cancel_the_job(lipserve, asked, server, long, interrupted):
+def test_ctrl_c_in_follow_does_not_cancel_the_job(lipserve, run_command, server, long, interrupted):
     job = queue(server.client, "cli-left", long, options=ENDLESS)["id"]
     code, out, err = lipserve("jobs", "follow", job, "--url", server.url, "--json")
     assert (code, json.loads(out)["state"] in ("queued", "running")) == (130, True)
     assert f"{job} continues" in err
-    assert asked("jobs", "cancel", job, "--json")["id"] == job
+    assert run_command("jobs", "cancel", job, "--json")["id"] == job
 
 
 @pytest.mark.slow
-def test_job_is_queued_followed_and_listed(refused, asked, recording):
-    queued = asked(
+def test_job_is_queued_followed_and_listed(run_rejected_command, run_command, recording):
+    queued = run_command(
         "train", recording(82), "--model", "cli-queued", "--no-wait", *QUICKLY, "--estimator", "se", "--json"
     )
     job = queued["id"]
-    assert "cli-queued (se): succeeded, version 1" in asked("jobs", "follow", job)
-    assert asked("jobs", "show", job, "--json")["state"] == "succeeded"
-    assert job in [each["id"] for each in asked("jobs", "list", "--json")]
-    assert "cli-queued" in asked("jobs", "list")
-    assert "conflict" in refused("jobs", "retry", job)
+    assert "cli-queued (se): succeeded, version 1" in run_command("jobs", "follow", job)
+    assert run_command("jobs", "show", job, "--json")["state"] == "succeeded"
+    assert job in [each["id"] for each in run_command("jobs", "list", "--json")]
+    assert "cli-queued" in run_command("jobs", "list")
+    assert "conflict" in run_rejected_command("jobs", "retry", job)
 
 
 @pytest.mark.slow
-def test_hold_out_defaults_to_the_service_and_zero_disables_it(asked, server, recording):
+def test_hold_out_defaults_to_the_service_and_zero_disables_it(run_command, server, recording):
     path = recording(12, samples=120, rate=10.0)
-    job = asked("train", path, "--model", "by-default", *QUICKLY, "--json")
+    job = run_command("train", path, "--model", "by-default", *QUICKLY, "--json")
     body = {"model": "by-default", "datasets": job["datasets"], "estimator": "lip-chain"}
     plain = server.client.post("/v1/jobs", json=body).json()
     server.client.post(f"/v1/jobs/{plain['id']}/cancel")
     assert job["holdout"] == {**plain["holdout"], "stretches": None, "only": False}
     assert (job["holdout"]["kind"], job["holdout"]["share"]) == ("auto", 0.3)
     assert job["quality"]["samples"] > 0
-    job = asked("train", path, "--model", "by-default", *QUICKLY, "--hold-out", 0, "--json")
+    job = run_command("train", path, "--model", "by-default", *QUICKLY, "--hold-out", 0, "--json")
     assert (job["holdout"], job["quality"]) == (None, None)
 
 
 @pytest.mark.slow
-def test_hold_out_only_data_are_never_learnt(asked, refused, server, recording):
+def test_hold_out_only_data_are_never_learnt(run_command, run_rejected_command, server, recording):
     path = recording(18, samples=120, rate=10.0)
-    text = asked("train", path, "--model", "cli-only", *QUICKLY)
+    text = run_command("train", path, "--model", "cli-only", *QUICKLY)
     assert "Evaluated on held-out rows; the version was then trained on all rows." in text
-    assert "Evaluated on" not in asked("train", path, "--model", "cli-only", *QUICKLY, "--hold-out-only")
+    assert "Evaluated on" not in run_command("train", path, "--model", "cli-only", *QUICKLY, "--hold-out-only")
     for number, learnt in ((1, True), (2, False)):
         lineage = server.client.get(f"/v1/models/cli-only/versions/{number}").json()["lineage"]
         assert lineage["holdout"]["learnt"] is learnt
-    judged = asked("evaluate", "cli-only", lineage["datasets"][0]["id"], "--held-out", "--version", 1)
+    judged = run_command("evaluate", "cli-only", lineage["datasets"][0]["id"], "--held-out", "--version", 1)
     assert "evaluated before training on them" in " ".join(judged.split())
-    assert "--hold-out above 0" in refused("train", path, "--model", "m", "--hold-out", 0, "--hold-out-only")
+    assert "--hold-out above 0" in run_rejected_command(
+        "train", path, "--model", "m", "--hold-out", 0, "--hold-out-only"
+    )
 
 
 def test_job_id_is_printed_before_the_end(lipserve, server, recording):

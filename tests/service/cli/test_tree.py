@@ -115,15 +115,15 @@ def test_exit_codes(lipserve):
     ("command", "message"),
     [
         ("simulate r2d2 x.csv", f"robot is 'r2d2', expected one of {', '.join(ROBOTS)}"),
-        ("simulate ur5 x.parquet", "expected the ending .csv or .npz"),
+        ("simulate ur5 x.parquet", "must end with .csv or .npz, got 'x.parquet'"),
         ("simulate ur5 x.csv --motion wild", "motion is 'wild'"),
         ("simulate ur5 x.csv --noise -1", "noise is -1.0"),
         ("simulate ur5 nowhere/x.csv --samples 40", "nowhere/x.csv"),
-        ("predict m --q 1,two,3", "--q is '1,two,3', expected numbers separated by commas"),
-        ("predict m --q=", "--q is ''"),
-        ("predict m --q 1 --dq x", "--dq is 'x'"),
-        ("predict m --q 1 --payload 2", "--payload is '2', expected mass,x,y,z"),
-        ("predict m --q 1 --payload 2,0,0,0 --payload-inertia 1,1,1", "expected xx,xy,xz,yy,yz,zz"),
+        ("predict m --q 1,two,3", "--q must be numbers separated by commas, got '1,two,3'"),
+        ("predict m --q=", "--q must be numbers separated by commas, got ''"),
+        ("predict m --q 1 --dq x", "--dq must be numbers separated by commas, got 'x'"),
+        ("predict m --q 1 --payload 2", "--payload must have the form mass,x,y,z, got '2'"),
+        ("predict m --q 1 --payload 2,0,0,0 --payload-inertia 1,1,1", "must have the form xx,xy,xz,yy,yz,zz"),
         ("predict m --q 1 --payload-inertia 1,0,0,1,0,1", "--payload-inertia requires --payload"),
         ("serve --port 70000", "port: Input should be less than or equal to 65535"),
         ("serve", "max_samples: "),
@@ -141,8 +141,8 @@ def test_invalid_arguments_are_explained_in_one_line(lipserve, tmp_path, monkeyp
     assert list(tmp_path.iterdir()) == []
 
 
-def test_status_shows_parts_and_missing_extras(lipserve, asked, server):
-    text, document = asked("status"), asked("status", "--json")
+def test_status_shows_parts_and_missing_extras(lipserve, run_command, server):
+    text, document = run_command("status"), run_command("status", "--json")
     assert f"{server.url} is ready: LIPServe {__version__}" in text
     assert [each["name"] for each in document["checks"]] == ["database", "home", "models", "learner", "training"]
     assert all(f"{each['name']} " in text and each["message"] in text for each in document["checks"])
@@ -160,9 +160,9 @@ def test_used_port_is_reported_before_the_home_is_created(lipserve, server, tmp_
     assert not (tmp_path / "home").exists()
 
 
-def test_address_of_the_dashboard(asked, server):
-    assert asked("open") == f"{server.url}/#/\n"
-    assert asked("open", "my-arm", "--live", "--json") == {"url": f"{server.url}/#/live/my-arm"}
+def test_address_of_the_dashboard(run_command, server):
+    assert run_command("open") == f"{server.url}/#/\n"
+    assert run_command("open", "my-arm", "--live", "--json") == {"url": f"{server.url}/#/live/my-arm"}
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ import pytest
 from service.datasets.formats.bags.reading import BagKind, open_bag
 from service.datasets.options import ReadOptions
 from service.foundation.settings import Settings
-from tests.service.datasets.reading import Read, taken
+from tests.service.datasets.reading import Read, read_blocks
 
 typesys = pytest.importorskip("rosbags.typesys", reason="bags are written by `rosbags`, of the extra `dev`")
 rosbag1 = pytest.importorskip("rosbags.rosbag1", reason="bags are written by `rosbags`, of the extra `dev`")
@@ -144,7 +144,7 @@ def bare(folder: Path, file: Path) -> Path:
 def read(path: Path, kind: BagKind, options: ReadOptions | None = None, settings: Settings = SETTINGS) -> Read:
     """Read the whole table of a bag."""
     with open_bag(path, kind, options or ReadOptions(), settings) as table:
-        return taken(table)
+        return read_blocks(table)
 
 
 @contextlib.contextmanager

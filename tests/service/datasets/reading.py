@@ -34,7 +34,7 @@ class Read:
         return np.column_stack(list(self.columns.values()))
 
 
-def taken(table):
+def read_blocks(table):
     """Read the blocks of a table and check the properties of every table."""
     blocks = list(table.blocks)
     for block in blocks:
@@ -57,12 +57,12 @@ def read(folder, body, kind, options=None, **settings):
     path.write_bytes(body)
     before = set(folder.iterdir())
     with open_table(path, kind, options or ReadOptions(), settings_of(folder, **settings)) as table:
-        result = taken(table)
+        result = read_blocks(table)
     assert set(folder.iterdir()) == before, "leftovers"
     return result
 
 
-def refused(folder, body, kind, options=None, error=ServiceError, **settings):
+def read_rejected(folder, body, kind, options=None, error=ServiceError, **settings):
     """Read an upload that is rejected; return (field, value, expected), or the message without a detail."""
     before = set(folder.iterdir())
     with pytest.raises(error) as caught:

@@ -111,7 +111,7 @@ kinds = st.builds(
 
 
 @given(st.lists(st.tuples(kinds, st.integers(1, 100)), min_size=1, max_size=6), st.randoms())
-def test_the_choice_does_not_depend_on_the_order_of_the_kinds(record, random):
+def test_joint_choice_does_not_depend_on_message_order(record, random):
     merged: dict[MessageKind, int] = {}
     for kind, count in record:
         merged[kind] = merged.get(kind, 0) + count

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from service.datasets.options import ReadOptions
 from service.foundation.errors import InvalidDataError, InvalidRequestError
-from tests.service.datasets.reading import read, refused
+from tests.service.datasets.reading import read, read_rejected
 
 NAMES = ["t", "q1", "tau1"]
 ROWS = [[0.0, 1.5, -2.0], [0.125, -2.25, 1e-3], [0.25, 1e3, 7.0]]
@@ -52,14 +52,14 @@ def test_one_table_in_many_dialects(tmp_path, body):
 def test_header_of_other_width_than_all_rows_is_an_error(tmp_path, sep):
     names = ["t", *(f"{quantity}{joint}" for quantity in ("q", "dq", "ddq", "tau") for joint in range(1, 8)), "odd"]
     rows = [[0.5 * column + row for column in range(29)] for row in range(60)]
-    said = refused(tmp_path, text(rows, names, sep).encode(), "csv", error=InvalidDataError)
+    said = read_rejected(tmp_path, text(rows, names, sep).encode(), "csv", error=InvalidDataError)
     assert said == ("header", "30 names", "29 names because each of the first 50 rows has 29 values")
 
 
 def test_row_of_other_width_than_the_header_is_an_error(tmp_path):
     rows = [[*row] for row in ROWS * 4]
     rows[5] = rows[5][:-1]
-    said = refused(tmp_path, text(rows).encode(), "csv", error=InvalidDataError)
+    said = read_rejected(tmp_path, text(rows).encode(), "csv", error=InvalidDataError)
     assert said == ("row 6", "2 values", "3 values, one per column of the header")
 
 
@@ -74,7 +74,7 @@ def test_dates_become_seconds_and_keep_nanoseconds(tmp_path):
 
 
 @pytest.mark.parametrize("word", ["", "NaN", "NA", "null", "None", " "])
-def test_words_for_missing_become_nan(tmp_path, word):
+def test_words_for_missing_values_become_nan(tmp_path, word):
     np.testing.assert_array_equal(read(tmp_path, f"t,q1\n0,1\n1,{word}\n2,3\n".encode(), "csv")["q1"], [1, np.nan, 3])
 
 
@@ -85,8 +85,10 @@ def test_delimiter_can_be_given(tmp_path, reply, sep):
 
 
 @pytest.mark.parametrize("reply", ["ab", "1", '"', "é"])
-def test_an_impossible_delimiter_is_refused(tmp_path, reply):
-    field, _, expected = refused(tmp_path, text().encode(), "csv", ReadOptions(delimiter=reply), InvalidRequestError)
+def test_invalid_delimiter_is_rejected(tmp_path, reply):
+    field, _, expected = read_rejected(
+        tmp_path, text().encode(), "csv", ReadOptions(delimiter=reply), InvalidRequestError
+    )
     assert field == "delimiter"
     assert "blank" in expected
 
@@ -95,9 +97,9 @@ def test_an_impossible_delimiter_is_refused(tmp_path, reply):
 def test_error_names_row_and_column_of_a_bad_cell(tmp_path, row):
     lines = ["t,q1", *(f"{number},{number % 7}" for number in range(1, 50_001))]
     lines[row] = "5,abc"
-    assert refused(tmp_path, "\n\n".join(lines).encode(), "csv") == (f"q1, row {row}", "abc", "a number")
+    assert read_rejected(tmp_path, "\n\n".join(lines).encode(), "csv") == (f"q1, row {row}", "abc", "a number")
     lines[row] = "5"
-    field, value, expected = refused(tmp_path, "\n".join(lines).encode(), "csv")
+    field, value, expected = read_rejected(tmp_path, "\n".join(lines).encode(), "csv")
     assert (field, value) == (f"row {row}", "1 values")
     assert "2 values" in expected
 
@@ -125,7 +127,7 @@ def test_error_names_row_and_column_of_a_bad_cell(tmp_path, row):
 )
 def test_damaged_csv_is_rejected_with_its_place(tmp_path, monkeypatch, body, field, message):
     monkeypatch.setattr("service.datasets.formats.table.MAX_COLUMNS", 20)
-    reply = refused(tmp_path, body, "csv", error=InvalidDataError)
+    reply = read_rejected(tmp_path, body, "csv", error=InvalidDataError)
     assert reply[0] == field
     assert message in " ".join(reply)
 
@@ -142,6 +144,6 @@ def test_output_of_the_csv_module_is_read_back(tmp_path_factory, rows, sep, quot
     np.testing.assert_array_equal(np.column_stack(list(result.columns.values())), rows)
 
 
-def test_a_header_alone_is_a_table_of_no_rows(tmp_path):
+def test_header_alone_is_an_empty_table(tmp_path):
     for body in (b"t,q1", b"t,q1\n\n\n"):
         assert len(read(tmp_path, body, "csv")["t"]) == 0

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.foundation.errors import InvalidDataError, TooLargeError
-from tests.service.datasets.reading import read, refused
+from tests.service.datasets.reading import read, read_rejected
 
 LEAVES = st.none() | st.floats(width=64) | st.integers(-(2**70), 2**70)
 ROW = {"t": 0.5, "q": [1, 2.5], "joint": {"pos": 3, "name": "a", "w": [{"x": 4}, {"x": 5}]}, "on": True}
@@ -70,7 +70,7 @@ def test_output_of_the_json_module_is_read_back(tmp_path_factory, rows):
 def test_error_names_a_bad_row(tmp_path, number, row, field, message):
     rows = [{"t": 1, "q": [1, 2]}] * 20_001
     rows[number - 1] = row
-    reply = refused(tmp_path, lines(rows), "json_lines", error=InvalidDataError)
+    reply = read_rejected(tmp_path, lines(rows), "json_lines", error=InvalidDataError)
     assert reply[0] == field
     assert message in " ".join(reply)
 
@@ -98,9 +98,9 @@ def test_damaged_json_is_rejected_with_its_place(tmp_path, monkeypatch, body, ki
     monkeypatch.setattr("service.datasets.formats.json.MAX_COLUMNS", 20)
     with monkeypatch.context() as short:
         short.setattr("service.datasets.formats.json.MAX_LINE_BYTES", 2000)
-        reply = refused(tmp_path, body, kind, error=InvalidDataError)
+        reply = read_rejected(tmp_path, body, kind, error=InvalidDataError)
     if b"[" * 5000 in body and kind == "json_lines":
-        reply = refused(tmp_path, body, kind, error=InvalidDataError)
+        reply = read_rejected(tmp_path, body, kind, error=InvalidDataError)
     assert reply[0] == field
     assert message in " ".join(reply)
 
@@ -108,7 +108,7 @@ def test_damaged_json_is_rejected_with_its_place(tmp_path, monkeypatch, body, ki
 def test_too_large_document_is_rejected_with_advice(tmp_path, monkeypatch):
     monkeypatch.setattr("service.datasets.formats.json.MAX_BYTES", 1000)
     body = json.dumps([ROW] * 100).encode()
-    assert "NDJSON" in refused(tmp_path, body, "json", error=TooLargeError)
+    assert "NDJSON" in read_rejected(tmp_path, body, "json", error=TooLargeError)
 
 
 def test_missing_values(tmp_path):

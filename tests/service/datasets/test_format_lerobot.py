@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from service.foundation.errors import InvalidDataError, TooLargeError
-from tests.service.datasets.reading import read, refused
+from tests.service.datasets.reading import read, read_rejected
 
 JOINTS = ["shoulder_pan", "gripper"]
 RNG = np.random.default_rng(4)
@@ -128,7 +128,7 @@ LAST = "data/chunk-000/episode_000002.parquet"
     ],
 )
 def test_damaged_data_set_is_rejected_with_the_member(tmp_path, files, field, message):
-    reply = refused(tmp_path, zipped(files), "lerobot", error=InvalidDataError)
+    reply = read_rejected(tmp_path, zipped(files), "lerobot", error=InvalidDataError)
     assert reply[0] == field
     assert message in " ".join(reply)
 
@@ -137,7 +137,7 @@ def test_error_names_the_file_and_the_row(tmp_path):
     state = [list(row) for row in STATE[40:60]]
     state[7] = [0.0]
     files = dataset(**{LAST: parquet(slice(40, 60), **{"observation.state": state})})
-    assert refused(tmp_path, zipped(files), "lerobot")[:2] == (
+    assert read_rejected(tmp_path, zipped(files), "lerobot")[:2] == (
         f"{LAST}: observation.state, row 8",
         "a list of 1 values",
     )
@@ -147,4 +147,4 @@ def test_zip_bomb_is_rejected_before_unpacking(tmp_path):
     files = dataset(**{LAST: bytes(3_000_000)})
     body = zipped(files)
     assert len(body) < 50_000
-    assert "at most 100000" in refused(tmp_path, body, "lerobot", error=TooLargeError, max_unpacked_bytes=100_000)
+    assert "at most 100000" in read_rejected(tmp_path, body, "lerobot", error=TooLargeError, max_unpacked_bytes=100_000)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.foundation.errors import InvalidDataError
-from tests.service.datasets.reading import read, refused
+from tests.service.datasets.reading import read, read_rejected
 from tests.service.datasets.test_format_lerobot import zipped
 
 RNG = np.random.default_rng(2)
@@ -102,7 +102,7 @@ def npy(array):
     ],
 )
 def test_damaged_npz_is_rejected_with_the_array(tmp_path, body, field, message):
-    reply = refused(tmp_path, body, "npz", error=InvalidDataError)
+    reply = read_rejected(tmp_path, body, "npz", error=InvalidDataError)
     assert reply[0] == field
     assert message in " ".join(reply)
 
@@ -127,20 +127,20 @@ def header(text, data=b""):
 )
 def test_false_array_header_is_rejected(tmp_path, descr, shape, data):
     lie = header(f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}\n", data)
-    reply = refused(tmp_path, zipped({"q.npy": lie, "tau.npy": npy(TAU)}), "npz")
+    reply = read_rejected(tmp_path, zipped({"q.npy": lie, "tau.npy": npy(TAU)}), "npz")
     assert reply[0] == "q"
     assert "0x" not in " ".join(reply)  # errors must not disclose memory addresses
 
 
 @pytest.mark.parametrize("text", ["", "{'descr': '<f8', (\n", "-" * 9000 + "1\n", "(" * 9000, "\0", "{" * 60000])
 def test_unparsable_array_header_is_rejected(tmp_path, text):
-    assert refused(tmp_path, zipped({"q.npy": header(text), "tau.npy": npy(TAU)}), "npz")[0] == "q"
+    assert read_rejected(tmp_path, zipped({"q.npy": header(text), "tau.npy": npy(TAU)}), "npz")[0] == "q"
 
 
 def test_joint_names_with_invalid_unicode_are_rejected(tmp_path):
     names = header("{'descr': '<U1', 'fortran_order': False, 'shape': (2,)}\n", b"\xff\xff\xff\x7f" * 2)
     body = zipped({"q.npy": npy(Q), "tau.npy": npy(TAU), "joint_names.npy": names})
-    assert refused(tmp_path, body, "npz")[0].startswith("joint_names")
+    assert read_rejected(tmp_path, body, "npz")[0].startswith("joint_names")
 
 
 class Trap:
@@ -159,8 +159,8 @@ def test_objects_are_never_unpickled(tmp_path, tmp_path_factory, array):
     trap = np.empty({"q": (100, 2), "joint_names": (2,), "dt": ()}[array], dtype=object)
     trap.flat[0] = Trap(marker)
     body = npz(**{"q": Q, "tau": TAU, array: trap})
-    assert refused(tmp_path, body, "npz")[0] == array
-    assert refused(tmp_path, pickle.dumps(Trap(marker)), "npz")[0] == "file"
+    assert read_rejected(tmp_path, body, "npz")[0] == array
+    assert read_rejected(tmp_path, pickle.dumps(Trap(marker)), "npz")[0] == "file"
     assert not marker.exists()
 
     with np.load(io.BytesIO(body), allow_pickle=True) as loaded:
@@ -172,18 +172,18 @@ def test_zip_bomb_with_a_false_size_is_rejected(tmp_path):
     body = npz(q=np.zeros((1_000_000, 2)), tau=np.zeros((1_000_000, 2)), compressed=True)
     with zipfile.ZipFile(io.BytesIO(body)) as file:
         size = file.getinfo("q.npy").file_size.to_bytes(4, "little")
-    assert refused(tmp_path, body.replace(size, (1000).to_bytes(4, "little")), "npz")[0] == "q"
+    assert read_rejected(tmp_path, body.replace(size, (1000).to_bytes(4, "little")), "npz")[0] == "q"
 
 
 def test_declared_directory_of_two_gigabytes_is_rejected(tmp_path):
     body = bytearray(npz(q=Q, tau=TAU))
     end = body.rindex(b"PK\x05\x06")
     struct.pack_into("<II", body, end + 12, 2**31 - 1, 0)
-    field, _, expected = refused(tmp_path, bytes(body), "npz")
+    field, _, expected = read_rejected(tmp_path, bytes(body), "npz")
     assert (field, expected) == ("file", "a complete NPZ archive")
 
 
 def test_too_many_members(tmp_path, monkeypatch):
     monkeypatch.setattr("service.datasets.formats.zips.MAX_MEMBERS", 20)
     body = zipped({f"{n}.npy": b"" for n in range(30)})
-    assert refused(tmp_path, body, "npz")[:2] == ("file", "30 members")
+    assert read_rejected(tmp_path, body, "npz")[:2] == ("file", "30 members")

@@ -17,7 +17,7 @@ from service.foundation.errors import InvalidDataError, TooLargeError
 from service.foundation.settings import Settings
 from service.storage.disk import Disk
 from tests.service.datasets.mapping_tables import options
-from tests.service.datasets.reading import read, refused
+from tests.service.datasets.reading import read, read_rejected
 from tests.service.datasets.test_format_lerobot import dataset, zipped
 
 RNG = np.random.default_rng(8)
@@ -75,7 +75,7 @@ def tar():
     ids=["HDF5", "MATLAB", "pickle", "gzip", "UTF-16", "image", "empty"],
 )
 def test_unsupported_format_is_named_with_the_declared_one(tmp_path, reply, body, name):
-    field, value, expected = refused(tmp_path, body, reply, error=InvalidDataError)
+    field, value, expected = read_rejected(tmp_path, body, reply, error=InvalidDataError)
     assert field == "file"
     assert name in value
     assert reply not in KINDS or KINDS[reply] in value + expected
@@ -84,7 +84,7 @@ def test_unsupported_format_is_named_with_the_declared_one(tmp_path, reply, body
 @pytest.mark.parametrize("reply", ["zip", None, "csv"])
 @pytest.mark.parametrize("files", [{"a.txt": b"hi"}, {"xl/a.xml": b"", "[Content_Types].xml": b""}, {}])
 def test_zip_of_other_files_is_rejected(tmp_path, reply, files):
-    assert "zip" in " ".join(refused(tmp_path, zipped(files), reply, error=InvalidDataError))
+    assert "zip" in " ".join(read_rejected(tmp_path, zipped(files), reply, error=InvalidDataError))
 
 
 def damaged(body, rng):
@@ -125,7 +125,7 @@ def test_damaged_files_are_read_or_rejected(tmp_path, kind):
     """Recordings that can be read are also prepared, and all results are finite."""
     rng, limits = np.random.default_rng(6), Settings(home=tmp_path)
     body = zipped(dataset()) if kind == "lerobot" else BODIES[kind]
-    path, outcomes = tmp_path / "upload", {"read": 0, "refused": 0}
+    path, outcomes = tmp_path / "upload", {"read": 0, "rejected": 0}
     for number in range(40 if kind == "lerobot" else 100):
         inside = kind in ("npz", "lerobot") and number % 3
         path.write_bytes(damaged_member(body, rng) if inside else damaged(body, rng))
@@ -137,7 +137,7 @@ def test_damaged_files_are_read_or_rejected(tmp_path, kind):
                 assert all(np.isfinite(staged.table(name)).all() for name in ("q", "dq", "ddq", "tau"))
             outcomes["read"] += 1
         except (InvalidDataError, TooLargeError):
-            outcomes["refused"] += 1
+            outcomes["rejected"] += 1
     assert min(outcomes.values()) > 5, outcomes
     assert {each.name for each in tmp_path.iterdir()} == {"upload"}
 
@@ -145,4 +145,4 @@ def test_damaged_files_are_read_or_rejected(tmp_path, kind):
 @pytest.mark.parametrize("body", ["#\n\n\r\n#\n\n", "%\n#\n%%\n", "#\n#\n1"])
 def test_file_of_comment_marks_is_rejected(tmp_path, body):
     """Found by fuzzing."""
-    refused(tmp_path, body.encode(), "csv")
+    read_rejected(tmp_path, body.encode(), "csv")

@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from service.foundation.errors import TooLargeError
-from tests.service.datasets.reading import read, refused
+from tests.service.datasets.reading import read, read_rejected
 
 RNG = np.random.default_rng(11)
 
@@ -97,14 +97,14 @@ def test_column_names_with_points_are_not_confused(tmp_path):
     assert {name: values[0] for name, values in result.columns.items()} == flat
 
 
-def test_lists_of_varying_length_are_ignored_and_a_single_odd_one_is_an_error(tmp_path):
+def test_lists_of_varying_length_are_ignored_and_one_odd_list_is_rejected(tmp_path):
     different = [[0.0] * (row % 5) for row in range(100)]
     result = read(tmp_path, parquet({"t": np.arange(100), "contacts": different}), "parquet")
     assert result.names == ("t",)
     assert any("contacts" in fact for fact in result.facts)
     odd = [[1.0, 2.0]] * 20_000
     odd[17_000] = [1.0]
-    assert refused(tmp_path, parquet({"q": odd}), "parquet")[:2] == ("q, row 17001", "a list of 1 values")
+    assert read_rejected(tmp_path, parquet({"q": odd}), "parquet")[:2] == ("q, row 17001", "a list of 1 values")
 
 
 def test_images_are_ignored(tmp_path):
@@ -122,7 +122,9 @@ def test_units_come_from_field_metadata(tmp_path):
 
 def test_pages_that_unpack_to_too_much_are_rejected(tmp_path):
     body = parquet({"t": np.zeros(1_000_000)}, compression="zstd", use_dictionary=False)
-    assert "at most 1000000" in refused(tmp_path, body, "parquet", error=TooLargeError, max_unpacked_bytes=1_000_000)
+    assert "at most 1000000" in read_rejected(
+        tmp_path, body, "parquet", error=TooLargeError, max_unpacked_bytes=1_000_000
+    )
 
 
 def test_extension_types_are_read_as_their_storage(tmp_path):
@@ -132,11 +134,11 @@ def test_extension_types_are_read_as_their_storage(tmp_path):
     assert [result[name][1] for name in result.names] == list(range(6, 12))
 
 
-def test_empty_table_false_footer_and_too_many_columns(tmp_path, monkeypatch):
+def test_empty_table_is_read_but_not_false_footer_or_too_many_columns(tmp_path, monkeypatch):
     assert len(read(tmp_path, parquet({"t": pa.array([], pa.float64())}), "parquet")["t"]) == 0
     assert read(tmp_path, parquet({"x": ["a"]}), "parquet").names == ()
     footer = parquet(pa.Table.from_pandas(frame()))[:-8] + struct.pack("<I4s", 2**31 - 1, b"PAR1")
-    assert refused(tmp_path, footer, "parquet")[0] == "file"
+    assert read_rejected(tmp_path, footer, "parquet")[0] == "file"
     many = parquet({f"c{i}": [1.0] for i in range(50)})
     monkeypatch.setattr("service.datasets.formats.table.MAX_COLUMNS", 20)
-    assert refused(tmp_path, many, "parquet")[:2] == ("columns", "50")
+    assert read_rejected(tmp_path, many, "parquet")[:2] == ("columns", "50")

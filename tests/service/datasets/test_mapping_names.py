@@ -53,10 +53,10 @@ def test_numbered_joints_are_found_in_order(patterns, of):
 def test_currents_beside_desired_torque_need_a_choice():
     """Neither is measured torque, so neither may be used without an option."""
     names = numbered("q#", "i#", "tau_des#")
-    with pytest.raises(InvalidDataError) as asked:
+    with pytest.raises(InvalidDataError) as caught:
         mapped(names)
-    assert "torque_constants is missing, expected 3 numbers in N·m/A" in str(asked.value)
-    assert 'or columns={"tau": "tau_des{joint}"} to learn commanded torque' in str(asked.value)
+    assert "torque_constants is missing, expected 3 numbers in N·m/A" in str(caught.value)
+    assert 'or columns={"tau": "tau_des{joint}"} to learn commanded torque' in str(caught.value)
     result = mapped(names, options(torque_constants=(0.1, 0.2, 0.3)))
     assert read_as(result)["tau"] == ["i1", "i2", "i3"]
     chosen = mapped(names, options(columns={"tau": "tau_des{joint}"}))
@@ -91,7 +91,7 @@ def test_named_joints_keep_their_names_and_the_order_of_the_file(pattern, joints
     assert read_as(result) == {"q": names, "tau": tau[::-1]}
 
 
-def test_joints_whose_names_differ_in_a_number_are_ordered_by_it():
+def test_joints_are_ordered_by_the_number_in_their_names():
     order = ("fr3_joint10", "fr3_joint2", "fr3_joint1")
     result = mapped([f"{joint}/{what}" for joint in order for what in ("position", "effort")])
     assert result.joints == order[::-1]
@@ -124,7 +124,7 @@ def test_measured_columns_are_preferred(names, firsts):
     assert {quantity: row[0] for quantity, row in read_as(mapped(names)).items()} == firsts
 
 
-def test_a_universal_robot_writes_many_columns():
+def test_columns_of_a_universal_robot_are_mapped():
     result = mapped(RTDE, options(torque_constants=(0.1,) * 6))
     assert read_as(result) == {
         "q": [f"actual_q_{joint}" for joint in range(6)],
@@ -190,7 +190,7 @@ REFUSED = [
     (["q1", "tau1"], {"drop_joints": ("joint1",)}, "joints is 0, expected 1 to 32"),
     (numbered("q#", "tau#", of=range(1, 34)), {}, "joints is 33, expected 1 to 32"),
     (numbered("q#", "current_#"), {}, "torque_constants is missing, expected 3 numbers"),
-    (["q1", "effort1 [A]"], {"effort": "measured"}, "effort is measured, expected the effort that effort"),
+    (["q1", "effort1 [A]"], {"effort": "measured"}, "expected the effort that the name or unit of effort"),
 ]
 
 
@@ -243,7 +243,7 @@ def test_joint_names_come_from_the_file_or_the_upload():
 ARM = Arm(("base", "shoulder", "elbow"), "current", (1.0, 2.0, 3.0))
 
 
-def test_a_robot_orders_its_joints_and_leaves_out_others():
+def test_robot_orders_its_joints_and_excludes_others():
     joints = ("elbow", "base", "gripper", "shoulder")
     names = [f"{joint}/{what}" for joint in joints for what in ("position", "effort")]
     result = mapped(names, robot=ARM)
@@ -254,13 +254,13 @@ def test_a_robot_orders_its_joints_and_leaves_out_others():
     assert any("gripper" in note for note in result.notes)
 
 
-def test_a_robot_names_joints_that_only_have_numbers():
+def test_robot_names_numbered_joints():
     result = mapped(numbered("q#", "tau#"), robot=ARM)
     assert result.joints == ARM.joint_names
     assert result.torque.effort == "measured"  # a column named torque is not a current
 
 
-def test_a_joint_of_a_robot_may_be_left_out_with_its_constant():
+def test_joint_of_a_robot_can_be_excluded_with_its_constant():
     names = [f"{joint}/{what}" for joint in ARM.joint_names for what in ("position", "effort")]
     result = mapped(names, options(drop_joints=("shoulder",)), ARM)
     assert result.joints == ("base", "elbow")

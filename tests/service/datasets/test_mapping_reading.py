@@ -33,7 +33,7 @@ def reading(tmp_path, limits):
     return once
 
 
-def refused(reading, columns, *args, **kwargs):
+def stage_rejected(reading, columns, *args, **kwargs):
     with pytest.raises(InvalidDataError) as caught:
         reading(columns, *args, **kwargs)
     return caught.value
@@ -135,7 +135,7 @@ def test_too_many_missing_rows_are_rejected_with_the_worst_column(reading):
     columns = canonical(motion())
     columns["tau2"][50:] = np.nan
     columns["q1"][0] = np.nan
-    reply = refused(reading, columns)
+    reply = stage_rejected(reading, columns)
     assert reply.detail[0].field == "tau2, row 51"
     assert "150 of 200 rows" in reply.message
 
@@ -181,7 +181,7 @@ NO_TIME = "199 repeat the time of the row before"
     ],
 )
 def test_unusable_values_are_rejected_with_their_row(reading, columns, field, message):
-    reply = refused(reading, columns)
+    reply = stage_rejected(reading, columns)
     assert reply.detail[0].field == field
     assert message in reply.message
 
@@ -216,11 +216,11 @@ def test_unwrapping_restarts_with_every_episode(reading):
 def test_positions_with_a_unit_have_no_limit(reading):
     data = motion()
     data["q"][:, 0] += 30.0
-    assert 'units={"q": "rad"} if the joint turns this far' in refused(reading, canonical(data)).message
+    assert 'units={"q": "rad"} if the joint turns this far' in stage_rejected(reading, canonical(data)).message
     np.testing.assert_array_equal(reading(canonical(data), options(units={"q": "rad"})).staged.table("q"), data["q"])
 
 
-def test_a_full_disk_stops_the_reading(tmp_path):
+def test_full_disk_stops_reading(tmp_path):
     limits = Settings(home=tmp_path, min_free_bytes=2**60)
     with pytest.raises(StorageFullError):
         read(table(canonical(motion())), tmp_path, options(), None, limits, Disk(limits))
@@ -236,7 +236,7 @@ def test_a_full_disk_stops_the_reading(tmp_path):
 )
 def test_derivatives_in_other_units_are_recognised(reading, scale, hint):
     data = motion(rows=1000)
-    reply = refused(reading, canonical({name: each * scale.get(name, 1.0) for name, each in data.items()}))
+    reply = stage_rejected(reading, canonical({name: each * scale.get(name, 1.0) for name, each in data.items()}))
     assert hint in reply.message
 
 

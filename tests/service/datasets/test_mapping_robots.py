@@ -29,7 +29,7 @@ def from_file(tmp_path, path, kind, robot=None):
 
 
 @pytest.mark.skipif(not PANDA.exists(), reason=f"{PANDA} is not there")
-def test_the_recording_of_a_real_panda(tmp_path):
+def test_recording_of_a_real_panda_is_mapped(tmp_path):
     rosbags = pytest.importorskip("rosbags.typesys")
     store = rosbags.get_typestore(rosbags.Stores.ROS2_HUMBLE)
     with sqlite3.connect(f"file:{PANDA}?mode=ro", uri=True) as database:
@@ -45,7 +45,7 @@ def test_the_recording_of_a_real_panda(tmp_path):
 
 
 @pytest.mark.skipif(not SCHUNK.exists(), reason=f"{SCHUNK} is not there")
-def test_the_episodes_of_a_real_schunk(tmp_path):
+def test_episodes_of_a_real_schunk_are_mapped(tmp_path):
     result = from_file(tmp_path, SCHUNK, "npz")
     assert result.noted == []
     with np.load(SCHUNK) as file:

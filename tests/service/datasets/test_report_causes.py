@@ -80,7 +80,7 @@ def upload(folder: Path, columns: dict[str, np.ndarray], /, **query: str) -> Dat
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", few(RECORDINGS, lambda case: case == QUICK))
-def test_nothing_is_wrong_with_a_good_recording(case: tuple[str, str, float, bool], tmp_path: Path) -> None:
+def test_good_recording_has_no_remedies(case: tuple[str, str, float, bool], tmp_path: Path) -> None:
     columns, arm = recording(*case), profiles.profile(case[0])
     for name, profile, names in (("known", arm, arm.joint_names), ("not", None, [f"a{k}" for k in arm.joint_names])):
         (tmp_path / name).mkdir()
@@ -128,7 +128,7 @@ QUICKLY = ("torque_sign of one", "no_gravity")
 
 
 @pytest.mark.parametrize("defect", few(DEFECTS, lambda defect: defect in QUICKLY))
-def test_a_defect_is_named_and_its_options_mend_it(defect: str, tmp_path: Path) -> None:
+def test_defect_is_named_and_its_options_correct_it(defect: str, tmp_path: Path) -> None:
     columns, options = defects(QUICK[0], recording(*QUICK))[defect]
     query = {"robot": QUICK[0], "effort": "measured", **options}
     report = upload(tmp_path, columns, **query)
@@ -142,7 +142,7 @@ def test_a_defect_is_named_and_its_options_mend_it(defect: str, tmp_path: Path) 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dirty", [False, True])
-def test_nearly_all_defects_are_named_and_hardly_one_wrongly(dirty: bool, tmp_path: Path) -> None:
+def test_defects_are_recognised_with_at_most_one_false_cause(dirty: bool, tmp_path: Path) -> None:
     verdicts = Counter()
     for case in (each for each in RECORDINGS if each[-1] == dirty):
         for defect, (columns, options) in defects(case[0], recording(*case)).items():
@@ -161,7 +161,7 @@ def test_nearly_all_defects_are_named_and_hardly_one_wrongly(dirty: bool, tmp_pa
 
 
 @pytest.mark.slow
-def test_an_arm_on_the_ceiling_or_on_a_wall_is_not_without_gravity(tmp_path: Path) -> None:
+def test_mounting_on_ceiling_or_wall_is_not_mistaken_for_missing_gravity(tmp_path: Path) -> None:
     columns, arm = recording(*QUICK), profiles.profile(QUICK[0])
     upright = gravity(QUICK[0], columns["q"])
     robot = load_robot(QUICK[0])
@@ -176,7 +176,7 @@ def test_an_arm_on_the_ceiling_or_on_a_wall_is_not_without_gravity(tmp_path: Pat
         assert words in remedy.text
 
 
-def test_gravity_that_is_there_twice_cannot_be_mended(tmp_path: Path) -> None:
+def test_gravity_counted_twice_cannot_be_corrected(tmp_path: Path) -> None:
     columns, arm = recording(*QUICK), profiles.profile(QUICK[0])
     twice = columns | {"tau": columns["tau"] + gravity(QUICK[0], columns["q"])}
     report = report_on(tmp_path, arm.joint_names, twice, arm)
@@ -185,7 +185,7 @@ def test_gravity_that_is_there_twice_cannot_be_mended(tmp_path: Path) -> None:
     assert factors == pytest.approx([2.0] * len(factors), abs=0.3)
 
 
-def test_without_a_robot_the_work_of_the_torques_tells_their_sign(tmp_path: Path) -> None:
+def test_work_of_the_torques_shows_their_sign_without_a_robot(tmp_path: Path) -> None:
     columns = recording(*QUICK)
     names = tuple(f"a{joint}" for joint in range(columns["q"].shape[1]))
     (remedy,) = report_on(tmp_path, names, columns | {"tau": -columns["tau"]}).remedies
@@ -259,13 +259,13 @@ def test_friction_is_judged_beside_the_robot_that_names_suggest(tmp_path: Path) 
     assert not any("No robot is named" in each for each in (*report.advice, *with_robot.advice))
 
 
-def test_the_robot_of_another_size_is_not_taken(tmp_path: Path) -> None:
+def test_robot_of_another_size_is_corrected(tmp_path: Path) -> None:
     columns = recording("ur10", *COURSES[0], False, 30.0)
     report = report_on(tmp_path, tuple(f"{each}_joint" for each in UR), columns, profiles.profile("ur3"))
     assert [(each.cause, each.options) for each in report.remedies] == [("robot", {"robot": "ur10"})]
 
 
-def test_rest_and_joints_that_move_together_are_told(tmp_path: Path) -> None:
+def test_report_advises_on_standstill_and_joints_that_move_together(tmp_path: Path) -> None:
     t = np.arange(3000) / 100
     swing = np.where(t < 10, np.sin(1.5 * t), np.sin(15.0))
     q = swing[:, None] * np.array([1.0, -0.5, 0.3])

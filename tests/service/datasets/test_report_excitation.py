@@ -81,7 +81,7 @@ def test_joints_that_stand_still_leave_parameters_unexcited(tmp_path: Path) -> N
     assert f"{entire.parameters - entire.rank} of 36 base parameters" in reply
 
 
-def test_one_direction_does_not_tell_coulomb_friction(tmp_path: Path) -> None:
+def test_motion_in_one_direction_does_not_identify_coulomb_friction(tmp_path: Path) -> None:
     t = np.arange(2000) / 100
     q = np.column_stack([0.5 * t + 0.05 * np.sin(2 * t), np.sin(1.3 * t) + 0.3 * np.sin(3.1 * t)])
     tau = np.cos(q) + 0.01 * np.random.default_rng(1).standard_normal(q.shape)
@@ -99,7 +99,7 @@ def test_reversals_ignore_noise_and_breaks() -> None:
     assert count_reversals(dq, part) == 2
 
 
-def test_collinearity_is_one_over_the_variance_inflation() -> None:
+def test_collinearity_is_the_inverse_of_variance_inflation() -> None:
     rng = np.random.default_rng(1)
     q, dq, ddq = rng.uniform(-2, 2, 500), rng.standard_normal(500), rng.standard_normal(500)
     ddq += 3 * dq

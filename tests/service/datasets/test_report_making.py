@@ -15,7 +15,7 @@ from service.datasets.staging import prepare
 from tests.service.datasets.report_data import profile_of, recording, report_on, staged
 
 
-def test_a_report_tells_of_the_samples(tmp_path: Path) -> None:
+def test_report_describes_the_samples(tmp_path: Path) -> None:
     columns = recording("double-pendulum", 20.0, 128.0, 6)
     profile = profile_of("double-pendulum", 50.0)
     raw = staged(tmp_path, profile.joint_names, columns)
@@ -39,7 +39,7 @@ def test_a_report_tells_of_the_samples(tmp_path: Path) -> None:
     assert "The recording lasts 20 s. Record several minutes" in report.advice[-1]
 
 
-def test_a_constant_torque_and_a_strange_robot(tmp_path: Path) -> None:
+def test_constant_torque_and_unknown_robot_get_a_report(tmp_path: Path) -> None:
     columns = dict(recording("double-pendulum", 20.0, 100.0, 6))
     columns["tau"] = columns["tau"].copy()
     columns["tau"][:, 1] = 2.0
@@ -51,7 +51,7 @@ def test_a_constant_torque_and_a_strange_robot(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rows", [30, 31, 45])
-def test_the_shortest_recordings_get_a_report(tmp_path: Path, rows: int) -> None:
+def test_shortest_recordings_get_a_report(tmp_path: Path, rows: int) -> None:
     rng = np.random.default_rng(rows)
     columns = {name: rng.standard_normal((rows, 3)) for name in ("q", "dq", "ddq", "tau")}
     columns |= {"t": np.arange(rows) / 10, "episode": np.repeat(np.arange(3.0), rows // 3 + 1)[:rows]}
@@ -60,5 +60,5 @@ def test_the_shortest_recordings_get_a_report(tmp_path: Path, rows: int) -> None
     assert all(each.seconds is None for each in report.lag)
 
 
-def test_of_many_names_only_the_first_are_listed() -> None:
+def test_long_lists_of_names_are_shortened() -> None:
     assert list_names("abcdefghijk") == "a, b, c, d, e, f, g, h and 3 more"

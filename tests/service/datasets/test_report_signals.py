@@ -104,7 +104,7 @@ def test_limits_follow_the_names() -> None:
     assert limits_of(None, PENDULUM) is None
 
 
-def test_a_torque_that_is_cut_off_is_seen() -> None:
+def test_clipped_torque_is_reported() -> None:
     t = np.arange(2000) / 100
     full = 8 * np.sin(2 * t) + 2 * np.sin(7 * t)
     tau = np.clip(full, -6, 5)
@@ -128,7 +128,7 @@ def troubled(tmp_path: Path) -> DatasetReport:
     return report_on(tmp_path, PENDULUM, columns, robot(upper=np.array([0.1, 1.0])), AS_IT_IS)
 
 
-def test_what_is_wrong_is_said(troubled: DatasetReport) -> None:
+def test_defects_of_signals_are_described(troubled: DatasetReport) -> None:
     reply = " ".join(troubled.warnings)
     assert "100 of 3000 rows lack a value" in reply
     assert "Positions of joint1" in reply
@@ -139,7 +139,7 @@ def test_what_is_wrong_is_said(troubled: DatasetReport) -> None:
 
 
 @pytest.mark.parametrize(("rate", "late"), [(50.0, 0.02), (50.0, -0.015), (250.0, 0.0033)])
-def test_a_known_lag_is_found(tmp_path: Path, rate: float, late: float) -> None:
+def test_known_lag_is_found(tmp_path: Path, rate: float, late: float) -> None:
     report = report_on(tmp_path, PENDULUM, recording("double-pendulum", 30.0, rate, 3, late))
     assert [each.joint for each in report.lag] == [None, *PENDULUM]
     for each in report.lag:
@@ -154,7 +154,7 @@ def test_a_known_lag_is_found(tmp_path: Path, rate: float, late: float) -> None:
         assert "torque leads motion" in reply
 
 
-def test_errors_held_out_are_those_of_fits_without_an_eighth() -> None:
+def test_held_out_errors_match_fits_without_one_eighth() -> None:
     rng = np.random.default_rng(2)
     features, y, penalty = rng.standard_normal((203, 6)), rng.standard_normal((203, 2)), 7.0
     features -= features.mean(axis=0)
@@ -171,7 +171,7 @@ def test_errors_held_out_are_those_of_fits_without_an_eighth() -> None:
         assert errors == pytest.approx(((y[part] - both[part] @ weights) ** 2).sum(axis=0), rel=1e-5)
 
 
-def test_a_lag_that_shifting_does_not_mend_is_no_warning() -> None:
+def test_lag_that_shifting_does_not_correct_gives_no_warning() -> None:
     certain = {"seconds": 0.03, "std_s": 0.003, "cost": 0.05}
     timing = Timing(**dict.fromkeys(Timing.model_fields, None) | {"gaps": [], "repeated_stamps": 0, "missing_rows": 0})
 
@@ -191,7 +191,7 @@ def test_a_lag_that_shifting_does_not_mend_is_no_warning() -> None:
 
 
 @pytest.mark.parametrize("rate", [30.0, 125.0, 1000.0])
-def test_noise_of_smoothed_torque_is_not_taken_for_its_own(rate: float) -> None:
+def test_only_smoothed_torque_is_recognised_as_smoothed(rate: float) -> None:
     t = np.arange(4000) / rate
     part = np.zeros(4000, np.int64)
     signal = 10 * np.sin(0.05 * rate * t) + 3 * np.tanh(50 * np.cos(0.02 * rate * t))
@@ -213,7 +213,7 @@ def test_torque_that_motion_does_not_explain_has_no_lag(tmp_path: Path) -> None:
     assert "explains only" in (report.lag[1].reason or "")
 
 
-def test_slow_motion_cannot_tell(tmp_path: Path) -> None:
+def test_slow_motion_shows_no_lag(tmp_path: Path) -> None:
     t = np.arange(3000) / 100
     q = np.column_stack([0.5 * np.sin(0.3 * t), 0.4 * np.sin(0.2 * t)])
     tau = 3 * q + 0.02 * np.random.default_rng(1).standard_normal(q.shape)
@@ -271,7 +271,7 @@ def test_noise_is_that_of_noise_level() -> None:
 
 
 @given(st.integers(1, 300), st.integers(2, 80), st.integers(0, 5))
-def test_a_preview_keeps_the_extremes(count: int, points: int, seed: int) -> None:
+def test_preview_keeps_the_extremes(count: int, points: int, seed: int) -> None:
     table = np.random.default_rng(seed).integers(0, 20, (count, 2)).astype(float)
     for joint, (rows, values) in enumerate(extremes(count, "q", lambda _, first, last: table[first:last], points)):
         assert len(rows) <= points

@@ -21,12 +21,12 @@ from service.storage.database import JobRow
 from service.storage.disk import Disk
 from tests.service.data import arrays, npz, post, queue, service_of, stream
 from tests.service.datasets.test_format_parquet import parquet
-from tests.service.datasets.test_uploads import created
+from tests.service.datasets.test_uploads import read_created
 
 SAMPLES = stream(samples=600, rate=100.0, seed=71)
 
 
-def test_the_library_reads_what_was_written_array_by_array(tmp_path):
+def test_arrays_written_one_by_one_are_read_by_the_library(tmp_path):
     path = tmp_path / "samples.safetensors"
     with path.open("wb") as file:
         digest = sample_file.write(file, len(SAMPLES), SAMPLES.n_joints, lambda name: getattr(SAMPLES, name))
@@ -58,7 +58,7 @@ def test_recipe_and_source_of_an_upload_are_kept(api):
         rate=50,
         joint_names="shoulder,elbow",
     )
-    dataset = created(answer)
+    dataset = read_created(answer)
     report = dataset["report"]
     assert dataset["joint_names"] == ["shoulder", "elbow"]
     assert report["rate_hz"] == pytest.approx(50.0)
@@ -70,9 +70,9 @@ def test_recipe_and_source_of_an_upload_are_kept(api):
     assert np.array(report["ranges"]["q"]["max"]) == pytest.approx(motion.max(axis=0), abs=0.05)
 
 
-def test_the_types_of_joints_are_those_of_the_robot_unless_the_job_says_otherwise(api):
+def test_joint_types_of_the_robot_are_the_default_of_a_job(api):
     tiago = stream("tiago", samples=80, seed=73)
-    dataset = created(post(api, npz(**arrays(tiago), joint_names=np.array(tiago.joint_names)), robot="tiago"))
+    dataset = read_created(post(api, npz(**arrays(tiago), joint_names=np.array(tiago.joint_names)), robot="tiago"))
     types = load_robot("tiago").joint_types
     assert types.count("prismatic") == 1
     assert dataset["report"]["joint_types"] == list(types)
@@ -80,21 +80,21 @@ def test_the_types_of_joints_are_those_of_the_robot_unless_the_job_says_otherwis
     with service_of(api).database.session() as session:
         assert session.scalar(select(JobRow).where(JobRow.id == job["id"])).request["joint_types"] == list(types)
     api.post(f"/v1/jobs/{job['id']}/cancel")
-    unknown = created(post(api, npz(**arrays(SAMPLES))))
+    unknown = read_created(post(api, npz(**arrays(SAMPLES))))
     assert unknown["report"]["joint_types"] is None
 
 
 @pytest.mark.parametrize("kind", recording.FORMATS)
-def test_the_benchmark_writes_what_the_service_reads(api, tmp_path, kind):
+def test_service_reads_files_of_the_benchmark(api, tmp_path, kind):
     path = tmp_path / f"recording.{kind}"
     recording.write(path, 3000, 2, ("q", "dq", "tau"), 0)
     media_type = {"csv": "text/csv", "parquet": "application/vnd.apache.parquet"}[kind]
-    report = created(post(api, path.read_bytes(), media_type))["report"]
+    report = read_created(post(api, path.read_bytes(), media_type))["report"]
     assert (report["rows_uploaded"], report["derived"]) == (3000, ["ddq"])
     assert report["rate_hz"] == pytest.approx(1000.0)
 
 
-def test_an_array_of_another_shape_is_not_written(tmp_path):
+def test_array_of_another_shape_is_rejected(tmp_path):
     with (tmp_path / "x").open("wb") as file, pytest.raises(ValueError, match="q has shape"):
         sample_file.write(file, len(SAMPLES), 3, lambda name: getattr(SAMPLES, name))
 
@@ -106,7 +106,7 @@ def position(t, joint):
     return np.sin((1 + 0.5 * joint) * t) + 0.2 * np.cos(3.3 * t + joint)
 
 
-def test_the_steps_say_all_that_is_needed_to_do_it_by_hand(tmp_path):
+def test_steps_suffice_to_repeat_the_preparation_by_hand(tmp_path):
     t = np.arange(ROWS) / RATE + np.random.default_rng(0).uniform(0, 0.7, ROWS) / RATE
     t[500:] += 3
     raw = Staged(tmp_path, NAMES, Disk(Settings(home=tmp_path)))

@@ -1,4 +1,4 @@
-"""Recordings in every accepted form become the same data set; what cannot be used is refused and leaves nothing."""
+"""Recordings in every accepted form become the same data set; unusable files are rejected and not stored."""
 
 import io
 
@@ -21,28 +21,28 @@ def stored(api, dataset):
     return store.samples(service.files, store.find(service.database, dataset["id"]))
 
 
-def created(answer):
+def read_created(answer):
     assert answer.status_code == 201, answer.text
     return answer.json()
 
 
-def nothing_stays(api):
-    """Check that no data set is listed and no file of one lies in the home."""
+def check_nothing_stored(api):
+    """Check that no data set is listed and that the home contains no file of one."""
     files = service_of(api).files
     assert api.get("/v1/datasets").json() == {"items": [], "next_cursor": None}
     assert list(files.uploads.iterdir()) == []
     assert list(files.datasets.iterdir()) == []
 
 
-def refused(api, body, media_type, status=422, code="invalid_data"):
-    """Upload what has to be refused, check that nothing of it stays; return the error."""
+def upload_rejected(api, body, media_type, status=422, code="invalid_data"):
+    """Upload a file that must be rejected, check that nothing of it is stored; return the error."""
     problem = error(post(api, body, media_type), status, code)
-    nothing_stays(api)
+    check_nothing_stored(api)
     return problem
 
 
 def changed(column, row, text):
-    """The table with another text in one cell, rows counted from 1."""
+    """Return the table with another text in one cell; rows count from 1."""
     table = columns(TRUE)
     table[column][row - 1] = text
     return csv(table)
@@ -51,7 +51,7 @@ def changed(column, row, text):
 @pytest.fixture(scope="module")
 def reference(api):
     """The stream as NPZ without anything optional."""
-    return created(post(api, npz(**arrays(TRUE))))
+    return read_created(post(api, npz(**arrays(TRUE))))
 
 
 def test_npz_is_stored_as_it_was_sent(api, reference):
@@ -66,22 +66,22 @@ def test_npz_is_stored_as_it_was_sent(api, reference):
     ("file_name", "name", "body"),
     [("../../etc/stream.csv", "stream.csv", GOOD), ("STREAM.NPZ", "STREAM.NPZ", npz(**arrays(TRUE)))],
 )
-def test_a_form_takes_the_kind_and_the_name_from_the_file_name(api, reference, file_name, name, body):
-    dataset = created(api.post("/v1/datasets", files={"file": (file_name, body)}))
+def test_form_upload_derives_format_and_name_from_the_file_name(api, reference, file_name, name, body):
+    dataset = read_created(api.post("/v1/datasets", files={"file": (file_name, body)}))
     assert (dataset["name"], dataset["sha256"]) == (name, reference["sha256"])
 
 
-def test_names_and_convention_of_the_query_come_before_those_of_the_file(api):
+def test_query_overrides_names_and_convention_of_the_file(api):
     body = npz(**arrays(TRUE), joint_names=np.array(["shoulder", "elbow"]))
-    assert created(post(api, body))["joint_names"] == ["shoulder", "elbow"]
+    assert read_created(post(api, body))["joint_names"] == ["shoulder", "elbow"]
     query = {"name": "Möve 1", "torque_convention": "gravity_compensated", "joint_names": "a, b"}
-    dataset = created(post(api, body, **query))
+    dataset = read_created(post(api, body, **query))
     assert (dataset["name"], dataset["torque_convention"]) == ("Möve 1", "gravity_compensated")
     assert dataset["joint_names"] == ["a", "b"]
 
 
-def test_times_are_not_needed_where_nothing_is_derived(api):
-    report = created(post(api, npz(**arrays(TRUE, "q", "dq", "ddq", "tau"))))["report"]
+def test_times_are_optional_if_nothing_is_derived(api):
+    report = read_created(post(api, npz(**arrays(TRUE, "q", "dq", "ddq", "tau"))))["report"]
     assert (report["rate_hz"], report["rows"]) == (None, 80)
 
 
@@ -114,9 +114,9 @@ WRONG = {
 
 
 @pytest.mark.parametrize("kind", WRONG)
-def test_what_cannot_be_used_is_refused_with_its_place(strict, kind):
+def test_unusable_file_is_rejected_with_the_place_of_the_error(strict, kind):
     body, media_type, field, message = WRONG[kind]
-    problem = refused(strict, body, media_type)
+    problem = upload_rejected(strict, body, media_type)
     assert problem["detail"][0]["field"] == field
     assert message in problem["message"]
     assert len(problem["message"]) < 400
@@ -131,30 +131,30 @@ def test_what_cannot_be_used_is_refused_with_its_place(strict, kind):
     ],
     ids=["announced", "in chunks", "bomb"],
 )
-def test_what_is_too_large_is_refused(strict, body, media_type, message):
-    assert message in refused(strict, body(), media_type, 413, "too_large")["message"]
+def test_too_large_file_is_rejected(strict, body, media_type, message):
+    assert message in upload_rejected(strict, body(), media_type, 413, "too_large")["message"]
 
 
-def test_a_form_that_is_too_large_is_refused(strict):
+def test_too_large_form_is_rejected(strict):
     error(strict.post("/v1/datasets", files={"file": ("a.csv", b"x" * LIMIT)}), 413, "too_large")
-    nothing_stays(strict)
+    check_nothing_stored(strict)
 
 
-def test_media_types_and_endings_that_are_accepted_are_told(strict):
-    message = refused(strict, GOOD, "text/plain", 415, "unsupported_media_type")["message"]
+def test_rejection_lists_accepted_media_types_and_suffixes(strict):
+    message = upload_rejected(strict, GOOD, "text/plain", 415, "unsupported_media_type")["message"]
     assert all(each in message for each in (*MEDIA_TYPES, "multipart/form-data"))
     answer = strict.post("/v1/datasets", files={"file": ("stream.csv.exe", GOOD)})
     problem = error(answer, 415, "unsupported_media_type")
     assert problem["detail"][0]["value"] == "stream.csv.exe"
     assert all(each in problem["message"] for each in SUFFIXES)
-    nothing_stays(strict)
+    check_nothing_stored(strict)
 
 
 @pytest.mark.parametrize("names", ["a", "a,a", "", "a,b\x7f"])
-def test_bad_joint_names_are_refused(strict, names):
+def test_bad_joint_names_are_rejected(strict, names):
     problem = error(post(strict, GOOD, "text/csv", joint_names=names), 422, "invalid_data")
     assert problem["detail"][0]["field"].startswith("joint_names")
-    nothing_stays(strict)
+    check_nothing_stored(strict)
 
 
 @pytest.fixture
@@ -164,7 +164,7 @@ def dataset(strict):
 
 
 @pytest.mark.own_files("looks for the file below the home")
-def test_deleted_data_set_is_gone_with_its_file(strict, dataset):
+def test_deletion_removes_the_data_set_and_its_file(strict, dataset):
     file = service_of(strict).files.datasets / f"{dataset}.safetensors"
     assert file.exists()
     answer = strict.delete(f"/v1/datasets/{dataset}")

@@ -113,16 +113,16 @@ def test_model_without_an_arm_rejects_a_payload(api, trained, rows):
 
 
 def test_impossible_payload_error_names_the_expected_value(api, motion):
-    def refused(**more):
+    def predict_rejected(**more):
         answer = api.post(PREDICT, json=query(motion, payload=PAYLOAD | more))
         (problem,) = error(answer, 422, "invalid_request")["detail"]
         return problem["field"], problem["expected"]
 
     sum_of = "no principal moment above the sum of the other two"
-    assert refused(inertia=[[1, 0, 0], [0, 1, 0], [0, 0, 3]]) == ("payload.inertia", sum_of)
-    assert refused(inertia=[[1, 1, 0], [0, 1, 0], [0, 0, 1]]) == ("payload.inertia", "a symmetric matrix")
-    assert refused(mass=0) == ("payload.mass", "greater than 0")
-    assert refused(com=[0, 1]) == ("payload.com", "a list of three")
+    assert predict_rejected(inertia=[[1, 0, 0], [0, 1, 0], [0, 0, 3]]) == ("payload.inertia", sum_of)
+    assert predict_rejected(inertia=[[1, 1, 0], [0, 1, 0], [0, 0, 1]]) == ("payload.inertia", "a symmetric matrix")
+    assert predict_rejected(mass=0) == ("payload.mass", "greater than 0")
+    assert predict_rejected(com=[0, 1]) == ("payload.com", "a list of three")
 
 
 @pytest.mark.slow

@@ -118,9 +118,7 @@ def test_expired_batch_is_reported_as_no_longer_kept(learning_service):
     with learning_service.service.database.transaction() as session:
         session.delete(log.find_batch(session, "forgetful", "arm", 0))
         log.stream(session, "forgetful", "arm").forgotten = 0
-    assert (
-        "no longer in the log" in learning_model.expect_error("GET", "observations/arm/0", 404, "not_found")["message"]
-    )
+    assert "is not in the log" in learning_model.expect_error("GET", "observations/arm/0", 404, "not_found")["message"]
 
 
 def _replace_value(rows, row, column, value):

@@ -87,7 +87,7 @@ def tally(tmp_path_factory) -> Tally:
     with open_trials(tmp_path_factory.mktemp("trials"), N_TRIALS, seed=5, batches=20) as trials:
         for number in range(N_TRIALS):
             trials.trial(VICTIMS[number % 2], batches=20)
-        trials.weigh()
+        trials.measure_one_batch()
     return trials.tally
 
 

@@ -82,7 +82,7 @@ def test_short_recording_is_inconclusive(api, arm):
     short = upload(api, stream(seed=7))["id"]
     found = post_comparison(api, arm, short, 1, 2).json()
     assert (found["outcome"], found["better"], found["blocks"]) == ("cannot_tell", None, 8)
-    assert "8 stretches" in found["verdict"]
+    assert "8 segments" in found["verdict"]
     assert "Record longer" in found["verdict"]
 
 

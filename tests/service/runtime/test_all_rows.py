@@ -100,7 +100,7 @@ def test_weights_in_shards_equal_weights_of_the_whole(settings, parts):
         assert part.independent_rows() == pytest.approx(weights.sum())
 
 
-def test_rows_without_times_count_at_most_as_chosen_rows(parts):
+def test_rows_without_times_count_no_more_than_chosen_rows(parts):
     table = Table(parts).weighed(500)
     assert [part.factor for part in table.parts] == [1.0, 500 / ROWS]
     assert table.independent_rows() == pytest.approx(0.1 * ROWS + 500, rel=0.01)

@@ -190,7 +190,7 @@ def test_spawner_that_hangs_is_replaced(settings, caplog):
     process.send_signal(signal.SIGSTOP)
     hasty = settings.model_copy(update={"parser_s": 4.0})
     with ThreadPoolExecutor() as pool:
-        waiting = [pool.submit(call, "noise", int, 0, settings=hasty) for _ in range(3)]
+        waiting = [pool.submit(call, "write_output", int, 0, settings=hasty) for _ in range(3)]
         assert [each.result() for each in waiting] == [7, 7, 7]
     assert process.wait(60) == -signal.SIGKILL
     assert "hangs and is killed: it has made no progress for 4 s" in caplog.text

@@ -297,8 +297,8 @@ def test_wrong_holdout_is_rejected(api, dataset, holdout, field, message):
 @pytest.mark.parametrize(
     ("stretches", "field", "message"),
     [
-        ([[9, 9]], "holdout.stretches.{}", "a first row and a larger last row, at most 120"),
-        ([[50, 60], [40, 45]], "holdout.stretches.{}", "in order"),
+        ([[9, 9]], "holdout.stretches.{}", "first < last and last at most 120"),
+        ([[50, 60], [40, 45]], "holdout.stretches.{}", "in increasing order"),
         ([[50, 121]], "holdout.stretches.{}", "at most 120"),
         ([[0, 100]], "holdout.stretches", "it leaves 20 samples"),
     ],
@@ -328,7 +328,7 @@ def test_split_without_training_rows_fails_the_job(api, dataset):
     seen = ended(api, queue(api, "left-nothing", dataset, holdout={"guard_s": 30.0})["id"])
     assert (seen["state"], seen["error"]["code"]) == ("failed", "cannot_hold_out")
     assert f"data set '{dataset}'" in seen["error"]["message"]
-    assert "guard_s is 30.0, expected less" in seen["error"]["message"]
+    assert "guard_s is 30.0, expected a smaller value" in seen["error"]["message"]
 
 
 @pytest.mark.slow

@@ -150,12 +150,12 @@ def test_versions_of_a_model_have_one_robot(api):
     body = {"model": "kept", "datasets": [other], "estimator": "lip-chain", "options": QUICK}
     for path in ("/v1/jobs", "/v1/jobs/check"):
         message = error(api.post(path, json=body), 409, "conflict")["message"]
-        assert "joint_names of its version 1 is joint1, joint2, that of this one is elbow, wrist" in message
+        assert "its version 1 has joint_names joint1, joint2; this one has elbow, wrist" in message
 
     train(api, "of-other", other)
     archive = exported(api, "of-other")
     message = error(api.post("/v1/models/import?name=kept", content=archive, headers=TAR), 409, "conflict")["message"]
-    assert "that of this one is elbow, wrist" in message
+    assert "this one has elbow, wrist" in message
     service = service_of(api)
     with service.database.session() as session:
         folder = service.files.version_folder(session.get_one(VersionRow, ("of-other", 1)).folder)
@@ -165,7 +165,7 @@ def test_versions_of_a_model_have_one_robot(api):
         api.put("/v1/models/kept/aliases/spare", json={"version": 2}),
         api.post("/v1/models/kept/rollback", json={"version": 2}),
     ):
-        assert "that of this one is elbow, wrist" in error(move, 409, "conflict")["message"]
+        assert "this one has elbow, wrist" in error(move, 409, "conflict")["message"]
     assert api.get("/v1/models/kept").json()["serving_version"] == 1
 
 

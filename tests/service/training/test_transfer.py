@@ -56,7 +56,7 @@ def test_version_trained_from_a_base_outlives_it(api, base_version, second):
         ),
         ({"base": "pendulum:1"}, "base", "a version of estimator rigid-body or rigid-body"),
         ({"joint_types": ["prismatic"] * 7}, "base", "joint_types of the data, prismatic, prismatic"),
-        ({"robot": "panda"}, "robot", "none if a base is given"),
+        ({"robot": "panda"}, "robot", "no robot together with a base"),
         ({"options": {"geometry": "learn"}}, "options.geometry", "auto, calibrate or fixed if a base is given"),
         ({"options": {"prior": "zero"}}, "options.prior", "the default if a base is given"),
         ({"base": "panda-sim@"}, "base", "pattern"),

@@ -143,7 +143,7 @@ def find_problems(home: Path, ledger: Ledger) -> list[str]:
             elif there and not problems:
                 problems += _find_learning_problems(database, files, settings, model)
         if sweep_unnamed(database, files):
-            problems.append("a second start finds something to sweep")
+            problems.append("a second start still finds files to delete")
     finally:
         database.close()
     for folder, query in FOLDERS.items():

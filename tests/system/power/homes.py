@@ -1,4 +1,4 @@
-"""Homes that recordings start from."""
+"""Homes in which recordings start."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def migrated_facts(home: Path) -> dict[str, Any]:
 
 
 def populated_home(recording: Recording) -> dict[str, Any]:
-    """Give a recording a home with a learning model; return its facts."""
+    """Create the home of a recording, with a learning model; return its facts."""
     populate_home(recording.home)
     return migrated_facts(recording.home)
 
 
 def earlier_release_home(recording: Recording, folder: Path) -> dict[str, Any]:
-    """Give a recording a home of release 0.2.0; return its facts after migration."""
+    """Create the home of a recording from release 0.2.0; return its facts after migration."""
     shutil.move(unpack_home(folder), recording.home)
     return migrated_facts(Path(shutil.copytree(recording.home, folder / "migrated")))

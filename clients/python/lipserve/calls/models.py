@@ -59,7 +59,7 @@ def train(
         >>> job.state, job.version
         ('succeeded', 1)
     """
-    body = _asked(model, datasets, estimator, joint_types, options, robot, holdout, promotion, base)
+    body = _training_body(model, datasets, estimator, joint_types, options, robot, holdout, promotion, base)
     return _route(record(Job), names={}, json=body, headers={KEY_HEADER: idempotency_key or new_key()})
 
 
@@ -80,11 +80,11 @@ def check_training(
 
     Without `datasets`, checks that depend on the data are skipped.
     """
-    body = _asked(model, datasets, estimator, joint_types, options, robot, holdout, promotion, base)
+    body = _training_body(model, datasets, estimator, joint_types, options, robot, holdout, promotion, base)
     return _route(nothing, names={}, json=body)
 
 
-def _asked(
+def _training_body(
     model: str,
     datasets: Sequence[str],
     estimator: str | None,

@@ -170,7 +170,7 @@ class WholeExcitation(Record, frozen=True, kw_only=True):
     """How well the data determine the robot's inertial parameters. Needs a robot with a URDF.
 
     parameters: Number of base parameters: combinations of inertial parameters that affect torque
-    rank: Number of base parameters excited more than 1 % as much as by random motion
+    rank: Number of base parameters with an excitation above 1 % of that of random motion
     condition: Condition number of the base regressor, columns scaled to equal norm
     weakest: Excitation of the least excited one divided by that of random motion
     weakest_body: Joint that moves the body with the least excited parameters

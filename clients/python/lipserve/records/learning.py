@@ -66,12 +66,13 @@ class LearningOptions(Record, frozen=True, kw_only=True):
     """Options of online learning.
 
     enabled: False pauses learning: rows are predicted, checked and logged, but not learnt
-    forgetting_s: Age at which a sample counts 1/e of a new one, s of event time; null: nothing is forgotten
+    forgetting_s: Time constant of forgetting, s of event time: a sample of this age has the weight 1/e. Null: nothing
+        is forgotten
     friction_walk_s: Time over which friction may drift by about 30 %, s, as in an arm that warms up. Learning follows
         it, and masses and geometry do not become less certain. 1800 suits most arms; null: friction does not drift
-    on_change: Reaction to a detected change of the robot, or to a stream whose first second is outside the 95 %
-        interval. `hold`: learning, also of that second, is paused until the owner decides. `adapt`: a new regime
-        begins. `learn`: learning continues as before
+    on_change: Reaction if the robot has changed, or if the first second of a stream is outside the 95 % interval.
+        `hold`: learning is paused until the owner decides; that second is not learnt. `adapt`: a new regime begins.
+        `learn`: learning continues as before
     torque_limits: Max |tau| of each joint's actuator, N·m, to reject saturated samples; null: unknown
     contact_threshold: Predictive standard deviations, noise included, beyond which a torque counts as a contact
     adaptive_intervals: Adapt interval widths online, by the `scale` of responses, so that 95 % of the streams'
@@ -144,7 +145,7 @@ class LearningStatus(Record, frozen=True, kw_only=True):
     lag_rows: Rows to learn that responses do not contain yet
     lag_s: Time since the arrival of the first row that responses do not contain yet, s
     events: Number of the newest event of the log
-    novel_share: Share of the latest samples outside the basis; null until rows are learnt
+    novel_share: Share of the latest samples that the model's basis does not represent; null until rows are learnt
     linearisation_error: Error of linearising the torque of a learnt arm around the trained arm: root mean square per
         joint in units of √(tau_std² + noise_std²). Zero for a joint predicted as well as stated; null without such an
         arm and until rows are learnt

@@ -73,7 +73,7 @@ class LiveStatus(Record, frozen=True, kw_only=True):
     contact_threshold: Standard deviations beyond which a row counts as a contact
     held: Why learning is paused until a decision; null if it is not
     failure: Why learning fails; null if it does not
-    novel_share: Share of the latest samples outside the basis; null until rows are learnt
+    novel_share: Share of the latest samples that the model's basis does not represent; null until rows are learnt
     counts: Rows by outcome since the service started; also `batches` and `duplicates`
     level: Probability of the interval
     windows: Prediction quality over sliding windows

@@ -72,10 +72,10 @@ class Model(Record, frozen=True, kw_only=True):
 class SelectionHeldOut(Record, frozen=True, kw_only=True):
     """Part that `auto` held out for the choice; the chosen estimator was then trained on it too.
 
-    blocks: Number of contiguous stretches of these rows
+    blocks: Number of contiguous ranges of these rows
     repeats: Whether all motion of the recording repeats itself, so that figures are too good, except at the edge
     edge_rows: Rows at the edge of the data, whose states are furthest from all others
-    edge_blocks: Number of contiguous stretches of the rows at the edge
+    edge_blocks: Number of contiguous ranges of the rows at the edge
     """
 
     rows: int

@@ -31,7 +31,7 @@ class SketchedJoint(Record, frozen=True, kw_only=True):
 
 
 class ArmSketch(Record, frozen=True, kw_only=True):
-    """Geometry for a drawing of an arm, joints from base to tip. `parameters` of the version has all of it."""
+    """Geometry for a drawing of an arm, joints from base to tip. The version's `parameters` have the full geometry."""
 
     gravity: list[float]
     joints: list[SketchedJoint]

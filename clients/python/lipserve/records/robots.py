@@ -29,7 +29,7 @@ class Robot(Record, frozen=True, kw_only=True):
 
 
 class ProfileJoint(Record, frozen=True, kw_only=True):
-    """A joint and its limits; null if it has none or none is known.
+    """A joint and its limits. A limit is null if the joint has none or it is unknown.
 
     aliases: Other names of the joint in recordings
     turns_freely: Whether the joint turns endlessly, so that it has no range

@@ -34,7 +34,7 @@ def migrate(engine: sa.Engine, lock: Callable[[sa.Connection, None], None]) -> N
 
 
 def revision(connection: sa.Connection) -> str | None:
-    """The revision of a database; None of a new one and of the first releases."""
+    """Return the revision of a database; None if it is new or from one of the first releases."""
     if not sa.inspect(connection).has_table("alembic_version"):
         return None
     number: str | None = connection.scalar(sa.text("SELECT version_num FROM alembic_version"))

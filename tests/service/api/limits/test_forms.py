@@ -24,7 +24,7 @@ def read(content_type, pieces):
     return form.end(), content
 
 
-def refused(content_type, body):
+def parse_rejected(content_type, body):
     with pytest.raises(InvalidRequestError) as caught:
         read(content_type, [body])
     return caught.value
@@ -62,14 +62,14 @@ HEAD = b"--x\r\nContent-Disposition: form-data; name=file; filename=a.csv\r\n\r\
     ids=["another field", "text in the field", "two files", "many parts"],
 )
 def test_form_has_one_file_and_few_other_bytes(form, field, value):
-    (problem,) = refused(*encoded(**form)).detail
+    (problem,) = parse_rejected(*encoded(**form)).detail
     assert problem.field == field
     assert value in (None, problem.value)
 
 
 @pytest.mark.parametrize("boundary", ["", "; boundary=", f"; boundary={'x' * 300}"], ids=["none", "empty", "long"])
 def test_boundary_is_required(boundary):
-    refused(f"multipart/form-data{boundary}", b"")
+    parse_rejected(f"multipart/form-data{boundary}", b"")
 
 
 @pytest.mark.parametrize(
@@ -78,4 +78,4 @@ def test_boundary_is_required(boundary):
     ids=["garbage", "nothing", "half", "endless header"],
 )
 def test_broken_or_short_form_is_rejected(body):
-    refused("multipart/form-data; boundary=x", body)
+    parse_rejected("multipart/form-data; boundary=x", body)

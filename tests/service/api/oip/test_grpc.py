@@ -210,7 +210,7 @@ REJECTED_REQUESTS = {
         f"outputs[0].parameters.classification is 3, expected {SHARED}",
     ),
     "output": (request(MOTION, "tau", "torque"), "outputs[1].name is torque, expected an output of"),
-    "no torque": (request(MOTION, "forward_dynamics"), "tau is missing, expected the torque that forward_dynamics or"),
+    "no torque": (request(MOTION, "forward_dynamics"), "`tau` is required for forward_dynamics or tau_external."),
     "not finite": (
         request(MOTION | {"dq": [0.0, np.nan] + [0.0] * 5}),
         "dq[1] is nan, expected a finite number of FP64",

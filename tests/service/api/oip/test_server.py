@@ -73,7 +73,7 @@ def test_client_gets_the_requested_outputs(server, client, motion):
 
 
 def test_client_reads_errors(client):
-    with pytest.raises(InferenceServerException, match=r"\[404\] no model 'nobody'"):
+    with pytest.raises(InferenceServerException, match=r"\[404\] No model is named 'nobody'"):
         client.infer("nobody", inputs(MOTION))
     with pytest.raises(InferenceServerException, match=r"\[400\] q\.shape is \[3\], expected \[7\]"):
         client.infer("panda-sim", inputs({name: [0.0] * 3 for name in MOTION}))

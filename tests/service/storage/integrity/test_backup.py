@@ -326,7 +326,7 @@ def test_truncated_backup_is_rejected_and_leaves_nothing(saved, tmp_path, member
     with tarfile.open(saved) as tar:
         info = tar.getmember(member)
     saved.write_bytes(saved.read_bytes()[: info.offset if where == "before" else info.offset_data + info.size // 2])
-    assert_rejected(saved, tmp_path, "damaged|cut off|is no backup")
+    assert_rejected(saved, tmp_path, "damaged|incomplete|is not a backup")
 
 
 @pytest.mark.parametrize("name", ["versions/mv_arm_0/model.safetensors", "lipserve.sqlite3", "backup.json"])
@@ -336,7 +336,7 @@ def test_changed_backup_is_rejected(saved, tmp_path, name):
     payload = bytearray(saved.read_bytes())
     payload[member.offset_data + member.size // 2] ^= 0x40
     saved.write_bytes(payload)
-    assert_rejected(saved, tmp_path, "damaged|is no backup|does not match")
+    assert_rejected(saved, tmp_path, "damaged|is not a backup|does not match")
 
 
 def test_missing_member_is_reported(saved, tmp_path):

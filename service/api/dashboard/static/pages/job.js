@@ -146,7 +146,7 @@ function request(job, names) {
     ["Robot", job.robot ?? "none"],
     ["Data sets", sets.length ? sets : "–"],
     ["Held out", heldOut(job.holdout)],
-    ...(job.refresh ? [["Refresh of", `version ${job.refresh.version}, ${TRIGGERS[job.refresh.trigger]}`]] : []),
+    ...(job.refresh ? [["Retraining of", `version ${job.refresh.version}, ${TRIGGERS[job.refresh.trigger]}`]] : []),
     ...(job.retry_of ? [["Retry of", link("an earlier job", `#/jobs/${job.retry_of}`)]] : []),
     ["Queued", when(job.created_at)],
     ["Started", job.started_at ? when(job.started_at) : "not yet"],

@@ -45,7 +45,7 @@ def upgrade() -> None:
 
 
 def _record(last: Any, said: list[dict[str, Any]]) -> dict[str, Any]:
-    """Of a stream's last batch, and what was said of its payload and of that of all streams."""
+    """Return the record of a stream from its last batch and the payloads declared for it or for all streams."""
     report, scale = last.report, last.report.get("scale")
     payload = max(said, key=lambda each: each["event"], default=None)
     if (watch := report.get("payload")) is not None and (payload is None or payload["event"] < last.number):

@@ -84,7 +84,7 @@ function friction(found, joints) {
     const figure = value == null ? "" : ` ${number(value, 2)}`;
     return [implausible ? badge("implausible", "bad") : badge(...IDENTIFIABILITY[verdict]), figure, std === null ? "" : ` ±\u00a0${number(std, 2)}`];
   };
-  const beside = found.friction_beside === "rigid bodies" ? "the robot’s rigid bodies" : "any smooth function of the motion";
+  const beside = found.friction_beside === "rigid bodies" ? "the torque of the robot’s rigid bodies" : "any torque that is a smooth function of the motion";
   return card(
     "Identifiability of friction",
     table(
@@ -95,7 +95,7 @@ function friction(found, joints) {
         { label: "Constant torque", cell: weight("offset") },
       ],
       found.joints,
-      { caption: `Separated from ${beside}; ±: one standard deviation` },
+      { caption: `Estimated together with ${beside}; ±: one standard deviation` },
     ),
   );
 }
@@ -184,7 +184,7 @@ function lag(rows, joints) {
           [
             { label: "Joint", cell: (row) => (row.joint === null ? "all joints" : jointColumn(joints).cell(row)) },
             { label: "Lag, ms", numeric: true, cell: (row) => `${number(1e3 * row.seconds, 2)} ± ${number(1e3 * row.std_s, 2)}` },
-            { label: "Error caused, of variance", numeric: true, cell: (row) => percent(row.cost, 2) },
+            { label: "Error from the lag, share of variance", numeric: true, cell: (row) => percent(row.cost, 2) },
           ],
           known,
           { caption: "Negative: the torque precedes the motion; ±: one standard deviation" },
@@ -227,8 +227,8 @@ function saturation(rows, joints) {
     table(
       [
         jointColumn(joints),
-        { label: "At extremes", numeric: true, cell: (row) => percent(row.at_largest, 2) },
-        { label: "Constant in motion", numeric: true, cell: (row) => (row.flat > 0 ? badge(percent(row.flat, 2), "warn") : percent(row.flat, 2)) },
+        { label: "At min or max torque", numeric: true, cell: (row) => percent(row.at_largest, 2) },
+        { label: "Constant while moving", numeric: true, cell: (row) => (row.flat > 0 ? badge(percent(row.flat, 2), "warn") : percent(row.flat, 2)) },
         { label: "At torque limit", numeric: true, cell: (row) => (row.at_limit > 0 ? badge(percent(row.at_limit, 2), "warn") : percent(row.at_limit, 2)) },
       ],
       rows,

@@ -32,7 +32,7 @@ export function holdOut(preview, dataset, rows, axis, { chosen }) {
     const found = range();
     inputs.forEach((input, side) => (input.value = found === null ? "" : String(Number(found[side].toPrecision(6)))));
     if (state.rows === null) {
-      replace(status, "No range selected. Set “Drag action” to select a range in the plots, or enter it here.");
+      replace(status, "No range selected. Enter it here, or set “Drag action” to “Select the range to hold out” and drag over a plot.");
       replace(actions);
       return;
     }

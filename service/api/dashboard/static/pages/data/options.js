@@ -38,7 +38,7 @@ export function uploadOptions() {
     form: select("form", [["", "zero-phase (default)"], ["causal", "causal, as in a live stream"]]),
     rate: numberInput("rate", "as recorded", "0.01", "1000000"),
     gap: numberInput("gap", "1.5", "1.01", "1000000"),
-    trim: numberInput("trim", "edges of the filter", "0", "1000000"),
+    trim: numberInput("trim", "edges affected by the filter", "0", "1000000"),
   };
   let expected; // effort of the chosen robot
   const robot = robotSelect({
@@ -103,10 +103,10 @@ export function uploadOptions() {
       field("Cutoff frequency, Hz", inputs.cutoff),
       field("Filter type", inputs.form),
       field("Resampling rate, Hz", inputs.rate),
-      field("Min gap, in usual time steps", inputs.gap),
+      field("Min gap, in median time steps", inputs.gap),
       field("Trim at both ends, s", inputs.trim),
       field("Torque convention", inputs.torque_convention),
-      field("Topic", inputs.topic, "Required for a bag with several candidates."),
+      field("Topic", inputs.topic, "Required if several topics of a bag can be read."),
       field("Delimiter", inputs.delimiter, "For CSV files."),
     ),
   );

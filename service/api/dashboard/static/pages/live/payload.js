@@ -31,7 +31,7 @@ export function payloadCard({ payloads }) {
           payloads,
           { caption: "Payload by stream", key: (each) => each.stream_id },
         ),
-    explanation("Mass at the tip in addition to that of the training, ± one standard deviation. Predictions include it. If the arm was learnt without a URDF, the mass is only as accurate as the learnt lengths.", NO_SAFETY),
+    explanation("Mass at the tip, in addition to the mass during training; ± one standard deviation. Predictions include it. If the arm was learnt without a URDF, the mass is only as accurate as the learnt lengths.", NO_SAFETY),
   );
 }
 

@@ -38,7 +38,7 @@ export class Rows {
     if (this.chosen === null || (!this.#picked && this.age() > SILENT_AFTER_S)) this.chosen = part.stream_id;
   }
 
-  /** Mark rows outside the basis of the version, which a later status reports. */
+  /** Mark rows that a later status reports as outside the training data. */
   mark({ stream_id, times }) {
     const novel = new Set(times);
     for (const row of this.#streams.get(stream_id)?.rows ?? []) row.novel ||= novel.has(row.time);

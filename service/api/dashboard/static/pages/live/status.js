@@ -45,13 +45,13 @@ export function qualityCard({ windows: [latest], joint_names: names, joint_types
         { label: "nMSE", numeric: true, cell: (joint) => scientific(latest.nmse[joint]) },
         { label: "RMSE", numeric: true, cell: (joint) => `${number(latest.rmse[joint], 2)}\u00a0${torqueUnit(types[joint])}` },
         { label: `${percent(level, 0)} coverage`, numeric: true, cell: (joint) => percent(latest.coverage[joint]) },
-        { label: "scaled", numeric: true, cell: (joint) => percent(latest.coverage_answered[joint]) },
+        { label: "served coverage", numeric: true, cell: (joint) => percent(latest.coverage_answered[joint]) },
         { label: "factor", numeric: true, cell: (joint) => `×\u00a0${number(scale[joint], 2)}` },
       ],
       names.map((_name, joint) => joint),
       { caption: `${count(latest.rows)} rows of the last ${span(latest.seconds)}, predicted before they were learnt` },
     ),
-    h("p", { class: "hint" }, "nMSE: mean squared error / variance of the torque; 0 is best. Coverage is that of the model’s own intervals. The served intervals are scaled by the factor, which follows the recent errors, including contacts and rest, to reach ", percent(level, 0), "."),
+    h("p", { class: "hint" }, "nMSE: mean squared error / variance of the torque; 0 is best. The first coverage is that of the model’s own intervals, the second that of the served ones. Served intervals are scaled by the factor. It adapts to recent errors, also at rest and during contacts, so that coverage reaches ", percent(level, 0), "."),
   );
 }
 

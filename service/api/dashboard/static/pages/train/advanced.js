@@ -24,7 +24,7 @@ export function advancedOptions(signal) {
     loaded = true;
     load();
   };
-  const types = h("input", { type: "text", name: "joint_types", placeholder: "those of the robot, else revolute", autocomplete: "off" });
+  const types = h("input", { type: "text", name: "joint_types", placeholder: "joint types of the robot, or revolute", autocomplete: "off" });
   return {
     element: h(
       "details",
