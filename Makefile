@@ -137,7 +137,7 @@ $(VENV)/.installed: $(VENV)/.running .ci/install-torch
 
 # the same with the dependencies of everything else
 $(VENV)/.installed-all: $(VENV)/.installed
-	$(BIN)/python -m pip install --disable-pip-version-check --no-compile -e clients/python -e '.[all,test,lint,nightly,docs,publish]'
+	$(BIN)/python -m pip install --disable-pip-version-check --no-compile -e clients/python -e '.[dev]'
 	@touch $@
 
 clean:

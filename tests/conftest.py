@@ -2,6 +2,7 @@
 
 import gc
 import re
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     return True if modules and all(map(_is_slow, modules)) else None
 
 
+@cache
 def _is_slow(module: Path) -> bool:
     text, name = module.read_text("utf-8"), module.relative_to(ROOT).as_posix()
     return bool(_ONLY_SLOW.search(text)) or (name.startswith(SYSTEM) and "mark.journey" not in text)

@@ -8,9 +8,13 @@ MAX_LISTED_JOINTS = 8
 """Max joints named in a sentence."""
 
 
+def _cut(items: Sequence[str]) -> Sequence[str]:
+    return [*items[:MAX_LISTED_JOINTS], "…"] if len(items) > MAX_LISTED_JOINTS else items
+
+
 def list_joints(items: Sequence[str], separator: str = ", ") -> str:
     """Return the items as one list, cut after MAX_LISTED_JOINTS."""
-    return separator.join([*items[:MAX_LISTED_JOINTS], "…"] if len(items) > MAX_LISTED_JOINTS else items)
+    return separator.join(_cut(items))
 
 
 def list_with_and(items: Sequence[str]) -> str:
@@ -55,7 +59,7 @@ def describe_unidentifiable(parameters: Mapping[str, Sequence[str]], calibrated:
 
 def describe_fallback(joints: Sequence[str], factor: float) -> str:
     """Return the warning about joints that fall back at `factor` times the range and speed of the recording."""
-    listed = list_with_and([*joints[:MAX_LISTED_JOINTS], "…"] if len(joints) > MAX_LISTED_JOINTS else joints)
+    listed = list_with_and(_cut(joints))
     return (
         f"At {factor:g} times the recorded range and speed, the torque of {listed} falls back to gravity and friction, "
         "as far as the recording identifies them. Record wider and faster motion to extend the model."

@@ -8,7 +8,6 @@ import pytest
 from tests.service.data import ENDLESS, ended, eventually, queue, running, stream, train, upload
 from tests.service.server import Server, command
 
-pytestmark = pytest.mark.slow
 QUERY = {"q": [0.3, -0.2], "dq": [0.1, 0.4], "ddq": [1.0, -0.5], "covariance": True}
 LONG = {**ENDLESS, "hyperparameter_samples": 60, "max_iterations": 25}
 """A fit that takes a few seconds."""

@@ -133,7 +133,6 @@ def test_killed_service_loses_no_torque_and_logs_none_twice(driver, tmp_path):
                 logged(server, name, measured)
 
 
-@pytest.mark.slow
 def test_control_loop_continues_after_a_restart(driver, tmp_path):
     measured, port = panda_rows(3000), free_port()
     server = Server(tmp_path / "home", port=port)
@@ -240,7 +239,6 @@ def test_example_runs(compiler, server, tmp_path):
     assert "no-such-model" in ran.stderr
 
 
-@pytest.mark.slow
 def test_cmake_builds_tests_and_installs(tmp_path):
     if not here("cmake"):
         pytest.skip("cmake is not installed")

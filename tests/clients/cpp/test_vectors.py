@@ -148,7 +148,6 @@ def test_cpp_client_agrees(any_compiler, tmp_path):
     assert f"{sum(map(len, KINDS.values()))} vectors, 0 failures" in checked(program, str(VECTORS))
 
 
-@pytest.mark.slow
 def test_cpp_client_compiles_optimised_and_without_exceptions(compiler, tmp_path):
     assert "throw" not in [word for line in (CPP / "include/lipserve/client.hpp").read_text().splitlines()
                            for word in line.partition("//")[0].split()]  # fmt: skip
@@ -157,7 +156,6 @@ def test_cpp_client_compiles_optimised_and_without_exceptions(compiler, tmp_path
     built(compiler, str(source), tmp_path, "-O3", "-fno-exceptions", "-fno-rtti")
 
 
-@pytest.mark.slow
 def test_cpp_client_never_reads_out_of_bounds(tmp_path):
     """Fuzz from the vectors with a fixed seed; the fuzzer fails if a sanitizer reports an error."""
     options = ("-O1", "-g", "-fsanitize=fuzzer,address,undefined", "-fno-sanitize-recover=all")

@@ -5,15 +5,12 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-import pytest
-
 from tests.service.data import arrays, npz, stream
 from tests.system.browser.accessibility import expect, focused, tab_to
 from tests.system.browser.conftest import Dashboard, Visit
 from tests.system.browser.visitor import Visitor
 
 
-@pytest.mark.slow
 def test_theme_choice_is_kept(windows: Visit, dashboard: Dashboard) -> None:
     visitor = windows(dashboard.server.url)
     page = visitor.open("#/")
@@ -35,7 +32,6 @@ if TYPE_CHECKING:
     from playwright.sync_api import FileChooser
 
 
-@pytest.mark.slow
 def test_model_is_trained_by_keyboard_only(visitor: Visitor) -> None:
     samples = stream(seed=3)
     file = {"name": "keys.npz", "mimeType": "application/octet-stream", "buffer": npz(**arrays(samples))}

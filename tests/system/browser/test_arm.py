@@ -49,7 +49,6 @@ def test_joint_frames_match_pinocchio(visitor: Visitor, kinds: str) -> None:
         np.testing.assert_allclose(origin, frame.translation, atol=1e-12)
 
 
-@pytest.mark.slow
 def test_gravity_points_down_in_the_drawing(visitor: Visitor) -> None:
     page = visitor.open("#/train")
     for gravity in ([0, 0, -9.81], [0, 0, 9.81], [9.81, 0, 0], [3.0, -4.0, 5.0], [1e-9, 0, -9.81]):
@@ -57,7 +56,6 @@ def test_gravity_points_down_in_the_drawing(visitor: Visitor) -> None:
         np.testing.assert_allclose(down, [0, 0, -np.linalg.norm(gravity)], atol=1e-9)
 
 
-@pytest.mark.slow
 def test_arm_is_drawn_and_moves_with_the_sliders(visitor: Visitor, arm: str) -> None:
     page = visitor.open(f"#/models/{arm}?tab=arm")
     figure = page.get_by_role("img", name=re.compile("The arm in 3-D, 7 joints from base to tip"))
@@ -93,7 +91,6 @@ def test_arm_is_drawn_and_moves_with_the_sliders(visitor: Visitor, arm: str) -> 
     assert audit(page) == []
 
 
-@pytest.mark.slow
 def test_version_without_geometry_explains_how_to_get_one(visitor: Visitor, dashboard: Dashboard) -> None:
     publish_arm_at(dashboard.server.home, "not-drawn", **NO_BODIES)
     page = visitor.open("#/models/not-drawn?tab=arm")
@@ -107,7 +104,6 @@ def swinging() -> Iterator[list[np.ndarray]]:
         yield [0.5 * np.sin(0.05 * row) * np.eye(7)[1], *np.zeros((3, 7))]
 
 
-@pytest.mark.slow
 def test_arm_follows_its_stream(visitor: Visitor, dashboard: Dashboard, arm: str) -> None:
     with playing(dashboard.server.url, arm, swinging(), rate=50.0):
         page = visitor.open(f"#/live/{arm}")

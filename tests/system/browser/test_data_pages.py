@@ -3,7 +3,6 @@
 import re
 
 import numpy as np
-import pytest
 
 from lipcore.estimators.catalogue import ESTIMATORS
 from lipcore.vocabulary import ROBOT_ESTIMATORS
@@ -11,8 +10,6 @@ from tests.service.data import ENDLESS, arrays, columns, csv, ended, job, npz, q
 from tests.system.browser.accessibility import audit, expect
 from tests.system.browser.conftest import Dashboard
 from tests.system.browser.visitor import Visitor
-
-pytestmark = pytest.mark.slow
 
 LONG = {**ENDLESS, "hyperparameter_samples": 250, "starts": 1}
 """Options of a long fit with short iterations."""

@@ -17,7 +17,6 @@ from tests.system.browser.visitor import Visitor
 if TYPE_CHECKING:
     from playwright.sync_api import Page
 
-pytestmark = pytest.mark.slow
 
 SAMPLES = stream(samples=200, rate=20.0, seed=31)
 RANGES = "[...document.querySelectorAll('.strip')].map(({layout}) => layout.xaxis.range)"

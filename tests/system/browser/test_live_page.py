@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from playwright.sync_api import Page
 
-pytestmark = pytest.mark.slow
 
 RATE = 50.0
 ROWS = 400

@@ -18,7 +18,6 @@ from tests.system.browser.visitor import DESKTOP, PHONE, Visitor
 if TYPE_CHECKING:
     from playwright.sync_api import Route
 
-pytestmark = pytest.mark.slow
 
 ROWS = 1200
 

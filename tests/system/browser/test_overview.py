@@ -73,7 +73,6 @@ def test_card_shows_quality_of_each_joint(visitor: Visitor, judged: dict[str, An
     assert (heights[0] < heights[1]) == (judged["quality"]["nmse"][0] < judged["quality"]["nmse"][1])
 
 
-@pytest.mark.slow
 def test_card_draws_the_arm_if_one_was_learnt(visitor: Visitor, judged: dict[str, Any]) -> None:
     page = visitor.open("#/")
     arm = card(page, "panda-sim").get_by_role("img", name="Learnt arm of panda-sim, 7 joints")
@@ -106,7 +105,6 @@ def test_card_draws_the_arm_if_one_was_learnt(visitor: Visitor, judged: dict[str
         assert seen == pytest.approx(wanted, abs=2e-4)
 
 
-@pytest.mark.slow
 def test_card_of_a_streaming_robot_is_live_and_shows_its_last_hour(visitor: Visitor, dashboard: Dashboard) -> None:
     archive = dashboard.client.get(f"/v1/models/{dashboard.model}/export").content
     headers = {"content-type": "application/x-tar"}
@@ -134,7 +132,6 @@ def test_card_of_a_streaming_robot_is_live_and_shows_its_last_hour(visitor: Visi
     expect(place).to_contain_text("idle for 1\u00a0min 5\u00a0s")
 
 
-@pytest.mark.slow
 def test_models_that_need_attention_come_first(visitor: Visitor, windows: Visit, dashboard: Dashboard) -> None:
     page = visitor.open("#/")
     name = "panda-sim"
@@ -159,7 +156,6 @@ def test_models_that_need_attention_come_first(visitor: Visitor, windows: Visit,
     assert audit(phone.page) == []
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("state", [slow("warning"), "failed"])
 def test_health_is_one_line_until_a_check_fails(visitor: Visitor, state: str) -> None:
     page = visitor.page

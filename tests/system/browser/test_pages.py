@@ -19,8 +19,6 @@ from tests.system.browser.conftest import Dashboard, Visit
 from tests.system.browser.robot import playing
 from tests.system.browser.visitor import DESKTOP, PHONE, Visitor, compress
 
-pytestmark = pytest.mark.slow
-
 NARROWEST = (320, 640)
 """A window 1280 px wide at 400 %: WCAG 2.2, 1.4.10."""
 MODEL_TABS = ("accuracy", "parts", "arm", "versions", "lineage", "ask", "learning")

@@ -21,7 +21,6 @@ from tests.system.browser.film import Film
 if TYPE_CHECKING:
     from lipcore.data.samples import Samples
 
-pytestmark = pytest.mark.slow
 
 PICTURES = bool(os.environ.get("LIPSERVE_SCREENSHOTS"))
 MODEL, STREAM = "cell-7", "robot-7"

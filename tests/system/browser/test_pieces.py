@@ -2,15 +2,12 @@
 
 from pathlib import Path
 
-import pytest
-
 from tests.packaging.test_pieces import without
 from tests.service.data import columns, csv, stream
 from tests.service.server import Server
 from tests.system.browser.accessibility import audit, expect
 from tests.system.browser.conftest import Visit
 
-pytestmark = pytest.mark.slow
 INGEST, ROBOTS = "pip install 'lipserve[ingest]'", "pip install 'lipserve[robots]'"
 
 

@@ -69,7 +69,6 @@ REFRESHED = """async () => {
 }"""
 
 
-@pytest.mark.slow
 def test_refresh_changes_nodes_in_place(visitor: Visitor) -> None:
     found = visitor.open("#/train").evaluate(REFRESHED)
     assert found.pop("added") == ["C", "more of A", "B"]
@@ -77,7 +76,6 @@ def test_refresh_changes_nodes_in_place(visitor: Visitor) -> None:
     assert all(found.values()), found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("route", [slow("#/"), "#/jobs"])
 def test_new_job_keeps_existing_links(visitor: Visitor, dashboard: Dashboard, route: str) -> None:
     page = visitor.open(route)
@@ -140,7 +138,6 @@ def arm(dashboard: Dashboard) -> str:
     return "live-arm"
 
 
-@pytest.mark.slow
 def test_change_is_decided_and_outdated_rows_are_marked(
     visitor: Visitor, dashboard: Dashboard, windows: Visit, arm: str
 ) -> None:
@@ -169,7 +166,6 @@ def test_change_is_decided_and_outdated_rows_are_marked(
     expect(page.get_by_text("no new rows, data is outdated")).to_be_visible()
 
 
-@pytest.mark.slow
 def test_live_page_shows_payloads_and_contacts(visitor: Visitor, dashboard: Dashboard) -> None:
     publish_arm_at(dashboard.server.home, "carrier")
     send_payload_batches(dashboard.client, "carrier", "cell-1")
@@ -191,14 +187,12 @@ def test_live_page_shows_payloads_and_contacts(visitor: Visitor, dashboard: Dash
     expect(carried).to_have_count(0)
 
 
-@pytest.mark.slow
 def test_live_page_without_model_lists_models(visitor: Visitor, dashboard: Dashboard) -> None:
     page = visitor.open("#/live")
     page.get_by_role("main").get_by_role("link", name=dashboard.model, exact=True).click()
     expect(page.get_by_role("heading", level=1, name=f"{dashboard.model} live")).to_be_visible()
 
 
-@pytest.mark.slow
 def test_live_page_reconnects_after_a_lost_connection(visitor: Visitor, dashboard: Dashboard) -> None:
     page = visitor.open(f"#/live/{dashboard.model}")
     expect(page.get_by_text("connected, no rows yet")).to_be_visible()

@@ -41,7 +41,6 @@ def locked(browser: Browser, tmp_path_factory: pytest.TempPathFactory) -> Iterat
         yield Locked(server.url, key)
 
 
-@pytest.mark.slow
 def test_wrong_key_is_asked_for_again(windows: Visit, locked: Locked) -> None:
     visitor = windows(locked.url)
     visitor.expect_refusals(401)
@@ -63,7 +62,6 @@ def test_wrong_key_is_asked_for_again(windows: Visit, locked: Locked) -> None:
     expect(page.get_by_role("dialog", name="API key")).to_be_visible()
 
 
-@pytest.mark.slow
 def test_cancelled_key_dialog_does_not_open_again_by_itself(windows: Visit, locked: Locked) -> None:
     visitor = windows(locked.url)
     visitor.expect_refusals(401)
@@ -97,7 +95,6 @@ def test_empty_service_shows_first_steps(windows: Visit, locked: Locked) -> None
         assert audit(page) == [], route
 
 
-@pytest.mark.slow
 def test_missing_pages_and_objects_are_reported(visitor: Visitor) -> None:
     visitor.expect_refusals(404)
     for route in ("#/data/ds_0000000000000000", "#/jobs/job_0000000000000000", "#/models/nobody", "#/live/nobody"):
@@ -106,7 +103,6 @@ def test_missing_pages_and_objects_are_reported(visitor: Visitor) -> None:
     expect(visitor.open("#/nowhere").get_by_text("does not exist")).to_be_visible()
 
 
-@pytest.mark.slow
 def test_overview_reports_a_lost_service(windows: Visit, dashboard: Dashboard) -> None:
     visitor = windows(dashboard.server.url)
     page = visitor.open("#/")

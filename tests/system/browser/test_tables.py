@@ -15,8 +15,6 @@ from tests.system.browser.visitor import PHONE, Visitor
 if TYPE_CHECKING:
     from playwright.sync_api import Locator
 
-pytestmark = pytest.mark.slow
-
 
 @pytest.fixture(scope="module")
 def rows(dashboard: Dashboard) -> dict[str, Any]:

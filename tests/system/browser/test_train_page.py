@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import re
 
-import pytest
-
 from lipcore.estimators.catalogue import ESTIMATORS
 from tests.service.data import stream, upload
 from tests.system.browser.accessibility import audit, expect
 from tests.system.browser.conftest import Dashboard
 from tests.system.browser.visitor import Visitor
-
-pytestmark = pytest.mark.slow
 
 
 def test_two_estimators_are_visible_and_the_others_folded(visitor: Visitor, dashboard: Dashboard) -> None:

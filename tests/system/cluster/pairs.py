@@ -19,16 +19,9 @@ LEARN_EVERYTHING = {"contact_threshold": 100.0, "on_change": "learn", "auto_refr
 """Learning options under which no batch is rejected."""
 
 
-def folder_store(shared: Shared) -> str:
-    """Return a folder as the shared file store; lighter than S3, which other tests use."""
-    folder = shared.folder / "files"
-    folder.mkdir(exist_ok=True)
-    return f"file://{folder}"
-
-
 def publish_models(shared: Shared, trained: Path, *models: str) -> None:
     """Publish models before any service runs, in a folder as the store."""
-    settings = shared.settings("before", files_url=folder_store(shared))
+    settings = shared.settings("before", files_url=shared.folder_url)
     database = Database.of(settings)
     for model in models:
         publish(database, Files.of(settings), trained, model)

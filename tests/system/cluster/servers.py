@@ -101,10 +101,8 @@ class S3:
     """A moto S3 endpoint in this process with one bucket; it keeps the objects during an outage."""
 
     def __init__(self) -> None:
-        from moto.server import ThreadedMotoServer
-
-        self._server = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-        self._server.start()
+        self.port = 0
+        self.start()
         _, self.port = self._server.get_host_and_port()
         self.url = f"http://127.0.0.1:{self.port}"
         self.env = {
@@ -166,7 +164,14 @@ class Shared:
     @property
     def files_url(self) -> str:
         """The URL of the files."""
-        return f"s3://{BUCKET}/{self.prefix}" if self.s3 else (self.folder / "files").as_uri()
+        return f"s3://{BUCKET}/{self.prefix}" if self.s3 else self.folder_url
+
+    @property
+    def folder_url(self) -> str:
+        """Address of a folder for the files, which is faster than S3."""
+        files = self.folder / "files"
+        files.mkdir(exist_ok=True)
+        return files.as_uri()
 
     def home(self, name: str) -> Path:
         """Return the home of a service."""
@@ -194,8 +199,6 @@ def sharing(postgres: Postgres, s3: S3 | None, folder: Path) -> Iterator[Shared]
     """Make a database, dropped afterwards, and a bucket prefix; services of this process find S3 in the environment."""
     database = postgres.create()
     shared = Shared(postgres, s3, folder, database, database)
-    if s3 is None:
-        (folder / "files").mkdir(exist_ok=True)
     try:
         with patch.dict(os.environ, s3.env if s3 else {}):
             yield shared

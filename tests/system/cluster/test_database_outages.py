@@ -43,7 +43,6 @@ def restart_under_load(postgres, answered):
     eventually(lambda: len(answered) >= seen + 2)
 
 
-@pytest.mark.slow
 def test_requests_get_retry_after_while_server_is_down(service, postgres):
     (pupil,), (client,) = service.enrol(ARM), service.clients
     body = npz(**arrays(stream()))
@@ -74,7 +73,6 @@ def test_requests_get_retry_after_while_server_is_down(service, postgres):
     eventually(lambda: client.get("/health/ready").status_code == 200)
 
 
-@pytest.mark.slow
 def test_restarts_under_load_keep_acknowledged_batches(shared, postgres):
     settings = shared.settings("before")
     database = Database.of(settings)

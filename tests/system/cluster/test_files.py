@@ -90,7 +90,6 @@ def test_files_of_one_service_are_used_by_another(shared):
         error(one.get(f"/v1/datasets/{dataset['id']}/preview"), 404, "not_found")
 
 
-@pytest.mark.slow
 def test_services_starting_together_install_one_shipped_model(shared):
     opened = [(Database.of(settings), Files.of(settings)) for settings in map(shared.settings, ("a", "b", "c"))]
     barrier = threading.Barrier(len(opened))
@@ -111,7 +110,6 @@ def test_services_starting_together_install_one_shipped_model(shared):
         database.close()
 
 
-@pytest.mark.slow
 def test_shared_files_are_verified(shared):
     settings = shared.settings("one")
     with service(shared, "one") as api:

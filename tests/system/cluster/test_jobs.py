@@ -45,7 +45,6 @@ def test_any_service_cancels_job_even_if_process_ignores_it(cluster_services):
     assert messages_of(one.ended(waiting))[-1] == "obeyed"
 
 
-@pytest.mark.slow
 def test_job_of_killed_worker_is_finished_by_another(cluster_services, workers):
     queue = cluster_services("a")
     job = queue.add("orphan", "wait")
@@ -61,7 +60,6 @@ def test_job_of_killed_worker_is_finished_by_another(cluster_services, workers):
     eventually(lambda: command(process) == "")
 
 
-@pytest.mark.slow
 def test_stopped_worker_returns_its_job(cluster_services, workers):
     queue = cluster_services("a")
     job = queue.add("handed", "wait")
@@ -75,7 +73,6 @@ def test_stopped_worker_returns_its_job(cluster_services, workers):
     assert queue.ended(job).state == "succeeded"
 
 
-@pytest.mark.slow
 def test_scheduler_outage_costs_no_attempt(cluster_services, workers):
     queue = cluster_services("a")
     runs, dies = queue.add("runs", "wait"), queue.add("later", "finish")
@@ -93,7 +90,6 @@ def test_scheduler_outage_costs_no_attempt(cluster_services, workers):
     eventually(lambda: queue.cluster.problem is None)
 
 
-@pytest.mark.slow
 def test_gpu_job_waits_for_worker_with_gpu(cluster_services, workers):
     queue = cluster_services("a")
     job, plain = queue.add("gpu", "wait", device="cuda"), queue.add("plain", "finish")
@@ -108,7 +104,6 @@ def test_gpu_job_waits_for_worker_with_gpu(cluster_services, workers):
     assert queue.ended(job).state == "succeeded"
 
 
-@pytest.mark.slow
 def test_job_of_stopped_or_dead_service_is_adopted(cluster_services):
     one, other = cluster_services("a"), cluster_services("b")
     job = one.add("followed", "wait")
@@ -151,7 +146,6 @@ def test_any_service_may_start_a_queued_job(local_services):
     assert [messages_of(one.ended(job))[-1] for job in (first, second)] == ["obeyed", "obeyed"]
 
 
-@pytest.mark.slow
 def test_job_of_lost_service_is_restarted_by_one_other(local_services):
     one, other, third = (
         local_services("a"),

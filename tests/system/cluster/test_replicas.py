@@ -23,7 +23,6 @@ from tests.service.server import Server
 from tests.system.cluster.pairs import (
     LEARN_EVERYTHING,
     Pair,
-    folder_store,
     predict_at_revision,
     publish_models,
     run_concurrently,
@@ -214,7 +213,6 @@ def test_deletions_reach_other_service(pair, arm):
     assert [pupil.predict()["version"] for pupil in again] == [3, 3]
 
 
-@pytest.mark.slow
 def test_late_service_predicts_the_same(shared_resources, pair, arm):
     """It starts from the snapshots of the others and newer events."""
     send_batches(arm, range(10), seed=5)
@@ -241,7 +239,6 @@ def _post_batch(pupil, number):
     return answer.is_success and answer.json()["revision"]
 
 
-@pytest.mark.slow
 def test_service_polls_without_notices(pair, arm, monkeypatch):
     first, second = arm
     monkeypatch.setattr(replication, "FULL_LOOK_S", 0.2)
@@ -268,7 +265,7 @@ def servers(shared: Shared) -> Iterator[list[Server]]:
 
 def start_service(shared: Shared, name: str) -> Server:
     """Start a service with its own home."""
-    return Server(shared.home(name), **(shared.env() | {"LIPSERVE_FILES_URL": folder_store(shared)}))
+    return Server(shared.home(name), **(shared.env() | {"LIPSERVE_FILES_URL": shared.folder_url}))
 
 
 def pupil(server: Server) -> LearningModel:
@@ -289,7 +286,6 @@ def send_until_acknowledged(servers: list[Server], number: int, rng: np.random.G
         assert answer.status_code == httpx.codes.SERVICE_UNAVAILABLE, answer.text
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_killed_service_loses_no_acknowledged_batch(shared, servers, seed):
     rng = np.random.default_rng(seed)

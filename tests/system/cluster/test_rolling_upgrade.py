@@ -18,11 +18,10 @@ from tests import ROOT
 from tests.service.data import DEADLINE, QUICK, eventually, queue, stream, train, upload
 from tests.service.learning.learning_models import QUERIES
 from tests.service.server import Server
-from tests.system.cluster.pairs import LEARN_EVERYTHING, folder_store
+from tests.system.cluster.pairs import LEARN_EVERYTHING
 from tests.system.cluster.servers import Shared
 from tests.system.faults.ledger import batch
 
-pytestmark = pytest.mark.slow
 RELEASE_BEFORE = ("v0.2.0", "6ef7985")
 """Names of the previous release in git."""
 FOLDERS = ("service", "lipcore", "clients/python", "models", "docs")
@@ -77,7 +76,7 @@ def fleet(postgres, s3, tmp_path, release_before):
     shared = Shared(postgres, s3, tmp_path, database, database)
     started: dict[str, Server] = {}
     settings = {
-        **{"LIPSERVE_DATABASE_URL": shared.database_url, "LIPSERVE_FILES_URL": folder_store(shared)},
+        **{"LIPSERVE_DATABASE_URL": shared.database_url, "LIPSERVE_FILES_URL": shared.folder_url},
         **{"LIPSERVE_PUBLISH_EVERY_S": "0.05", "LIPSERVE_MIN_REVISION_WAIT_S": "20", "LIPSERVE_REPLICA_LOST_S": "3"},
     }
     old = {"PYTHONPATH": f"{release_before}:{release_before / 'clients/python'}", "PYTHONSAFEPATH": "1"}

@@ -25,7 +25,6 @@ def sum_on(executor, work=ordered_floats):
     return sum_shards(executor, work, SHARDS, lambda: False)
 
 
-@pytest.mark.slow
 def test_cluster_sum_is_identical_and_survives_lost_worker(shared, tmp_path):
     with shard_executor(Settings(home=tmp_path)) as inline:
         local_sum = sum_on(inline)
@@ -42,7 +41,6 @@ def test_cluster_sum_is_identical_and_survives_lost_worker(shared, tmp_path):
                 sum_shards(executor, ordered_floats, SHARDS, lambda: True)
 
 
-@pytest.mark.slow
 def test_executor_requires_scheduler(shared):
     settings = shared.settings(cluster="tcp://127.0.0.1:1")
     with pytest.raises(ClusterUnavailableError, match="cannot be reached"), shard_executor(settings):
@@ -54,7 +52,6 @@ FAST_TAKEOVER = {"LIPSERVE_REPLICA_LOST_S": "2"}
 LONG = {"hyperparameter_samples": 150, "posterior_samples": 60, "max_iterations": 200}
 
 
-@pytest.mark.slow
 def test_job_of_killed_service_is_served_by_another(shared, tmp_path):
     with cluster(shared, tmp_path / "cluster", "one") as workers:
         env = {**shared.env(), **FAST_TAKEOVER, "LIPSERVE_CLUSTER": workers.address}

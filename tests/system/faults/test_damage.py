@@ -19,7 +19,6 @@ from tests.system.faults.damage import HARM, cut, empty, flip, zero
 from tests.system.faults.harness import populate_home
 from tests.system.faults.ledger import ARM, Ledger, batch, list_items, predict_queries, query_rows, verify_database
 
-pytestmark = pytest.mark.slow
 BATCHES = 12
 ADDRESS = "http://127.0.0.1"
 harm = pytest.mark.parametrize("harm", HARM, ids=lambda each: each.__name__)

@@ -61,7 +61,6 @@ def test_kill_keeps_acknowledged_writes_and_no_partial_ones(harness_pool, point)
     harness_pool.run_trial(run)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fault", STARTS.values(), ids=STARTS)
 def test_restart_recovers_from_kill_during_start(harness_pool, fault):
     """There is a job to restart and a file to delete."""
@@ -75,7 +74,6 @@ def test_restart_recovers_from_kill_during_start(harness_pool, fault):
     harness_pool.run_trial(run)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("fault", FIRST_STARTS.values(), ids=FIRST_STARTS)
 def test_restart_recovers_from_kill_during_first_start(tmp_path, fault):
     harness = FaultHarness(tmp_path, TARGETS, populated=False)

@@ -15,7 +15,6 @@ from tests.system.faults.harness import FaultHarness
 from tests.system.faults.ledger import ARM, batch, list_items, predict_queries
 from tests.system.faults.storage import fill_disk, lock_database, small_disk
 
-pytestmark = pytest.mark.slow
 MiB = 1 << 20
 WRITES = ("dataset", "robot", "job", "observation", "unlearning", "serving", "learning")
 

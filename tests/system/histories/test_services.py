@@ -158,7 +158,6 @@ def test_history_of_one_disturbed_service_is_consistent(tmp_path: Path) -> None:
         assert disturbances.done
 
 
-@pytest.mark.slow
 def test_history_of_three_services_with_broken_network_is_consistent(shared: Shared) -> None:
     group = ServiceGroup(shared.settings("before"), shared.folder, jobs=True)
     proxies = [Proxy(shared.database_url) for _ in range(3)]

@@ -73,7 +73,6 @@ def test_power_cuts_during_each_kind_of_request(tmp_path):
     check_cuts(recording, tmp_path, 5)
 
 
-@pytest.mark.slow
 def test_power_cuts_over_lifetime_of_home(tmp_path):
     recording = Recording(tmp_path / "recorded")
     with RecordedService(recording) as service:
@@ -87,7 +86,6 @@ def test_power_cuts_over_lifetime_of_home(tmp_path):
             check_service_continues(home, tmp_path / "log", ledger)
 
 
-@pytest.mark.slow
 def test_power_cuts_during_migration(tmp_path):
     recording = Recording(tmp_path / "recorded")
     with RecordedService(recording, homes.earlier_release_home(recording, tmp_path), shipped=False) as service:
@@ -96,7 +94,6 @@ def test_power_cuts_during_migration(tmp_path):
     check_cuts(recording, tmp_path, CUTS // 2)
 
 
-@pytest.mark.slow
 def test_failed_syncs_acknowledge_nothing(tmp_path):
     """Requests whose sync failed are rejected, and later acknowledged writes do not depend on them."""
     recording = Recording(tmp_path / "recorded")

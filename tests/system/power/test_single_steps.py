@@ -104,7 +104,6 @@ else:
 """
 
 
-@pytest.mark.slow
 def test_later_commits_do_not_depend_on_unsynced_one(tmp_path):
     """The next start reads the commit from SQLite's log in memory, because only the process died; the disk lacks it."""
     recording = Recording(tmp_path / "recorded")

@@ -49,7 +49,6 @@ def send(client, case):
     return client.request(prepared.method, prepared.url, content=prepared.body, headers=dict(prepared.headers))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", REQUEST_KINDS)
 def test_responses_to_generated_requests_are_as_documented(fuzzed, subtests, kind):
     """Sixty requests of each operation."""
