@@ -24,7 +24,7 @@ def another_unit(robot: Robot, share: float, seed: int) -> Robot:
 JOINTS = (3, 8)
 """Min and max number of joints."""
 TILTED_SHARE, TILT_RAD = 1 / 3, 0.5
-"""Share of arms whose first axis is not upright, and the standard deviation of its tilt."""
+"""Share of arms without an upright first axis, and the standard deviation of its tilt."""
 JOINT_OFFSET_M, CENTRE_OFFSET_M = 0.2, 0.1
 """Standard deviation of a joint's position in its parent's frame, and of a body's centre of mass."""
 FIRST_MASS_KG, MASS_RATIO = 8.0, 0.7

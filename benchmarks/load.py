@@ -20,7 +20,7 @@ class TrainingLoad:
 
     Attributes:
         slices: measured slices.
-        uncovered: slices whose job had ended before they did.
+        uncovered: slices of jobs that had ended before.
         seconds: duration of all slices.
         used_s: processor time of the training processes meanwhile; 0 if the system does not report it.
     """

@@ -34,7 +34,7 @@ TRAIN_SEED, QUERY_SEED = 1, 2
 QUERY_SINUSOIDS = 100
 """Queries follow another trajectory of twice the bandwidth, as in the paper's tests."""
 RANDOM_QUERIES = 500
-"""Queries for a model whose simulator is unknown."""
+"""Queries for a model without a known simulator."""
 
 
 class BenchError(RuntimeError):

@@ -165,7 +165,7 @@ def update_models(learners: Learners, models: Collection[str] | None) -> None:
 
 
 def find_lagging_models(learners: Learners) -> dict[str, int]:
-    """Return the models whose revision here is behind their log, with the number of the log's newest event."""
+    """Return the models with a revision here that is behind their log, with the number of the log's newest event."""
     held = learners.loaded.held()
     newest = select(func.max(EventRow.number)).where(EventRow.model == LearnerRow.model).scalar_subquery()
     query = select(LearnerRow.model, LearnerRow.version, LearnerRow.start, newest).where(

@@ -15,7 +15,7 @@ from lipcore.data.samples import Array
 BATCH = 1000
 """Queries of a batch."""
 CHECKED_QUERIES = 5
-"""Queries whose answers are compared with the model's own before the timing."""
+"""Queries with answers that are compared with the model's own before the timing."""
 TOLERANCE = 1e-6
 """Relative, and in N·m: service and benchmark rebuild the posterior; rounding differs with BLAS threads."""
 

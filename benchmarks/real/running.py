@@ -95,7 +95,7 @@ def run(options: Options, console: Console) -> Outcome:
 
 
 def make_plan(options: Options, service: Service) -> Plan:
-    """Prepare the recordings; return the cells whose names match `only`."""
+    """Prepare the recordings; return the cells with names that match `only`."""
     work, all_skipped = {}, {}
     for recording in options.recordings:
         found, skipped = splits(prepare(recording, options.folder, options.out / "prepared", service))

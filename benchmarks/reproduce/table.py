@@ -72,7 +72,7 @@ def rows(results: Iterable[CellResult], joint_names: Sequence[str]) -> list[Row]
 
 
 def select(table: Iterable[Row], **equal: object) -> list[Row]:
-    """Return the rows whose columns have the given values."""
+    """Return the rows with the given values in their columns."""
     return [row for row in table if all(getattr(row, name) == value for name, value in equal.items())]
 
 

@@ -1,4 +1,4 @@
-"""Accuracy of a learnt arm whose friction drifts for half an hour, with several options of online learning.
+"""Accuracy of a learnt arm with friction that drifts for half an hour, with several options of online learning.
 
     python benchmarks/studies/drifting_friction.py SEED[,SEED...] [CASE[;CASE...]] [ROBOT]
 

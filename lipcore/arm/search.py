@@ -30,7 +30,7 @@ class SearchOptions:
     direction_shares: tuple[float, ...] = (0.25, 0.05, 0.175, 0.175, 0.175, 0.175)
     """Shares of axes parallel to the one before, antiparallel or across it, ordered as `RIGHT_ANGLE_DIRECTIONS`."""
     upright_share: float = 0.5
-    """Share of arms whose first axis is upright."""
+    """Share of arms with an upright first axis."""
     right_base_share: float = 0.7
     """Share of arms with the first axis upright, upside down or horizontal."""
     across_m: float = 0.2

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from lipcore.data.samples import Array, Samples
 
 LEVELS = (0.5, 0.8, 0.95, 0.99)
-"""Probabilities of the intervals whose coverage and width are always returned."""
+"""Probabilities of the intervals; their coverage and width are always returned."""
 RELIABILITY_LEVELS = (*(k / 20 for k in range(1, 20)), 0.99)
 """Probabilities of the reliability curve: 5, 10 … 95 and 99 %."""
 
@@ -56,7 +56,7 @@ def evaluate(
     """Return the metrics of predicted torques (N, n) against measured ones.
 
     std: (N, n) of the function; noise_std: (n,) or (N, n); scale: (n,) factor on the half widths of intervals, but not
-    on the density. nmse is NaN for a joint whose measured torque is constant. Raise ValueError if shapes differ.
+    on the density. nmse is NaN for a joint with constant measured torque. Raise ValueError if shapes differ.
     """
     if mean.shape != tau.shape or std.shape != tau.shape:
         raise ValueError(f"mean has shape {mean.shape} and std {std.shape}, expected {tau.shape}, the shape of tau")
@@ -157,7 +157,7 @@ class Comparison:
     """Metrics of a second model minus those of a first, per joint."""
 
     nmse: Difference
-    """NaN for a joint whose measured torque is constant."""
+    """NaN for a joint with constant measured torque."""
     rmse: Difference
     """N·m (N)."""
     coverage: Difference
@@ -165,7 +165,7 @@ class Comparison:
     """Nats."""
     total: Difference
     """Of the negative log predictive density summed over the joints, nats a sample, and of the nMSE averaged over
-    the joints whose torque varies: (2,)."""
+    the joints with varying torque: (2,)."""
     blocks: int
     """Number of blocks of samples behind the standard errors."""
 
@@ -178,7 +178,7 @@ class BlockScores:
     """Number of rows of each block, (B,)."""
     sums: Array
     """Sums over the rows of a block, (B, 2): negative log predictive density summed over the joints, nats; and
-    squared error / variance of the torque averaged over the joints whose torque varies, NaN if none does."""
+    squared error / variance of the torque averaged over the joints with varying torque, NaN if there are none."""
 
     @classmethod
     def of(cls, samples: Samples, answer: TorqueDistribution) -> BlockScores:

@@ -49,7 +49,7 @@ class OutlierOptions:
     end_rows: int = 3
     """First and last rows of an episode, which are not checked: only one of their sides is recorded."""
     min_rows: int = 12
-    """Min rows of an episode whose rows are compared with their neighbours."""
+    """Min rows of an episode to compare its rows with their neighbours."""
     far_ratio: float = 30.0
     """In a shorter episode a row is corrupt if it is this many times as far from the median as all others."""
     max_share: float = 0.02

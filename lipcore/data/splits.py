@@ -81,7 +81,7 @@ def split(episode: Numbers, t: Array, how: Split, stretches: Sequence[Sequence[i
     `how` chooses, first and last exclusive, in order of episode and time.
 
     Episodes form one course of time, in the order of their numbers, while time rises from one to the next. Pieces of a
-    recording with gaps are therefore as near as their times. Episodes whose clocks restart are far from each other.
+    recording with gaps are therefore as near as their times. Episodes with restarted clocks are far from each other.
 
     Equal arguments return equal parts on every machine and in every release. Rows in another order return the same
     parts in that order.

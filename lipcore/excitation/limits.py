@@ -35,8 +35,10 @@ class Limits:
             if values.shape != (n,):
                 raise ValueError(f"{name} has shape {values.shape}, expected {(n,)}, one for each joint")
             finite = np.isfinite(values).all() if name != "torque" else not np.isnan(values).any()
-            if not finite or (name not in ("lower", "upper") and (values <= 0).any()):
-                raise ValueError(f"{name} is {values.tolist()}, expected a positive number for every joint")
+            positive = name not in ("lower", "upper")
+            if not finite or (positive and (values <= 0).any()):
+                number = "a positive number" if positive else "a finite number"
+                raise ValueError(f"{name} is {values.tolist()}, expected {number} for every joint")
         for joint, low, high in zip(self.joint_names, self.lower, self.upper, strict=True):
             if not low < high:
                 raise ValueError(f"joint {joint!r} may move from {low} to {high}, expected a range that is not empty")

@@ -242,7 +242,7 @@ def _vectors(model: TorqueModel, learnt: LinearWeights) -> Array:
 
 
 def _add_payload(model: TorqueModel, learnt: LinearWeights) -> TorqueModel:
-    """Return the model whose torque changes with the geometry as that of an arm with PAYLOAD."""
+    """Return the model with the torque's change with the geometry of an arm that carries PAYLOAD."""
     parameters = learnt.arm.arm.parameters.copy()
     parameters[-1] += PAYLOAD.parameters
     loaded = ArmKernel(replace(learnt.arm.arm, parameters=parameters))

@@ -1,4 +1,4 @@
-"""A URDF of an arm whose geometry was learnt: one link a joint, with its mass, its friction and its rotor.
+"""A URDF of an arm with learnt geometry: one link a joint, with its mass, its friction and its rotor.
 
 URDF has no tag for rotor inertia: it is written in a `<transmission>`, as Drake reads it. The torque of a simulator
 that ignores it lacks rotor · ddq. Offset torque is written as a comment. Friction of slow joints only is left out. If

@@ -30,7 +30,7 @@ class Candidate(TypedDict):
     standard_error: Positive | None
     """Standard error of that difference."""
     nmse: list[Positive | None] | None
-    """(n,), None for a joint whose torque does not vary."""
+    """(n,), None for a joint with constant torque."""
     edge_nmse: NotRequired[list[Positive | None] | None]
     """(n,), of the rows at the edge of the data, relative to the variance of all held-out rows."""
     coverage: list[Share | None] | None

@@ -43,7 +43,7 @@ class AdaptiveOptions:
     """Time between rows without times."""
     min_scale: float = 0.1
     max_scale: float = 1e4
-    """A small scale is safe for its own stream, whose next misses raise it at once; for other queries see `widest`."""
+    """A small scale is safe for its own stream: its next misses raise it at once; for other queries see `widest`."""
 
 
 OPTIONS = AdaptiveOptions()

@@ -108,7 +108,7 @@ def time_span(time: Array, code: Codes) -> tuple[float, float] | None:
 
 
 def is_contact(tau: Array, mean: Array, std: Array, noise_std: Array, threshold: float) -> Mask:
-    """Return the rows (N,) whose |z| (see `external`) exceeds the threshold at any joint. tau, mean, std: (N, n).
+    """Return the rows (N,) with |z| (see `external`) above the threshold at any joint. tau, mean, std: (N, n).
 
     The stream's `scale` is not used: it follows the measurements, so a contact would widen its own gate.
     """
@@ -121,7 +121,7 @@ or N."""
 
 
 def is_implausible(tau: Array, mean: Array, noise_std: Array, gravity: bool) -> Mask:
-    """Return the rows, (N,) in order of time, whose torque cannot be measured; all if more than half are such.
+    """Return the rows, (N,) in order of time, with torque that cannot be measured; all if more than half are such.
 
     tau, mean: (N, n), the torque sent as measured, and the model's; noise_std: (n,); gravity: whether torques contain
     it.
@@ -259,7 +259,7 @@ def _check_shapes(t: Array | None, q: Array, dq: Array, ddq: Array | None, tau: 
 
 
 def _time_jumps(t: Array, after: float | None, before: float | None) -> Mask:
-    """Return the rows (N,) whose time is out of bounds or out of order."""
+    """Return the rows (N,) with times out of bounds or out of order."""
     inside = np.isfinite(t)
     inside &= (t > (-np.inf if after is None else after)) & (t < (np.inf if before is None else before))
     kept = np.flatnonzero(inside)

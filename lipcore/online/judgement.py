@@ -17,7 +17,7 @@ from lipcore.online.record import Record
 from lipcore.online.scale import IntervalCoverage
 
 MAX_INNOVATION_ROWS = 1000
-"""Rows whose innovations are stored, to distinguish friction from a payload."""
+"""Rows with stored innovations, to distinguish friction from a payload."""
 
 
 @dataclass(frozen=True)

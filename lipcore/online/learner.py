@@ -17,7 +17,7 @@ from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.statistics import Statistics, add_to, empty
 
 CHUNK_ROWS = 500
-"""Rows whose features are computed together: 28 MB for a thousand variables."""
+"""Rows of features that are computed together: 28 MB for a thousand variables."""
 NovelRowsCallback = Callable[[NDArray[np.bool_]], None]
 """Receives a mask, (N,), of the rows that lie outside the basis; see `uncovered`."""
 
@@ -130,7 +130,7 @@ class OnlineModel:
     def training_torque(self) -> TrainingTorque | None:
         """Return the version's, for the fallback of predictions; None after a change and with forgetting.
 
-        These widen the variance of torques whose mean is still the best estimate.
+        These widen the variance of torques; their mean is still the best estimate.
         """
         return self.base.training_torque if self.before is None and self.forgetting_s is None else None
 

@@ -87,7 +87,7 @@ class Epoch:
 class Regime:
     """What is known of a robot between two changes: a prior N(centre, I) and the sums of its rows since.
 
-    The trained version is part of the sums of the first regime, as samples whose mean is the centre.
+    The trained version is part of the sums of the first regime, as samples with the centre as their mean.
     """
 
     begins: float

@@ -49,7 +49,7 @@ class Posterior(ABC):
 
     @abstractmethod
     def whiten(self, cross: Array) -> Array:
-        """Return K columns whose squared lengths are the explained variances, (M, K) to (r, K)."""
+        """Return K columns with the explained variances as squared lengths, (M, K) to (r, K)."""
 
     @abstractmethod
     def with_torques(self, term: TorqueKernel, covariance: Callable[[Motion], Array]) -> Array:

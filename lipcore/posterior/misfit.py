@@ -91,7 +91,7 @@ class Misfit:
         return replace(self, rest=np.maximum(self.rest, OPTIONS.rest_share * coulomb**2))
 
     def with_rest(self, other: Misfit) -> Misfit:
-        """Return this misfit, with `rest` and `slow` of another misfit for joints whose `rest` is larger there."""
+        """Return this misfit, with `rest` and `slow` of another misfit for joints with a larger `rest` there."""
         larger = other.rest > self.rest
         rest, slow = np.where(larger, other.rest, self.rest), np.where(larger, other.slow, self.slow)
         return replace(self, rest=rest, slow=slow)

@@ -213,7 +213,7 @@ def _rows(
     corrupt: NDArray[np.bool_],
     steps: list[record.Step],
 ) -> _Rows:
-    """Return the rows that are neither missing nor corrupt and whose time is not repeated."""
+    """Return the rows that are neither missing nor corrupt, without repeated times."""
     numbers = np.zeros(len(missing)) if episode is None else episode
     count = int(missing.sum())
     first = int(missing.argmax()) + 1 if count else None

@@ -145,7 +145,7 @@ def load_robot(name: str) -> Robot:
 
 
 def list_installed_robots() -> tuple[str, ...]:
-    """Return the names of the robots whose URDFs are installed."""
+    """Return the names of the robots with installed URDFs."""
     try:
         folder = _robots_folder()
     except MissingExtraError:

@@ -34,7 +34,7 @@ from service.storage import errors as storage_errors
 logger = logging.getLogger(__name__)
 
 OPEN_INFERENCE = "/v2"
-"""Prefix of the Open Inference Protocol, whose errors have their own form."""
+"""Prefix of the Open Inference Protocol, which has its own form of errors."""
 ERROR_CODE = "lipserve.error_code"
 """Key of the error code in the ASGI scope of a failed request, for metrics and logs."""
 UNEXPECTED_ERROR = "Unexpected error. See the service's log for details."

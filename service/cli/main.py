@@ -28,7 +28,7 @@ class Entry(NamedTuple):
 
 
 class LazyGroup(TyperGroup):
-    """Group whose commands are imported when they run; lists and help show the texts in `entries`.
+    """Group of commands that are imported when they run; lists and help show the texts in `entries`.
 
     Errors in a module's `ERRORS` are printed without a traceback, as are ValueError, OSError and MissingExtraError.
     """

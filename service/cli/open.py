@@ -20,9 +20,7 @@ app = alone()
 
 @app.command("open")
 def open_(
-    model: Annotated[
-        str | None, typer.Argument(help="Model whose page to open.", autocompletion=connecting.models)
-    ] = None,
+    model: Annotated[str | None, typer.Argument(help="Model to show.", autocompletion=connecting.models)] = None,
     live: Annotated[bool, typer.Option("--live", help="Use the live page, which shows streamed data.")] = False,
     browser: Annotated[
         bool, typer.Option("--browser", help="Also open the address in this machine's browser.")

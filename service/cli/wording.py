@@ -44,7 +44,7 @@ def _field(match: re.Match[str]) -> str:
 
 
 def _objects(text: str) -> str:
-    """Replace fields whose value is a JSON object by options."""
+    """Replace fields with a JSON object as value by options."""
     out, at = "", 0
     while (match := _GIVEN.search(text, at)) is not None:
         try:

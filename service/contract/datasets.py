@@ -72,8 +72,8 @@ class Lag(BaseModel):
     reason: str | None = Field(None, description="Why the lag is unknown; null if it is known")
     improves: list[str] = Field(
         [],
-        description="Joints whose torque is predicted clearly better on held-out parts if the lag is corrected. Empty "
-        "unless the lag differs from 0",
+        description="Joints with a clearly better prediction of torque on held-out parts if the lag is corrected. "
+        "Empty unless the lag differs from 0",
     )
 
 
@@ -214,7 +214,7 @@ class DatasetReport(BaseModel):
     joint_types: list[JointType] | None = Field(
         None, description="Joint types of the robot, which training jobs use by default; null if unknown"
     )
-    robot: str | None = Field(None, description="Robot whose limits were compared with the data; null if none")
+    robot: str | None = Field(None, description="Robot with the limits that were compared with the data; null if none")
     upload_sha256: str | None = Field(
         None, description="Hash of the uploaded file; null if an earlier release stored it"
     )

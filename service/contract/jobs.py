@@ -114,7 +114,7 @@ class JobRequest(BaseModel):
     options: Options = Field(default_factory=Options)
     holdout: Holdout | None = Field(
         default_factory=Holdout,
-        description="Part of the data sets to hold out for the evaluation, whose figures are in the version's lineage. "
+        description="Part of the data sets to hold out for the evaluation; its figures are in the version's lineage. "
         "The version is then trained on all samples, unless `only` is true. "
         f"By default {100 * _HOLDOUT.share:.0f} %, chosen by `{_HOLDOUT.kind}`; null: nothing",
     )

@@ -48,7 +48,7 @@ class SelectionHeldOut(BaseModel):
         description="Whether all motion of the recording repeats itself, so that figures are too good, except at the "
         "edge"
     )
-    edge_rows: int = Field(0, description="Rows at the edge of the data, whose states are furthest from all others")
+    edge_rows: int = Field(0, description="Rows at the edge of the data: their states are furthest from all others")
     edge_blocks: int = Field(0, description="Number of contiguous ranges of the rows at the edge")
 
 
@@ -339,7 +339,7 @@ class Evaluation(BaseModel):
         description="Upper end of this confidence interval. If it is below 0.9, intervals are too narrow"
     )
     repeats_training: float | None = Field(
-        description="Share of the samples whose motion (position, velocity and acceleration) repeats training motion, "
+        description="Share of samples with motion (position, velocity and acceleration) that repeats training motion, "
         "so that figures are too good; null if the version was trained on these samples, or if its data sets were "
         "deleted"
     )

@@ -33,7 +33,7 @@ UPLOAD_BODY = upload_body(
         },
         **{kind: {"schema": BINARY} for kind in MEDIA_TYPES if kind not in ("text/csv", "application/x-ndjson")},
     },
-    f"A file whose name ends in {', '.join(SUFFIXES)}",
+    f"A file with a name that ends in {', '.join(SUFFIXES)}",
 )
 
 

@@ -27,7 +27,7 @@ from service.storage.rows import read_page as newest_rows
 
 EventKind = Literal["batch", "replay", "unlearn", "rollback", "change", "settings", "payload"]
 UNTIMED_CODES = [Code.NON_FINITE, Code.TIME_JUMP]
-"""Codes of rows whose time is invalid."""
+"""Codes of rows with an invalid time."""
 ARRAY_NAMES = tuple(field.name for field in fields(Rows))
 """Names of the arrays in the safetensors archive of an event's rows."""
 

@@ -1,7 +1,7 @@
 """The learnt state of a version: its newest snapshot, and the fold of the events since.
 
 The state after event k is the fold of the events up to k that are not void. To undo is to mark events void and to
-delete the snapshots that contain them, in one transaction. A process whose state contains void events folds the log
+delete the snapshots that contain them, in one transaction. A process with void events in its state folds the log
 again from the newest remaining snapshot. So the state is a function of the log, to the last bit, whichever process
 computes it, when, and in however many steps. Services that share a log return the same answers. (This requires the same
 release, kind of processor and number of threads.)
@@ -68,7 +68,7 @@ class RestoredState:
     number: int
     """Last event that `online` contains."""
     seen: int
-    """Last event whose undoing is taken into account."""
+    """Last event that is considered for undoing."""
     torn: bool = False
     """Whether the newest snapshot is unreadable. If so, gaps of the log are skipped."""
 

@@ -67,7 +67,7 @@ class Streams:
         return own
 
     def factors(self, version: int) -> dict[str, Factor]:
-        """Return the interval factors of a version, for the streams whose last batch it predicted."""
+        """Return the interval factors of a version, for the streams of which it predicted the last batch."""
         return {
             name: Factor(record.scale.state.factor, record.scale.accepted.factor, record.received, record.doubted)
             for name, record in self._records.items()
@@ -125,7 +125,7 @@ class Streams:
             self._records = {name: record for name, record in self._records.items() if name != stream_id}
 
     def expire(self, session: Session, model: str, silent_since: float) -> None:
-        """Delete the streams of a model whose last batch arrived before a Unix time, s. Streams with a payload stay."""
+        """Delete the streams of a model with a last batch before a Unix time, s. Streams with a payload stay."""
         silent = StreamRow.model == model, StreamRow.received < silent_since
         for row in session.scalars(select(StreamRow).where(*silent).options(undefer(StreamRow.record))):
             payload = _record_of(row).payload

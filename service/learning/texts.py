@@ -24,7 +24,7 @@ def describe_departure(joints: str, version: int, follows: str) -> str:
 
 
 def describe_opening(stream_id: str, coverage: float, follows: str) -> str:
-    """Return the alarm of a stream whose first second does not fit."""
+    """Return the alarm of a stream with a first second that does not fit."""
     return (
         f"Stream {stream_id} does not fit the model: coverage of the 95 % intervals in its first second is "
         f"{percent(coverage)}. Check that it is this robot, with the learnt friction and payload. "

@@ -18,7 +18,7 @@ Plain = bool | int | Finite
 
 
 class Strict(BaseModel):
-    """Model whose values already have the right type."""
+    """Model with values that already have the right type."""
 
     model_config = ConfigDict(extra="allow", strict=True)
 

@@ -74,7 +74,7 @@ def publish(
     start: int | None = None,
     promotion: Promotion | None = None,
 ) -> int:
-    """Add a version whose files are complete; return its number. It is visible once the session commits.
+    """Add a version with complete files; return its number. It is visible once the session commits.
 
     It serves from then on, unless it is a candidate. `start` is the number of the model's last event that the training
     includes; the default is the newest event. `promotion` records why the version serves or not.

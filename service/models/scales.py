@@ -9,7 +9,7 @@ from lipcore.data.samples import Array
 from lipcore.online.adaptive import widest
 
 RECENT_S = 60.0
-"""Queries without a stream use the streams whose last batch is at most this much older than the newest, s."""
+"""Queries without a stream use streams with a last batch at most this much older than the newest, s."""
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def shard_executor(settings: Settings, gpu: bool = False) -> Iterator[Executor]:
 
     gpu: the shards need a GPU. They run on workers of a cluster that have one, or in this process.
 
-    A shard whose worker was lost ends with an error that `is_worker_lost` recognises. Submit it again to the same
+    A shard of a lost worker ends with an error that `is_worker_lost` recognises. Submit it again to the same
     executor. Raise ClusterUnavailableError.
     """
     if settings.cluster is not None:
@@ -192,7 +192,7 @@ def choose_settings(sent: Settings | None) -> Settings:
 
 
 def settings_to_send(settings: Settings) -> Settings | None:
-    """Return the settings to send with a shard; None for a cluster, whose workers have their own. Secrets stay here."""
+    """Return the settings to send with a shard; None for a cluster: its workers have their own. Secrets stay here."""
     return None if settings.cluster is not None else settings
 
 

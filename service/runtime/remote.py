@@ -1,6 +1,6 @@
 """Calls that are sent to a cluster, packed as bytes.
 
-The scheduler unpickles each call that it forwards. Here it finds bytes, and functions whose modules import nothing.
+The scheduler unpickles each call that it forwards. Here it finds bytes, and functions of modules that import nothing.
 Importing numerics would stop a scheduler for seconds.
 """
 

@@ -82,7 +82,7 @@ def page(
 
 
 def _text(moment: datetime) -> str:
-    """Return a time in the format of the lines, whose text order is the order of time."""
+    """Return a time in the format of the lines; their text order is the order of time."""
     return moment.astimezone(UTC).isoformat(timespec="milliseconds")
 
 

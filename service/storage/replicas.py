@@ -1,4 +1,4 @@
-"""Services that share a database: each sends heartbeats, and takes over jobs of services whose heartbeats stop.
+"""Services that share a database: each sends heartbeats; jobs of services without them are taken over.
 
 The database's clock dates the heartbeats. A single service sends none and owns all jobs.
 """
@@ -78,7 +78,7 @@ class Replicas:
         return not self.database.shared or owner == self.id
 
     def list_claimable_owners(self, session: Session) -> set[str | None]:
-        """Return the owners whose jobs this service may claim: itself, None, and services that are lost.
+        """Return the owners of jobs that this service may claim: itself, None, and services that are lost.
 
         After a gap in this service's own heartbeats no service counts as lost for a time: the others may have had the
         same gap.

@@ -85,7 +85,7 @@ def count_rows(path: Path) -> int:
 
 
 class Reader:
-    """An open file whose rows are read in parts, even after the file is deleted. Safe from several threads.
+    """An open file of rows that are read in parts, even after the file is deleted. Safe from several threads.
 
     The file is not mapped into memory; only the requested rows are in memory.
     """

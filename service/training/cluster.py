@@ -25,14 +25,14 @@ from service.training.queue import JobQueue
 logger = logging.getLogger(__name__)
 
 RETRY_S = 1.0
-"""Delay before a job whose ticket was lost gets another one, s."""
+"""Delay before a job with a lost ticket gets another one, s."""
 
 HOST = "service.training.hosting:host"
 """Function that a worker calls for a job, as a name: the service and the scheduler must not import its module."""
 
 
 class ClusterQueue(JobQueue):
-    """Queue whose jobs run on workers of a cluster and outlive their service.
+    """Queue of jobs that run on workers of a cluster and outlive their service.
 
     The owner of a job is the service that watches it. If that service stops, another one takes its jobs over.
     """

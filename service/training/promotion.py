@@ -2,7 +2,7 @@
 
 It stays a candidate if `lipcore.model.acceptance` does not accept it, or if paired differences show that it is worse
 than the serving version. Both are compared as trained. A version that has since learnt the held-out rows is compared by
-its judged fit, whose scores its lineage contains. Of equally good versions 1 to 7 % stay candidates (simulated: 5 to 60
+its judged fit; its lineage contains the scores. Of equally good versions 1 to 7 % stay candidates (simulated: 5 to 60
 s held out, errors correlated over 0.1 to 3 s).
 """
 

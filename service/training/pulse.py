@@ -33,9 +33,9 @@ class PaceOptions:
     with the cube of their samples: measured 0.9 for two joints and 1.9 for seven.
     """
     fit_rows: int = 200_000
-    """Rows whose pass takes about as long as a fit; for the displayed fraction."""
+    """Rows of a pass that takes about as long as a fit; for the displayed fraction."""
     last_fit_rows: int = 20_000
-    """Rows whose pass takes about as long as the last fit, which does not search."""
+    """Rows of a pass that takes about as long as the last fit, which does not search."""
 
 
 PACE = PaceOptions()
@@ -96,7 +96,7 @@ class SupersededError(RuntimeError):
 class Heartbeat:
     """Writes heartbeats and progress to a job's row while its block runs and makes progress.
 
-    The fit reports to it and reads from it without waiting for the database. A process whose work hangs sends no more
+    The fit reports to it and reads from it without waiting for the database. A process that hangs sends no more
     heartbeats and is killed by its watcher, see `lifecycle`.
 
     `own` reads the job's row in a session and raises SupersededError if another attempt has the job. `model` is the
@@ -158,7 +158,7 @@ class Heartbeat:
     def plan(self, fit: int, rows: int, later: int = 0) -> None:
         """Divide the remaining fraction among a fit that begins, a pass over `rows` rows, and the rest.
 
-        `fit` and `later` are in rows whose pass takes as long; `later` is everything after the pass.
+        `fit` and `later` are in rows of a pass that takes as long; `later` is everything after the pass.
         """
         begins, total = self._latest.get("fraction", 0.0), fit + rows + later
         self._fit_begins = begins

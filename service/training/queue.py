@@ -1,8 +1,8 @@
 """Job queue: rows in the database, run by training processes, each watched by one thread here.
 
 Three threads share the work. The watcher alone tracks which process has which job; it only reads the database, so that
-no lock there keeps it from killing a process. The clerk writes the outcome of jobs whose process ended, and retries
-until it is written. A new version is loaded in its own thread.
+no lock there keeps it from killing a process. When the process of a job has ended, the clerk writes
+the outcome, and retries until it is written. A new version is loaded in its own thread.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ class Page(Generic[T]):
 
 @dataclass(frozen=True)
 class Route:
-    """HTTP method and path of a route; of several paths, the one whose names in braces are all given is used."""
+    """HTTP method and path of a route; of several paths, the first with all its names in braces given is used."""
 
     method: str
     paths: tuple[str, ...]

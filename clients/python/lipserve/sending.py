@@ -204,7 +204,7 @@ class Attempts:
         if answer.status < 400:
             return None
         if self._call.removes and self._lost and answer.status == NOT_FOUND:
-            return None  # removed by the attempt whose answer was lost
+            return None  # removed by the attempt that lost its answer
         after = _retry_after(answer.headers)
         patient = self._call.repeatable and self._made < self._reach.retries
         if answer.status in LATER and patient and after is not None and after <= MAX_PAUSE_S:

@@ -74,7 +74,7 @@ of the arms' joints have a coverage below 85 % with it, 6 to 9 % without.
 @inlined
 def fallback_share(variance: float, usual: float) -> float:
     """Return the share of the fallback, 0 to 1, from the posterior variance and the training variance, (N·m)²."""
-    if not variance > FALLBACK_START * usual:  # a joint whose torque never varied has a `usual` of zero
+    if not variance > FALLBACK_START * usual:  # without variation of the torque, `usual` is zero
         return 0.0
     return min((variance - FALLBACK_START * usual) / ((FALLBACK_END - FALLBACK_START) * usual), 1.0)
 

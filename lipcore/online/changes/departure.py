@@ -108,7 +108,7 @@ class Departure:
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """Return the joints whose torque has drifted further than the version's uncertainty allows."""
+        """Return the joints with more drift of their torque than the version's uncertainty allows."""
         return tuple(int(joint) for joint in np.flatnonzero(self.level > OPTIONS.bound))
 
     @property

@@ -148,7 +148,7 @@ class ChangeDetector:
     alarm: Change | None = None
 
     def step(self, record: Record, at: float) -> tuple[ChangeDetector, Change | None]:
-        """Add a record whose last row has event time `at`, s; return the detector and the change that it detects.
+        """Add a record with its last row at event time `at`, s; return the detector and the change that it detects.
 
         Records of up to about 0.5 s are merged into buckets; longer ones are one bucket each. A late record counts as
         of now. Raise ValueError if the joints differ from those before.

@@ -40,7 +40,7 @@ class Opening:
     rows: float
     """Effective rows so far."""
     inside: Array
-    """Those whose torque lay inside the joint's 95 % interval, (n,)."""
+    """Those with the torque inside the joint's 95 % interval, (n,)."""
     since: float | None = None
     """Event time of the first row, s; None before it."""
 
@@ -84,7 +84,7 @@ class Opening:
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """Return the joints whose coverage is below the min share."""
+        """Return the joints with coverage below the min share."""
         return tuple(int(joint) for joint in np.flatnonzero(self.coverage < OPENING.min_share))
 
     def evidence(self, joint_names: Sequence[str]) -> dict[str, Any]:

@@ -79,7 +79,7 @@ class ArmWithPayload:
 
 @dataclass(frozen=True, eq=False)
 class Draw:
-    """A draw from the posterior: the minimum of the energy whose residuals are shifted by noise.
+    """A draw from the posterior: the minimum of the energy with residuals that are shifted by noise.
 
     noise: of the training and of the payload's prior; None: the minimum without noise.
     """

@@ -295,7 +295,7 @@ class PayloadTracker:
 
     @staticmethod
     def from_other_version(values: Mapping[str, Any], n: int, carrier: Carrier) -> PayloadTracker:
-        """Return the tracker that another version, whose last link has another frame, wrote with `to_json`."""
+        """Return the tracker that another version, with another frame of the last link, wrote with `to_json`."""
         since, held = values["since"], values["held"]
         if held is None:
             return PayloadTracker(n, since=since)

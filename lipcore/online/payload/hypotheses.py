@@ -153,7 +153,7 @@ class CellWindow:
 
     @classmethod
     def of(cls, around: LinearisedCarrier, cells: Sequence[Cell]) -> CellWindow:
-        """Return the window of cells whose residuals and features belong to `around`."""
+        """Return the window of cells with residuals and features that belong to `around`."""
         return cls.among(around, cells, [range(len(cells))])[0]
 
     @classmethod

@@ -189,7 +189,7 @@ def remove_payload(
     learners: LearnersDep,
     model: str,
     stream_id: Annotated[
-        StreamId | None, Query(description="The stream whose robot carries no payload. Default: all streams")
+        StreamId | None, Query(description="The stream of the robot without a payload. Default: all streams")
     ] = None,
 ) -> Payloads:
     """Predict without a payload from now on."""

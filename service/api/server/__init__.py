@@ -1,4 +1,4 @@
 """Extensions of uvicorn: connections, sockets, and the WebSocket protocol."""
 
 HOLDS_FOR = {"uvicorn": ">=0.54,<0.60", "websockets": ">=15,<18"}
-"""Supported versions, whose internals are extended here. A test checks them against pyproject.toml."""
+"""Supported versions; their internals are extended here. A test checks them against pyproject.toml."""

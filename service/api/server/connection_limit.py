@@ -29,7 +29,7 @@ class LimitedConnection(Protocol):
 class ConnectionLimit:
     """The connections of one server, in the order in which they are closed. Use it in the event loop.
 
-    First come connections without any request, then idle ones after an answer, then those whose clients do not read
+    First come connections without any request, then idle ones after an answer, then those of clients that do not read
     their answer; the oldest of each kind first. A connection that is being answered is never closed.
     """
 

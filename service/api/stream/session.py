@@ -144,7 +144,7 @@ class FrameReader:
         self._lengths = {torque: frames.request_bytes(self.n_joints, torque) for torque in (False, True)}
 
     def read(self, data: bytes, flags: int, n: int, budget: float) -> Array:
-        """Return q, dq, ddq of a frame, (3, n), whose header was read before; raise InvalidRequestError.
+        """Return q, dq, ddq of a frame with a header that was read before, (3, n); raise InvalidRequestError.
 
         The presence of the torque is checked, but not its values: see `torque`.
         """

@@ -96,7 +96,7 @@ def _has_names(comment: str, row: str) -> bool:
 
 
 def _header_without_names(lines: list[str], index: int, delimiter: str | None, naming: Naming) -> Header:
-    """Return the header of a file without names whose first row of numbers is that line."""
+    """Return the header of a file without names that has that line as its first row of numbers."""
     first = lines[index].strip("\r\n")
     rows = _sample_rows(lines, index)
     chosen = _parse_delimiter(delimiter) if delimiter else _choose_delimiter(first, rows)
@@ -182,7 +182,7 @@ def _parse_delimiter(delimiter: str) -> str:
     known = {"tab": "\t", "\\t": "\t", "blank": BLANK, "space": BLANK, "comma": ",", "semicolon": ";"}
     chosen = known.get(delimiter, delimiter)
     if len(chosen) != 1 or chosen.isalnum() or chosen in "\"'.+-_\r\n" or ord(chosen) > 126:
-        raise invalid_request("delimiter", delimiter, "one of , ; | tab blank")
+        raise invalid_request("delimiter", delimiter, "one character, such as , ; | a blank or a tab")
     return chosen
 
 

@@ -144,7 +144,7 @@ def _sniff_text(head: bytes) -> str | None:
 def open_table(path: Path, kind: str | None, options: ReadOptions, settings: Settings) -> Iterator[Table]:
     """Open a recording as a table; raise InvalidDataError, TooLargeError or MissingExtraError.
 
-    kind: the declared format, a key of `KINDS` or "zip", or None. A file whose content has another format is read as
+    kind: the declared format, a key of `KINDS` or "zip", or None. A file with content of another format is read as
     that, and the table's facts say so. If its format cannot be read, the error names both.
     """
     if path.stat().st_size == 0:

@@ -118,7 +118,7 @@ def _friction_sign(joint: JointExcitation, dq: Array, tau: Array) -> int:
 
 
 def _check_work(upload: Upload, signals: Signals, work: TorqueWork) -> Remedy | None:
-    """Report torques whose work on the motion is negative. This needs no robot."""
+    """Report torques that do negative work on the motion. This needs no robot."""
     usual = float(np.sqrt(np.mean(signals.dq**2, axis=0)) @ np.sqrt(np.mean(signals.tau**2, axis=0)))
     if work.trend > -CAUSE.trend or work.power > -FRICTION.negative_share * usual:
         return None
@@ -183,7 +183,7 @@ class _Case:
         )
 
     def check_sign(self) -> Remedy | None:
-        """Report joints whose gravity, inertia or friction has the opposite sign, and none of them the right one."""
+        """Report joints with gravity, inertia or friction of the opposite sign, and none of them the right one."""
         n, comparison = self.upload.n_joints, self.comparison
         signs = np.zeros((n, 3), np.int64)
         for j in range(n):

@@ -28,7 +28,7 @@ class MotionFitOptions:
     products: int = 100
     """Random angles, with three features each."""
     max_neighbours: int = 3
-    """Max joints whose angles are summed."""
+    """Max joints with summed angles."""
     ridge: float = 1e-9
     """Penalty of the joints' own features, as a share of their variance, for collinear features."""
     max_used: float = 0.5

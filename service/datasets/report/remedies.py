@@ -58,7 +58,7 @@ class Upload:
     def torque_columns(self, column: Sequence[int]) -> dict[str, str] | None:
         """Return options that read torque from other columns, or None if joints were left out.
 
-        column: for each joint, the joint whose column has its torque, (n,).
+        column: for each joint, the joint with its torque in the column, (n,).
         """
         if self.source is None or self.source["dropped_joints"]:
             return None

@@ -45,7 +45,7 @@ def bodies_of(robot: Profile, names: tuple[str, ...]) -> Bodies | None:
 
 
 def gravity_joints(comparison: Comparison) -> list[int]:
-    """Return the joints whose torque contains a significant part of gravity."""
+    """Return the joints with a significant part of gravity in their torque."""
     significant = [joint for joint in range(len(comparison.gravity)) if comparison.is_significant(joint, 0)]
     return [joint for joint in significant if comparison.explained[joint] > MATCH.explained]
 
@@ -90,7 +90,7 @@ def ask_for_robot(n_joints: int) -> str | None:
 
 
 def find_better_robot(upload: Upload, bodies: Bodies, comparison: Comparison, signals: Signals) -> Remedy | None:
-    """Suggest a robot that also matches the joint names and whose gravity fits, unlike that of the named robot."""
+    """Suggest a robot that also matches the joint names and has fitting gravity, unlike the named robot."""
     own = median_gravity(comparison)
     if own is None or 1 / MATCH.wrong < own < MATCH.wrong:
         return None

@@ -103,7 +103,7 @@ def negative_friction(joints: Sequence[str]) -> str:
 
 
 def torque_order(robot: str, moved: Iterable[tuple[str, str]]) -> str:
-    """Report torque columns in another order. moved: (joint, joint whose column has its torque)."""
+    """Report torque columns in another order. moved: (joint, joint with its torque in the column)."""
     pairs = list_names([f"the torque read for {read} belongs to {joint}" for joint, read in moved])
     return f"The torque columns are in another order than the positions, by the torque that {robot} needs: {pairs}."
 

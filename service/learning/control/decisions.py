@@ -172,7 +172,7 @@ def _to_version(learners: Learners, model: str, version: int) -> schema.RolledBa
 
 CHANGE = "change"
 CHUNK_EVENTS = 50
-"""Events whose rows are replayed in one transaction, so that observations do not wait long for the lock."""
+"""Events that are replayed in one transaction, so that observations do not wait long for the lock."""
 
 
 def set_options(learners: Learners, model: str, options: LearningOptions) -> None:
@@ -271,13 +271,13 @@ def alarms(learners: Learners, model: str, part: Page) -> schema.AlarmPage:
 
 
 def _replayed(session: Session, batch: EventRow) -> set[str]:
-    """Return the codes whose rows have been replayed. Rows that a rollback has undone can be replayed again."""
+    """Return the codes of rows that have been replayed. Rows that a rollback has undone can be replayed again."""
     events = log.find_related(session, batch, "replay")
     return {code for event in events if not event.void for code in (event.detail or {})["codes"]}
 
 
 def _complete(rows: Rows) -> NDArray[np.bool_]:
-    """Return which rows have only finite numbers, (N,). Rows whose acceleration could not be derived have not."""
+    """Return which rows have only finite numbers, (N,). Rows without a derived acceleration have not."""
     numbers = np.hstack([rows.time[:, None], rows.q, rows.dq, rows.ddq, rows.tau])
     return np.asarray(np.isfinite(numbers).all(axis=1))
 

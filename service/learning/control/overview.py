@@ -156,6 +156,6 @@ def _read_last_arrivals(session: Session, models: Sequence[str]) -> dict[str, fl
 
 
 def _find_paused(session: Session, models: Sequence[str]) -> set[str]:
-    """Return the models whose learning is paused."""
+    """Return the models with paused learning."""
     query = select(LearningRow.model, LearningRow.held).where(LearningRow.model.in_(models))
     return {model for model, held in session.execute(query) if held is not None}

@@ -202,7 +202,7 @@ def read_newest_revision(session: Session, model: str, version: int) -> int:
 
 
 def list_reachable(session: Session, model: str, version: int) -> list[Range]:
-    """Return the ranges [first, last] of revisions whose state can be reconstructed, in rising order.
+    """Return the ranges [first, last] of revisions that can be reconstructed, in rising order.
 
     A state needs the version as trained or a snapshot, and all events since. Events that a rollback has undone are not
     learnt again, so their states are lost.

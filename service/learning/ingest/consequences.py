@@ -39,7 +39,7 @@ def _unlearn_stream(session: Session, event: EventRow) -> None:
 
 
 def raise_clock_alarm(session: Session, model: str, stream_id: str, leap: float) -> None:
-    """Raise the alarm of a stream whose clock is ahead of its rows' arrival."""
+    """Raise the alarm of a stream with a clock ahead of its rows' arrival."""
     evidence = {"stream_id": stream_id, "ahead_s": leap}
     raise_alarm(session, model, "clock", texts.describe_clock(stream_id, leap), evidence)
 

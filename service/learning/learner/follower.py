@@ -190,6 +190,6 @@ class Follower:
             answering = online.model(floor)
             self._revision, self._solved = Revision.of(answering), (online, floor)
             error = linearisation_error(answering)
-            # a joint whose errors are no larger than stated needs no refresh
+            # a joint with errors no larger than stated needs no refresh
             self._linearisation = None if error is None else tuple(np.where(floor > 0, error, 0.0).tolist())
         return self._revision

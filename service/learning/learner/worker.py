@@ -27,7 +27,7 @@ MIN_PAUSE_S, MAX_PAUSE_S = 1.0, 60.0
 
 
 def run(settings: Settings, connection: Connection) -> None:
-    """Follow the models whose names arrive over the connection, until it ends or None arrives.
+    """Follow the models with names that arrive over the connection, until it ends or None arrives.
 
     Send a heartbeat after each step, at most every `BEAT_S`, and every `BEAT_S` while idle.
     """

@@ -41,7 +41,7 @@ REFINING_SHARE, REFINING_S = 0.15, 2.0
 
 
 def run(settings: Settings, connection: Connection) -> None:
-    """Follow the streams whose rows arrive over the connection, until it ends or None arrives."""
+    """Follow the streams of the rows that arrive over the connection, until it ends or None arrives."""
     database, files = Database.of(settings), Files.of(settings)
     weigher = Weigher(Versions(database, files))
     try:

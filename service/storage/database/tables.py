@@ -232,7 +232,7 @@ class StreamRow(Base):
     missing: Mapped[dict[str, Any]]
     """Ranges [first, last] of missing sequence numbers below `last`."""
     forgotten: Mapped[int | None] = mapped_column(BigInteger)
-    """Highest sequence number whose batch was deleted, so that a repetition is not recognised."""
+    """Highest sequence number of a deleted batch, so that a repetition is not recognised."""
     created_at: Mapped[str]
     received: Mapped[float | None]
     """Time of the last batch, Unix s; None for rows of earlier releases."""

@@ -43,7 +43,7 @@ NO_BUCKET = "there is no such bucket"
 
 
 class Bucket:
-    """Objects of a bucket whose keys begin with a prefix; safe from several threads of one process."""
+    """Objects of a bucket with keys that begin with a prefix; safe from several threads of one process."""
 
     def __init__(self, bucket: str, prefix: str) -> None:
         self._bucket, self._prefix = bucket, prefix
@@ -83,7 +83,7 @@ class Bucket:
             self._system.rm_file(self._path(key))
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Yield objects whose keys begin with `prefix`."""
+        """Yield objects with keys that begin with `prefix`."""
         parent, _, beginning = prefix.rpartition("/")
         with _of_store(missing=NO_BUCKET):
             objects: dict[str, Any] = self._system.find(self._path(parent), detail=True, prefix=beginning)

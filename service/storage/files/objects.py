@@ -62,7 +62,7 @@ class ObjectStore(Protocol):
         """Delete an object; do nothing if there is none."""
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Yield objects whose keys begin with `prefix`.
+        """Yield objects with keys that begin with `prefix`.
 
         prefix: a folder's name, a slash, and optionally the beginning of a name in the folder.
         """
@@ -90,7 +90,7 @@ class RetryingStore:
         self._objects.delete(key)
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Yield objects whose keys begin with `prefix`."""
+        """Yield objects with keys that begin with `prefix`."""
         return iter(self._ask(lambda: builtins.list(self._objects.list(prefix))))
 
     def check(self) -> None:
@@ -162,7 +162,7 @@ class FolderStore:
                     return
 
     def list(self, prefix: str) -> Iterator[Entry]:
-        """Yield objects whose keys begin with `prefix`, with leftovers of an interrupted `put`."""
+        """Yield objects with keys that begin with `prefix`, with leftovers of an interrupted `put`."""
         parent, _, beginning = prefix.rpartition("/")
         with _of_folder():
             self.check()

@@ -178,7 +178,7 @@ class SharedFiles:
 
     @contextmanager
     def _draft(self, name: str) -> Iterator[Path]:
-        """Yield an empty temporary folder whose name begins with `name`; it is deleted after the block."""
+        """Yield an empty temporary folder with a name that begins with `name`; it is deleted after the block."""
         path = Path(tempfile.mkdtemp(prefix=f"{name}-", dir=self._drafts))
         try:
             yield path

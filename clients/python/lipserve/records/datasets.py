@@ -85,7 +85,7 @@ class Lag(Record, frozen=True, kw_only=True):
     std_s: Standard deviation of the lag, s, from leaving out one eighth of the data at a time
     cost: Share of the torque's variance that becomes error because of the lag
     reason: Why the lag is unknown; null if it is known
-    improves: Joints whose torque is predicted clearly better on held-out parts if the lag is corrected. Empty unless
+    improves: Joints with a clearly better prediction of torque on held-out parts if the lag is corrected. Empty unless
         the lag differs from 0
     """
 
@@ -267,7 +267,7 @@ class DatasetReport(Record, frozen=True, kw_only=True):
     recipe: Options of the preparation
     steps: Steps of `preparation` with their parameters
     joint_types: Joint types of the robot, which training jobs use by default; null if unknown
-    robot: Robot whose limits were compared with the data; null if none
+    robot: Robot with the limits that were compared with the data; null if none
     upload_sha256: Hash of the uploaded file; null if an earlier release stored it
     lag: All joints combined first, then each joint
     against_robot: Null without a robot's URDF

@@ -74,7 +74,7 @@ class SelectionHeldOut(Record, frozen=True, kw_only=True):
 
     blocks: Number of contiguous ranges of these rows
     repeats: Whether all motion of the recording repeats itself, so that figures are too good, except at the edge
-    edge_rows: Rows at the edge of the data, whose states are furthest from all others
+    edge_rows: Rows at the edge of the data: their states are furthest from all others
     edge_blocks: Number of contiguous ranges of the rows at the edge
     """
 

@@ -98,7 +98,7 @@ def optional(kind: Any, *names: str) -> Iterator[sa.Column[Any]]:
 
 
 def numbered() -> list[Any]:
-    """Column and primary key of a table whose rows are counted."""
+    """Column and primary key of a table with counted rows."""
     return [sa.Column("seq", NUMBER, autoincrement=True, nullable=False), sa.PrimaryKeyConstraint("seq")]
 
 

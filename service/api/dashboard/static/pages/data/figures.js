@@ -232,7 +232,7 @@ function saturation(rows, joints) {
         { label: "At torque limit", numeric: true, cell: (row) => (row.at_limit > 0 ? badge(percent(row.at_limit, 2), "warn") : percent(row.at_limit, 2)) },
       ],
       rows,
-      { caption: "Share of samples whose torque may be clipped" },
+      { caption: "Share of samples with a torque that may be clipped" },
     ),
   );
 }

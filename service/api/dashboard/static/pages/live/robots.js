@@ -7,7 +7,7 @@ import { badge, card, empty, heading, link, repeat, table } from "../../ui.js";
 
 const PERIOD_S = 3;
 const MAX_MODELS = 100;
-const MAX_DETAILED = 20; // models whose streams are read, the most recent first
+const MAX_DETAILED = 20; // models to read streams of, the most recent first
 
 /** Show the list and update it while the page is visible; throw an error of the first update. */
 export async function robots(view, signal) {

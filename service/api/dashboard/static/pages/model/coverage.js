@@ -16,7 +16,7 @@ export function coverageVerdict(figures, joint) {
   return share > MAX_COVERAGE && low > 0.95 ? ["intervals too wide", "plain"] : ["good", "good"];
 }
 
-/** Return the joints whose intervals are significantly too narrow. */
+/** Return the joints with significantly too narrow intervals. */
 export function narrowJoints(figures) {
   return figures.coverage.map((_share, joint) => joint).filter((joint) => coverageVerdict(figures, joint)[1] === "bad");
 }

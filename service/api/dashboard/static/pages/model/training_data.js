@@ -1,4 +1,4 @@
-// Notes on samples that the version was trained on, whose figures are optimistic.
+// Notes on samples that the version was trained on: their figures are optimistic.
 
 import { h } from "../../dom.js";
 import { HELD_OUT_NOTE } from "../job/words.js";
