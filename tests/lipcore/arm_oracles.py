@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 from torch.func import grad, jvp
 
-from lipcore import FitOptions, TorqueModel, train
+from lipcore import FitOptions, TorqueModel, TorquePrediction, train
 from lipcore.arm.learning import learn
+from lipcore.data.metrics import evaluate
 from lipcore.data.samples import Samples
 from lipcore.estimators.task import Task
 from lipcore.kernels.geometry import Geometry
@@ -57,6 +58,29 @@ def train_from_geometry(
 def record_motion(robot: Robot, seed: int, size: int = 120, noise: float = 0.01, viscous: float = 0.2) -> Samples:
     """Simulate a robot that moves over most of its range."""
     return simulate(robot, Simulation(size, speed=10, noise=noise, viscous=viscous, motion="full"), seed)
+
+
+def hold_joints(samples: Samples, joints: Sequence[int], position: float) -> Samples:
+    """Return samples in which some joints never move."""
+    q, dq, ddq = samples.q.copy(), samples.dq.copy(), samples.ddq.copy()
+    q[:, joints], dq[:, joints], ddq[:, joints] = position, 0.0, 0.0
+    return replace(samples, q=q, dq=dq, ddq=ddq)
+
+
+def nmse_per_joint(model: TorqueModel, unseen: Samples) -> np.ndarray:
+    """Return the nMSE on another motion, (n,)."""
+    answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
+    return np.asarray(evaluate(unseen.tau, *answer.interval).nmse)
+
+
+def assert_predicts_finite_torque(model: TorqueModel, samples: Samples) -> TorquePrediction:
+    """Assert finite predictions at the samples and elsewhere; return those at the samples."""
+    answer = model.predict(samples.q, samples.dq, samples.ddq, covariance=True)
+    elsewhere = model.predict(samples.q + 1.0, 2 * samples.dq + 0.1, samples.ddq - 1.0)
+    for part in (answer.tau, answer.tau_std, answer.covariance, answer.noise_std, elsewhere.tau, elsewhere.tau_std):
+        assert np.isfinite(part).all()
+    assert (answer.noise_std > 0).all()
+    return answer
 
 
 def reversed_pendulum_model(mode: str, options: FitOptions) -> TorqueModel:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -243,12 +244,10 @@ def hyperparameter_range(name: str) -> tuple[float, float]:
 
 
 @st.composite
-def problems(
-    draw: st.DrawFn, max_joints: int = 4, samples: int = 2, kernels: Sequence[str] = tuple(KERNELS)
-) -> Problem:
-    """Draw problems with mixed joints and states within a few rad. kernels: of KERNELS."""
+def problems(draw: st.DrawFn, max_joints: int = 4) -> Problem:
+    """Draw problems of two samples with mixed joints and states within a few rad."""
     joint_types = draw(st.lists(st.sampled_from(["revolute", "prismatic"]), min_size=1, max_size=max_joints))
-    make, shapes = KERNELS[draw(st.sampled_from(kernels))]
+    make, shapes = KERNELS[draw(st.sampled_from(tuple(KERNELS)))]
     n = len(joint_types)
 
     def array(shape: tuple[int, ...], bound: float) -> np.ndarray:
@@ -256,7 +255,7 @@ def problems(
 
     bounds = {name: 1.0 if name.startswith("kinetic.log_") else 3.0 for name in shapes(n)}
     params = {name: array(shape, bounds[name]) for name, shape in shapes(n).items()}
-    motion = Motion.from_arrays(*(array((samples, n), 4.0) for _ in range(3)))
+    motion = Motion.from_arrays(*(array((2, n), 4.0) for _ in range(3)))
     return Problem(make(joint_types), params, motion)
 
 
@@ -296,6 +295,12 @@ def worst_energy_error(problem: Problem, pairs: Sequence[tuple[int, int]] = PAIR
     return worst
 
 
+def central_difference(value: Callable[[float], Any], step: float) -> Any:
+    """Return the slope at zero of a function, a number or an array, exact to about step⁴."""
+    near, far = (value(s * step) - value(-s * step) for s in (1, 2))
+    return (8 * near - far) / (12 * step)
+
+
 def zero_position(kind: str, share: Sequence[float], q: float) -> float:
     """Return the position q' at which the base kernel p(q, q') of shares (σ, α, β) is zero."""
     sigma, alpha, beta = share
@@ -303,6 +308,25 @@ def zero_position(kind: str, share: Sequence[float], q: float) -> float:
         return -(sigma + beta) / (alpha * q)
     cosine, sine = alpha * math.cos(q), beta * math.sin(q)
     return math.atan2(sine, cosine) + math.acos(-sigma / math.hypot(cosine, sine))
+
+
+def base_shares(problem: Problem) -> np.ndarray:
+    """Return (σ, α, β) of each joint's potential base kernel, (n, 3)."""
+    if isinstance(problem.kernel, LipKernel):
+        return shares_of(torch.from_numpy(problem.params["potential.logits"])).numpy()
+    alpha = 1 / (1 + np.exp(-problem.params["chain.logits"]))
+    turns = np.array([kind == "revolute" for kind in problem.kernel.joint_types])
+    return np.stack([1 - alpha, alpha, alpha * turns], axis=1)
+
+
+def cross_zeros(problem: Problem, q: np.ndarray, joints: Sequence[int], offset: float = 0.0) -> Problem:
+    """Return the problem with p(q, q') = 0 of some joints for samples 0, at q (n,), and 1, plus an offset of q'."""
+    moved, shares = problem.motion.q.copy(), base_shares(problem)
+    moved[0] = q
+    for joint in joints:
+        kind = problem.kernel.joint_types[joint]
+        moved[1, joint] = zero_position(kind, shares[joint].tolist(), q[joint]) + offset
+    return replace(problem, motion=replace(problem.motion, q=moved))
 
 
 def with_full_counts(model: TorqueModel, samples: Samples) -> TorqueModel:

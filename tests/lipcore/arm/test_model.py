@@ -1,9 +1,10 @@
 """Tests of models with a learnt arm: storage, reports, online learning and alternative arms."""
 
-import copy
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,8 @@ import msgspec
 import numpy as np
 import pinocchio as pin
 import pytest
-from safetensors.numpy import load as load_tensors
-from safetensors.numpy import save as save_tensors
 
 from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save
-from lipcore.data.metrics import evaluate
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import make_estimator
 from lipcore.files import persistence
@@ -32,12 +30,14 @@ from tests.lipcore.arm_oracles import (
     arm,
     as_robot,
     as_rows,
+    nmse_per_joint,
     random_motions,
     record_motion,
     reversed_pendulum_model,
     train_from_geometry,
 )
 from tests.lipcore.arms import parameters, random_bodies, random_geometry
+from tests.lipcore.files.test_persistence import edit_tensor
 
 OPTIONS = FitOptions(device="cpu", statistics="chosen")
 GEOMETRY, _, ROBOT = arm("RPR", 51)
@@ -82,14 +82,10 @@ def with_alternatives(model: TorqueModel, samples: Samples, count: int = 1) -> T
 
 @pytest.mark.parametrize("kind", ["learn", "calibrate", "fixed", "alternatives"])
 def test_saved_arm_loads_unchanged(kind: str, learnt_model: TorqueModel, samples: Samples, tmp_path: Path) -> None:
-    if kind == "learn":
-        model = learnt_model
+    if kind in ("calibrate", "fixed"):
+        model = reversed_pendulum_model(kind, OPTIONS)
     else:
-        model = (
-            with_alternatives(learnt_model, samples, 2)
-            if kind == "alternatives"
-            else reversed_pendulum_model(kind, OPTIONS)
-        )
+        model = learnt_model if kind == "learn" else with_alternatives(learnt_model, samples, 2)
     manifest = save(model, tmp_path / "model")
     again = load(tmp_path / "model")
     queries = random_motions(model.n_joints, 3).transpose(1, 0, 2)
@@ -107,39 +103,39 @@ def test_saved_arm_loads_unchanged(kind: str, learnt_model: TorqueModel, samples
         assert again.arm.order.tolist() == [1, 0]
 
 
-Edit = Callable[[dict[str, Array]], object]
-INVALID_EDITS: dict[str, tuple[Edit, str]] = {
-    "no rotation": (lambda t: t["arm/rotation"].__imul__(2), "not a rotation"),
-    "no axis": (lambda t: t["arm/axis"].fill(0), "not of length one"),
-    "missing": (lambda t: t.pop("arm/unit"), "'arm/unit' is missing"),
-    "order": (lambda t: t["arm/order"].fill(0), "expected each joint once"),
-    "widths": (lambda t: t["arm/widths"].fill(0), "positive numbers"),
-    "parameters": (lambda t: t.update({"arm/parameters": t["arm/parameters"][:2].copy()}), "parameters has shape"),
-    "rotor": (lambda t: t.update({"arm/rotor": t["arm/rotation"][0, 0, :2].copy()}), "rotor has shape"),
-    "steps": (lambda t: t.update({"arm/expected": t["arm/expected"][:1].copy()}), "expected has shape"),
-    "not finite": (lambda t: t["arm/translation"].fill(np.nan), "finite"),
+Change = Callable[[Any], Array | None]
+INVALID_TENSORS: dict[str, tuple[str, Change, str]] = {
+    "no rotation": ("rotation", lambda values: 2 * values, "not a rotation"),
+    "no axis": ("axis", np.zeros_like, "not of length one"),
+    "missing": ("unit", lambda values: None, "'arm/unit' is missing"),
+    "order": ("order", np.zeros_like, "expected each joint once"),
+    "widths": ("widths", np.zeros_like, "positive numbers"),
+    "parameters": ("parameters", lambda values: values[:2], "parameters has shape"),
+    "rotor": ("rotor", lambda values: np.ones(2), "rotor has shape"),
+    "steps": ("expected", lambda values: values[:1], "expected has shape"),
+    "not finite": ("translation", lambda values: values * np.nan, "finite"),
     "coefficients": (
-        lambda t: t.update({"arm/other/linear": t["arm/other/linear"][:, :, :2].copy()}),
+        "other/linear",
+        lambda values: values[:, :, :2],
         r"'arm/other/linear' has shape \(3, 3, 2\), expected \(3, 3, 4\)",
     ),
-    "no probability": (lambda t: t["arm/other/probability"].fill(0), "outside 0 to 1"),
-    "improbable": (lambda t: t["arm/other/probability"].fill(0.9), "positive definite|cholesky"),
-    "none": (lambda t: t.update({"arm/other/probability": np.zeros(0)}), "has shape"),
-    "unknown": (lambda t: t.update({"arm/shadow": np.zeros(1)}), "does not know"),
+    "no probability": ("other/probability", np.zeros_like, "outside 0 to 1"),
+    "improbable": ("other/probability", lambda values: 0 * values + 0.9, "positive definite|cholesky"),
+    "none": ("other/probability", lambda values: np.zeros(0), "has shape"),
+    "unknown": ("shadow", lambda values: np.zeros(1), "does not know"),
 }
+"""By id: a tensor of the arm, its change, and the message."""
 
 
-@pytest.mark.parametrize("name", INVALID_EDITS)
-def test_invalid_arm_tensors_are_rejected(name: str, learnt_model: TorqueModel, samples: Samples) -> None:
-    edit, message = INVALID_EDITS[name]
-    manifest, files = persistence.encode(with_alternatives(learnt_model, samples, 2))
-    tensors = load_tensors(files["model.safetensors"])
-    edit(tensors)
-    payload = save_tensors(tensors)
-    manifest["tensors"] |= {"bytes": len(payload), "sha256": persistence.sha256(payload)}
-    changed = {**files, "model.safetensors": payload, "manifest.json": persistence.manifest_bytes(manifest)}
+@pytest.mark.parametrize("name", INVALID_TENSORS)
+def test_invalid_arm_tensors_are_rejected(
+    name: str, learnt_model: TorqueModel, samples: Samples, tmp_path: Path
+) -> None:
+    tensor, change, message = INVALID_TENSORS[name]
+    save(with_alternatives(learnt_model, samples, 2), tmp_path / "model")
+    edit_tensor(tmp_path / "model", f"arm/{tensor}", change)
     with pytest.raises(ModelFormatError, match=message):
-        persistence.decode(changed)
+        load(tmp_path / "model")
 
 
 def test_unknown_geometry_mode_is_rejected(learnt_model: TorqueModel) -> None:
@@ -175,17 +171,10 @@ def test_alternative_arms_have_the_moments_of_their_mixture(
     np.testing.assert_allclose(added, spread, rtol=1e-8, atol=1e-12 * prior)
 
 
-def nmse_per_joint(model: TorqueModel, unseen: Samples) -> np.ndarray:
-    answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
-    return np.asarray(evaluate(unseen.tau, *answer.interval).nmse)
-
-
 def record_heavier_arm(seed: int, size: int) -> Samples:
     """Record another arm of the same kind with a mass at its tip."""
     robot = arm("RPR", 51)[2]
-    tip = robot.model.inertias[3]
-    tip.mass = tip.mass + 0.5
-    robot.model.inertias[3] = tip
+    robot.model.inertias[3] += pin.Inertia(0.5, robot.model.inertias[3].lever, np.zeros((3, 3)))
     return record_motion(robot, seed, size)
 
 
@@ -251,35 +240,34 @@ def test_arm_must_be_reported_completely(reported: Any) -> None:
         read_manifest_bytes(manifest({name: reported[name] for name in ("friction", "inertia")}))
 
 
-MALFORMED_REPORTS: dict[str, Callable[[Any], None]] = {
-    r"parameters.geometry.mode is 'guess', expected one of learn": lambda r: r["geometry"].update(mode="guess"),
-    r"parameters.geometry: Object missing required field `order`": lambda r: r["geometry"].pop("order"),
-    r"parameters.geometry: order is .*, expected each of the joints 0 to 2": lambda r: r["geometry"].update(
-        order=[0, 0, 1]
-    ),
-    r"parameters.geometry.gravity\[2\] is": lambda r: r["geometry"].update(gravity=[0, 0, "down"]),
-    r"parameters.geometry.joints is a list of 2 entries, expected 3": lambda r: r["geometry"]["joints"].pop(),
-    r"parameters.geometry.joints\[1\].type": lambda r: r["geometry"]["joints"][1].update(type="ball"),
-    r"parameters.geometry.joints\[0\]: turn_std has 1 value": lambda r: r["geometry"]["joints"][0].update(
-        turn_std=[0.1]
-    ),
-    r"parameters.geometry.joints\[0\].undetermined": lambda r: r["geometry"]["joints"][0].update(undetermined=["x"]),
-    r"parameters.geometry.joints\[2\]: Object contains unknown field `mesh`": lambda r: r["geometry"]["joints"][
-        2
-    ].update(mesh="file"),
-    r"parameters.geometry: rotation contains a matrix": lambda r: r["geometry"]["joints"][0]["rotation"][0].reverse(),
-    r"parameters.rotor.std is": lambda r: r["rotor"].update(std=[0.1]),
-    r"parameters.inertia.bodies\[1\].mean.first_moment\[0\] is": lambda r: r["inertia"]["bodies"][1]["mean"].update(
-        first_moment=[None, 0, 0]
-    ),
-    r"parameters.inertia.bodies\[0\].undetermined is": lambda r: r["inertia"]["bodies"][0].update(undetermined="mass"),
-    r"parameters: Object contains unknown field `colour`": lambda r: r.update(colour="red"),
+MIRRORED_ROW = random_geometry("RPR", 1).rotation[0, 0, ::-1].tolist()
+MALFORMED_REPORTS: dict[str, tuple[str, Any]] = {
+    r"parameters.geometry.mode is 'guess', expected one of learn": ("geometry.mode", "guess"),
+    r"parameters.geometry: Object missing required field `order`": ("geometry.order", ...),
+    r"parameters.geometry: order is .*, expected each of the joints 0 to 2": ("geometry.order", [0, 0, 1]),
+    r"parameters.geometry.gravity\[2\] is": ("geometry.gravity", [0, 0, "down"]),
+    r"parameters.geometry.joints is a list of 2 entries, expected 3": ("geometry.joints.2", ...),
+    r"parameters.geometry.joints\[1\].type": ("geometry.joints.1.type", "ball"),
+    r"parameters.geometry.joints\[0\]: turn_std has 1 value": ("geometry.joints.0.turn_std", [0.1]),
+    r"parameters.geometry.joints\[0\].undetermined": ("geometry.joints.0.undetermined", ["x"]),
+    r"parameters.geometry.joints\[2\]: Object contains unknown field `mesh`": ("geometry.joints.2.mesh", "file"),
+    r"parameters.geometry: rotation contains a matrix": ("geometry.joints.0.rotation.0", MIRRORED_ROW),
+    r"parameters.rotor.std is": ("rotor.std", [0.1]),
+    r"parameters.inertia.bodies\[1\].mean.first_moment\[0\] is": ("inertia.bodies.1.mean.first_moment", [None, 0, 0]),
+    r"parameters.inertia.bodies\[0\].undetermined is": ("inertia.bodies.0.undetermined", "mass"),
+    r"parameters: Object contains unknown field `colour`": ("colour", "red"),
 }
+"""By message: the place of an entry and its wrong value, or `...` if it is removed."""
 
 
 @pytest.mark.parametrize("expected", MALFORMED_REPORTS)
 def test_malformed_report_is_rejected(reported: Any, expected: str) -> None:
-    changed = copy.deepcopy(reported)
-    MALFORMED_REPORTS[expected](changed)
+    path, value = MALFORMED_REPORTS[expected]
+    *parents, last = (int(part) if part.isdigit() else part for part in path.split("."))
+    entry = reduce(getitem, parents, reported)
+    if value is ...:
+        del entry[last]
+    else:
+        entry[last] = value
     with pytest.raises(ModelFormatError, match=expected.replace("'", "['\"]")):
-        read_manifest_bytes(manifest(changed))
+        read_manifest_bytes(manifest(reported))

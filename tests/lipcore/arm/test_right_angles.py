@@ -22,11 +22,11 @@ from lipcore.data.samples import Samples
 from lipcore.estimators.options import FitOptions
 from lipcore.estimators.task import Task
 from lipcore.kernels.geometry import Geometry
-from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.training.fit import fit_estimator
-from tests.lipcore.arm_oracles import arm, record_motion
+from tests.lipcore.arm_oracles import arm, nmse_per_joint, record_motion
 
 OPTIONS = FitOptions(posterior_samples=150, device="cpu", search_seconds=4.0)
 
@@ -82,27 +82,21 @@ def test_probabilities_follow_the_evidence() -> None:
     np.testing.assert_allclose(right_angle_probabilities(found), np.array([6, 4]) / 7)
 
 
-def short_recording(robot: Robot, seed: int, rows: int = 80) -> Samples:
-    """Simulate a few seconds of moderate motion, which leave much of the geometry undetermined."""
-    return simulate(robot, Simulation(rows, rate=20.0, speed=4.0, noise=0.05, coulomb=0.2), seed)
-
-
 def reported_probabilities(found: ArmFit) -> np.ndarray:
     """Return the reported probabilities of right angles, (n,)."""
     return np.array([found.report[f"right_angle_{joint + 1}"] for joint in range(found.arm.n_joints)], float)
 
 
-def nmse_per_joint(found: ArmFit, task: Task, unseen: Samples) -> np.ndarray:
-    """Return the nMSE on another motion, (n,)."""
-    model = fit_estimator(task, "rigid-body", found)
-    error = model.predict(unseen.q, unseen.dq, unseen.ddq).tau - unseen.tau
-    return np.mean(error**2, axis=0) / unseen.tau.var(axis=0)
+def nmse_of_fit(found: ArmFit, task: Task, unseen: Samples) -> np.ndarray:
+    return nmse_per_joint(fit_estimator(task, "rigid-body", found), unseen)
 
 
 @pytest.mark.slow
 def test_undetermined_axes_are_learnt_at_right_angles(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = load_robot("panda")
-    samples, unseen = short_recording(robot, 3), simulate(robot, Simulation(100, speed=6.0, coulomb=0.2), 9)
+    # a few seconds of moderate motion leave much of the geometry undetermined
+    samples = simulate(robot, Simulation(80, rate=20.0, speed=4.0, noise=0.05, coulomb=0.2), 3)
+    unseen = simulate(robot, Simulation(100, speed=6.0, coulomb=0.2), 9)
     task = Task(samples, robot.joint_types, OPTIONS)
     begin = panda().moved(np.random.default_rng(2).normal(0, 0.15, panda().size))
     found = learn(task, begin=(begin,))
@@ -113,7 +107,7 @@ def test_undetermined_axes_are_learnt_at_right_angles(monkeypatch: pytest.Monkey
     monkeypatch.setattr(right_angles, "likely_layouts", lambda *given: [])
     free = learn(task, begin=(begin,))
     assert not reported_probabilities(free).any()
-    with_prior, without = (nmse_per_joint(each, task, unseen) for each in (found, free))
+    with_prior, without = (nmse_of_fit(each, task, unseen) for each in (found, free))
     assert np.log(with_prior).mean() < np.log(without).mean() - np.log(1.5)
 
 
@@ -121,7 +115,8 @@ def test_undetermined_axes_are_learnt_at_right_angles(monkeypatch: pytest.Monkey
 def test_arm_without_right_angles_is_learnt() -> None:
     geometry, _, robot = arm("RRRR", 7)
     samples = record_motion(robot, 4, 150)
-    found = learn(Task(samples, robot.joint_types, OPTIONS), begin=(geometry.canonical(),))
+    task = Task(samples, robot.joint_types, OPTIONS)
+    found = learn(task, begin=(geometry.canonical(),))
     probabilities = reported_probabilities(found)
     assert (probabilities[1:] < 0.05).all(), probabilities
-    assert nmse_per_joint(found, Task(samples, robot.joint_types, OPTIONS), record_motion(robot, 5)).max() < 1e-2
+    assert nmse_of_fit(found, task, record_motion(robot, 5)).max() < 1e-2

@@ -24,8 +24,7 @@ from lipcore.model.warnings import REFIT_ERROR, linearisation_error, warnings
 from lipcore.online.learner import OnlineModel
 from lipcore.robots.library import Robot
 from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
-from tests.lipcore.arm.test_model import nmse_per_joint
-from tests.lipcore.arm_oracles import arm, as_rows, train_from_geometry
+from tests.lipcore.arm_oracles import arm, as_rows, nmse_per_joint, train_from_geometry
 
 GEOMETRY, BODIES, ROBOT = arm("RRR", 31)
 PROBABILITY, EXTRA_VISCOUS = 0.27, 1.5
@@ -160,7 +159,7 @@ def test_torque_of_weights_matches_pinocchio(model: TorqueModel) -> None:
 
 
 SLOW_ROBOT = random_arm(1, joints=3)
-SLOW_PLACEMENTS = tuple(SLOW_ROBOT.model.jointPlacements)[1:]
+SLOW_PLACEMENTS = SLOW_ROBOT.model.jointPlacements[1:]
 SLOW_GEOMETRY = Geometry(
     SLOW_ROBOT.joint_types,
     np.array([place.rotation for place in SLOW_PLACEMENTS]),
@@ -168,19 +167,18 @@ SLOW_GEOMETRY = Geometry(
     np.tile([0.0, 0.0, 1.0], (3, 1)),
     SLOW_ROBOT.model.gravity.linear.copy(),
 )
-OPTIONS = FitOptions(device="cpu")
-STREAM = Simulation(300, n_sinusoids=30, speed=5.0, noise=0.05, viscous=0.3)
 
 
 def simulate_slow_motion(seed: int, stribeck: float) -> Samples:
     """Simulate slow motion with Coulomb friction of 0.4 N·m and Stribeck friction."""
-    samples = simulate(SLOW_ROBOT, STREAM, seed)
+    stream = Simulation(300, n_sinusoids=30, speed=5.0, noise=0.05, viscous=0.3)
+    samples = simulate(SLOW_ROBOT, stream, seed)
     fading = 0.4 + stribeck * np.exp(-((samples.dq / 0.1) ** 2))
     return replace(samples, tau=samples.tau + fading * np.tanh(samples.dq / 0.02))
 
 
 def train_slow_arm(stribeck: float) -> TorqueModel:
-    return train_from_geometry(SLOW_GEOMETRY, SLOW_ROBOT, simulate_slow_motion(1, stribeck), OPTIONS)
+    return train_from_geometry(SLOW_GEOMETRY, SLOW_ROBOT, simulate_slow_motion(1, stribeck), FitOptions(device="cpu"))
 
 
 @pytest.fixture(scope="module")
@@ -241,10 +239,8 @@ def test_invalid_stribeck_flag_is_rejected(stribeck_model: TorqueModel, values: 
 
 def test_stribeck_friction_is_learnt_online(stribeck_model: TorqueModel) -> None:
     online = OnlineModel.start(stribeck_model, forgetting_s=None).change(-1.0)
-    learnt, unseen = (
-        online.learn(as_rows(simulate_slow_motion(5, 1.0), began=0.0)).model(),
-        simulate_slow_motion(6, 1.0),
-    )
+    learnt = online.learn(as_rows(simulate_slow_motion(5, 1.0), began=0.0)).model()
+    unseen = simulate_slow_motion(6, 1.0)
     assert (nmse_per_joint(learnt, unseen) < nmse_per_joint(stribeck_model, unseen)).all()
     friction = friction_coefficients(learnt.posterior, learnt.estimator)
     assert friction.stribeck is not None

@@ -1,15 +1,16 @@
 """Tests of the uncertainty of a coverage, against SciPy's exact test and simulated correlated errors."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from scipy.stats import binomtest, norm
 
 from lipcore.data.coverage import clopper_pearson, coverage_interval
 from lipcore.data.metrics import TorqueDistribution
 from lipcore.data.samples import Samples
+from tests.lipcore.data.test_metrics import autoregressive, recording
 
 
 @pytest.mark.parametrize(("hits", "count"), [(0, 10), (17, 20), (10, 10), (850, 1000), (1, 1)])
@@ -24,17 +25,9 @@ def test_bounds_narrow_with_more_samples() -> None:
     assert high[0] > 0.9 > high[1]
 
 
-def recording_of_errors(columns: np.ndarray, rate: float = 100.0) -> Samples:
-    """Return a recording whose torque (N, n) is predicted as zero."""
-    none, rows = np.zeros_like(columns), len(columns)
-    names = tuple(f"joint{k}" for k in range(columns.shape[1]))
-    return Samples(names, np.arange(rows) / rate, np.zeros(rows, np.int64), none, none, none, columns)
-
-
-def autoregressive(rng: np.random.Generator, rho: float, rows: int, n: int) -> np.ndarray:
-    """Return errors (rows, n) of unit variance with correlation `rho` between neighbours."""
-    white = rng.standard_normal((rows + 1000, n))
-    return np.asarray(lfilter([np.sqrt(1 - rho**2)], [1, -rho], white, axis=0)[1000:])
+def recording_of_errors(columns: np.ndarray) -> Samples:
+    """Return a recording at 100 Hz whose torque (N, n) is predicted as zero."""
+    return recording(np.arange(len(columns)) / 100, columns)
 
 
 def predict_zero(samples: Samples, deviation: float) -> TorqueDistribution:
@@ -66,19 +59,21 @@ def test_low_coverage_is_certain_only_with_enough_errors() -> None:
     assert coverage_interval(many, predict_zero(many, 0.7)).is_below(0.9).all()
 
 
-def test_errors_constant_over_an_episode_count_once() -> None:
-    """Test episodes of eight rows whose clocks restart, and the same rows as one recording."""
-    samples = recording_of_errors(np.repeat(np.random.default_rng(2).standard_normal((300, 4)), 8, axis=0))
-    answer = predict_zero(samples, 1.0)
-    anew = replace(samples, t=np.tile(np.arange(8) / 100, 300))
-    for each in (samples, anew):
-        np.testing.assert_allclose(coverage_interval(each, answer).independent, 300, rtol=0.15)
-
-
-def test_rows_across_a_gap_are_independent() -> None:
-    """The second of two equal rows comes after a gap or a restart of the clock, so both count."""
-    samples = recording_of_errors(np.repeat(np.random.default_rng(2).standard_normal((600, 1)), 2, axis=0))
-    answer = predict_zero(samples, 1.0)
-    assert coverage_interval(samples, answer).independent[0] == pytest.approx(600, rel=0.15)
-    anew = replace(samples, t=np.tile([0.01, 0.0], 600))
-    assert coverage_interval(anew, answer).independent[0] == pytest.approx(1200, rel=0.15)
+@pytest.mark.parametrize(
+    ("errors", "rows_each", "times", "expected"),
+    [
+        (300, 8, None, 300),
+        (300, 8, np.arange(8) / 100, 300),
+        (600, 2, None, 600),
+        (600, 2, [0.01, 0.0], 1200),
+    ],
+    ids=["constant for eight rows", "constant in episodes of eight rows", "pairs", "pairs across a clock restart"],
+)
+def test_only_rows_of_one_course_count_once(
+    errors: int, rows_each: int, times: Sequence[float] | None, expected: int
+) -> None:
+    columns = np.random.default_rng(2).standard_normal((errors, 4))
+    samples = recording_of_errors(np.repeat(columns, rows_each, axis=0))
+    if times is not None:
+        samples = replace(samples, t=np.tile(times, errors))
+    np.testing.assert_allclose(coverage_interval(samples, predict_zero(samples, 1.0)).independent, expected, rtol=0.15)

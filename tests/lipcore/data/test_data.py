@@ -1,6 +1,6 @@
 """Tests of samples, motion and signals, and of the weights of rows of a fast stream."""
 
-import re
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -44,8 +44,6 @@ def table(rows: int = 6, episode: tuple[int, ...] | None = None, names: tuple[st
 def test_wrong_array_shape_is_named(name: str) -> None:
     with pytest.raises(ValueError, match=rf"^{name} has shape \(6, 3\), expected \(6, 2\)"):
         replace(table(), **{name: np.zeros((6, 3))})
-    with pytest.raises(ValueError, match=re.escape("episode has shape (5,), expected (6,)")):
-        replace(table(), episode=np.zeros(5, dtype=np.int64))
 
 
 def test_episodes_are_contiguous_runs() -> None:
@@ -60,18 +58,21 @@ def test_concatenation_keeps_row_order_and_separates_episodes() -> None:
     assert len(joined.episodes()) == 4
 
 
-def test_concatenation_of_other_joints_or_nothing_is_rejected() -> None:
-    with pytest.raises(ValueError, match=r"joint names differ: \['a', 'c'\]"):
-        Samples.concatenate([table(), table(names=("a", "c"))])
-    with pytest.raises(ValueError, match="no samples"):
-        Samples.concatenate([])
-
-
-def test_invalid_motion_and_joint_types_are_rejected() -> None:
-    with pytest.raises(ValueError, match="q has shape"):
-        Motion.from_arrays(*np.zeros((3, 4, 2, 2)))
-    with pytest.raises(ValueError, match="joint_types is empty"):
-        check_joint_types([])
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: replace(table(), episode=np.zeros(5, dtype=np.int64)), r"episode has shape \(5,\), expected \(6,\)"),
+        (lambda: Samples.concatenate([table(), table(names=("a", "c"))]), r"joint names differ: \['a', 'c'\]"),
+        (lambda: Samples.concatenate([]), "no samples"),
+        (lambda: Motion.from_arrays(*np.zeros((3, 4, 2, 2))), "q has shape"),
+        (lambda: check_joint_types([]), "joint_types is empty"),
+        (lambda: low_pass(np.zeros((15, 2)), RATE), "signal has 15 samples, expected at least 16"),
+        (lambda: differentiate(np.zeros((2, 1)), RATE), "signal has 2 samples, expected at least 3"),
+    ],
+)
+def test_invalid_arrays_are_rejected(make: Callable[[], object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make()
 
 
 @pytest.mark.parametrize("name", ["q", "dq", "ddq"])
@@ -96,15 +97,11 @@ def test_low_pass_keeps_slow_and_removes_fast_signals() -> None:
     assert gain[16.0] < 1e-4
 
 
-def test_short_signals_and_invalid_cutoffs_are_rejected() -> None:
+def test_invalid_cutoffs_are_rejected_and_short_signals_are_not() -> None:
     for cutoff in (0.0, 50.0, float("nan")):
         with pytest.raises(ValueError, match=r"cutoff is .* Hz, expected between 0 and half the sampling rate, 50 Hz"):
             low_pass(sinusoid(1.0), RATE, cutoff)
-    with pytest.raises(ValueError, match="signal has 15 samples, expected at least 16"):
-        low_pass(np.zeros((15, 2)), RATE)
     assert low_pass(np.zeros((16, 2)), RATE).shape == (16, 2)
-    with pytest.raises(ValueError, match="signal has 2 samples, expected at least 3"):
-        differentiate(np.zeros((2, 1)), RATE)
 
 
 def test_differentiate_is_exact_on_quadratics() -> None:

@@ -98,12 +98,11 @@ def random_predictions(rng, shape):
     ]
 
 
-def correlated(rng, seconds, step, memory, count):
-    """Return recordings (N, count) with a correlation time of `memory` seconds, mean 0 and deviation 1."""
-    decay = np.exp(-step / memory)
-    noise = rng.normal(size=(round(seconds / step), count)) * np.sqrt(1 - decay**2)
-    noise[0] /= np.sqrt(1 - decay**2)
-    return lfilter([1.0], [1.0, -decay], noise, axis=0)
+def autoregressive(rng, rho, rows, count):
+    """Return recordings (rows, count) of mean 0 and deviation 1 with correlation `rho` between neighbours."""
+    noise = rng.normal(size=(rows, count)) * np.sqrt(1 - rho**2)
+    noise[0] /= np.sqrt(1 - rho**2)
+    return lfilter([1.0], [1.0, -rho], noise, axis=0)
 
 
 def test_differences_match_the_metrics():
@@ -135,7 +134,7 @@ def test_joint_with_constant_torque_has_no_nmse():
 def test_interval_excludes_zero_as_rarely_as_stated(seconds, memory):
     """Without a difference, 5 % of the intervals exclude zero; naive intervals exclude it far more often."""
     step = max(0.02, seconds / 5000)
-    values = correlated(np.random.default_rng(5), seconds, step, memory, 600)
+    values = autoregressive(np.random.default_rng(5), np.exp(-step / memory), round(seconds / step), 600)
     starts = blocks(recording(np.arange(len(values)) * step, np.zeros((len(values), 1))))
     wrong = average_differences(values, starts).significant.mean()
     assert wrong < 0.085, wrong
@@ -144,7 +143,7 @@ def test_interval_excludes_zero_as_rarely_as_stated(seconds, memory):
 
 
 def test_real_difference_is_found():
-    values = correlated(np.random.default_rng(6), 60, 0.02, 0.3, 300) + 0.5
+    values = autoregressive(np.random.default_rng(6), np.exp(-0.02 / 0.3), 3000, 300) + 0.5
     starts = blocks(recording(np.arange(3000) / 50, np.zeros((3000, 1))))
     assert average_differences(values, starts).significant.mean() > 0.9
 
@@ -155,15 +154,15 @@ def test_single_block_has_infinite_standard_error():
     assert not found.significant.any()
 
 
-def test_blocks_are_seconds_within_an_episode():
-    t = np.arange(60) / 20
-    episode = np.repeat([0, 1], [25, 35])
-    assert blocks(recording(t, np.zeros((60, 1)), episode)).tolist() == [0, 20, 25, 45]
-
-
-def test_many_episodes_are_one_block_each():
-    t, episode = np.arange(400) / 4, np.repeat(np.arange(MIN_BLOCKS), 400 // MIN_BLOCKS)
-    assert blocks(recording(t, np.zeros((400, 1)), episode)).tolist() == list(range(0, 400, 400 // MIN_BLOCKS))
+@pytest.mark.parametrize(
+    ("rate", "lengths", "starts"),
+    [(20, [25, 35], [0, 20, 25, 45]), (4, [400 // MIN_BLOCKS] * MIN_BLOCKS, range(0, 400, 400 // MIN_BLOCKS))],
+    ids=["seconds within an episode", "many episodes are one block each"],
+)
+def test_blocks_do_not_cross_episodes(rate, lengths, starts):
+    rows = sum(lengths)
+    given = recording(np.arange(rows) / rate, np.zeros((rows, 1)), np.repeat(np.arange(len(lengths)), lengths))
+    assert blocks(given).tolist() == list(starts)
 
 
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]

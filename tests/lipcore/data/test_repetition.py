@@ -19,6 +19,7 @@ from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Simulation, simulate
 from lipcore.training.held_out import find_unrepeated
+from tests.lipcore.arm_oracles import hold_joints
 
 PANDA = load_robot("panda")
 TYPES = ("revolute",) * 7
@@ -41,20 +42,21 @@ def halves(samples: Samples) -> tuple[Samples, Samples]:
     return samples.rows(slice(0, cut - 15)), samples.rows(slice(cut + 15, None))
 
 
-@pytest.mark.parametrize(("speed", "dirt"), [(1.0, None), (5.0, None), (2.0, Dirt())])
-def test_periodic_motion_is_found_with_its_period(speed: float, dirt: Dirt | None) -> None:
-    found = repetition(*halves(motion("periodic", speed=speed, dirt=dirt)), TYPES)
-    assert found.share > 0.9
-    assert found.is_repeated
-    assert found.period == pytest.approx(10.0 / speed, rel=0.02)
-
-
-@pytest.mark.parametrize("course", ["sinusoids", "rests"])
-def test_nonperiodic_motion_is_not_repeated(course: str) -> None:
-    found = repetition(*halves(motion(course)), TYPES)
-    assert found.share < 0.1
-    assert not found.is_repeated
-    assert found.period is None
+@pytest.mark.parametrize(
+    ("course", "speed", "dirt", "period"),
+    [
+        ("periodic", 1.0, None, 10.0),
+        ("periodic", 5.0, None, 2.0),
+        ("periodic", 2.0, Dirt(), 5.0),
+        ("sinusoids", 2.0, None, None),
+        ("rests", 2.0, None, None),
+    ],
+)
+def test_periodic_motion_alone_is_repeated(course: str, speed: float, dirt: Dirt | None, period: float | None) -> None:
+    found = repetition(*halves(motion(course, speed=speed, dirt=dirt)), TYPES)
+    assert found.is_repeated == (period is not None)
+    assert found.share > 0.9 if period else found.share < 0.1
+    assert found.period == (period and pytest.approx(period, rel=0.02))
 
 
 @pytest.mark.slow
@@ -67,9 +69,8 @@ def test_repeated_motion_counts_once(course: str, passes: int) -> None:
     apart = replace(samples, episode=np.arange(2000) // 500)
     assert measure_distinct_share(apart, TYPES) == measure_distinct_share(samples, TYPES)
     still = samples.rows(np.zeros(500, np.int64))
-    assert measure_distinct_share(join_motions(still, samples), TYPES) == pytest.approx(
-        (500 + 2000 / passes) / 2500, rel=0.1
-    )
+    expected = (500 + 2000 / passes) / 2500
+    assert measure_distinct_share(join_motions(still, samples), TYPES) == pytest.approx(expected, rel=0.1)
 
 
 def test_motion_of_another_recording_is_recognised() -> None:
@@ -82,17 +83,12 @@ def test_repeated_share_matches_distances_one_by_one() -> None:
     """States are half the limit away from a known one, and the last quarter twice the limit."""
     rng = np.random.default_rng(0)
     known = np.repeat(rng.standard_normal((40, 5)), 2, axis=0)  # every other step is zero, so the minimum limit applies
-    usual = np.sqrt(2 * np.concatenate([known]).var(axis=0).sum())
+    limit = OPTIONS.min_near * np.sqrt(2 * known.var(axis=0).sum())
     away = rng.standard_normal((40, 5))
-    away *= (
-        OPTIONS.min_near
-        * usual
-        / np.linalg.norm(away, axis=1)[:, None]
-        * np.where(np.arange(40) < 30, 0.5, 2.0)[:, None]
-    )
+    away *= limit * np.where(np.arange(40) < 30, 0.5, 2.0)[:, None] / np.linalg.norm(away, axis=1, keepdims=True)
     states = known[1::2] + away
     nearest = [min(np.linalg.norm(state - each) for each in known) for state in states]
-    expected = np.mean(np.array(nearest[:30]) <= OPTIONS.min_near * usual) * 0.75
+    expected = np.mean(np.array(nearest[:30]) <= limit) * 0.75
     assert measure_repeated_share(known[1::2].repeat(3, axis=0), states) >= expected > 0.7
 
 
@@ -113,9 +109,7 @@ def test_unrepeated_motion_is_held_out_instead_of_repeated_end() -> None:
 def test_whole_groups_of_periods_are_held_out() -> None:
     """Two motions alternate, three periods each: the last part repeats the first, the middle is new."""
     one, two = (motion("periodic", seed=seed, rows=750) for seed in (1, 2))
-    recording = join_motions(one, two, one)
-    found = find_unrepeated(recording, TYPES, 0.3, 0)
-    assert found == [(750, 1500)]
+    assert find_unrepeated(join_motions(one, two, one), TYPES, 0.3, 0) == [(750, 1500)]
 
 
 @pytest.mark.parametrize("course", ["periodic", "sinusoids"])
@@ -137,6 +131,4 @@ def test_episodes_count_as_blocks() -> None:
 
 def test_motion_without_return_has_no_period() -> None:
     assert find_period(motion("rests"), TYPES) is None
-    still = motion(rows=100)
-    still = replace(still, q=0 * still.q, dq=0 * still.dq, ddq=0 * still.ddq)
-    assert find_period(still, TYPES) is None
+    assert find_period(hold_joints(motion(rows=100), range(7), 0.0), TYPES) is None

@@ -150,44 +150,41 @@ def test_guard_ends_at_pauses_and_clock_restarts():
     assert split(episode, np.concatenate([t, t]), how).guarded == 0
 
 
+def split_rows(rows, how):
+    """Split one episode at 100 Hz."""
+    return split(np.zeros(rows, dtype=np.int64), np.arange(rows) / 100, how)
+
+
 @pytest.mark.parametrize(
-    ("episodes", "rows", "how", "message"),
+    ("make", "message"),
     [
-        (1, 50, Split("episodes"), "episodes is 1, expected at least 2"),
-        (1, 50, Split("blocks", blocks=51), "blocks is 51, expected at most the number of rows, 50"),
+        (lambda: split_rows(50, Split("episodes")), "episodes is 1, expected at least 2"),
         (
-            1,
-            50,
-            Split("last", guard_s=10.0),
+            lambda: split_rows(50, Split("blocks", blocks=51)),
+            "blocks is 51, expected at most the number of rows, 50",
+        ),
+        (
+            lambda: split_rows(50, Split("last", guard_s=10.0)),
             "guard_s is 10.0, expected a smaller value: all rows held out are closer",
         ),
-        (1, 50, Split("last", 0.99, guard_s=0.02), "all rows to train on are closer than that"),
-        (1, 1, Split("last"), "rows is 1, expected at least 2"),
+        (lambda: split_rows(50, Split("last", 0.99, guard_s=0.02)), "all rows to train on are closer than that"),
+        (lambda: split_rows(1, Split("last")), "rows is 1, expected at least 2"),
+        (lambda: Split("rows"), "kind is 'rows', expected one of episodes, last, blocks"),
+        (lambda: Split(share=1.0), "share is 1.0"),
+        (lambda: Split(share=float("nan")), "share is nan"),
+        (lambda: Split(blocks=1), "blocks is 1"),
+        (lambda: Split(guard_s=float("inf")), "guard_s is inf"),
     ],
 )
-def test_impossible_holdout_is_explained(episodes, rows, how, message):
-    episode = np.arange(rows) * episodes // rows
+def test_impossible_splits_are_explained(make, message):
     with pytest.raises(SplitError, match=message):
-        split(episode, np.arange(rows) / 100, how)
+        make()
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"kind": "rows"}, "kind is 'rows', expected one of episodes, last, blocks"),
-        ({"share": 1.0}, "share is 1.0"),
-        ({"share": float("nan")}, "share is nan"),
-        ({"blocks": 1}, "blocks is 1"),
-        ({"guard_s": float("inf")}, "guard_s is inf"),
-    ],
-)
-def test_invalid_splits_and_rows_are_rejected(given, message):
-    with pytest.raises(SplitError, match=message):
-        Split(**given)
-    with pytest.raises(ValueError, match="t has shape"):
-        split(np.zeros(3, dtype=np.int64), np.zeros(4), Split())
-    with pytest.raises(ValueError, match="not finite"):
-        split(np.zeros(3, dtype=np.int64), np.array([0.0, np.nan, 1.0]), Split())
+@pytest.mark.parametrize(("t", "message"), [([0.0] * 4, "t has shape"), ([0.0, np.nan, 1.0], "not finite")])
+def test_invalid_times_are_rejected(t, message):
+    with pytest.raises(ValueError, match=message):
+        split(np.zeros(3, dtype=np.int64), np.array(t), Split())
 
 
 def test_selected_rows_start_an_episode_after_each_gap():

@@ -19,7 +19,7 @@ from lipcore.estimators.catalogue import (
     calibrate,
     make_estimator,
 )
-from lipcore.kernels.arm_prior import Arm, arm_of_robot
+from lipcore.kernels.arm_prior import arm_of_robot
 from lipcore.kernels.base import on_last_diagonal
 from lipcore.model import dynamics
 from lipcore.model.parameters import friction_coefficients, inertial_parameters, weight_posterior
@@ -29,60 +29,54 @@ from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.training import fit
 from lipcore.vocabulary import ROBOT_ESTIMATORS
+from tests.lipcore.arm_oracles import assert_predicts_finite_torque, hold_joints
 
 ROBOT = "double-pendulum"
 TYPES = ("revolute", "revolute")
 OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=40, starts=1, device="cpu")
+FIT_TOLERANCE = 1e-6
+"""Largest relative difference between two fits to the same samples: the steps of a search amplify rounding."""
 every_estimator = pytest.mark.parametrize("name", ESTIMATORS)
 
 
-def simulate_pendulum(noise: float = 0.002, seed: int = 1) -> Samples:
-    return simulate(load_robot(ROBOT), Simulation(n_samples=60, speed=10, noise=noise, viscous=0.05), seed)
+def simulate_pendulum(noise: float = 0.002) -> Samples:
+    return simulate(load_robot(ROBOT), Simulation(n_samples=60, speed=10, noise=noise, viscous=0.05), seed=1)
 
 
 def robot_of(name: str, samples: Samples) -> RigidBody | None:
     return RigidBody.from_profile(ROBOT, samples.joint_names, TYPES) if name in ROBOT_ESTIMATORS else None
 
 
-def arm_of(name: str, samples: Samples, prior: str = "urdf", mode: str = "fixed") -> Arm | None:
-    robot = robot_of(name, samples)
-    return None if robot is None else arm_of_robot(robot, prior=prior, mode=mode)
-
-
 def train_estimator(name: str, samples: Samples, options: FitOptions = OPTIONS) -> TorqueModel:
     return train(samples, TYPES, name, options, robot=robot_of(name, samples))
 
 
+def assert_close(found: ArrayLike, expected: ArrayLike, share: float = FIT_TOLERANCE) -> None:
+    np.testing.assert_allclose(found, expected, rtol=0, atol=share * np.abs(np.asarray(expected)).max())
+
+
 @every_estimator
-def test_estimator_learns_a_small_robot(name: str) -> None:
+def test_estimator_learns_a_small_robot_and_is_loaded_unchanged(name: str, tmp_path: Path) -> None:
     samples = simulate_pendulum()
     even = np.arange(60) % 2 == 0
     model = train_estimator(name, samples.rows(even))
     unseen = samples.rows(~even)
-    answer = model.predict(unseen.q, unseen.dq, unseen.ddq)
+    answer = model.predict(unseen.q, unseen.dq, unseen.ddq, covariance=True)
     figures = evaluate(unseen.tau, *answer.interval)
     assert (figures.nmse < (0.1 if name in ("se", "gip", "lse") else 0.01)).all(), figures.nmse
     assert (figures.coverage > 0.7).all(), figures.coverage
     assert model.estimator.name == name
     assert list(model.estimator.terms)[-1] == "friction"
     assert ("rigid_body" in model.estimator.terms) == (name in ROBOT_ESTIMATORS)
-
-
-def with_resting_joint(samples: Samples) -> Samples:
-    """Return samples in which the second joint never moves."""
-    q, dq, ddq = samples.q.copy(), samples.dq.copy(), samples.ddq.copy()
-    q[:, 1], dq[:, 1], ddq[:, 1] = 0.3, 0.0, 0.0
-    return replace(samples, q=q, dq=dq, ddq=ddq)
-
-
-def with_all_at_zero(samples: Samples) -> Samples:
-    """Return samples in which no joint moves and all encoders read zero."""
-    return replace(samples, q=0 * samples.q, dq=0 * samples.dq, ddq=0 * samples.ddq)
+    save(model, tmp_path / "model")
+    again = load(tmp_path / "model").predict(unseen.q, unseen.dq, unseen.ddq, covariance=True)
+    for part in ("tau", "tau_std", "noise_std", "covariance"):
+        assert_close(getattr(again, part), getattr(answer, part), 1e-9)
 
 
 AWKWARD_DATA: dict[str, Callable[[], Samples]] = {
-    "one joint stands still": lambda: with_resting_joint(simulate_pendulum()),
-    "all joints stand still": lambda: with_all_at_zero(simulate_pendulum()),
+    "one joint stands still": lambda: hold_joints(simulate_pendulum(), [1], 0.3),
+    "all joints stand still": lambda: hold_joints(simulate_pendulum(), [0, 1], 0.0),
     "samples repeat": lambda: simulate_pendulum().rows(np.arange(60) % 12),
     "free of noise": lambda: simulate_pendulum(noise=0.0),
     "a joint without torque": lambda: replace(simulate_pendulum(), tau=simulate_pendulum().tau * [1.0, 0.0]),
@@ -97,14 +91,10 @@ AWKWARD_DATA: dict[str, Callable[[], Samples]] = {
 def test_awkward_data_give_a_model(name: str, data: str) -> None:
     samples = AWKWARD_DATA[data]()
     model = train_estimator(name, samples, replace(OPTIONS, hyperparameter_samples=25, max_iterations=15))
-    answer = model.predict(samples.q, samples.dq, samples.ddq, covariance=True)
-    for part in (answer.tau, answer.tau_std, answer.covariance, answer.noise_std):
-        assert np.isfinite(part).all()
-    assert (answer.noise_std > 0).all()
+    answer = assert_predicts_finite_torque(model, samples)
     if not (data == "no torque at all" and name in ROBOT_ESTIMATORS):  # the URDF's masses rule out zero torque
         assert model.fit["jitter"] == 0.0
-    elsewhere = model.predict(samples.q + 1.0, 2 * samples.dq, samples.ddq - 1.0)
-    assert np.isfinite(elsewhere.tau).all()
+
     if name != "rigid-body":  # rigid bodies cannot produce all of these torques
         assert (np.abs(answer.tau - samples.tau).mean(0) <= samples.tau.std(0) + 3 * answer.noise_std).all()
 
@@ -119,7 +109,9 @@ def test_awkward_data_give_a_model(name: str, data: str) -> None:
 )
 def test_evidence_gradient_matches_finite_differences(name: str, prior: str, mode: str) -> None:
     samples = simulate_pendulum().rows(np.arange(7))
-    kernel = make_estimator(name, TYPES, arm=arm_of(name, samples, prior, mode)).kernel
+    robot = robot_of(name, samples)
+    arm = None if robot is None else arm_of_robot(robot, prior=prior, mode=mode)
+    kernel = make_estimator(name, TYPES, arm=arm).kernel
     motion, tau, rng = samples.motion(), samples.tau, np.random.default_rng(3)
     params = kernel.initial(motion, tau)
     params = {key: value + 0.3 * np.array(rng.standard_normal(value.shape)) for key, value in params.items()}
@@ -189,52 +181,37 @@ def test_invalid_training_argument_is_named(samples: Samples) -> None:
 
 
 FACTOR = 1.75
-FIT_TOLERANCE = 1e-6
-"""Largest relative difference between two fits to the same samples."""
+
 ZERO_PRIOR_OPTIONS = FitOptions(hyperparameter_samples=30, max_iterations=20, starts=1, device="cpu", prior="zero")
 
 
 @pytest.fixture(scope="module", params=["lip-chain", "lip", "rigid-body"])
-def uncalibrated_model(request: pytest.FixtureRequest, samples: Samples) -> TorqueModel:
+def calibration_pair(request: pytest.FixtureRequest, samples: Samples) -> tuple[TorqueModel, TorqueModel]:
+    """Return the same model without and with a calibration factor."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(fit, "calibrate", lambda name: NO_CALIBRATION)
-        return train_estimator(request.param, samples, ZERO_PRIOR_OPTIONS)
-
-
-@pytest.fixture(scope="module")
-def calibrated_model(uncalibrated_model: TorqueModel, samples: Samples) -> TorqueModel:
-    """Return the same model, trained with a calibration factor."""
+        plain = train_estimator(request.param, samples, ZERO_PRIOR_OPTIONS)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(FUNCTION_STD_FACTOR, uncalibrated_model.estimator.name, FACTOR)
-        return train_estimator(uncalibrated_model.estimator.name, samples, ZERO_PRIOR_OPTIONS)
+        patch.setitem(FUNCTION_STD_FACTOR, request.param, FACTOR)
+        return plain, train_estimator(request.param, samples, ZERO_PRIOR_OPTIONS)
 
 
-def assert_close(found: ArrayLike, expected: ArrayLike) -> None:
-    """Assert equality up to rounding, which the steps of a search amplify."""
-    np.testing.assert_allclose(found, expected, rtol=0, atol=FIT_TOLERANCE * np.abs(np.asarray(expected)).max())
-
-
-def test_calibration_scales_predictions(
-    uncalibrated_model: TorqueModel, calibrated_model: TorqueModel, samples: Samples
-) -> None:
-    assert calibrated_model.calibration == Calibration(FACTOR)
+def test_calibration_scales_predictions(calibration_pair: tuple[TorqueModel, TorqueModel], samples: Samples) -> None:
+    plain, calibrated = calibration_pair
+    assert calibrated.calibration == Calibration(FACTOR)
     query = samples.q + 0.3, samples.dq, 2 * samples.ddq
-    one, other = (model.predict(*query, covariance=True) for model in (uncalibrated_model, calibrated_model))
+    one, other = (model.predict(*query, covariance=True) for model in calibration_pair)
     assert_close(other.tau, one.tau)
     assert_close(other.noise_std, one.noise_std)
-    unexpressed = on_last_diagonal(uncalibrated_model.posterior.misfit.variance(Motion.from_arrays(*query)))
+    unexpressed = on_last_diagonal(plain.posterior.misfit.variance(Motion.from_arrays(*query)))
     assert_close(other.covariance - unexpressed, FACTOR**2 * (one.covariance - unexpressed))
     assert_close(other.tau_std**2, other.covariance.diagonal(axis1=1, axis2=2))
     assert (one.tau_std > 0).all()
 
 
-def test_calibration_scales_components(
-    uncalibrated_model: TorqueModel, calibrated_model: TorqueModel, samples: Samples
-) -> None:
+def test_calibration_scales_components(calibration_pair: tuple[TorqueModel, TorqueModel], samples: Samples) -> None:
     motion, tau = samples.motion()[10:15], samples.tau[10:15]
-    one, other = (
-        dynamics.components(m, motion, dynamics.COMPONENTS, tau) for m in (uncalibrated_model, calibrated_model)
-    )
+    one, other = (dynamics.components(m, motion, dynamics.COMPONENTS, tau) for m in calibration_pair)
     for name in dynamics.COMPONENTS:
         assert_close(other[name].mean, one[name].mean)
         if name != "forward_dynamics":  # its std includes the misfit
@@ -242,29 +219,27 @@ def test_calibration_scales_components(
         assert (one[name].std > 0).any(), name
 
 
-def test_calibration_scales_parameters(uncalibrated_model: TorqueModel, calibrated_model: TorqueModel) -> None:
-    one, other = (friction_coefficients(m.posterior, m.estimator) for m in (uncalibrated_model, calibrated_model))
+def test_calibration_scales_parameters(calibration_pair: tuple[TorqueModel, TorqueModel]) -> None:
+    one, other = (friction_coefficients(m.posterior, m.estimator) for m in calibration_pair)
     for name in ("viscous", "coulomb", "offset"):
         assert_close(getattr(other, name), getattr(one, name))
         assert_close(getattr(other, f"{name}_std"), FACTOR * getattr(one, f"{name}_std"))
-    if uncalibrated_model.robot is not None:
-        bodies, scaled = (inertial_parameters(m.posterior, m.estimator) for m in (uncalibrated_model, calibrated_model))
+    if calibration_pair[0].robot is not None:
+        bodies, scaled = (inertial_parameters(m.posterior, m.estimator) for m in calibration_pair)
         assert_close(scaled.mean, bodies.mean)
         assert_close(scaled.std, FACTOR * bodies.std)
-        weights, more = (
-            weight_posterior(m.posterior, m.estimator.terms["rigid_body"])
-            for m in (uncalibrated_model, calibrated_model)
-        )
+        weights, more = (weight_posterior(m.posterior, m.estimator.terms["rigid_body"]) for m in calibration_pair)
         assert np.array_equal(weights.scale, more.scale)  # of the prior
 
 
-def test_calibration_factor_is_saved_and_loaded(calibrated_model: TorqueModel, tmp_path: Path) -> None:
-    manifest = save(calibrated_model, tmp_path / "model")
-    assert manifest["calibration"] == {"function_std_factor": FACTOR}
-    again = load(tmp_path / "model")
-    assert again.calibration == calibrated_model.calibration
+def test_calibration_factor_is_saved_and_loaded(
+    calibration_pair: tuple[TorqueModel, TorqueModel], tmp_path: Path
+) -> None:
+    _, calibrated = calibration_pair
+    assert save(calibrated, tmp_path / "model")["calibration"] == {"function_std_factor": FACTOR}
+    assert load(tmp_path / "model").calibration == calibrated.calibration
     # the saved factor counts, not the estimator's current one
-    assert calibrate(calibrated_model.estimator.name).function_std_factor != FACTOR
+    assert calibrate(calibrated.estimator.name).function_std_factor != FACTOR
 
 
 @pytest.mark.parametrize("factor", [0.999, 0.0, -2.0, float("nan"), float("inf"), 100.0])

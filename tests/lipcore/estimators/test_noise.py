@@ -8,11 +8,11 @@ import pytest
 from scipy.optimize import minimize
 
 from lipcore.data.motion import Array, Motion
-from lipcore.data.samples import Samples
 from lipcore.estimators import noise
 from lipcore.kernels.base import SumKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.posterior.exact import negative_log_evidence, noisy_gram
+from tests.lipcore.data.test_metrics import recording
 from tests.lipcore.oracles import random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
@@ -141,15 +141,9 @@ def test_noise_never_falls_below_its_floor() -> None:
     )
 
 
-def table(tau: np.ndarray) -> Samples:
-    zeros = np.zeros_like(tau)
-    names = tuple(f"joint{k}" for k in range(tau.shape[1]))
-    return Samples(names, np.arange(len(tau)) / 10, np.zeros(len(tau), dtype=np.int64), zeros, zeros, zeros, tau)
-
-
 def test_start_is_white_noise_or_hundredth_of_spread() -> None:
     t, rng = np.arange(500) / 100, np.random.default_rng(0)
     wave = 10 * np.sin(2 * np.pi * 0.5 * t)
-    std = noise.start(table(np.stack([wave, wave + 0.5 * rng.standard_normal(500)], axis=1)))
+    std = noise.start(recording(t, np.stack([wave, wave + 0.5 * rng.standard_normal(500)], axis=1)))
     assert std[0] == pytest.approx(0.01 * wave.std(), rel=1e-6)
     assert std[1] == pytest.approx(0.5, rel=0.15)

@@ -4,10 +4,11 @@ import ctypes
 import re
 import shutil
 import subprocess
-import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -42,13 +43,23 @@ BODY = Body(2.0, np.array([0.05, -0.03, 0.12]), INERTIA)
 needs_compiler = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler, cc, which is not installed")
 
 
-def compile_library(files: dict[str, str], folder: Path, *more: str) -> Path:
-    """Compile the source as a shared library, without warnings."""
-    for name, text in files.items():
-        (folder / name).write_text(text, encoding="ascii")
-    command = ["cc", *FLAGS, *more, "-shared", "-fPIC", SOURCE, "-o", "model.so", "-lm"]
+def run(folder: Path, *command: str) -> str:
+    """Run a command in a folder and return its output."""
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def write_files(files: dict[str, str], folder: Path) -> None:
+    folder.mkdir(exist_ok=True)
+    for name, text in files.items():
+        (folder / name).write_text(text, encoding="ascii")
+
+
+def compile_library(files: dict[str, str], folder: Path, *more: str) -> Path:
+    """Compile the source as a shared library, without warnings."""
+    write_files(files, folder)
+    run(folder, "cc", *FLAGS, *more, "-shared", "-fPIC", SOURCE, "-o", "model.so", "-lm")
     return folder / "model.so"
 
 
@@ -194,11 +205,7 @@ def test_compiled_numbers_match_the_model(name: str, tmp_path: Path) -> None:
 
 @needs_compiler
 @pytest.mark.parametrize(
-    "name",
-    few(
-        ["panda", "prismatic", "alternatives", "fixed, from its tip", "energies", "local"],
-        kept=lambda name: name == "panda",
-    ),
+    "name", ["panda", *map(slow, ("prismatic", "alternatives", "fixed, from its tip", "energies", "local"))]
 )
 @pytest.mark.parametrize("body", [BODY, Body(0.7, np.array([0.1, 0.2, -0.3]))], ids=["body", "point"])
 def test_compiled_payload_matches_a_declared_payload(name: str, body: Body, tmp_path: Path) -> None:
@@ -229,13 +236,8 @@ def test_self_test_detects_a_changed_number(name: str, between: tuple[str, str],
     large = [span for span in found if abs(float(text[slice(*span)])) > 0.05]
     for start, end in np.random.default_rng(0).choice(large, 8, replace=False):
         wrong = repr(float(text[start:end]) * (1 + 1e-5))
-        path = compile_library({**files, SOURCE: text[:start] + wrong + text[end:]}, make_folder(tmp_path / str(start)))
+        path = compile_library({**files, SOURCE: text[:start] + wrong + text[end:]}, tmp_path / str(start))
         assert ctypes.CDLL(str(path)).lipserve_selftest() > 0, text[start:end]
-
-
-def make_folder(folder: Path) -> Path:
-    folder.mkdir()
-    return folder
 
 
 @pytest.mark.slow
@@ -245,10 +247,9 @@ def make_folder(folder: Path) -> Path:
 )
 def test_code_has_no_mutable_state(make: Callable[[], TorqueModel], tmp_path: Path) -> None:
     """The object has no writable data and calls only five functions of libm."""
-    compile_library(c_files(make(), ORIGIN), tmp_path)
-    subprocess.run(["cc", *FLAGS, "-c", SOURCE, "-o", "model.o"], cwd=tmp_path, check=True)
-    listed = subprocess.run(["nm", "model.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
-    kinds = {line.split()[-1]: line.split()[-2] for line in listed.splitlines()}
+    write_files(c_files(make(), ORIGIN), tmp_path)
+    run(tmp_path, "cc", *FLAGS, "-c", SOURCE, "-o", "model.o")
+    kinds = {line.split()[-1]: line.split()[-2] for line in run(tmp_path, "nm", "model.o").splitlines()}
     called = {name for name, kind in kinds.items() if kind == "U"}
     by_compilers = {"memcpy", "memmove", "memset", "sincos", "_GLOBAL_OFFSET_TABLE_", "__stack_chk_fail"}
     assert called - by_compilers <= {"sin", "cos", "sqrt", "exp", "tanh"}
@@ -264,16 +265,11 @@ MAIN = '#include "lipserve_model.h"\nint main(void) { return lipserve_selftest()
 def test_compilers_and_sanitizers_report_nothing(name: str, compiler: str, tmp_path: Path) -> None:
     if shutil.which(compiler) is None:
         pytest.skip(f"needs {compiler}, which is not installed")
-    (tmp_path / "main.c").write_text(MAIN)
-    for file, text in c_files(MODELS[name](), ORIGIN).items():
-        (tmp_path / file).write_text(text, encoding="ascii")
+    write_files({"main.c": MAIN, **c_files(MODELS[name](), ORIGIN)}, tmp_path)
     sanitized = sanitizers(compiler)
     for more in ((), (*sanitized, "-O1")) if sanitized else ((),):
-        command = [compiler, *FLAGS, *more, "main.c", SOURCE, "-o", "main", "-lm"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stderr
-        ran = subprocess.run(["./main"], cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert ran.returncode == 0, ran.stderr
+        run(tmp_path, compiler, *FLAGS, *more, "main.c", SOURCE, "-o", "main", "-lm")
+        run(tmp_path, "./main")
 
 
 @needs_compiler
@@ -281,18 +277,10 @@ def test_threads_do_not_disturb_each_other(tmp_path: Path) -> None:
     model = load(PANDA)
     path = compile_library(c_files(model, ORIGIN), tmp_path)
     motions = [draw_motions(model, 2000, seed) for seed in (1, 2)]
-    alone, together = [evaluate_library(path, motion) for motion in motions], [None, None]
-
-    def ask(place: int) -> None:
-        together[place] = evaluate_library(path, motions[place])
-
-    threads = [threading.Thread(target=ask, args=(place,)) for place in (0, 1)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for before, after in zip(alone, together, strict=True):
-        np.testing.assert_array_equal(before, after)
+    alone = [evaluate_library(path, motion) for motion in motions]
+    with ThreadPoolExecutor() as threads:
+        together = list(threads.map(partial(evaluate_library, path), motions))
+    np.testing.assert_array_equal(alone, together)
 
 
 @needs_compiler
@@ -344,15 +332,12 @@ def test_other_estimators_are_rejected() -> None:
 @pytest.mark.skipif(shutil.which("c++") is None, reason="needs a C++ compiler, c++, which is not installed")
 def test_example_controller_uses_the_code(tmp_path: Path) -> None:
     model = load(PANDA)
-    compile_library(c_files(model, ORIGIN), tmp_path)
-    subprocess.run(["cc", *FLAGS, "-c", SOURCE], cwd=tmp_path, check=True)
-    example = ROOT / "docs/examples/feedforward_controller.cpp"
+    write_files(c_files(model, ORIGIN), tmp_path)
+    run(tmp_path, "cc", *FLAGS, "-c", SOURCE)
     strict = ("-std=c++17", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2", "-I.")
-    command = ["c++", *strict, str(example), "lipserve_model.o", "-o", "controller"]
-    subprocess.run(command, cwd=tmp_path, check=True)
+    example = ROOT / "docs/examples/feedforward_controller.cpp"
+    run(tmp_path, "c++", *strict, str(example), "lipserve_model.o", "-o", "controller")
     limits = np.array([model.training_range["q"][end] for end in ("min", "max")])
     for middle, used in ((limits.mean(0), 20), (limits[1] + 1.0, 0)):
-        ran = subprocess.run(
-            ["./controller", "20", *map(str, middle)], cwd=tmp_path, check=True, capture_output=True, text=True
-        )
-        assert ran.stdout.startswith(f"used {used} of 20, the longest cycle took")
+        printed = run(tmp_path, "./controller", "20", *map(str, middle))
+        assert printed.startswith(f"used {used} of 20, the longest cycle took")

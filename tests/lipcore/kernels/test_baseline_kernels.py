@@ -13,7 +13,7 @@ from lipcore.kernels.base import PairKernel, State
 from lipcore.kernels.independent import GeometricallyInspiredKernel, SquaredExponentialKernel
 from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.posterior.exact import negative_log_evidence
-from tests.lipcore.oracles import Energy, instant, scale_of, torque_terms
+from tests.lipcore.oracles import Energy, Problem, worst_block_error
 
 BASELINES = ["se", "gip", "lse"]
 KERNELS: dict[str, Callable[[Sequence[str]], PairKernel]] = {
@@ -78,22 +78,17 @@ def lagrangian(joint_types: Sequence[str], params: Mapping[str, Array]) -> Energ
     return Energy(kernel, +1)
 
 
-def worst_lse_error(joint_types: Sequence[str], params: Mapping[str, Array], motion: Motion) -> float:
-    """Return the largest error over the pairs (0, 0) and (0, 1), relative to the scale of rounding errors."""
-    blocks = LagrangianSEKernel(joint_types).blocks(params, State.rows(motion), State.columns(motion))
-    energy, worst = lagrangian(joint_types, params), 0.0
-    for i, j in ((0, 0), (0, 1)):
-        x, y = instant(motion, i), instant(motion, j)
-        terms = torque_terms([energy], x, y)
-        error = float(np.abs(blocks[:, :, i, j] - terms.sum(0).numpy()).max())
-        worst = max(worst, error / scale_of([energy], x, y, terms))
-    return worst
+class LagrangianProblem(Problem):
+    """A problem of the kernel lse."""
+
+    def energies(self) -> list[Energy]:
+        """Return the prior of L by its definition: a squared exponential of (cos q, sin q) or q, and of dq."""
+        return [lagrangian(self.kernel.joint_types, self.params)]
 
 
 @robots
 def test_lse_equals_automatic_differentiation(joint_types: tuple[str, ...]) -> None:
-    _, params, motion = random_case("lse", joint_types, samples=2)
-    assert worst_lse_error(joint_types, params, motion) < 1e-12
+    assert worst_block_error(LagrangianProblem(*random_case("lse", joint_types, samples=2))) < 1e-12
 
 
 def se_loop(joint_types: Sequence[str], params: Mapping[str, np.ndarray], x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -140,11 +135,10 @@ def gip_loop(joint_types: Sequence[str], params: Mapping[str, np.ndarray], x: np
 def test_se_and_gip_equal_plain_loops(name: str, loop: Callable[..., np.ndarray], joint_types: tuple[str, ...]) -> None:
     kernel, params, motion = random_case(name, joint_types, samples=3)
     blocks = kernel.blocks(params, State.rows(motion), State.columns(motion))
-    arrays_ = dict(params)
     states = np.stack([motion.q, motion.dq, motion.ddq], axis=1)
     for i, x in enumerate(states):
         for j, y in enumerate(states):
-            np.testing.assert_allclose(blocks[:, :, i, j], loop(joint_types, arrays_, x, y), rtol=1e-12, atol=1e-14)
+            np.testing.assert_allclose(blocks[:, :, i, j], loop(joint_types, params, x, y), rtol=1e-12, atol=1e-14)
 
 
 @pytest.mark.parametrize("still", [(0,), (0, 1, 2)], ids=["one", "all"])

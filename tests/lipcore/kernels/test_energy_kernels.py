@@ -17,13 +17,13 @@ from tests.lipcore.oracles import (
     RELATIVE_TOLERANCE,
     Problem,
     base_kernel,
-    chain_base_kernel,
+    base_shares,
+    cross_zeros,
     problems,
     random_problem,
     shares_of,
     worst_block_error,
     worst_energy_error,
-    zero_position,
 )
 
 MIXED = ("revolute", "prismatic", "revolute")
@@ -59,28 +59,17 @@ def test_kernels_stay_exact_at_zeros_of_base_kernels(
     joint_types: tuple[str, ...], zero_joints: tuple[int, ...], offset: float, kernel: str
 ) -> None:
     rng, n = np.random.default_rng(4), len(joint_types)
-    problem = random_problem(joint_types, 1, seed=n, kernel=kernel)
+    problem = random_problem(joint_types, 2, seed=n, kernel=kernel)
     if kernel == "chain":  # σ < α: p changes sign
         problem.params["chain.logits"] = np.array(rng.uniform(0.3, 1.5, n))
-        alpha = 1 / (1 + np.exp(-problem.params["chain.logits"]))
-        beta = np.array([float(kind == "revolute") for kind in joint_types]) * alpha
-        share = np.stack([1 - alpha, alpha, beta], axis=1)
     else:
-        logits = np.tile([0.9, 1.3], (n, 1))
-        problem.params["potential.logits"] = problem.params["kinetic.logits"] = logits
-        share = shares_of(torch.from_numpy(logits)).numpy()
-    q, q2 = rng.uniform(0.3, 1.2, (2, n))
+        problem.params["potential.logits"] = problem.params["kinetic.logits"] = np.tile([0.9, 1.3], (n, 1))
+    problem = cross_zeros(problem, rng.uniform(0.3, 1.2, n), zero_joints)
     for joint in zero_joints:
-        kind, at = joint_types[joint], torch.tensor(q[joint])
-        q2[joint] = zero_position(kind, share[joint].tolist(), q[joint])
-        there = torch.tensor(q2[joint])
-        chain = kernel == "chain"
-        p = (chain_base_kernel if chain else base_kernel)(kind, share[joint, 1] if chain else share[joint], at, there)
+        share, (at, there) = base_shares(problem)[joint], torch.from_numpy(problem.motion.q[:, joint])
+        p = base_kernel(joint_types[joint], torch.from_numpy(share), at, there)
         assert abs(float(p)) < 1e-15
-        q2[joint] += offset
-    v, v2, a, a2 = rng.uniform(-2, 2, (4, n))
-    motion = Motion.from_arrays(np.stack([q, q2]), np.stack([v, v2]), np.stack([a, a2]))
-    crossing = Problem(problem.kernel, problem.params, motion)
+    crossing = cross_zeros(problem, problem.motion.q[0], zero_joints, offset)
     assert worst_block_error(crossing, [(0, 1)]) < RELATIVE_TOLERANCE
     if kernel == "chain":  # for the other kernel these energies are zero, which leaves no relative error
         assert worst_energy_error(crossing, [(0, 1)]) < RELATIVE_TOLERANCE

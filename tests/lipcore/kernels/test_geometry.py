@@ -20,13 +20,17 @@ from tests.lipcore.robots.test_urdf import joint, link
 from tests.lipcore.robots.test_urdf import robot as robot_of
 
 KINDS = ("R", "RPR", "PRR", "RRRR")
+ROBOTS = ("double-pendulum", "panda", "kinova", "tiago")
 
 
-def placements(robot: Robot, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def assert_same_placements(geometry: Geometry, robot: Robot, seed: int) -> None:
+    """Compare the frames of all joints with Pinocchio's."""
     data = robot.model.createData()
-    pin.forwardKinematics(robot.model, data, robot.configuration(q))
-    places = list(data.oMi)[1:]
-    return np.array([each.rotation for each in places]), np.array([each.translation for each in places])
+    for q in random_motions(robot.n_joints, seed)[:, 0]:
+        pin.forwardKinematics(robot.model, data, robot.configuration(q))
+        rotations, origins = geometry.placements(q)
+        np.testing.assert_allclose(rotations, [each.rotation for each in data.oMi[1:]], atol=1e-12)
+        np.testing.assert_allclose(origins, [each.translation for each in data.oMi[1:]], atol=1e-12)
 
 
 def regressor(geometry: Geometry, queries: np.ndarray) -> np.ndarray:
@@ -57,18 +61,15 @@ def test_step_between_geometries_is_recovered(kinds: str, gravity: bool) -> None
         np.testing.assert_allclose(back, -size * step, rtol=0, atol=2 * size**2)
 
 
-def test_number_of_identifiable_geometry_parameters() -> None:
-    for kinds, gravity, expected in (
-        ("R", True, (2,)),
-        ("R", False, (0,)),
-        ("P", True, (2,)),
-        ("RPR", True, (2, 2, 4)),
-        ("PRR", False, (0, 4, 4)),
-    ):
-        geometry = random_geometry(kinds, 3, gravity)
-        assert geometry.screws == expected
-        assert geometry.size == sum(expected) == len(geometry.turns) == len(geometry.shifts())
-        assert geometry.turns.sum() == sum(min(count, 2) for count in expected)
+@pytest.mark.parametrize(
+    ("kinds", "gravity", "screws"),
+    [("R", True, (2,)), ("R", False, (0,)), ("P", True, (2,)), ("RPR", True, (2, 2, 4)), ("PRR", False, (0, 4, 4))],
+)
+def test_number_of_identifiable_geometry_parameters(kinds: str, gravity: bool, screws: tuple[int, ...]) -> None:
+    geometry = random_geometry(kinds, 3, gravity)
+    assert geometry.screws == screws
+    assert geometry.size == sum(screws) == len(geometry.turns) == len(geometry.shifts())
+    assert geometry.turns.sum() == sum(min(count, 2) for count in screws)
 
 
 @pytest.mark.parametrize("kinds", KINDS)
@@ -90,14 +91,12 @@ def test_canonical_arm_has_the_same_torques(kinds: str) -> None:
         assert unexplained_share(regressor(geometry.moved(np.full(geometry.size, 0.1)), queries), torque) > 1e-3
 
 
-@pytest.mark.parametrize("name", ["double-pendulum", "panda", "kinova", "tiago"])
+@pytest.mark.parametrize("name", ROBOTS)
 def test_placements_match_pinocchio(name: str) -> None:
     robot = load_robot(name)
     body = RigidBody.from_profile(name, robot.joint_names, robot.joint_types)
     geometry = Geometry.from_robot(body)
-    for q in random_motions(robot.n_joints, 11)[:, 0]:
-        for found, expected in zip(geometry.placements(q), placements(robot, q), strict=True):
-            np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert_same_placements(geometry, robot, 11)
     np.testing.assert_array_equal(geometry.gravity, robot.model.gravity.linear)
     assert not Geometry.from_robot(body, gravity=False).gravity.any()
 
@@ -112,10 +111,7 @@ def test_unaligned_axes_are_read_from_pinocchio() -> None:
     body = RigidBody.from_urdf(robot_of(*map(link, "abcd"), *tilted), ("ab", "bc", "cd"), types)
     geometry = Geometry.from_robot(body)
     np.testing.assert_allclose(geometry.axis, np.array([[1, 2, -2], [2, -1, 2], [-1.8, 0, 2.4]]) / 3, atol=1e-12)
-    robot = Robot("odd", body.model, body.joint_names, types, *np.zeros((3, 3)))
-    for q in random_motions(3, 12)[:, 0]:
-        for found, expected in zip(geometry.placements(q), placements(robot, q), strict=True):
-            np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert_same_placements(geometry, Robot("odd", body.model, body.joint_names, types, *np.zeros((3, 3))), 12)
 
 
 def test_rotations() -> None:
@@ -144,7 +140,6 @@ def test_invalid_geometry_is_rejected() -> None:
             Geometry(good.joint_types, **{**parts, name: value})
 
 
-ROBOTS = ("double-pendulum", "panda", "kinova", "tiago")
 CHAINS = ("RPR", "PRR", "RRP", "RRRR", "P", "R")
 TOLERANCE = 1e-10
 """Relative tolerance for rounding errors."""
@@ -187,11 +182,10 @@ def test_mass_regressor_matches_pinocchio(kinds: str) -> None:
     geometry, bodies, robot = arm(kinds, 2)
     n = len(kinds)
     queries, data = random_motions(n, 3), robot.model.createData()
-    out = np.empty((len(queries), 10 * n, n))
-    arm_masses(geometry.constants, geometry.gravity, np.arange(n), queries, out)
+    found = regressor(geometry, queries).reshape(len(queries), n, 10 * n)
     expected = [pin.computeJointTorqueRegressor(robot.model, data, *motion).copy() for motion in queries]
-    assert_close(out.transpose(0, 2, 1), np.array(expected).reshape(len(queries), n, 10 * n))
-    assert_close(out.transpose(0, 2, 1) @ bodies.reshape(-1), inverse_dynamics(robot, *queries.transpose(1, 0, 2)))
+    assert_close(found, np.array(expected).reshape(found.shape))
+    assert_close(found @ bodies.reshape(-1), inverse_dynamics(robot, *queries.transpose(1, 0, 2)))
 
 
 @pytest.mark.each_once

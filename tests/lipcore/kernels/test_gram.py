@@ -4,7 +4,6 @@ import math
 
 import numpy as np
 import pytest
-import torch
 
 from lipcore.data.motion import Array, Motion
 from lipcore.estimators.catalogue import make_estimator
@@ -13,7 +12,7 @@ from lipcore.kernels.friction import SIGN_WIDTH, STRIBECK_SPEED, FrictionKernel
 from lipcore.kernels.lip import LipKernel
 from lipcore.posterior.exact import negative_log_evidence
 from lipcore.posterior.on_device import evidence_on
-from tests.lipcore.oracles import KERNELS, Problem, TorchForm, random_problem, shares_of, zero_position
+from tests.lipcore.oracles import KERNELS, Problem, TorchForm, cross_zeros, random_problem
 
 JOINTS = ("revolute", "prismatic", "revolute")
 
@@ -33,7 +32,7 @@ def features(speed: float) -> list[float]:
 
 @pytest.mark.parametrize("terms", [3, 4])
 def test_block_is_the_covariance_of_independent_weights(terms: int) -> None:
-    motion = random_problem(("revolute", "prismatic", "revolute"), samples=4, seed=1).motion
+    motion = random_problem(JOINTS, samples=4, seed=1).motion
     std = np.exp(np.random.default_rng(1).normal(size=(3, terms)))
     motion = Motion(motion.q, 0.02 * motion.dq, motion.ddq)  # slow enough to change the sign
     kernel = FrictionKernel(3, terms == 4)
@@ -76,7 +75,7 @@ def compare_with_formula(problem: Problem) -> None:
 @pytest.mark.slow
 @kernels
 def test_kernels_with_many_joints_match_the_formula(kernel: str) -> None:
-    problem = random_problem(("revolute", "prismatic", "revolute") * 5, 3, seed=0, kernel=kernel)
+    problem = random_problem(JOINTS * 5, 3, seed=0, kernel=kernel)
     if kernel == "chain":
         problem.params["chain.logits"] -= 3.0
     compare_with_formula(problem)
@@ -88,20 +87,10 @@ def test_kernels_with_many_joints_match_the_formula(kernel: str) -> None:
 def test_kernels_are_exact_at_zeros(kernel: str, joint_types: tuple[str, ...], zeros: tuple[int, ...]) -> None:
     """With p_b = 0 of one, two or all joints, the derivatives stay exact, as nothing divides by p_b."""
     problem = random_problem(joint_types, 2, seed=3, kernel=kernel)
-    logits = np.full((3, 2), 0.7)  # σ < α, β: p changes sign
     for name, value in problem.params.items():
         if name.endswith("logits"):
-            value[:] = 0.7 if kernel == "chain" else logits[: len(value)]
-    shares = shares_of(torch.from_numpy(logits)).numpy()
-    if kernel == "chain":
-        alpha = np.full(3, 1 / (1 + np.exp(-0.7)))
-        straight = np.array([kind == "prismatic" for kind in joint_types])
-        shares = np.stack([1 - alpha, alpha, np.where(straight, 0.0, alpha)], axis=1)
-    q = problem.motion.q.copy()
-    q[0] = np.array([0.4, 0.9, 1.1])
-    for joint in zeros:
-        q[1, joint] = zero_position(joint_types[joint], shares[joint].tolist(), float(q[0, joint]))
-    compare_with_formula(Problem(problem.kernel, problem.params, Motion(q, problem.motion.dq, problem.motion.ddq)))
+            value[:] = 0.7  # σ < α, β: p changes sign
+    compare_with_formula(cross_zeros(problem, np.array([0.4, 0.9, 1.1]), zeros))
 
 
 @kernels
@@ -109,16 +98,15 @@ def test_no_samples_give_empty_matrices(kernel: str) -> None:
     problem = random_problem(("revolute",) * 2, 3, seed=0, kernel=kernel)
     assert problem.kernel.gram(problem.params, problem.motion, problem.motion[:0]).shape == (6, 0)
     nothing = np.zeros((0, 0))
-    assert not any(
-        bool(each.any()) for each in problem.kernel.gradient(problem.params, problem.motion[:0], nothing).values()
-    )
+    gradient = problem.kernel.gradient(problem.params, problem.motion[:0], nothing)
+    assert not any(bool(each.any()) for each in gradient.values())
 
 
 @pytest.mark.parametrize("estimator", ["se", "gip", "lse"])
 def test_torch_evidence_matches_numpy(estimator: str) -> None:
     """Run the GPU code on the CPU: value and every derivative, including friction's."""
-    problem = random_problem(("revolute", "prismatic", "revolute"), 7, seed=5, kernel="chain")
-    kernel = make_estimator(estimator, ("revolute", "prismatic", "revolute")).kernel
+    problem = random_problem(JOINTS, 7, seed=5, kernel="chain")
+    kernel = make_estimator(estimator, JOINTS).kernel
     tau = np.random.default_rng(6).standard_normal((7, 3))
     params = {**kernel.initial(problem.motion, tau), "noise.log_std": np.full(3, -1.0)}
     expected = negative_log_evidence(kernel, params, problem.motion, tau)

@@ -6,16 +6,13 @@ Other tests compare the formulas with automatic differentiation, plain loops and
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
-from lipcore import FitOptions, Samples, load, save, train
 from lipcore.data.motion import Array, Motion
-from lipcore.estimators.catalogue import ESTIMATORS
 from lipcore.kernels.arm import ArmKernel
 from lipcore.kernels.arm_prior import Alternative, Arm
 from lipcore.kernels.base import LinearKernel, PairKernel, State, SumKernel, TorqueKernel
@@ -30,11 +27,8 @@ from lipcore.kernels.lse import LagrangianSEKernel
 from lipcore.kernels.mixture import MixtureKernel
 from lipcore.kernels.newton_euler import rigid_body_torque
 from lipcore.kernels.payload import PayloadKernel
-from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Simulation, simulate
-from lipcore.robots.urdf import RigidBody
-from lipcore.vocabulary import ROBOT_ESTIMATORS
 from tests.lipcore.arms import random_bodies, random_geometry
+from tests.lipcore.oracles import central_difference
 
 RELATIVE_TOLERANCE = 1e-10
 """Relative tolerance for rounding errors."""
@@ -73,21 +67,18 @@ def derivatives_by_bodies(geometry: Geometry, order: np.ndarray, motion: Motion)
 def derivatives_by_geometry(arm: Arm, motion: Motion) -> Array:
     """Return ∂τ/∂θ at the arm's bodies, (N, n, g)."""
 
-    def moved(step: Array) -> Array:
-        return bodies_torque(arm.geometry.moved(step), arm.order, arm.parameters, motion)
+    def torque(direction: Array, step: float) -> Array:
+        return bodies_torque(arm.geometry.moved(step * direction), arm.order, arm.parameters, motion)
 
-    steps = GEOMETRY_STEP * np.eye(arm.steps)
-    return np.stack(
-        [(8 * (moved(s) - moved(-s)) - moved(2 * s) + moved(-2 * s)) / (12 * GEOMETRY_STEP) for s in steps], axis=2
-    )
+    slopes = [central_difference(partial(torque, direction), GEOMETRY_STEP) for direction in np.eye(arm.steps)]
+    return np.stack(slopes, axis=2)
 
 
 def arm_features(arm: Arm, motion: Motion) -> Array:
     """Return the features of an arm without alternatives."""
     rotors = motion.ddq[:, :, None] * np.eye(arm.n_joints)
-    return np.concatenate(
-        [derivatives_by_bodies(arm.geometry, arm.order, motion), rotors, derivatives_by_geometry(arm, motion)], axis=2
-    )
+    bodies = derivatives_by_bodies(arm.geometry, arm.order, motion)
+    return np.concatenate([bodies, rotors, derivatives_by_geometry(arm, motion)], axis=2)
 
 
 def mixture_features(kernel: MixtureKernel, arms: Sequence[Alternative], order: np.ndarray, motion: Motion) -> Array:
@@ -148,10 +139,9 @@ def arm_with_alternatives_case(joint_types: Sequence[str]) -> Case:
 def payload_case(joint_types: Sequence[str]) -> Case:
     arm = random_arm(joint_types)
     last = slice(10 * int(arm.order[-1]), 10 * int(arm.order[-1]) + 10)
-    room = np.arange(1.0, 11.0)
-    return Case(
-        PayloadKernel(arm, room), [lambda motion: derivatives_by_bodies(arm.geometry, arm.order, motion)[..., last]]
-    )
+
+    bodies = partial(derivatives_by_bodies, arm.geometry, arm.order)
+    return Case(PayloadKernel(arm, np.arange(1.0, 11.0)), [lambda motion: bodies(motion)[..., last]])
 
 
 def friction_case(joint_types: Sequence[str], stribeck: bool = False) -> Case:
@@ -192,10 +182,8 @@ robots = pytest.mark.parametrize("joint_types", JOINTS.values(), ids=JOINTS)
 def draw_problem(kernel: TorqueKernel, samples: int) -> tuple[dict[str, Array], Motion]:
     """Return hyperparameters around the kernel's start, and random motion."""
     rng = np.random.default_rng(samples)
-    motion = Motion(*rng.uniform(-2, 2, (3, samples, kernel.n_joints)))
-    start = kernel.initial(
-        Motion(*rng.uniform(-2, 2, (3, 20, kernel.n_joints))), rng.normal(0, 5, (20, kernel.n_joints))
-    )
+    motion, training = (Motion(*rng.uniform(-2, 2, (3, size, kernel.n_joints))) for size in (samples, 20))
+    start = kernel.initial(training, rng.normal(0, 5, training.q.shape))
     return {name: np.asarray(value + 0.3 * rng.standard_normal(value.shape)) for name, value in start.items()}, motion
 
 
@@ -293,21 +281,3 @@ def test_query_covariances_equal_the_formula(name: str, joint_types: tuple[str, 
             kernel.regressor().fill(query.arrays()[0], one)
             assert np.array_equal(one, found[0, 1 : p + 1])
             assert_close(kernel.features(query), expected.transpose(0, 2, 1), case.share)
-
-
-@pytest.fixture(scope="module")
-def samples() -> Samples:
-    return simulate(load_robot("double-pendulum"), Simulation(n_samples=60, speed=10, noise=0.002, viscous=0.05), 1)
-
-
-@pytest.mark.parametrize("name", ESTIMATORS)
-def test_loaded_model_predicts_like_the_saved_one(name: str, samples: Samples, tmp_path: Path) -> None:
-    options = FitOptions(hyperparameter_samples=20, posterior_samples=40, max_iterations=5, starts=1, device="cpu")
-    robot = RigidBody.from_profile("double-pendulum", samples.joint_names, JOINTS["RR"])
-    known = robot if name in ROBOT_ESTIMATORS else None
-    model = train(samples, JOINTS["RR"], name, options, robot=known)
-    save(model, tmp_path / "model")
-    query = samples.q + 0.1, 0.5 * samples.dq, samples.ddq
-    before, after = (each.predict(*query, covariance=True) for each in (model, load(tmp_path / "model")))
-    for part in ("tau", "tau_std", "noise_std", "covariance"):
-        assert_close(getattr(after, part), getattr(before, part), 1e-9)

@@ -84,8 +84,7 @@ def case(request: pytest.FixtureRequest) -> Case:
         bodies = RigidBody.from_profile(setting.robot, samples.joint_names, robot.joint_types)
     model = with_full_counts(train(samples, robot.joint_types, setting.estimator, options, robot=bodies), samples)
     unseen = simulate(robot, Simulation(n_samples=40, n_sinusoids=100, speed=10, noise=0.0), seed=7)
-    tau = unseen.tau
-    found = dynamics.components(model, unseen.motion(), dynamics.COMPONENTS, tau)
+    found = dynamics.components(model, unseen.motion(), dynamics.COMPONENTS, unseen.tau)
     reference = dynamics.reference_posture(model)
     return Case(robot, model, unseen, found, pinocchio_components(robot, unseen, reference, setting.viscous))
 
@@ -93,34 +92,34 @@ def case(request: pytest.FixtureRequest) -> Case:
 def pinocchio_components(robot: Robot, unseen: Samples, reference: np.ndarray, viscous: float) -> dict[str, np.ndarray]:
     model, data, rest = robot.model, robot.model.createData(), np.zeros(robot.n_joints)
     bottom = pin.computePotentialEnergy(model, data, robot.configuration(reference))
-    friction = viscous * unseen.dq
-    rows: dict[str, list[np.ndarray]] = {name: [] for name in dynamics.COMPONENTS}
-    for k in range(len(unseen)):
-        q, v, a = robot.configuration(unseen.q[k]), unseen.dq[k], unseen.ddq[k]
-        upper = np.triu(pin.crba(model, data, q))
+
+    def components_of(row: int) -> dict[str, np.ndarray | float]:
+        q, v, a = robot.configuration(unseen.q[row]), unseen.dq[row], unseen.ddq[row]
+        upper, friction = np.triu(pin.crba(model, data, q)), viscous * v
         inertia = upper + np.triu(upper, 1).T
         gravity = pin.computeGeneralizedGravity(model, data, q).copy()
-        rows["inertia_matrix"].append(inertia)
-        rows["gravity"].append(gravity)
-        rows["coriolis"].append(pin.rnea(model, data, q, v, rest) - gravity)
-        rows["inertial"].append(inertia @ a)
-        rows["friction"].append(friction[k])
-        rows["kinetic_energy"].append(pin.computeKineticEnergy(model, data, q, v))
-        rows["potential_energy"].append(pin.computePotentialEnergy(model, data, q) - bottom)
-        rows["forward_dynamics"].append(pin.aba(model, data, q, v, unseen.tau[k] - friction[k]).copy())
-    return {name: np.array(values) for name, values in rows.items()}
+        return {
+            "inertia_matrix": inertia,
+            "gravity": gravity,
+            "coriolis": pin.rnea(model, data, q, v, rest) - gravity,
+            "inertial": inertia @ a,
+            "friction": friction,
+            "kinetic_energy": pin.computeKineticEnergy(model, data, q, v),
+            "potential_energy": pin.computePotentialEnergy(model, data, q) - bottom,
+            "forward_dynamics": pin.aba(model, data, q, v, unseen.tau[row] - friction).copy(),
+        }
+
+    rows = [components_of(row) for row in range(len(unseen))]
+    return {name: np.array([row[name] for row in rows]) for name in dynamics.COMPONENTS}
 
 
 @pytest.mark.parametrize("name", dynamics.COMPONENTS)
 def test_components_match_pinocchio(case: Case, name: str) -> None:
     estimate, truth = case.found[name], case.truth[name]
-    error, std = np.abs(estimate.mean - truth), estimate.std
-    size = np.abs(truth).max()
-    inside = float((error <= 4 * std + 1e-9 * size).mean())
-
+    error, std, size = np.abs(estimate.mean - truth), estimate.std, np.abs(truth).max()
     assert estimate.mean.shape == estimate.std.shape == truth.shape
     assert error.max() < MAX_RELATIVE_ERROR[name] * size
-    assert inside > 0.9
+    assert (error <= 4 * std + 1e-9 * size).mean() > 0.9
     assert std.max() > 0
 
 
@@ -233,7 +232,7 @@ def test_invalid_requests_are_rejected(case: Case) -> None:
 
 TYPES = ("revolute", "prismatic")
 N, SAMPLES, QUERIES = 2, 3, 2
-JOINT_NAMES = ("a", "b")
+EACH_QUERY = few(range(QUERIES), lambda row: row == 0)
 
 
 ENERGIES = {"lip": lip_energies, "lip-chain": chain_energies}
@@ -253,30 +252,25 @@ class SmallModel(NamedTuple):
 @pytest.fixture(scope="module", params=ENERGIES)
 def small_model(request: pytest.FixtureRequest) -> SmallModel:
     rng = np.random.default_rng(3)
-    motion = Motion.from_arrays(*rng.uniform(-1.5, 1.5, (3, SAMPLES, N)))
-    query = Motion.from_arrays(*rng.uniform(-1.5, 1.5, (3, QUERIES, N)))
+    motion, query = (Motion.from_arrays(*rng.uniform(-1.5, 1.5, (3, count, N))) for count in (SAMPLES, QUERIES))
     tau = rng.normal(size=(SAMPLES, N))
-    like = make_estimator(request.param, TYPES).kernel.initial(motion, tau)
+    estimator, outputs = make_estimator(request.param, TYPES), np.arange(SAMPLES * N)
+    like = estimator.kernel.initial(motion, tau)
     params = {name: np.asarray(rng.uniform(-1, 0.5, value.shape)) for name, value in like.items()}
     params["noise.log_std"] = np.array([-1.5, -2.0])
-    kernel, outputs = make_estimator(request.param, TYPES).kernel, np.arange(SAMPLES * N)
-    basis = Basis.build(kernel, params, motion, outputs)
-    statistics = collect(basis, np.exp(2 * params["noise.log_std"]), motion, tau)
-    estimator = make_estimator(request.param, TYPES)
+    variance = np.exp(2 * params["noise.log_std"])
+    statistics = collect(Basis.build(estimator.kernel, params, motion, outputs), variance, motion, tau)
     posterior = CompactPosterior.restore(estimator.kernel, params, motion, outputs, statistics)
     span = training_range(motion)
-    model = TorqueModel(estimator, JOINT_NAMES, TYPES, "gravity_included", {}, {}, posterior, span, {})
-    energies = ENERGIES[request.param](TYPES, params)
-    data = instants_of(motion)
-    noise = np.tile(np.exp(2 * params["noise.log_std"]), SAMPLES)
-    gram = torque_covariance(energies, data, data) + friction_covariance(params, data, data) + np.diag(noise)
-    return SmallModel(model, motion, tau, energies, gram, query)
+    model = TorqueModel(estimator, ("a", "b"), TYPES, "gravity_included", {}, {}, posterior, span, {})
+    energies, data = ENERGIES[request.param](TYPES, params), instants_of(motion)
+    gram = torque_covariance(energies, data, data) + friction_covariance(params, data, data)
+    return SmallModel(model, motion, tau, energies, gram + np.diag(np.tile(variance, SAMPLES)), query)
 
 
 def torque_covariance(energies: list[Energy], xs: Sequence[Instant], ys: Sequence[Instant]) -> np.ndarray:
     """Return the covariance of the torques of the energies alone, (len(xs) n, len(ys) n)."""
-    blocks = [[torque_terms(energies, x, y).sum(0).numpy() for y in ys] for x in xs]
-    return np.block(blocks)
+    return np.block([[torque_terms(energies, x, y).sum(0).numpy() for y in ys] for x in xs])
 
 
 def friction_covariance(params: Mapping[str, Array], xs: Sequence[Instant], ys: Sequence[Instant]) -> np.ndarray:
@@ -303,14 +297,12 @@ def assert_estimate(found: dynamics.Estimate, row: int, mean: np.ndarray, std: n
     np.testing.assert_allclose(found.std[row].ravel(), std, rtol=1e-7, atol=1e-7)
 
 
-@pytest.mark.parametrize("row", few(range(QUERIES), lambda row: row == 0))
+@pytest.mark.parametrize("row", EACH_QUERY)
 def test_energies_match_the_dense_posterior(small_model: SmallModel, row: int) -> None:
-    names = ["kinetic_energy", "potential_energy"]
-    found = dynamics.components(small_model.model, small_model.query, names)
-    x = instant(small_model.query, row)
+    found = dynamics.components(small_model.model, small_model.query, ["kinetic_energy", "potential_energy"])
+    x, data = instant(small_model.query, row), instants_of(small_model.motion)
     origin = dynamics.reference_posture(small_model.model)
     reference = tuple(map(torch.as_tensor, (origin, np.zeros(N), np.zeros(N))))
-    data = instants_of(small_model.motion)
     torques = np.array([[energy_torque(small_model.energies, at, y).numpy() for y in data] for at in (x, reference)])
     torques = torques.transpose(0, 2, 1, 3).reshape(2, len(small_model.energies), -1)  # (at, energy, m)
 
@@ -327,7 +319,7 @@ def test_energies_match_the_dense_posterior(small_model: SmallModel, row: int) -
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row", few(range(QUERIES), lambda row: row == 0))
+@pytest.mark.parametrize("row", EACH_QUERY)
 def test_torques_and_inertia_match_the_dense_posterior(small_model: SmallModel, row: int) -> None:
     q, v, a = instant(small_model.query, row)
     zero, eye = torch.zeros(N, dtype=torch.float64), torch.eye(N, dtype=torch.float64)
@@ -347,13 +339,11 @@ def test_torques_and_inertia_match_the_dense_posterior(small_model: SmallModel, 
         assert_estimate(found[name], row, *condition(small_model, rows @ prior @ rows.T, rows @ cross))
 
 
-@pytest.mark.parametrize("row", few(range(QUERIES), lambda row: row == 0))
+@pytest.mark.parametrize("row", EACH_QUERY)
 def test_friction_matches_the_dense_posterior(small_model: SmallModel, row: int) -> None:
-    x = instant(small_model.query, row)
-    params = small_model.model.posterior.params
-    prior, cross = (
-        friction_covariance(params, [x], [x]),
-        friction_covariance(params, [x], instants_of(small_model.motion)),
+    params, x, data = small_model.model.posterior.params, [instant(small_model.query, row)], small_model.motion
+    expected = condition(
+        small_model, friction_covariance(params, x, x), friction_covariance(params, x, instants_of(data))
     )
     friction = dynamics.components(small_model.model, small_model.query, ["friction"])["friction"]
-    assert_estimate(friction, row, *condition(small_model, prior, cross))
+    assert_estimate(friction, row, *expected)

@@ -25,10 +25,12 @@ def run_scale(score, batch=BATCH, rate=RATE, delay=0):
     return np.concatenate(missed), np.concatenate(factors), state
 
 
-def miss_share(missed, rows=ROWS_PER_MINUTE):
-    """Return the share of misses in every window of `rows` rows."""
+def assert_near_five_percent(missed, rows=ROWS_PER_MINUTE):
+    """Assert a share of misses of 3 to 7 % in every window of `rows` rows."""
     sums = np.concatenate([np.zeros((1, missed.shape[1])), np.cumsum(missed, axis=0)])
-    return (sums[rows:] - sums[:-rows]) / rows
+    share = (sums[rows:] - sums[:-rows]) / rows
+    assert share.min() > 0.03
+    assert share.max() < 0.07
 
 
 def adversarial_scores(seed, rows=4 * ROWS_PER_MINUTE):
@@ -47,30 +49,23 @@ def adversarial_scores(seed, rows=4 * ROWS_PER_MINUTE):
 
 @pytest.mark.parametrize("seed", [100, 101])
 def test_misses_stay_near_five_percent_every_minute(seed):
-    share = miss_share(run_scale(adversarial_scores(seed))[0])
-    assert share.min() > 0.03
-    assert share.max() < 0.07
+    assert_near_five_percent(run_scale(adversarial_scores(seed))[0])
 
 
 def test_misses_stay_near_five_percent_against_an_adversary():
     """Scores lie just outside for 3 s, then far inside until the scale is back."""
-    state, missed, now = AdaptiveScale.start(np.ones(1)), [], 0.0
-    hurting = True
+    state, missed, now, hurting = AdaptiveScale.start(np.ones(1)), [], 0.0, True
     for _ in range(4 * ROWS_PER_MINUTE // BATCH):
-        factor = state.factor
-        part = np.full((BATCH, 1), factor[0] * (1.01 if hurting else 0.1))
+        part = np.full((BATCH, 1), state.factor[0] * (1.01 if hurting else 0.1))
+        missed.append(outside(part, state.factor))
         now += BATCH / RATE
         state = state.step(now - np.arange(BATCH)[::-1] / RATE, part)
-        missed.append(outside(part, factor))
         hurting = (state.log[0] < 1.0) if hurting else (state.log[0] < -1.0)
-    share = miss_share(np.concatenate(missed))
-    assert share.min() > 0.03
-    assert share.max() < 0.07
+    assert_near_five_percent(np.concatenate(missed))
 
 
 def test_jump_by_a_hundred_is_covered_after_one_batch():
-    rng = np.random.default_rng(3)
-    score = np.abs(rng.standard_normal((400, 3))) / 1.96
+    score = np.abs(np.random.default_rng(3).standard_normal((400, 3))) / 1.96
     score[200:] *= 100.0
     missed, factors, _ = run_scale(score)
     assert missed[200:210].mean() > 0.9
@@ -88,21 +83,18 @@ def test_scale_falls_within_seconds():
 
 @pytest.mark.parametrize(("rate", "batch"), [(10.0, 1), (100.0, 5), (1000.0, 100)])
 def test_coverage_does_not_depend_on_the_rate(rate, batch):
-    rng = np.random.default_rng(5)
     rows = round(180 * rate)
-    t = np.arange(rows) / rate
-    score = np.abs(rng.standard_normal((rows, 1))) * (0.3 + 2 * (t > 90))[:, None]
-    share = miss_share(run_scale(score, batch, rate)[0], round(60 * rate))
-    assert share.min() > 0.03
-    assert share.max() < 0.07
+    level = 0.3 + 2 * (np.arange(rows) / rate > 90)[:, None]
+    score = np.abs(np.random.default_rng(5).standard_normal((rows, 1))) * level
+    assert_near_five_percent(run_scale(score, batch, rate)[0], round(60 * rate))
 
 
 def test_long_batch_leaves_a_debt():
+    options = adaptive.OPTIONS
     state = AdaptiveScale.start(np.ones(1)).step(np.arange(500) / RATE, np.full((500, 1), 3.0))
-    assert state.log[0] == pytest.approx(np.log(3.0 * adaptive.OPTIONS.margin))
-    assert state.owed[0] == pytest.approx(
-        min(0.95 * 500 / RATE * adaptive.OPTIONS.rate - state.log[0], adaptive.OPTIONS.max_owed), rel=0.01
-    )
+    assert state.log[0] == pytest.approx(np.log(3.0 * options.margin))
+    owed = min(0.95 * 500 / RATE * options.rate - state.log[0], options.max_owed)
+    assert state.owed[0] == pytest.approx(owed, rel=0.01)
     still = state.step(5.0 + np.arange(1, 11) / RATE, np.full((10, 1), 0.1))  # they stand for 0.11 s
     assert still.log[0] == pytest.approx(state.log[0])
     assert still.owed[0] == pytest.approx(state.owed[0] - 0.055)
@@ -122,18 +114,14 @@ def test_rows_without_times_count_with_the_usual_step():
     assert at_once.log[0] == pytest.approx(0.95 * adaptive.OPTIONS.rate * adaptive.OPTIONS.usual_step_s)
     paused = at_once.step(np.full(1, 1000.0), score)
     assert paused.log[0] - at_once.log[0] == pytest.approx(at_once.log[0])
-    none = paused.step(np.empty(0), np.empty((0, 1)))
-    assert none is paused
+    assert paused.step(np.empty(0), np.empty((0, 1))) is paused
 
 
 def test_state_is_stored_exactly():
     _, _, state = run_scale(adversarial_scores(7, 1000))
     again = AdaptiveScale.from_json(json.loads(json.dumps(state.to_json())))
-    assert (again.log.tolist(), again.owed.tolist(), again.last) == (
-        state.log.tolist(),
-        state.owed.tolist(),
-        state.last,
-    )
+    for name in ("log", "owed", "last"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(state, name))
 
 
 def test_scores_and_widest_scale():

@@ -5,35 +5,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore import FitOptions, TorqueModel, train
+from lipcore import FitOptions, TorqueModel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.online import regime, transfer
 from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.transfer import consolidate
-from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Simulation, simulate
-from lipcore.robots.urdf import RigidBody
 from tests.lipcore.arm_oracles import as_rows, assert_same_predictions
+from tests.lipcore.estimators.test_estimators import train_estimator
+from tests.lipcore.online.test_learner import assert_solution, learn_parts, simulate_pendulum
 
-ROBOT, START_S = "double-pendulum", 1000.0
-STREAM = Simulation(n_samples=120, speed=10, noise=0.02, viscous=0.1, coulomb=0.2)
+START_S = 1000.0
 OPTIONS = FitOptions(hyperparameter_samples=60, max_iterations=60, starts=1, device="cpu", compact_tolerance=0.1)
 
 
 @pytest.fixture(scope="module", params=["lip-chain", "rigid-body"])
 def base(request: pytest.FixtureRequest) -> TorqueModel:
-    samples = simulate(load_robot(ROBOT), STREAM, seed=1)
-    robot = None
-    if request.param == "rigid-body":
-        robot = RigidBody.from_profile(ROBOT, samples.joint_names, ("revolute",) * 2)
-    return train(samples, ("revolute",) * 2, request.param, OPTIONS, robot=robot)
+    return train_estimator(request.param, simulate_pendulum(1, coulomb=0.2), OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def rows() -> Rows:
     """Return twelve seconds of the same robot, whose friction grows by half."""
-    samples = simulate(load_robot(ROBOT), replace(STREAM, viscous=0.0, coulomb=0.0), seed=2)
+    samples = simulate_pendulum(2, viscous=0.0)
     factor = (1 + 0.5 * samples.t / samples.t[-1])[:, None]
     friction = factor * (0.1 * samples.dq + 0.2 * np.sign(samples.dq))
     return as_rows(replace(samples, tau=samples.tau + friction), START_S)
@@ -57,7 +51,6 @@ def dense_process(base: TorqueModel, rows: Rows, time_s: float, epoch: np.ndarra
     other variables. The trained samples lie ten epochs before epoch 0, as torques with the trained mean.
     """
     posterior, friction = base.posterior, friction_places(base)
-    assert posterior.statistics is not None
     centre = posterior.basis.root.T @ posterior.weights
     kept = np.ones(len(centre))
     kept[friction] = np.sqrt(1 - (0.3 * np.maximum(np.abs(centre[friction]), 0.03)) ** 2 / 10)
@@ -82,59 +75,59 @@ def dense_process(base: TorqueModel, rows: Rows, time_s: float, epoch: np.ndarra
     return centre + gain @ residual, np.eye(len(centre)) - gain @ cross.T
 
 
-@pytest.mark.parametrize("time_s", [5.0, 60.0], ids=["folded", "kept"])
-def test_model_is_one_process_with_walking_friction(base: TorqueModel, rows: Rows, time_s: float) -> None:
+def spread_of(online: OnlineModel) -> np.ndarray:
+    """Return the standard deviation of each whitened variable."""
+    return np.sqrt(online.now.solve(online.walk).covariance.diagonal())
+
+
+def numbers_of_epochs(online: OnlineModel) -> list[int]:
+    return [each.number for each in online.now.epochs]
+
+
+@pytest.mark.parametrize(("time_s", "epochs"), [(5.0, 4), (60.0, 2)], ids=["folded", "kept"])
+def test_model_is_one_process_with_walking_friction(base: TorqueModel, rows: Rows, time_s: float, epochs: int) -> None:
     """Test 24 epochs, most of them folded, and 2 epochs."""
-    online = with_friction_walk(base, time_s)
-    for part in np.array_split(np.arange(len(rows)), 9):
-        online = online.learn(rows.take(part))
-    assert len(online.now.epochs) == (4 if time_s == 5.0 else 2)
-    mean, covariance = dense_process(base, rows, time_s, ((rows.time - START_S) // (time_s / 10)).astype(int))
-    found = online.now.solve(online.walk)
-    np.testing.assert_allclose(found.mean, mean, rtol=0, atol=1e-6 * np.abs(mean).max())
-    spread = found.covariance
-    np.testing.assert_allclose(spread, covariance, rtol=0, atol=1e-6)
+    online = learn_parts(with_friction_walk(base, time_s), rows, np.array_split(np.arange(len(rows)), 9))
+    assert len(online.now.epochs) == epochs
+    epoch = ((rows.time - START_S) // (time_s / 10)).astype(int)
+    assert_solution(online, *dense_process(base, rows, time_s, epoch))
 
 
 def test_model_follows_friction_and_keeps_the_arm(base: TorqueModel, rows: Rows) -> None:
-    friction = friction_places(base)
-    plain, walked = OnlineModel.start(base).learn(rows), with_friction_walk(base, 5.0).learn(rows)
-    late = rows.take(slice(-20, None))
-    answers = [each.model().predict(late.q, late.dq, late.ddq).tau for each in (plain, walked)]
-    assert np.mean((answers[1] - late.tau) ** 2) < 0.9 * np.mean((answers[0] - late.tau) ** 2)
-    spread = [np.sqrt(each.now.solve(each.walk).covariance.diagonal()) for each in (plain, walked)]
-    ratio = spread[1] / spread[0]
-    others = np.setdiff1d(np.arange(len(ratio)), friction)
+    friction, late = friction_places(base), rows.take(slice(-20, None))
+    plain, walked = (each.learn(rows) for each in (OnlineModel.start(base), with_friction_walk(base, 5.0)))
+    before, after = (
+        np.mean((each.model().predict(late.q, late.dq, late.ddq).tau - late.tau) ** 2) for each in (plain, walked)
+    )
+    assert after < 0.9 * before
+    ratio = spread_of(walked) / spread_of(plain)
     assert ratio[friction].max() > 2
-    assert np.median(ratio[others]) < 1.05
+    assert np.median(np.delete(ratio, friction)) < 1.05
 
 
 def test_order_does_not_matter_while_epochs_are_kept(base: TorqueModel, rows: Rows) -> None:
     start = with_friction_walk(base, 40.0)  # epochs of 4 s
     at_once = start.learn(rows)
-    assert [each.number for each in at_once.now.epochs] == [0, 1, 2]
-    shuffled = start
-    for part in np.array_split(np.random.default_rng(0).permutation(len(rows)), 7):
-        shuffled = shuffled.learn(rows.take(part))
+    assert numbers_of_epochs(at_once) == [0, 1, 2]
+    shuffled = learn_parts(start, rows, np.array_split(np.random.default_rng(0).permutation(len(rows)), 7))
     assert_same_predictions(shuffled.model(), at_once.model(), rows)
 
 
 def test_folded_epochs_are_closed(base: TorqueModel, rows: Rows) -> None:
     online = with_friction_walk(base, 10.0).learn(rows)  # epochs of 1 s: 8 to 11 are kept
-    assert [each.number for each in online.now.epochs] == [8, 9, 10, 11]
+    assert numbers_of_epochs(online) == [8, 9, 10, 11]
     early = rows.take(slice(70, 80))
     moved = replace(early, time=early.time + 1.0)
     assert transfer.dump(online.learn(early)) == transfer.dump(online.learn(moved))
 
 
 def test_long_pause_opens_only_the_friction(base: TorqueModel, rows: Rows) -> None:
-    friction = friction_places(base)
-    early = replace(rows.take(slice(0, 60)), time=rows.time[:60])
+    friction, centre = friction_places(base), base.posterior.basis.root.T @ base.posterior.weights
     later = replace(rows.take(slice(60, 61)), time=rows.time[60:61] + 1e9, weight=np.full(1, 1e-12))
-    before, after = with_friction_walk(base, 5.0).learn(early), with_friction_walk(base, 5.0).learn(early).learn(later)
-    one, other = (np.sqrt(each.now.solve(each.walk).covariance.diagonal()) for each in (before, after))
+    before = with_friction_walk(base, 5.0).learn(rows.take(slice(0, 60)))
+    after = before.learn(later)
+    one, other = spread_of(before), spread_of(after)
     np.testing.assert_allclose(other[friction], 1.0, atol=1e-6)
-    centre = base.posterior.basis.root.T @ base.posterior.weights
     np.testing.assert_allclose(after.now.solve(after.walk).mean[friction], centre[friction], atol=1e-6)
     assert (other >= one - 1e-9).all()
     assert np.median(np.delete(other / one, friction)) < 2
@@ -151,27 +144,23 @@ def test_without_a_walk_nothing_changes(base: TorqueModel, rows: Rows, monkeypat
 
 
 def test_ended_walk_keeps_its_friction(base: TorqueModel, rows: Rows) -> None:
-    walked = with_friction_walk(base, 10.0).learn(rows)
+    start = with_friction_walk(base, 10.0)
+    known, walked = transfer.dump(start), start.learn(rows)
     ended = walked.with_walk(None)
     assert_same_predictions(ended.model(), walked.model(), rows)
-    known = transfer.dump(with_friction_walk(base, 10.0))
-    start = with_friction_walk(base, 10.0)
     start.detached().with_walk(None).learn(rows, own=True)
     assert transfer.dump(start) == known, "sums of others are overwritten"
-    again = ended.with_walk(10.0)
-    assert_same_predictions(again.model(), walked.model(), rows)
+    assert_same_predictions(ended.with_walk(10.0).model(), walked.model(), rows)
     assert walked.with_walk(10.0) is walked
 
 
 def test_stored_state_and_in_place_learning_are_exact(base: TorqueModel, rows: Rows) -> None:
-    usual = OnlineModel.start(base, 50.0, START_S).with_walk(10.0)
-    own = usual.detached()
-    for part in np.array_split(np.arange(len(rows)), 8):
-        usual, own = usual.learn(rows.take(part)), own.learn(rows.take(part), own=True)
-    own = own.symmetrised()
-    assert transfer.dump(own) == transfer.dump(usual)
-    read = transfer.load(base, transfer.dump(usual))
-    assert transfer.dump(read) == transfer.dump(usual)
+    start, parts = OnlineModel.start(base, 50.0, START_S).with_walk(10.0), np.array_split(np.arange(len(rows)), 8)
+    usual = learn_parts(start, rows, parts)
+    state = transfer.dump(usual)
+    assert transfer.dump(learn_parts(start.detached(), rows, parts, own=True).symmetrised()) == state
+    read = transfer.load(base, state)
+    assert transfer.dump(read) == state
     more = replace(rows, time=rows.time + 12.0)
     assert transfer.dump(read.learn(more)) == transfer.dump(usual.learn(more))
     assert_same_predictions(consolidate(usual), usual.model(), rows, 0.0)

@@ -1,17 +1,18 @@
 """Tests of online learning with every estimator: dense references, forgetting, changes and new versions."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from safetensors.numpy import load as load_tensors
 from safetensors.numpy import save as save_tensors
 
-from lipcore import FitOptions, ModelFormatError, TorqueModel, load, save, train
+from lipcore import FitOptions, ModelFormatError, Samples, TorqueModel, load, save
 from lipcore.data.motion import Motion
-from lipcore.data.samples import Samples
 from lipcore.estimators.catalogue import ESTIMATORS
 from lipcore.files.probing import probe
 from lipcore.online import transfer
@@ -22,51 +23,51 @@ from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.misfit import shared_rows
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Simulation, simulate
-from lipcore.robots.urdf import RigidBody
-from lipcore.vocabulary import ROBOT_ESTIMATORS, Code
+from lipcore.vocabulary import Code
 from tests.choosing import few
 from tests.lipcore.arm_oracles import as_rows, assert_same_predictions
+from tests.lipcore.estimators.test_estimators import train_estimator
 
-ROBOT = "double-pendulum"
+ROBOT, TYPES = "double-pendulum", ("revolute",) * 2
 OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=25, starts=1, device="cpu", compact_tolerance=0.1)
+PRECISE_OPTIONS = FitOptions(hyperparameter_samples=60, max_iterations=60, starts=1, device="cpu")
+STREAM = Simulation(n_samples=120, speed=10, noise=0.02, viscous=0.1)
+
+
+def simulate_pendulum(seed: int, **changes: Any) -> Samples:
+    return simulate(load_robot(ROBOT), replace(STREAM, **changes), seed=seed)
+
+
+def learn_parts(online: OnlineModel, rows: Rows, parts: Iterable[Any], **how: Any) -> OnlineModel:
+    """Learn the rows at each of these places in turn."""
+    for part in parts:
+        online = online.learn(rows.take(part), **how)
+    return online
 
 
 @pytest.fixture(scope="module", params=few(ESTIMATORS, {"lip-chain", "se", "rigid-body+lip-chain"}.__contains__))
 def model(request: pytest.FixtureRequest) -> TorqueModel:
-    samples = simulate(load_robot(ROBOT), Simulation(n_samples=80, speed=10, noise=0.02, viscous=0.1), seed=1)
-    robot = None
-    if request.param in ROBOT_ESTIMATORS:
-        robot = RigidBody.from_profile(ROBOT, samples.joint_names, ("revolute",) * 2)
-    return train(samples, ("revolute",) * 2, request.param, OPTIONS, robot=robot)
+    return train_estimator(request.param, simulate_pendulum(1, n_samples=80), OPTIONS)
 
 
 @pytest.fixture(scope="module")
 def rows() -> Rows:
     """Return another motion of the same robot with slightly more viscous friction."""
-    return as_rows(simulate(load_robot(ROBOT), Simulation(n_samples=120, speed=10, noise=0.02, viscous=0.12), seed=2))
+    return as_rows(simulate_pendulum(2, viscous=0.12))
 
 
 def test_learning_does_not_depend_on_batches_and_order(model: TorqueModel, rows: Rows) -> None:
-    assert_same_predictions(OnlineModel.start(model).model(), model, rows)
-    whole = OnlineModel.start(model).learn(rows).model()
-    rng = np.random.default_rng(0)
-    parts = np.array_split(rng.permutation(len(rows)), 7)
-    shuffled = OnlineModel.start(model)
-    for part in parts:
-        shuffled = shuffled.learn(rows.take(part))
-    assert_same_predictions(shuffled.model(), whole, rows)
-    one_by_one = OnlineModel.start(model)
-    for k in range(12):
-        one_by_one = one_by_one.learn(rows.take(slice(k, k + 1)))
-    assert_same_predictions(one_by_one.model(), OnlineModel.start(model).learn(rows.take(slice(0, 12))).model(), rows)
+    start = OnlineModel.start(model)
+    assert_same_predictions(start.model(), model, rows)
+    shuffled = learn_parts(start, rows, np.array_split(np.random.default_rng(0).permutation(len(rows)), 7))
+    assert_same_predictions(shuffled.model(), start.learn(rows).model(), rows)
+    one_by_one = learn_parts(start, rows, np.arange(12)[:, None])
+    assert_same_predictions(one_by_one.model(), start.learn(rows.take(slice(0, 12))).model(), rows)
 
 
 def test_forgetting_does_not_depend_on_order(model: TorqueModel, rows: Rows) -> None:
-    began = float(rows.time.min())
-    start = OnlineModel.start(model, forgetting_s=5.0, since=began)
-    backwards = start
-    for part in np.array_split(np.arange(len(rows))[::-1], 4):
-        backwards = backwards.learn(rows.take(part))
+    start = OnlineModel.start(model, forgetting_s=5.0, since=float(rows.time.min()))
+    backwards = learn_parts(start, rows, np.array_split(np.arange(len(rows))[::-1], 4))
     assert_same_predictions(backwards.model(), start.learn(rows).model(), rows)
     assert start.learn(rows).samples < 0.9 * len(rows)
 
@@ -125,17 +126,9 @@ def test_change_keeps_the_mean_and_opens_the_uncertainty(model: TorqueModel, row
     assert changed.samples == 0
 
 
-PRECISE_OPTIONS = FitOptions(hyperparameter_samples=60, max_iterations=60, starts=1, device="cpu")
-STREAM = Simulation(n_samples=120, speed=10, noise=0.02, viscous=0.1)
-
-
-def simulate_pendulum(seed: int, **changes: object) -> Samples:
-    return simulate(load_robot(ROBOT), replace(STREAM, **changes), seed=seed)  # type: ignore[arg-type]
-
-
 @pytest.fixture(scope="module")
 def base() -> TorqueModel:
-    return train(simulate_pendulum(1), ("revolute",) * 2, "lip-chain", PRECISE_OPTIONS)
+    return train_estimator("lip-chain", simulate_pendulum(1), PRECISE_OPTIONS)
 
 
 def row_noise(posterior: CompactPosterior, motion: Motion, shared: float = 10.0) -> np.ndarray:
@@ -146,82 +139,76 @@ def row_noise(posterior: CompactPosterior, motion: Motion, shared: float = 10.0)
     return noise.reshape(-1)
 
 
-def regression(
-    posterior: CompactPosterior, motion: Motion, tau: np.ndarray, noise: np.ndarray, centre: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def open_variance(posterior: CompactPosterior, motion: Motion, features: np.ndarray) -> np.ndarray:
+    """Return the prior variance of each torque in turn that the features leave open.
+
+    The linear terms' features explain their share of the prior exactly.
+    """
+    prior = posterior.kernel.variance(posterior.params, motion).diagonal(axis1=1, axis2=2)
+    return np.maximum(prior.reshape(-1) - np.square(features).sum(0), 0.0)
+
+
+def regression(posterior, motion, tau, noise, centre) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and covariance of the whitened variables, conditioned on all torques."""
     features = posterior.basis.features(motion)
-    prior = posterior.kernel.variance(posterior.params, motion).diagonal(axis1=1, axis2=2)
-    open_ = np.maximum(prior.reshape(-1) - np.square(features).sum(0), 0.0)
-    # the linear terms' features explain their share of the prior exactly
-    gram = features.T @ features + np.diag(noise + open_)
+    gram = features.T @ features + np.diag(noise + open_variance(posterior, motion, features))
     gain = features @ np.linalg.inv(gram)
     mean = centre + gain @ (tau.reshape(-1) - features.T @ centre)
     return mean, np.eye(len(centre)) - gain @ features.T
 
 
 def assert_solution(online: OnlineModel, mean: np.ndarray, covariance: np.ndarray, tolerance: float = 1e-6) -> None:
-    found = online.now.solve()
+    found = online.now.solve(online.walk)
     np.testing.assert_allclose(found.mean, mean, rtol=0, atol=tolerance * np.abs(mean).max())
-    spread = found.covariance
-    np.testing.assert_allclose(spread, covariance, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(found.covariance, covariance, rtol=0, atol=tolerance)
 
 
 def test_learning_equals_the_posterior_of_all_samples(base: TorqueModel, rows: Rows) -> None:
     old = simulate_pendulum(1)
-    motion = Samples.concatenate([old, simulate_pendulum(2)]).motion()
+    parts = old.motion(), rows.motion()
+    motion = Motion(*np.concatenate([each.arrays() for each in parts]).swapaxes(0, 1))
     tau = np.concatenate([old.tau, rows.tau])
-    shared = shared_rows(old, ("revolute",) * 2, len(old))  # the recorded motion repeats itself
+    shared = shared_rows(old, TYPES, len(old))  # the recorded motion repeats itself
     assert shared > 10.0
-    noise = [row_noise(base.posterior, old.motion(), shared), row_noise(base.posterior, simulate_pendulum(2).motion())]
-    zeros = np.zeros(len(base.posterior.basis))
-    expected = regression(base.posterior, motion, tau, np.concatenate(noise), zeros)
+    noise = np.concatenate([row_noise(base.posterior, *each) for each in zip(parts, (shared, 10.0), strict=True)])
+    expected = regression(base.posterior, motion, tau, noise, np.zeros(len(base.posterior.basis)))
     assert_solution(OnlineModel.start(base).learn(rows), *expected)
 
 
 def test_forgetting_weighs_rows_by_age_around_the_version(base: TorqueModel, rows: Rows) -> None:
     began, forgetting = float(rows.time.min()), 4.0
     online = OnlineModel.start(base, forgetting, since=began).learn(rows)
-    posterior = base.posterior
-    age = rows.time.max() - rows.time
+    posterior, motion = base.posterior, rows.motion()
     # the version's own samples are pseudo-observations with its sums, centred on its mean
     factor = np.exp(-(rows.time.max() - began) / forgetting)
     centre = posterior.basis.root.T @ posterior.weights
-    assert posterior.statistics is not None
-    old = factor * posterior.statistics.a
-    values, vectors = np.linalg.eigh(old)
-    scale = np.sqrt(np.maximum(values, 0.0))
-    features = posterior.basis.features(rows.motion())
-    prior = posterior.kernel.variance(posterior.params, rows.motion()).diagonal(axis1=1, axis2=2)
-    open_ = np.maximum(prior.reshape(-1) - np.square(features).sum(0), 0.0)
-    precision = np.repeat(np.exp(-age / forgetting), 2) / (row_noise(posterior, rows.motion()) + open_)
-    design = np.concatenate([(vectors * scale).T, features.T * np.sqrt(precision)[:, None]])
-    target = np.concatenate([(vectors * scale).T @ centre, rows.tau.reshape(-1) * np.sqrt(precision)])
+    values, vectors = np.linalg.eigh(factor * posterior.statistics.a)
+    old = (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    features = posterior.basis.features(motion)
+    variance = row_noise(posterior, motion) + open_variance(posterior, motion, features)
+    root = np.sqrt(np.repeat(np.exp((rows.time - rows.time.max()) / forgetting), 2) / variance)
+    design = np.concatenate([old, features.T * root[:, None]])
+    target = np.concatenate([old @ centre, rows.tau.reshape(-1) * root])
     covariance = np.linalg.inv(np.eye(len(centre)) + design.T @ design)
-    mean = covariance @ (centre + design.T @ target)
-    assert_solution(online, mean, covariance, 1e-5)
+    assert_solution(online, covariance @ (centre + design.T @ target), covariance, 1e-5)
 
 
 def test_changed_robot_is_learnt_around_the_old_mean(base: TorqueModel, rows: Rows) -> None:
     heavier = simulate_pendulum(3, payload=Payload(2.0))
     known = OnlineModel.start(base).learn(rows)
-    changed = known.change(5000.0)
-    loaded = as_rows(heavier, 5001.0)
+    changed, loaded = known.change(5000.0), as_rows(heavier, 5001.0)
     learnt = changed.learn(loaded)
-    centre = known.now.solve().mean
-    expected = regression(
-        base.posterior, heavier.motion(), heavier.tau, row_noise(base.posterior, heavier.motion()), centre
-    )
+    noise = row_noise(base.posterior, heavier.motion())
+    expected = regression(base.posterior, heavier.motion(), heavier.tau, noise, known.now.solve().mean)
     assert_solution(learnt, *expected)
 
-    unseen = simulate_pendulum(4, payload=Payload(2.0), noise=0.0)
-    errors = {}
-    few = loaded.take(slice(0, 15))
-    for name, online in (("as before", known), ("anew", changed.learn(few)), ("on top", known.learn(few))):
-        errors[name] = np.mean((online.model().predict(unseen.q, unseen.dq, unseen.ddq).tau - unseen.tau) ** 2)
-    assert errors["anew"] < 0.2 * errors["as before"]
-    assert errors["anew"] < 0.2 * errors["on top"]
-    honest = learnt.model().predict(unseen.q, unseen.dq, unseen.ddq)
+    unseen, few = simulate_pendulum(4, payload=Payload(2.0), noise=0.0), loaded.take(slice(0, 15))
+    before, anew, on_top, honest = (
+        each.model().predict(unseen.q, unseen.dq, unseen.ddq)
+        for each in (known, changed.learn(few), known.learn(few), learnt)
+    )
+    for other in (before, on_top):
+        assert np.mean((anew.tau - unseen.tau) ** 2) < 0.2 * np.mean((other.tau - unseen.tau) ** 2)
     assert (np.abs(honest.tau - unseen.tau) < 1.96 * honest.tau_std).mean() > 0.8
 
 
@@ -282,12 +269,10 @@ def test_invalid_arguments_are_rejected(base: TorqueModel, rows: Rows, tmp_path:
 
 def test_damaged_or_foreign_state_is_rejected(base: TorqueModel, rows: Rows) -> None:
     payload = transfer.dump(OnlineModel.start(base).learn(rows))
-    known = base.posterior.statistics
-    assert known is not None
-    moved = replace(known, b=known.b + 1)
-    other = replace(base, posterior=replace(base.posterior, weights=base.posterior.weights + 1, statistics=moved))
+    posterior, known = base.posterior, base.posterior.statistics
+    moved = replace(posterior, weights=posterior.weights + 1, statistics=replace(known, b=known.b + 1))
     with pytest.raises(ValueError, match="another version"):
-        transfer.load(other, payload)
+        transfer.load(replace(base, posterior=moved), payload)
     tensors = load_tensors(payload)
     old = save_tensors({**tensors, "now/numbers": tensors["now/numbers"][:2]})  # as releases before 0.2.0 wrote it
     for broken in (b"", payload[:-10], b"x" * 100, payload[:8] + b"[" + payload[9:], old):
@@ -297,14 +282,11 @@ def test_damaged_or_foreign_state_is_rejected(base: TorqueModel, rows: Rows) -> 
 
 @pytest.mark.parametrize("forgetting", [None, 20.0])
 def test_learning_in_place_gives_identical_bits(base: TorqueModel, rows: Rows, forgetting: float | None) -> None:
-    parts = [rows.take(slice(0, 40)), rows.take(slice(40, 41)), rows.take(slice(41, None))]
-    usual = OnlineModel.start(base, forgetting, since=float(rows.time.min()))
-    untouched = transfer.dump(usual)
-    own = usual.detached()
-    for part in parts:
-        usual, own = usual.learn(part), own.learn(part, own=True)
-    usual, own = usual.change(5000.0), own.change(5000.0)
-    usual, own = usual.learn(parts[1]), own.learn(parts[1], own=True)
+    parts = [slice(0, 40), slice(40, 41), slice(41, None)]
+    start = OnlineModel.start(base, forgetting, since=float(rows.time.min()))
+    untouched = transfer.dump(start)
+    usual = learn_parts(start, rows, parts).change(5000.0).learn(rows.take(parts[1]))
+    own = learn_parts(start.detached(), rows, parts, own=True).change(5000.0).learn(rows.take(parts[1]), own=True)
     assert transfer.dump(own.symmetrised()) == transfer.dump(usual)
     assert transfer.dump(OnlineModel.start(base, forgetting, since=float(rows.time.min()))) == untouched
     assert np.array_equal(usual.now.statistics.a, usual.now.statistics.a.T)
@@ -322,9 +304,7 @@ def learn_in_mode(base: TorqueModel, rows: Rows, how: str) -> OnlineModel:
 
 @pytest.mark.parametrize("how", ["plain", "forgetting", "changed"])
 @pytest.mark.parametrize("floor", [None, VARIANCE_FLOOR], ids=["no floor", "floor"])
-def test_saved_consolidated_model_predicts_identically(
-    base: TorqueModel, rows: Rows, how: str, floor: np.ndarray | None, tmp_path: Path
-) -> None:
+def test_saved_consolidated_model_predicts_identically(base, rows, how, floor, tmp_path) -> None:
     learnt = learn_in_mode(base, rows, how)
     whole = consolidate(learnt, floor)
     save(whole, tmp_path / "model")
@@ -338,13 +318,13 @@ def test_saved_consolidated_model_predicts_identically(
 
 
 def test_manifest_counts_learnt_samples(base: TorqueModel, rows: Rows, tmp_path: Path) -> None:
-    trained = base.posterior.statistics
-    assert trained is not None
-    weight = float(rows.weight.sum())
-    plain = save(consolidate(learn_in_mode(base, rows, "plain")), tmp_path / "plain")
-    assert plain["compact"]["data_samples"] == round(trained.samples + weight)
-    changed = save(consolidate(learn_in_mode(base, rows, "changed")), tmp_path / "changed")
-    assert 0 < changed["compact"]["data_samples"] < trained.samples
+    trained = base.posterior.statistics.samples
+    plain, changed = (
+        save(consolidate(learn_in_mode(base, rows, how)), tmp_path / how)["compact"]["data_samples"]
+        for how in ("plain", "changed")
+    )
+    assert plain == round(trained + float(rows.weight.sum()))
+    assert 0 < changed < trained
 
 
 def test_negative_floor_is_rejected(base: TorqueModel, rows: Rows, tmp_path: Path) -> None:
@@ -357,14 +337,11 @@ def test_negative_floor_is_rejected(base: TorqueModel, rows: Rows, tmp_path: Pat
 
 def test_probe_detects_invalid_predictions(base: TorqueModel) -> None:
     probe(base)
-    posterior = base.posterior
-    params = {name: value.copy() for name, value in posterior.params.items()}
-    params["noise.log_std"] += 400.0
-    statistics = posterior.statistics
-    assert statistics is not None
-    inducing, outputs = posterior.basis.inducing, posterior.basis.outputs
+    posterior, basis = base.posterior, base.posterior.basis
+    params = {**posterior.params, "noise.log_std": posterior.params["noise.log_std"] + 400.0}
     with np.errstate(over="ignore"):
-        restored = CompactPosterior.restore(base.estimator.kernel, params, inducing, outputs, statistics)
-    broken = replace(base, posterior=restored)
+        restored = CompactPosterior.restore(
+            base.estimator.kernel, params, basis.inducing, basis.outputs, posterior.statistics
+        )
     with pytest.raises(ModelFormatError, match="noise_std of a probe"):
-        probe(broken)
+        probe(replace(base, posterior=restored))

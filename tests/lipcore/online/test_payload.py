@@ -1,48 +1,55 @@
 """Tests of tracking a stream's payload: detection, removal, declaration, quiet streams and contacts."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-import lipcore
+from lipcore import load
 from lipcore.model.body import Body
 from lipcore.model.payload import Carrier
-from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.online.payload.holding import PayloadTracker
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Payload, Simulation, simulate
 from tests import ROOT
+from tests.lipcore.arm_oracles import as_rows
 from tests.lipcore.stepping import run_to_end
 
-SHIPPED = ROOT / "models" / "panda-sim"
 RATE, UP_S, DOWN_S = 100.0, 20.0, 22.0
 
 
 @pytest.fixture(scope="module")
 def carrier():
-    return Carrier(lipcore.load(SHIPPED))
+    return Carrier(load(ROOT / "models" / "panda-sim"))
 
 
 def simulate_stream(seed, mass=0.0, noise=0.05, first=19.0, last=23.0):
     """Return rows of a Panda that carries a mass, off its last axis, from UP_S to DOWN_S."""
-    robot, motion = load_robot("panda"), Simulation(2400, RATE, speed=5.0, noise=noise)
-    free = simulate(robot, motion, seed)
-    full = simulate(
-        robot, Simulation(2400, RATE, speed=5.0, noise=noise, payload=Payload(mass, 0.0, (0.02, 0.02, 0.08))), seed
-    )
-    carried = ((free.t >= UP_S) & (free.t < DOWN_S))[:, None] if mass else np.zeros((len(free), 1), bool)
-    tau = np.where(carried, full.tau, free.tau)
-    rows = Rows(free.t, free.q, free.dq, free.ddq, tau, np.zeros(len(free), np.uint8))
+    motion = Simulation(2400, RATE, speed=5.0, noise=noise)
+    payloads = None, Payload(mass, 0.0, (0.02, 0.02, 0.08))
+    free, full = (simulate(load_robot("panda"), replace(motion, payload=payload), seed) for payload in payloads)
+    carried = ((free.t >= UP_S) & (free.t < DOWN_S))[:, None] & (mass > 0)
+    return between(as_rows(replace(free, tau=np.where(carried, full.tau, free.tau)), 0.0), first, last)
+
+
+def between(rows, first, last=np.inf):
     return rows.take((rows.time >= first) & (rows.time < last))
 
 
-def track_payload(carrier, rows, block=10):
+def track_payload(carrier, rows, block=10, tracker=None):
     """Return time and tracker after each block."""
-    tracker, out = PayloadTracker(7), []
+    tracker, out = tracker or PayloadTracker(7), []
     for first in range(0, len(rows), block):
-        tracker = tracker.step(carrier, rows.take(slice(first, first + block)))
-        out.append((rows.time[min(first + block, len(rows)) - 1], tracker))
+        part = rows.take(slice(first, first + block))
+        tracker = tracker.step(carrier, part)
+        out.append((part.time[-1], tracker))
     return out
+
+
+def last_tracker(*args, **kwargs):
+    return track_payload(*args, **kwargs)[-1][1]
 
 
 @pytest.mark.slow
@@ -69,89 +76,79 @@ def test_quiet_stream_has_no_payload(carrier):
 
 def test_payload_from_before_the_stream_is_noticed(carrier):
     trackers = track_payload(carrier, simulate_stream(303, 1.0, first=20.5))
-    found = next(at for at, tracker in trackers if tracker.held is not None)
-    assert found < 20.5 + 0.7
+    assert next(at for at, tracker in trackers if tracker.held is not None) < 20.5 + 0.7
 
 
 def test_push_on_one_joint_is_a_contact(carrier):
     rows = simulate_stream(304)
-    tau = rows.tau.copy()
     pushed = (rows.time >= UP_S) & (rows.time < UP_S + 0.2)
-    tau[pushed, 0] += 6.0  # about a vertical axis, on which weight does nothing
-    rows = Rows(rows.time, rows.q, rows.dq, rows.ddq, tau, rows.code)
-    trackers = track_payload(carrier, rows)
+    push = np.outer(pushed, [6.0, *[0.0] * 6])  # about a vertical axis, on which weight does nothing
+    trackers = track_payload(carrier, replace(rows, tau=rows.tau + push))
     assert all(tracker.held is None for _, tracker in trackers)
     assert "contact" in {tracker.state for _, tracker in trackers}
 
 
 @pytest.mark.slow
 def test_small_payload_must_last_unlike_a_push(carrier):
-    held = {round(at, 2): tracker.held for at, tracker in track_payload(carrier, simulate_stream(305, 0.1))}
+    carried, free = simulate_stream(305, 0.1), simulate_stream(305)
+    held = {round(at, 2): tracker.held for at, tracker in track_payload(carrier, carried)}
     taken = min(at for at, each in held.items() if each is not None)
     assert UP_S + 0.2 < taken < UP_S + 0.45
     mass, std = next(each for at, each in reversed(held.items()) if at < DOWN_S).estimate.mass
     assert abs(mass - 0.1) < 4 * std
     for begin in (20.0, 20.8, 21.5):  # the weight of the same mass, for 0.2 s each
-        carried, free = simulate_stream(305, 0.1), simulate_stream(305)
         during = ((carried.time >= begin) & (carried.time < begin + 0.2))[:, None]
-        tau = np.where(during, carried.tau, free.tau)
-        pushed = Rows(free.time, free.q, free.dq, free.ddq, tau, free.code)
+        pushed = replace(free, tau=np.where(during, carried.tau, free.tau))
         assert all(tracker.held is None for _, tracker in track_payload(carrier, pushed))
 
 
 @pytest.mark.slow
 def test_batch_size_does_not_change_detection(carrier):
     rows = simulate_stream(300, 1.0, last=21.0)
-    masses = [track_payload(carrier, rows, block)[-1][1].held.estimate.mass[0] for block in (3, 10, 77, len(rows))]
+    masses = [last_tracker(carrier, rows, block).held.estimate.mass[0] for block in (3, 10, 77, len(rows))]
     np.testing.assert_allclose(masses, 1.0, atol=0.02)
 
 
 def test_repeated_rows_and_gaps_are_skipped(carrier):
     rows = simulate_stream(300, 1.0, last=21.0)
     tracker = PayloadTracker(7).step(carrier, rows)
-    again = tracker.step(carrier, rows)
-    assert again.held.count == tracker.held.count
+    assert tracker.step(carrier, rows).held.count == tracker.held.count
     later = rows.take(slice(50, 60))
-    later = Rows(later.time + 100.0, later.q, later.dq, later.ddq, later.tau, later.code)
-    assert len(tracker.step(carrier, later).cells) <= 2
+    assert len(tracker.step(carrier, replace(later, time=later.time + 100.0)).cells) <= 2
 
 
 def test_declared_payload_is_used_until_rows_overrule_it(carrier):
-    rows = simulate_stream(305, 1.0, last=21.9)
-    carried = rows.take(rows.time >= UP_S)
     right = PayloadTracker(7).declare(carrier, Body(1.0, np.array([0.0, 0.04, 0.08])), UP_S)
     assert right.held.declared
     np.testing.assert_allclose(right.load.payload[:1], 1.0)
     wrong = PayloadTracker(7).declare(carrier, Body(3.0, np.array([0.0, 0.0, 0.1])), UP_S)
-    for block in range(0, len(carried), 10):
-        wrong = wrong.step(carrier, carried.take(slice(block, block + 10)))
+    wrong = last_tracker(carrier, simulate_stream(305, 1.0, first=UP_S, last=21.9), tracker=wrong)
     assert wrong.held.estimate.mass[0] == pytest.approx(1.0, abs=0.05)
     assert not wrong.held.declared
     assert wrong.put_down(30.0).load is None
 
 
 def test_payload_is_restored_from_its_report(carrier):
-    tracker = track_payload(carrier, simulate_stream(300, 1.0, last=21.0))[-1][1]
+    tracker = last_tracker(carrier, simulate_stream(300, 1.0, last=21.0))
     again = PayloadTracker.from_json(tracker.to_json(), 7, carrier)
     assert (again.state, again.since, again.held.count) == (tracker.state, tracker.since, tracker.held.count)
     np.testing.assert_allclose(again.load.payload, tracker.load.payload)
     np.testing.assert_allclose(again.held.estimate.covariance, tracker.held.estimate.covariance)
-    nothing = PayloadTracker.from_json(PayloadTracker(7).put_down(3.0).to_json(), 7, carrier)
-    assert (nothing.held, nothing.since) == (None, 3.0)
+    for restore in (PayloadTracker.from_json, PayloadTracker.from_other_version):
+        nothing = restore(PayloadTracker(7).put_down(3.0).to_json(), 7, carrier)
+        assert (nothing.held, nothing.since) == (None, 3.0)
 
 
 def test_another_revision_keeps_the_payload(carrier):
-    tracker = track_payload(carrier, simulate_stream(300, 1.0, last=21.0))[-1][1]
-    online = OnlineModel.start(carrier.model).learn(simulate_stream(306, first=0.0, last=2.0))
-    other = Carrier(online.model())
+    tracker, online = last_tracker(carrier, simulate_stream(300, 1.0, last=21.0)), OnlineModel.start(carrier.model)
+    other = Carrier(online.learn(simulate_stream(306, first=0.0, last=2.0)).model())
     few = simulate_stream(300, 1.0, first=21.0, last=21.03)
     found = tracker.step(other, few).held.estimate
     assert found is not tracker.held.estimate
     assert found.mass[0] == pytest.approx(tracker.held.estimate.mass[0], abs=0.01)
     # a revision that has learnt nothing new gives the same estimate
-    same = Carrier(OnlineModel.start(carrier.model).model())
-    kept = tracker.step(same, few)
-    floor = Carrier(OnlineModel.start(carrier.model).model(np.full(7, 0.1)))
+    kept = tracker.step(Carrier(online.model()), few)
+    floor = Carrier(online.model(np.full(7, 0.1)))
     assert kept.step(floor, simulate_stream(300, 1.0, first=21.03, last=21.04)).held.estimate is kept.held.estimate
 
 
@@ -160,7 +157,7 @@ def test_payload_is_noticed_despite_uneven_rows(carrier, seed):
     rng, rows = np.random.default_rng(seed), simulate_stream(300, 1.5, noise=0.01, last=20.6)
     late = np.where(rng.random(len(rows)) < 0.3, rng.exponential(0.005, len(rows)), 0.0)
     time = np.maximum.accumulate(rows.time + late) + 1e-5 * np.arange(len(rows))
-    rows = Rows(time, rows.q, rows.dq, rows.ddq, rows.tau, rows.code).take(slice(seed, None))
+    rows = replace(rows, time=time).take(slice(seed, None))
     found = next(at for at, tracker in track_payload(carrier, rows, block=3) if tracker.held is not None)
     assert UP_S < found < UP_S + 0.25
 
@@ -172,15 +169,15 @@ def refine_payload(tracker):
 @pytest.mark.slow
 def test_refined_estimate_stays_until_the_next_refinement(carrier):
     rows = simulate_stream(300, 1.0, last=21.9)
-    first = track_payload(carrier, rows.take(rows.time < UP_S + 0.2))[-1][1]
+    first = last_tracker(carrier, between(rows, 0.0, UP_S + 0.2))
     found = refine_payload(first)
-    later = rows.take((rows.time >= UP_S + 0.2) & (rows.time < UP_S + 0.25))
+    later = between(rows, UP_S + 0.2, UP_S + 0.25)
     second = first.step(carrier, later).refined(found)
     assert second.held.estimate is found.estimate
     assert second.held.count == first.held.count + len(later)
     explored = second.refined(refine_payload(second))  # draws that rows have ruled out start again
     assert explored.refinement() is None
-    last = explored.step(carrier, rows.take(rows.time >= UP_S + 0.25))
+    last = explored.step(carrier, between(rows, UP_S + 0.25))
     assert last.held.estimate is not explored.held.estimate  # estimated again meanwhile
     assert last.held.estimate.draws is explored.held.estimate.draws
     late = last.refined(found).held.estimate  # from many fewer rows
@@ -195,38 +192,30 @@ def test_refined_estimate_stays_until_the_next_refinement(carrier):
 
 def test_outline_continues_like_the_tracker(carrier):
     rows = simulate_stream(300, 1.0, last=21.9)
-    tracker = track_payload(carrier, rows.take(rows.time < UP_S + 0.5))[-1][1]
+    tracker = last_tracker(carrier, between(rows, 0.0, UP_S + 0.5))
     outline = tracker.outline()
     assert len(outline.held.rows) == 0
-    more = rows.take(rows.time >= UP_S + 0.5)
-    for block in range(0, len(more), 10):
-        part = more.take(slice(block, block + 10))
-        tracker, outline = tracker.step(carrier, part), outline.step(carrier, part)
-    for each in (tracker, outline):
-        mass, std = each.held.estimate.mass
+    for start in (tracker, outline):
+        mass, std = last_tracker(carrier, between(rows, UP_S + 0.5), tracker=start).held.estimate.mass
         assert abs(mass - 1.0) < 4 * std + 0.005
         assert std < 0.03
 
 
 def test_payload_carries_over_to_another_version(carrier):
     rows = simulate_stream(300, 1.5, last=21.9)
-    noticed = track_payload(carrier, rows.take(rows.time < UP_S + 0.5))[-1][1]
+    noticed = last_tracker(carrier, between(rows, 0.0, UP_S + 0.5))
     tracker = PayloadTracker.from_other_version(noticed.to_json(), 7, carrier)
     assert (tracker.state, tracker.since, tracker.held.declared) == ("payload", noticed.since, False)
     mass, std = tracker.held.estimate.mass
     assert mass == pytest.approx(1.5, abs=0.02)
     assert 0.03 < std < 0.1
-    motion = rows.take(rows.time >= UP_S + 0.5)
+    later = between(rows, UP_S + 0.5)
     vague, exact = (
-        carrier.with_payload(each.load).predict(motion.q, motion.dq, motion.ddq) for each in (tracker, noticed)
+        carrier.with_payload(each.load).predict(later.q, later.dq, later.ddq) for each in (tracker, noticed)
     )
     assert (vague.tau_std.max(0) > 5 * exact.tau_std.max(0)).any()
-    assert (np.abs(vague.tau - motion.tau) < 1.96 * np.sqrt(vague.tau_std**2 + vague.noise_std**2)).mean() > 0.9
-    for block in range(0, len(motion), 10):
-        tracker = tracker.step(carrier, motion.take(slice(block, block + 10)))
-    assert tracker.held.estimate.mass[1] < 0.03
-    nothing = PayloadTracker.from_other_version(PayloadTracker(7).put_down(3.0).to_json(), 7, carrier)
-    assert (nothing.held, nothing.since) == (None, 3.0)
+    assert (np.abs(vague.tau - later.tau) < 1.96 * np.sqrt(vague.tau_std**2 + vague.noise_std**2)).mean() > 0.9
+    assert last_tracker(carrier, later, tracker=tracker).held.estimate.mass[1] < 0.03
 
 
 @pytest.mark.slow
@@ -236,12 +225,8 @@ def test_state_changes_at_most_once_a_second(carrier):
     knock, tau = (rows.time / 0.4).astype(int), rows.tau.copy()
     hit = rows.time % 0.4 < 0.15
     tau[hit, knock[hit] % 7] += np.where(knock[hit] % 2, 20.0, -20.0)
-    knocked = Rows(rows.time, rows.q, rows.dq, rows.ddq, tau, rows.code)
-    tracker, states = PayloadTracker(7), []
-    for first in range(0, len(knocked), 10):
-        tracker = tracker.step(carrier, knocked.take(slice(first, first + 10)))
-        states.append(tracker.state)
-    changes = [0.1 * place for place in range(1, len(states)) if states[place] != states[place - 1]]
-    assert "contact" in states
-    assert tracker.held is None
+    trackers = [tracker for _, tracker in track_payload(carrier, replace(rows, tau=tau))]
+    changes = [0.1 * place for place, (one, other) in enumerate(pairwise(trackers), 1) if one.state != other.state]
+    assert "contact" in {tracker.state for tracker in trackers}
+    assert trackers[-1].held is None
     assert min(np.diff(changes), default=1.0) >= 0.99

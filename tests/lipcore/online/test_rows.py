@@ -9,23 +9,19 @@ from hypothesis import strategies as st
 
 from lipcore.online.acceleration import RateError, derive, rate_of, window
 from lipcore.online.gates import MAX_TORQUE, Patience, RowLimits, check_rows, is_contact, time_span
-from lipcore.robots.library import Robot, load_robot
+from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
 from lipcore.vocabulary import CODES
 
 LIMITS = RowLimits(12.6, 50.0, 2000.0, None, 1.0, 1e-3)
 PANDA_TORQUE = np.array([87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0])
 N = 8
+PANDA = load_robot("panda")
 
 
-@pytest.fixture(scope="module")
-def panda() -> Robot:
-    return load_robot("panda")
-
-
-def batch(rows: int = N, joints: int = 2) -> dict[str, np.ndarray]:
+def batch(rows: int = N) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
-    motion = {name: rng.uniform(0.1, 1.0, (rows, joints)) for name in ("q", "dq", "ddq", "tau")}
+    motion = {name: rng.uniform(0.1, 1.0, (rows, 2)) for name in ("q", "dq", "ddq", "tau")}
     return {"t": 100.0 + np.arange(rows) / 10, **motion}
 
 
@@ -33,9 +29,9 @@ def names(codes: np.ndarray) -> list[str]:
     return [CODES[code] for code in codes]
 
 
-def rejected_for_time(t: list[float], limits: RowLimits = LIMITS, **bounds) -> list[int]:
+def rejected_for_time(t: list[float], **bounds: float) -> list[int]:
     """Return the places of rows rejected for their time, and check that nothing else is rejected."""
-    codes = names(check_rows(**batch(len(t)) | {"t": np.array(t)}, limits=limits, **bounds))
+    codes = names(check_rows(**batch(len(t)) | {"t": np.array(t)}, limits=LIMITS, **bounds))
     assert set(codes) <= {"learnt", "time_jump"}
     return [place for place, code in enumerate(codes) if code == "time_jump"]
 
@@ -49,8 +45,8 @@ def test_magnitude_beyond_its_limit_rejects_the_row(field: str, maximum: float) 
     assert set(codes) == {"learnt", "limit"}
 
 
-def test_panda_motion_is_learnt_unless_saturated(panda: Robot) -> None:
-    samples = simulate(panda, Simulation(n_samples=500, rate=50, speed=5, noise=0.05), seed=0)
+def test_panda_motion_is_learnt_unless_saturated() -> None:
+    samples = simulate(PANDA, Simulation(n_samples=500, rate=50, speed=5, noise=0.05), seed=0)
     q, dq, ddq, tau = samples.q, samples.dq, samples.ddq, samples.tau
     for t, second in ((samples.t, ddq), (None, ddq), (samples.t, None)):
         codes = check_rows(t, q, dq, second, tau, replace(LIMITS, torque=PANDA_TORQUE))
@@ -65,10 +61,10 @@ def test_panda_motion_is_learnt_unless_saturated(panda: Robot) -> None:
     assert set(codes[below]) == {"learnt"}
 
 
-def test_robot_at_rest_is_not_learnt(panda: Robot) -> None:
-    q = np.tile((panda.lower + panda.upper) / 2, (20, 1))
+def test_robot_at_rest_is_not_learnt() -> None:
+    q = np.tile((PANDA.lower + PANDA.upper) / 2, (20, 1))
     still = np.zeros_like(q)
-    tau = inverse_dynamics(panda, q, still, still)
+    tau = inverse_dynamics(PANDA, q, still, still)
     dq = 5e-4 * np.random.default_rng(0).uniform(-1, 1, q.shape)
     assert set(names(check_rows(None, q, dq, still, tau, LIMITS))) == {"stationary"}
     assert set(names(check_rows(None, q, dq, still, tau, replace(LIMITS, stationary_speed=0.0)))) == {"learnt"}
@@ -77,17 +73,15 @@ def test_robot_at_rest_is_not_learnt(panda: Robot) -> None:
 
 
 def test_first_applicable_code_is_returned() -> None:
-    data = batch()
-    limits = replace(LIMITS, torque=np.array([1.0, 1.0]))
+    data, limits = batch(), replace(LIMITS, torque=np.array([1.0, 1.0]))
     data["dq"][:] = 0.0  # all are stationary
     data["tau"][:4, 0] = 0.99  # and saturated
     data["t"][:3] = 0.0  # and out of time
     data["q"][:2, 0] = 99.0  # and beyond a limit
     data["ddq"][0, 1] = np.nan  # and not finite
-    assert names(check_rows(**data, limits=limits, after=50.0)) == [
-        *("non_finite", "limit", "time_jump", "saturation"),
-        *["stationary"] * 4,
-    ]
+    codes = names(check_rows(**data, limits=limits, after=50.0))
+    assert codes[:4] == ["non_finite", "limit", "time_jump", "saturation"]
+    assert codes[4:] == ["stationary"] * 4
 
 
 @given(
@@ -100,8 +94,7 @@ def test_kept_times_increase_with_minimal_loss(honest: list[int], wrong: list[tu
     for place, value in wrong:
         t[min(place, len(t) - 1)] = float(value)
     rejected = rejected_for_time(t)
-    kept = np.delete(t, rejected)
-    assert (np.diff(kept) > 0).all()
+    assert (np.diff(np.delete(t, rejected)) > 0).all()
     assert len(rejected) <= len(wrong)
 
 
@@ -110,11 +103,8 @@ def test_times_outside_their_bounds_are_rejected() -> None:
     assert rejected_for_time([1.0, 2.0, 3.0, 4.0], after=2.0) == [0, 1]
     assert rejected_for_time([1.0, 2.0, 3.0, 4.0], before=3.0) == [2, 3]
     assert rejected_for_time([4.0, 5.0, 1e12], before=60.0) == [2]  # a jump into the future
-
-
-def test_pause_rejects_no_row() -> None:
-    assert rejected_for_time([1.0, 1.1, 1.2, 5.0, 5.1]) == []
-    assert rejected_for_time([-1e308, 1e308]) == []
+    for pause in ([1.0, 1.1, 1.2, 5.0, 5.1], [-1e308, 1e308]):
+        assert rejected_for_time(pause) == []
 
 
 def reject_batches(batches: list[list[float]]) -> list[list[int]]:
@@ -192,8 +182,7 @@ def test_patience_is_exhausted_by_lasting_contact() -> None:
 )
 @settings(deadline=None)
 def test_patience_does_not_depend_on_batches(seed: int, share: float, rate: float, cuts: list[int]) -> None:
-    rng = np.random.default_rng(seed)
-    time, contact = np.arange(300) / rate, rng.random(300) < share
+    time, contact = np.arange(300) / rate, np.random.default_rng(seed).random(300) < share
     whole, parts = Patience(1.0).step(time, contact), Patience(1.0)
     for a, b in zip([0, *sorted(cuts)], [*sorted(cuts), 300], strict=True):
         parts = parts.step(time[a:b], contact[a:b])
@@ -214,10 +203,8 @@ def gain(frequency: float, rate: float) -> complex:
 
 
 # 3 (sin x − x cos x)/x³ at T = 0.04 s, worked out by hand; the sum over few samples differs by less than 0.02
-@pytest.mark.parametrize(("frequency", "expected"), [(1.0, 0.994), (2.0, 0.975), (4.0, 0.903), (9.94, 0.5)])
+@pytest.mark.parametrize(("frequency", "expected"), [(1.0, 0.994), (2.0, 0.975), (4.0, 0.903), (9.9, 0.5)])
 def test_gain_matches_theory_without_phase_shift(frequency: float, expected: float) -> None:
-    # whole periods in 10 s
-    frequency = round(frequency * 10) / 10
     assert abs(gain(frequency, 1000.0) - expected) < 0.01
     assert abs(np.angle(gain(frequency, 100.0))) < 1e-9
 
@@ -238,9 +225,7 @@ def test_noise_matches_theory() -> None:
 )
 @example(coefficients=(1.0, 1.0, 1.0), half=4, extra=-1, rate=100)
 @settings(deadline=None)
-def test_derivative_is_exact_on_quadratics_with_stated_delay(
-    coefficients: tuple[float, float, float], half: int, extra: int, rate: int
-) -> None:
+def test_derivative_is_exact_on_quadratics_with_stated_delay(coefficients, half, extra, rate) -> None:
     a, b, c = coefficients
     t = np.arange(2 * half + 1 + extra) / rate
     derived = derive(t, (a + b * t + c * t**2)[:, None], half)
@@ -253,8 +238,7 @@ def test_derivative_is_exact_on_quadratics_with_stated_delay(
 @given(cut=st.integers(5, 55), half=st.integers(1, 4))
 @settings(deadline=None)
 def test_overlapping_batches_equal_the_whole(cut: int, half: int) -> None:
-    rng = np.random.default_rng(cut)
-    t, dq = np.arange(60) / 100.0, rng.standard_normal((60, 2))
+    t, dq = np.arange(60) / 100.0, np.random.default_rng(cut).standard_normal((60, 2))
     whole = derive(t, dq, half).ddq
     cut = max(cut, 2 * half + 1)
     first = derive(t[:cut], dq[:cut], half)
@@ -264,8 +248,7 @@ def test_overlapping_batches_equal_the_whole(cut: int, half: int) -> None:
 
 @pytest.mark.parametrize("rate", [50.0, 100.0, 333.0, 1000.0])
 def test_rate_is_found_from_jittered_times(rate: float) -> None:
-    rng = np.random.default_rng(4)
-    t = EPOCH + (np.arange(200) + rng.uniform(-0.09, 0.09, 200)) / rate
+    t = EPOCH + (np.arange(200) + np.random.default_rng(4).uniform(-0.09, 0.09, 200)) / rate
     assert rate_of(t) == pytest.approx(rate, rel=2e-3)
 
 

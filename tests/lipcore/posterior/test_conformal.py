@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from lipcore import FitOptions, TorqueModel, train
+from lipcore import FitOptions, Samples, TorqueModel, TorquePrediction, train
 from lipcore.data.metrics import LEVEL, blocks, evaluate, quantile
-from lipcore.data.samples import Array, Samples
+from lipcore.data.samples import Array
 from lipcore.data.splits import GUARD_S
-from lipcore.model.torque_model import TorquePrediction
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.conformal import Conformal, _quantile, fit_conformal, scores
 from lipcore.posterior.statistics import collect
@@ -18,11 +17,14 @@ TYPES = ("revolute",) * 2
 QUICK_OPTIONS = FitOptions(hyperparameter_samples=40, posterior_samples=150, max_iterations=10, starts=1, device="cpu")
 
 
+def simulate_pendulum(seed: int, n_samples: int = 50) -> Samples:
+    stream = Simulation(n_samples=n_samples, rate=10.0, speed=5.0, noise=0.05)
+    return simulate(load_robot("double-pendulum"), stream, seed)
+
+
 @pytest.fixture(scope="module")
 def samples() -> Samples:
-    robot, stream = load_robot("double-pendulum"), Simulation(n_samples=50, rate=10.0, speed=5.0, noise=0.05)
-    first, second = (simulate(robot, stream, seed) for seed in (1, 2))
-    return Samples.concatenate([first, second])
+    return Samples.concatenate([simulate_pendulum(seed) for seed in (1, 2)])
 
 
 @pytest.fixture(scope="module", params=["rigid-body", "lip-chain"])
@@ -38,9 +40,8 @@ def posterior_of(model: TorqueModel, samples: Samples, variance: Array) -> Compa
 
 
 def test_scores_match_posteriors_without_the_block(model: TorqueModel, samples: Samples) -> None:
-    rng, starts = np.random.default_rng(0), blocks(samples)
-    noise = model.posterior.noise_variance
-    variance = noise * rng.uniform(1, 3, samples.tau.shape)
+    starts, noise = blocks(samples), model.posterior.noise_variance
+    variance = noise * np.random.default_rng(0).uniform(1, 3, samples.tau.shape)
     found = scores(posterior_of(model, samples, variance), samples, variance, starts)
     assert len(starts) == 10
     for first, last in zip(starts, [*starts[1:], len(samples)], strict=True):
@@ -92,14 +93,13 @@ def test_intervals_are_never_narrowed() -> None:
 
 def test_scale_corrects_an_underestimated_noise(model: TorqueModel, samples: Samples) -> None:
     """A model with a tenth of the noise has low coverage; its scale corrects that."""
-    posterior = model.posterior
-    tenth = posterior.noise_variance / 100
-    old, motion = posterior, samples.motion()
-    residual = samples.tau - old.kernel.mean(motion)
-    overconfident = CompactPosterior.build(old.kernel, old.basis, collect(old.basis, tenth, motion, residual), tenth)
+    old, motion = model.posterior, samples.motion()
+    tenth = old.noise_variance / 100
+    statistics = collect(old.basis, tenth, motion, samples.tau - old.kernel.mean(motion))
+    overconfident = CompactPosterior.build(old.kernel, old.basis, statistics, tenth)
     found = fit_conformal(overconfident, samples, np.broadcast_to(tenth, samples.tau.shape))
     assert min(found.scale) > 3
-    unseen = simulate(load_robot("double-pendulum"), Simulation(n_samples=200, rate=10.0, speed=5.0, noise=0.05), 9)
+    unseen = simulate_pendulum(9, 200)
     answer = overconfident.predict(unseen.motion())
     given = unseen.tau, answer.mean, answer.std, np.sqrt(tenth)
     assert (evaluate(*given).coverage < 0.6).all()
@@ -107,7 +107,6 @@ def test_scale_corrects_an_underestimated_noise(model: TorqueModel, samples: Sam
 
 
 def test_trained_models_have_a_conformal_scale(model: TorqueModel, samples: Samples) -> None:
-    assert model.conformal is not None
     assert model.conformal.blocks == 10  # seconds
     assert max(model.conformal.guaranteed) <= 10 / 11
     answer = model.predict(samples.q, samples.dq, samples.ddq)

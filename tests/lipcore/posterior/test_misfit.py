@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lipcore import FitOptions, Samples, load, save, train
+from lipcore import FitOptions, Samples, TorqueModel, load, save
 from lipcore.arm.learning import learn
 from lipcore.data.independence import INDEPENDENT_HZ
 from lipcore.data.metrics import evaluate
@@ -14,13 +14,14 @@ from lipcore.data.motion import Motion
 from lipcore.estimators.task import Task
 from lipcore.kernels.fast.answer import ACCELERATED
 from lipcore.kernels.geometry import Geometry
-from lipcore.model.torque_model import TorqueModel
+from lipcore.model.parameters import friction_coefficients
 from lipcore.posterior.misfit import OPTIONS, Misfit, estimate_misfit, low_speed_variance, shared_rows
 from lipcore.robots.dirt import Dirt
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.training.fit import fit_estimator
+from tests.lipcore.estimators.test_estimators import train_estimator
 
 TYPES = ("revolute",) * 2
 ROBOT = load_robot("double-pendulum")
@@ -34,9 +35,7 @@ def simulate_dirty(seed: int, **changes: object) -> Samples:
 
 @pytest.fixture(scope="module", params=["rigid-body", "lip-chain"])
 def model(request: pytest.FixtureRequest) -> TorqueModel:
-    samples = simulate_dirty(1)
-    robot = RigidBody.from_profile("double-pendulum", samples.joint_names, TYPES)
-    return train(samples, TYPES, request.param, QUICK_OPTIONS, robot=robot if request.param == "rigid-body" else None)
+    return train_estimator(request.param, simulate_dirty(1), QUICK_OPTIONS)
 
 
 def test_low_speed_variance_is_found() -> None:
@@ -63,13 +62,11 @@ def test_lasting_residuals_are_not_white_noise(seconds: float) -> None:
     rng = np.random.default_rng(1)
     residual = rng.standard_normal((5000, 1))
     if seconds:
-        width = round(50 * seconds)
-        residual = np.apply_along_axis(lambda x: np.convolve(x, np.hanning(width), "same"), 0, residual)
+        residual = np.convolve(residual[:, 0], np.hanning(round(50 * seconds)), "same")[:, None]
     dq = 1.0 + rng.uniform(0, 1, residual.shape)
     moved = np.stack([dq, 3 * dq])
     misfit, noise = estimate_misfit(residual, residual, moved, [slice(0, 2500), slice(2500, 5000)])
-    share = misfit.lasting / noise
-    assert share == pytest.approx(1.0 if seconds else 0.0, abs=0.05)
+    assert misfit.lasting / noise == pytest.approx(1.0 if seconds else 0.0, abs=0.05)
     usual = np.sqrt(np.mean(dq**2, axis=0))
     np.testing.assert_allclose((misfit.speed, misfit.acceleration), (usual, 3 * usual))
 
@@ -80,40 +77,31 @@ def test_rows_of_one_second_share_lasting_errors() -> None:
     assert shared_rows(samples, TYPES, 5) == 1.0
     again = Samples.concatenate([samples, samples, samples])  # the same motion, and so the same error, three times
     assert shared_rows(again, TYPES, 600) == pytest.approx(30.0, rel=0.05)
-    noise, dq = np.array([1.0, 1.0]), np.array([[0.0, 3.0]])
-    one = np.ones(2)
-    misfit = Misfit(0.5 * one, one, np.array([0.25, 1.0]), one, one)
-    counted = misfit.of_row(noise, dq)
-    rows = INDEPENDENT_HZ * OPTIONS.lasting_s
+    one, rows = np.ones(2), INDEPENDENT_HZ * OPTIONS.lasting_s
+    counted = Misfit(0.5 * one, one, np.array([0.25, 1.0]), one, one).of_row(one, np.array([[0.0, 3.0]]))
     expected = [0.75 + rows * (0.25 + 0.5), rows * (1.0 + 0.5 * np.exp(-9.0))]
     np.testing.assert_allclose(counted, np.array([expected]))
 
 
 def test_predictions_include_the_misfit(model: TorqueModel) -> None:
     """Compare with the formula at rest and at new speeds, and the compiled prediction with the plain one."""
-    posterior, n = model.posterior, 2
-    misfit = posterior.misfit
+    posterior, misfit = model.posterior, model.posterior.misfit
     assert misfit.is_nonzero
-    q = np.full((4, n), 0.3)
     dq = np.array([[0.0, 0.0], [0.01, -0.02], [9.0, -7.0], [2.0, 9.0]])
     ddq = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.0], [-50.0, 90.0]])
-    bare = replace(model, posterior=replace(posterior, misfit=Misfit.none(n)))
-    found, without = (each.predict(q, dq, ddq, covariance=True) for each in (model, bare))
+    motion = Motion(np.full((4, 2), 0.3), dq, ddq)
+    bare = replace(model, posterior=replace(posterior, misfit=Misfit.none(2)))
+    found, without = (each.predict(motion.q, dq, ddq, covariance=True) for each in (model, bare))
     rest, slow, lasting, speed, acceleration = misfit.packed()
     faster, harder = (np.maximum(np.mean((x / u) ** 2, axis=1) - 1, 0.0) for x, u in ((dq, speed), (ddq, acceleration)))
     faster += ACCELERATED * harder
     expected = rest * np.exp(-((dq / slow) ** 2)) + lasting * faster[:, None]
     np.testing.assert_allclose(found.tau_std**2 - without.tau_std**2, expected, rtol=1e-6, atol=1e-9 * expected.max())
-    plain = posterior.predict(Motion.from_arrays(q, dq, ddq))
-    assert found.covariance is not None
-    np.testing.assert_allclose(found.covariance, plain.covariance, rtol=1e-6, atol=1e-8)
-    one = model.answer(np.stack([q[3], dq[3], ddq[3]]))[1]
-    np.testing.assert_allclose(one, found.tau_std[3], rtol=1e-9)
+    np.testing.assert_allclose(found.covariance, posterior.predict(motion).covariance, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(model.answer(motion.arrays()[3])[1], found.tau_std[3], rtol=1e-9)
 
 
 def test_friction_at_rest_may_hold_any_torque(model: TorqueModel) -> None:
-    from lipcore.model.parameters import friction_coefficients
-
     coulomb = friction_coefficients(model.posterior, model.estimator).coulomb
     assert (model.posterior.misfit.rest >= 0.9 * OPTIONS.rest_share * coulomb**2).all()
     held = simulate_dirty(7, course="rests", speed=0.5)
@@ -129,23 +117,17 @@ def test_misfit_is_saved_and_loaded(model: TorqueModel, tmp_path: Path) -> None:
     again = load(tmp_path / "model")
     assert np.array_equal(again.posterior.misfit.packed(), model.posterior.misfit.packed())
     assert again.conformal == model.conformal
-    query = simulate_dirty(2).rows(slice(0, 50))
-    for name in ("tau", "tau_std"):
-        found, expected = (getattr(each.predict(query.q, query.dq, query.ddq), name) for each in (again, model))
-        np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
 def test_stretches_cover_a_long_recording() -> None:
-    slow, fast = simulate_dirty(1), simulate_dirty(2, speed=50.0)
-    samples = Samples.concatenate([slow, fast])
+    samples = Samples.concatenate([simulate_dirty(1), simulate_dirty(2, speed=50.0)])
     task = Task(samples, TYPES)
     assert task.contiguous(len(samples)) is samples
     part = task.contiguous(400)
     assert len(part) == 400
     speeds = (np.sqrt(np.mean(each.dq**2, axis=0)) for each in (part, samples))
     np.testing.assert_allclose(*speeds, rtol=0.2)
-    lengths = {each.stop - each.start for each in part.episodes()}
-    assert lengths == {20}
+    assert {each.stop - each.start for each in part.episodes()} == {20}
     for each in part.episodes():
         np.testing.assert_allclose(np.diff(part.t[each]), 1 / STREAM.rate, rtol=1e-6)
 

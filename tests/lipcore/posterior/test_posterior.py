@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from lipcore import FitOptions, Samples, TorqueModel, load, train
+from lipcore import FitOptions, NotPositiveDefiniteError, Samples, TorqueModel, load
 from lipcore.data.motion import Array, Motion
-from lipcore.estimators.catalogue import ESTIMATORS
+from lipcore.estimators.catalogue import ESTIMATORS, make_estimator
 from lipcore.kernels.base import Params, SumKernel, TorqueKernel
 from lipcore.kernels.friction import FrictionKernel
 from lipcore.model import dynamics
@@ -19,13 +19,10 @@ from lipcore.posterior.basis import Basis
 from lipcore.posterior.compact import CompactPosterior
 from lipcore.posterior.compression import Deviation, compress
 from lipcore.posterior.exact import ExactPosterior, negative_log_evidence
-from lipcore.posterior.linalg import NotPositiveDefiniteError
 from lipcore.posterior.statistics import collect
-from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Simulation, simulate
-from lipcore.robots.urdf import RigidBody
-from lipcore.vocabulary import ROBOT_ESTIMATORS
 from tests import ROOT
+from tests.lipcore.estimators.test_estimators import train_estimator
+from tests.lipcore.online.test_learner import simulate_pendulum
 from tests.lipcore.oracles import KERNELS, Problem, TorchForm, random_problem, with_full_counts
 
 PANDA = ROOT / "models/panda-sim"
@@ -55,28 +52,24 @@ def setting(request: pytest.FixtureRequest) -> Setting:
 
 def covariance(setting: Setting, x: Motion, y: Motion) -> np.ndarray:
     """Return k(x, y), one pair of samples at a time, (N n, M n)."""
-    rows = []
-    for i in range(len(x)):
-        row = [setting.kernel.gram(setting.problem.params, x[i : i + 1], y[j : j + 1]) for j in range(len(y))]
-        rows.append(np.hstack(row))
-    return np.vstack(rows)
+    gram, params = setting.kernel.gram, setting.problem.params
+    return np.block([[gram(params, x[i : i + 1], y[j : j + 1]) for j in range(len(y))] for i in range(len(x))])
 
 
 def test_mean_and_covariance_match_the_dense_reference(setting: Setting) -> None:
-    training = setting.problem.motion
+    training, query = setting.problem.motion, setting.query
     noise = np.exp(setting.problem.params["noise.log_std"])
     dense = covariance(setting, training, training) + np.diag(np.tile(noise**2, len(training)))
-    cross = covariance(setting, setting.query, training)
-    mean = cross @ np.linalg.solve(dense, setting.tau.ravel())
-    total = covariance(setting, setting.query, setting.query) - cross @ np.linalg.solve(dense, cross.T)
+    cross, prior = covariance(setting, query, training), covariance(setting, query, query)
+    mean = (cross @ np.linalg.solve(dense, setting.tau.ravel())).reshape(-1, N_JOINTS)
+    total = prior - cross @ np.linalg.solve(dense, cross.T)
 
-    answer = setting.posterior.predict(setting.query)
-    size = np.abs(covariance(setting, setting.query, setting.query)).max()
-    assert np.allclose(answer.mean.ravel(), mean, rtol=0, atol=1e-9 * np.abs(mean).max())
-    assert np.allclose(setting.posterior.mean(setting.query), answer.mean, rtol=0, atol=1e-9 * np.abs(mean).max())
-    for k in range(len(setting.query)):
+    answer, size = setting.posterior.predict(query), np.abs(prior).max()
+    for found in (answer.mean, setting.posterior.mean(query)):
+        assert np.allclose(found, mean, rtol=0, atol=1e-9 * np.abs(mean).max())
+    for k, found in enumerate(answer.covariance):
         part = slice(N_JOINTS * k, N_JOINTS * (k + 1))
-        assert np.allclose(answer.covariance[k], total[part, part], rtol=0, atol=1e-10 * size)
+        assert np.allclose(found, total[part, part], rtol=0, atol=1e-10 * size)
     assert np.allclose(answer.std.ravel() ** 2, np.diag(total), rtol=0, atol=1e-10 * size)
 
 
@@ -116,9 +109,7 @@ def test_value_is_the_gaussian_density(setting: Setting) -> None:
 
 
 @pytest.mark.parametrize("pairs", [None, 4096, 30], ids=["compiled", "one chunk", "many chunks"])
-def test_gradient_matches_finite_differences(
-    setting: Setting, pairs: int | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_gradient_matches_finite_differences(setting, pairs, monkeypatch) -> None:
     energies: TorqueKernel = setting.problem.kernel
     if pairs is not None:
         # with many chunks the pairs below the diagonal blocks are only counted, not computed
@@ -144,17 +135,13 @@ def test_gradient_matches_finite_differences(
         assert np.allclose(gradient[name], expected, rtol=1e-6, atol=1e-7), name
 
 
-def test_singular_covariance_is_reported() -> None:
-    problem = random_problem(("revolute",), samples=5, seed=0)
-    params = problem.params | {"noise.log_std": np.array([float("nan")])}
-    kernel = SumKernel(problem.kernel, FrictionKernel(1))
+def test_singular_covariance_is_reported(setting: Setting) -> None:
+    params = setting.problem.params | {"noise.log_std": np.full(N_JOINTS, np.nan)}
     with pytest.raises(NotPositiveDefiniteError):
-        negative_log_evidence(kernel, params, problem.motion, np.zeros((5, 1)))
+        negative_log_evidence(setting.kernel, params, setting.problem.motion, setting.tau)
 
 
-ROBOT = "double-pendulum"
 OPTIONS = FitOptions(hyperparameter_samples=40, max_iterations=40, starts=1, device="cpu")
-STREAM = Simulation(n_samples=120, speed=10, noise=0.02, viscous=0.1, coulomb=0.05)
 
 
 class Case(NamedTuple):
@@ -167,13 +154,11 @@ class Case(NamedTuple):
 
 
 def fit_case(name: str) -> Case:
-    samples = simulate(load_robot(ROBOT), STREAM, seed=1)
-    body = RigidBody.from_profile(ROBOT, samples.joint_names, ("revolute",) * 2) if name in ROBOT_ESTIMATORS else None
-    model = with_full_counts(train(samples, ("revolute",) * 2, name, OPTIONS, robot=body), samples)
+    samples = simulate_pendulum(1, coulomb=0.05)
+    model = with_full_counts(train_estimator(name, samples, OPTIONS), samples)
     posterior = model.posterior
-    kernel, params, motion = posterior.kernel, posterior.params, samples.motion()
-    exact = ExactPosterior.fit(kernel, params, motion, samples.tau, posterior.std_factor)
-    return Case(model, exact, samples, simulate(load_robot(ROBOT), replace(STREAM, n_sinusoids=100), seed=2).motion())
+    exact = ExactPosterior.fit(posterior.kernel, posterior.params, samples.motion(), samples.tau, posterior.std_factor)
+    return Case(model, exact, samples, simulate_pendulum(2, coulomb=0.05, n_sinusoids=100).motion())
 
 
 @pytest.fixture(scope="module", params=ESTIMATORS)
@@ -186,33 +171,27 @@ def chain() -> Case:
     return fit_case("lip-chain")
 
 
-def deviation(case: Case, posterior: CompactPosterior) -> Deviation:
+def deviation(case: Case, posterior: CompactPosterior) -> float:
+    """Return the largest deviation of means and standard deviations from the exact posterior's."""
     expected, answer = case.exact.predict(case.unseen), posterior.predict(case.unseen)
-    return Deviation.between(expected, answer.mean, answer.std, np.sqrt(posterior.noise_variance))
-
-
-def posterior_of_all_outputs(case: Case) -> CompactPosterior:
-    """Return a compact posterior with all torques as inducing outputs."""
-    exact, noise = case.exact, np.exp(2 * case.exact.params["noise.log_std"])
-    count = len(exact.weights) if case.model.posterior.basis.term is not None else 0
-    basis = Basis.build(exact.kernel, exact.params, exact.motion, np.arange(count))
-    residual = case.samples.tau - exact.kernel.mean(exact.motion)
-    return CompactPosterior.build(
-        exact.kernel, basis, collect(basis, noise, exact.motion, residual), noise, exact.std_factor
-    )
+    found = Deviation.between(expected, answer.mean, answer.std, np.sqrt(posterior.noise_variance))
+    return max(found.mean_max, found.std_max)
 
 
 def test_compact_posterior_keeps_its_tolerance_on_unseen_motion(case: Case) -> None:
     report = case.model.compact
     assert report["tolerance_reached"] is True
     assert max(report["mean_max"], report["std_max"]) <= report["tolerance"] == 0.01
-    found = deviation(case, case.model.posterior)
-    assert max(found.mean_max, found.std_max) < 0.02
+    assert deviation(case, case.model.posterior) < 0.02
 
 
 def test_all_outputs_give_the_exact_posterior(case: Case) -> None:
-    found = deviation(case, posterior_of_all_outputs(case))
-    assert max(found.mean_max, found.std_max) < 1e-3
+    exact, noise = case.exact, np.exp(2 * case.exact.params["noise.log_std"])
+    count = len(exact.weights) if case.model.posterior.basis.term is not None else 0
+    basis = Basis.build(exact.kernel, exact.params, exact.motion, np.arange(count))
+    statistics = collect(basis, noise, exact.motion, case.samples.tau - exact.kernel.mean(exact.motion))
+    found = CompactPosterior.build(exact.kernel, basis, statistics, noise, exact.std_factor)
+    assert deviation(case, found) < 1e-3
 
 
 def test_components_match_the_exact_posterior(case: Case) -> None:
@@ -246,12 +225,10 @@ def test_too_few_outputs_widen_the_interval(chain: Case) -> None:
 
 def test_size_does_not_grow_with_samples(chain: Case) -> None:
     """Four times the samples of the same motion need hardly more outputs."""
-    params, kernel = chain.exact.params, chain.exact.kernel
     sizes = []
     for count in (1, 4):
-        stream = replace(STREAM, n_samples=120 * count, rate=10.0 * count)
-        samples = simulate(load_robot(ROBOT), stream, seed=1)
-        exact = ExactPosterior.fit(kernel, params, samples.motion(), samples.tau)
+        samples = simulate_pendulum(1, coulomb=0.05, n_samples=120 * count, rate=10.0 * count)
+        exact = ExactPosterior.fit(chain.exact.kernel, chain.exact.params, samples.motion(), samples.tau)
         sizes.append(len(compress(exact, samples.tau, 0.02, 1500).posterior.basis))
     assert sizes[1] < 1.25 * sizes[0]
 
@@ -263,13 +240,12 @@ def test_small_standard_deviation_keeps_its_digits() -> None:
     """
     model = load(PANDA)
     posterior, count = model.posterior, 5
-    assert posterior.statistics is not None
     draw, limits = np.random.default_rng(3).uniform, model.training_range
-    motion = [draw(limits[name]["min"], limits[name]["max"], (count, 7)) for name in ("q", "dq", "ddq")]
+    motion = Motion(*(draw(limits[name]["min"], limits[name]["max"], (count, 7)) for name in ("q", "dq", "ddq")))
     with localcontext(prec=50):
         exact = np.frompyfunc(Decimal, 1, 1)
         total = exact(posterior.statistics.a) + exact(np.eye(len(posterior.basis)))
-        rows = exact(posterior.basis.features(Motion.from_arrays(*motion)))
+        rows = exact(posterior.basis.features(motion))
         before = (rows * rows).sum(0)
         for k in range(len(total)):  # elimination, column by column, of the matrix and the features at once
             factor = total[k + 1 :, k] / total[k, k]
@@ -278,9 +254,9 @@ def test_small_standard_deviation_keeps_its_digits() -> None:
         left = (rows * rows / np.diagonal(total)[:, None]).sum(0)
         shares = (left / before).astype(float)
     assert np.median(shares) < 1e-7
-    variance = model.posterior.std_factor**2 * left.astype(float).reshape(count, 7)
-    variance += posterior.misfit.variance(Motion.from_arrays(*motion))
-    np.testing.assert_allclose(model.predict(*motion).tau_std, np.sqrt(variance), rtol=1e-8)
+    variance = posterior.std_factor**2 * left.astype(float).reshape(count, 7) + posterior.misfit.variance(motion)
+    answer = model.predict(motion.q, motion.dq, motion.ddq)
+    np.testing.assert_allclose(answer.tau_std, np.sqrt(variance), rtol=1e-8)
 
 
 def test_indefinite_statistics_are_rejected(chain: Case) -> None:
@@ -290,9 +266,7 @@ def test_indefinite_statistics_are_rejected(chain: Case) -> None:
         CompactPosterior.build(posterior.kernel, posterior.basis, broken, posterior.noise_variance)
 
 
-def test_terms_of_another_model_are_rejected(chain: Case) -> None:
-    other = fit_case("lip").model.estimator.terms
-    with pytest.raises(ValueError, match="not belong to this posterior"):
-        chain.model.posterior.mean(chain.unseen, other["energy"])
-    with pytest.raises(ValueError, match="not belong to this basis"):
-        chain.model.posterior.mean(chain.unseen, other["friction"])
+@pytest.mark.parametrize(("term", "owner"), [("energy", "posterior"), ("friction", "basis")])
+def test_terms_of_another_model_are_rejected(chain: Case, term: str, owner: str) -> None:
+    with pytest.raises(ValueError, match=f"not belong to this {owner}"):
+        chain.model.posterior.mean(chain.unseen, make_estimator("lip", ("revolute",) * 2).terms[term])

@@ -5,17 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lipcore.data.motion import Array, Motion
+from lipcore.data.motion import Motion
 from lipcore.posterior.linalg import NotPositiveDefiniteError, cholesky
 from lipcore.posterior.selection import PREFERENCE, pivots, spread_out
 
 
-def random_motion(size: int, seed: int = 0) -> Motion:
-    return Motion.from_arrays(*np.random.default_rng(seed).normal(size=(3, size, 3)))
-
-
 def test_repeated_samples_are_selected_once() -> None:
-    motion = random_motion(3)[np.arange(60) % 3]  # a robot that holds three postures
+    postures = np.random.default_rng(0).normal(size=(3, 3, 3))
+    motion = Motion.from_arrays(*postures[:, np.arange(60) % 3])  # a robot that holds three postures
     chosen = spread_out(motion, 10)
     assert len(set(chosen.tolist())) == 10
     assert chosen.tolist() == sorted(spread_out(motion, 10).tolist())
@@ -30,30 +27,20 @@ def test_rare_regions_are_represented() -> None:
     assert {17, 171, 333} <= set(chosen)
 
 
-def gram_of(rows: int, rank: int, seed: int) -> Array:
-    rng = np.random.default_rng(seed)
-    factor = rng.normal(size=(rows, rank)) * np.logspace(1, -2, rank)
-    return factor @ factor.T
-
-
 @given(st.integers(1, 8), st.integers(1, 4), st.integers(1, 30), st.integers(1, 40), st.integers(0, 99))
-def test_every_prefix_is_a_cholesky_factor(
-    samples: int, per_sample: int, rank: int, max_outputs: int, seed: int
-) -> None:
-    gram = gram_of(samples * per_sample, rank, seed)
+def test_every_prefix_is_a_cholesky_factor(samples, per_sample, rank, max_outputs, seed) -> None:
+    factor = np.random.default_rng(seed).normal(size=(samples * per_sample, rank)) * np.logspace(1, -2, rank)
+    gram = factor @ factor.T
     before = gram.copy()
     found = pivots(gram, per_sample, max_outputs, 1e-9)
     assert np.array_equal(gram, before)
-    chosen = found.outputs.tolist()
-    assert len(set(chosen)) == len(chosen) <= min(max_outputs, len(gram))
-    scale = float(gram.diagonal().max())
+    chosen, scale = found.outputs, float(gram.diagonal().max())
+    assert len(set(chosen.tolist())) == len(chosen) <= min(max_outputs, len(gram))
     for count in {1, len(chosen) // 2, len(chosen)} - {0}:
-        picked, lower = found.outputs[:count], found.lower[:, :count]
+        picked, lower = chosen[:count], found.lower[:, :count]
         square = lower[picked]
-        assert (
-            np.array_equal(np.triu(square, 1), np.zeros_like(square))
-            or np.abs(np.triu(square, 1)).max() < 1e-6 * scale**0.5
-        )
+        above = np.abs(np.triu(square, 1)).max()
+        assert above == 0 or above < 1e-6 * scale**0.5
         assert np.allclose(square @ square.T, gram[picked][:, picked], rtol=0, atol=1e-7 * scale)
         left = gram.diagonal() - np.square(lower).sum(1)
         assert left.min() > -1e-7 * scale
@@ -69,14 +56,10 @@ def test_outputs_of_selected_samples_come_first() -> None:
     assert sorted(order) == list(range(6))
 
 
-def well_conditioned(size: int) -> Array:
-    root = np.random.default_rng(0).standard_normal((size, size))
-    return root @ root.T + np.eye(size)
-
-
 def test_factor_solves_whitens_and_has_log_determinant() -> None:
-    matrix = well_conditioned(6)
-    factor, right = cholesky(matrix), well_conditioned(6)[:, :2]
+    root = np.random.default_rng(0).standard_normal((6, 6))
+    matrix = root @ root.T + np.eye(6)
+    factor, right = cholesky(matrix), matrix[:, :2]
     assert factor.jitter == 0
     assert np.allclose(matrix @ factor.solve(right), right, rtol=0, atol=1e-12)
     assert np.allclose(factor.solve(right[:, 0]), factor.solve(right)[:, 0], rtol=0, atol=1e-14)

@@ -17,7 +17,9 @@ from lipcore.preparation.recipe import PreparationError, Recipe
 RATE = 90.0
 """Hz. A period of the cut-off is 22.5 samples, far from a whole number, so that rounding cannot matter."""
 ALL = ("q", "dq", "ddq", "tau")
+TIMES = np.arange(1000) / RATE
 NONE_MISSING = np.zeros(1000, dtype=bool)
+DEFAULTS = Recipe()
 FREQUENCIES = np.array([0.1, 0.23, 0.41, 0.7, 1.1])
 
 
@@ -34,14 +36,17 @@ def select_columns(columns, names):
     return {name: columns[name] for name in names}
 
 
+def prepare(t, columns, recipe=DEFAULTS, episode=None, missing=None):
+    """Return the plan of a recording and its prepared columns."""
+    made = plan(t, episode, np.zeros(len(t), dtype=bool) if missing is None else missing, tuple(columns), recipe)
+    return made, made.apply(columns)
+
+
 def prepare_like_the_paper(columns, rate, cutoff=4.0):
     """Prepare one even recording with SciPy alone."""
     sections = butter(4, cutoff, fs=rate, output="sos")
-    found = {name: sosfiltfilt(sections, columns[name]) for name in ("q", "tau")}
-    if "dq" in columns:
-        found["dq"] = sosfiltfilt(sections, columns["dq"])
-    else:
-        found["dq"] = np.gradient(found["q"], 1 / rate, edge_order=2)
+    found = {name: sosfiltfilt(sections, values) for name, values in columns.items()}
+    found.setdefault("dq", np.gradient(found["q"], 1 / rate, edge_order=2))
     found["ddq"] = np.gradient(sosfiltfilt(sections, found["dq"]), 1 / rate, edge_order=2)
     edge = int(np.ceil(rate / cutoff))
     return {name: found[name][edge:-edge] for name in ALL}
@@ -53,13 +58,11 @@ def step_texts(made):
 
 @pytest.mark.parametrize("names", [("q", "tau"), ("q", "dq", "tau")])
 def test_defaults_match_the_paper(names):
-    t = np.arange(1000) / RATE
-    columns = select_columns(motion(t), names)
-    made = plan(t, None, NONE_MISSING, names, Recipe())
-    found = made.apply(columns)
+    columns = select_columns(motion(TIMES), names)
+    made, found = prepare(TIMES, columns)
     for name, expected in prepare_like_the_paper(columns, RATE).items():
         np.testing.assert_allclose(found[name], expected, rtol=0, atol=1e-12 * max(1, np.abs(expected).max()))
-    np.testing.assert_array_equal(made.t, t[23:-23])
+    np.testing.assert_array_equal(made.t, TIMES[23:-23])
     assert (made.rate, made.cutoff, made.delay_s, made.edges) == (pytest.approx(RATE), 4.0, 0.0, 46)
     assert step_texts(made) == [
         f"{', '.join(['q', 'tau', *names[1:-1]])} low-passed at 4 Hz without delay",
@@ -71,9 +74,10 @@ def test_defaults_match_the_paper(names):
 def test_complete_columns_stay_unchanged():
     t = np.cumsum(np.random.default_rng(0).uniform(0.5, 1.4, 1000)) / RATE
     for recipe, stamps in ((Recipe(), t), (Recipe(rate_hz=100.0), np.arange(1000) / 99.7)):
-        columns, made = motion(stamps), plan(stamps, None, NONE_MISSING, ALL, recipe)
+        columns = motion(stamps)
+        made, found = prepare(stamps, columns, recipe)
         assert [step["step"] for step in made.steps] in ([], ["split"])
-        for name, values in made.apply(columns).items():
+        for name, values in found.items():
             np.testing.assert_array_equal(values, columns[name])
 
 
@@ -87,11 +91,9 @@ def test_complete_columns_need_no_times():
 
 def test_filters_do_not_cross_episodes_or_gaps():
     """Three parts together give the same results as each part alone."""
-    t = np.arange(1000) / RATE
-    t[600:] += 1.0
+    t = TIMES + (np.arange(1000) >= 600)
     columns = select_columns(motion(t), ("q", "tau"))
-    made = plan(t, np.repeat([0.0, 1.0], [300, 700]), NONE_MISSING, ("q", "tau"), Recipe())
-    found = made.apply(columns)
+    made, found = prepare(t, columns, episode=np.repeat([0.0, 1.0], [300, 700]))
     assert (made.gaps, made.episodes) == (1, 3)
     assert step_texts(made)[:2] == ["2 episodes kept separate", "split at 1 gap in time"]
     for index, part in enumerate((slice(0, 300), slice(300, 600), slice(600, 1000))):
@@ -102,14 +104,12 @@ def test_filters_do_not_cross_episodes_or_gaps():
 
 def test_missing_rows_are_removed_and_short_gaps_bridged():
     """Three missing rows, 44 ms, are bridged at a cut-off of 4 Hz; a second of them splits the recording."""
-    t = np.arange(1000) / RATE
     missing = np.zeros(1000, dtype=bool)
     missing[200:203] = missing[600:700] = True
-    columns = select_columns(motion(t), ("q", "tau"))
+    columns = select_columns(motion(TIMES), ("q", "tau"))
     for values in columns.values():
         values[missing] = np.nan
-    made = plan(t, None, missing, ("q", "tau"), Recipe())
-    found = made.apply(columns)
+    made, found = prepare(TIMES, columns, missing=missing)
     assert (made.missing, made.first_missing, made.gaps, made.resampled) == (103, 201, 1, True)
     assert step_texts(made)[0] == "103 rows with missing values left out, the first is row 201"
     assert len(made) == (600 - 46) + (300 - 46)
@@ -129,14 +129,13 @@ def test_missing_rows_without_times_split_the_recording():
 
 
 def test_first_row_of_equal_stamps_is_kept():
-    t = np.arange(1000) / RATE
+    t = TIMES.copy()
     t[[11, 12, 40]] = t[[10, 10, 39]]
-    made = plan(t, None, NONE_MISSING, ALL, Recipe(gap_steps=5))
+    made, found = prepare(t, dict.fromkeys(ALL, np.arange(1000.0)), Recipe(gap_steps=5))
     assert (made.repeated, len(made)) == (3, 997)
     assert step_texts(made) == ["3 rows with a repeated time stamp left out, the first is row 12"]
-    kept = made.apply({name: np.arange(1000.0) for name in ALL})["q"]
-    assert 10 in kept
-    assert not {11, 12, 40} & set(kept)
+    assert 10 in found["q"]
+    assert not {11, 12, 40} & set(found["q"])
 
 
 @pytest.mark.parametrize(("rate", "spread"), [(30.0, 0.4), (100.0, 0.4), (500.0, 0.4), (100.0, 0.9)])
@@ -144,9 +143,8 @@ def test_uneven_stamps_are_resampled(rate, spread):
     rng = np.random.default_rng(4)
     count = int(20 * rate)
     t = 1.7e9 + (np.arange(count) + rng.uniform(-spread / 2, spread / 2, count)) / rate
-    columns = select_columns(motion(t - 1.7e9), ("q", "tau"))
-    made = plan(t, None, np.zeros(count, dtype=bool), ("q", "tau"), Recipe())
-    found, true = made.apply(columns), motion(made.t - 1.7e9)
+    made, found = prepare(t, select_columns(motion(t - 1.7e9), ("q", "tau")))
+    true = motion(made.t - 1.7e9)
     assert made.resampled
     assert made.rate == pytest.approx(rate, rel=0.01)
     np.testing.assert_allclose(np.diff(made.t), 1 / made.rate, rtol=1e-3)
@@ -158,54 +156,45 @@ def test_uneven_stamps_are_resampled(rate, spread):
 @pytest.mark.parametrize(("rate", "whole"), [(45.0, True), (18.0, True), (25.0, False), (64.0, False)])
 def test_lower_rate_may_be_chosen(rate, whole):
     t = np.arange(2000) / RATE
-    made = plan(t, None, np.zeros(2000, dtype=bool), ("q", "tau"), Recipe(rate_hz=rate))
-    found, true = made.apply(select_columns(motion(t), ("q", "tau"))), motion(made.t)
+    columns = select_columns(motion(t), ("q", "tau"))
+    made, found = prepare(t, columns, Recipe(rate_hz=rate))
+    true = motion(made.t)
     assert made.rate == pytest.approx(rate)
     np.testing.assert_allclose(np.diff(made.t), 1 / rate, rtol=1e-9)
     for name in ALL:
         assert np.abs(found[name] - true[name]).max() < 0.02 * np.ptp(true[name])
-    every = plan(t, None, np.zeros(2000, dtype=bool), ("q", "tau"), Recipe()).apply(
-        select_columns(motion(t), ("q", "tau"))
-    )
     if whole:
-        expected = every["ddq"][:: int(RATE / rate)]
+        expected = prepare(t, columns)[1]["ddq"][:: int(RATE / rate)]
         np.testing.assert_allclose(found["ddq"], expected, rtol=0, atol=1e-12 * np.abs(expected).max())
 
 
 def test_lower_rate_filters_out_aliases():
     """At 18 Hz, a vibration of 17 Hz would look like one of 1 Hz."""
     t = np.arange(2000) / RATE
-    vibration = np.sin(2 * np.pi * 17 * t)
-    made = plan(t, None, np.zeros(2000, dtype=bool), ALL, Recipe(rate_hz=18))
-    columns = motion(t)
-    shaken = made.apply({name: values + vibration for name, values in columns.items()})
-    smooth = made.apply(columns)
+    made, smooth = prepare(t, motion(t), Recipe(rate_hz=18))
+    shaken = made.apply({name: values + np.sin(2 * np.pi * 17 * t) for name, values in motion(t).items()})
     assert made.cutoff == pytest.approx(7.2)
     for name in ALL:
         assert np.abs(shaken[name] - smooth[name]).max() < 0.01
 
 
 def test_filtering_may_be_forced_or_disabled():
-    t = np.arange(1000) / RATE
-    columns = motion(t)
-    always = plan(t, None, NONE_MISSING, ALL, Recipe(filtering="always", cutoff_hz=11)).apply(columns)
+    columns = motion(TIMES)
+    _, always = prepare(TIMES, columns, Recipe(filtering="always", cutoff_hz=11))
     sections = butter(4, 11, fs=RATE, output="sos")
     for name in ALL:
         np.testing.assert_allclose(always[name], sosfiltfilt(sections, columns[name])[9:-9], rtol=0, atol=1e-12)
-    never = plan(t, None, NONE_MISSING, ("q", "tau"), Recipe(filtering="never"))
-    found = never.apply(columns)
+    _, found = prepare(TIMES, select_columns(columns, ("q", "tau")), Recipe(filtering="never"))
     np.testing.assert_array_equal(found["q"], columns["q"])
     dq = np.gradient(columns["q"], 1 / RATE, edge_order=2)
     np.testing.assert_allclose(found["ddq"], np.gradient(dq, 1 / RATE, edge_order=2), rtol=0, atol=1e-9)
 
 
 def test_ends_may_be_cut_off():
-    t = np.arange(1000) / RATE
-    made = plan(t, np.repeat([0.0, 1.0], 500), NONE_MISSING, ALL, Recipe(trim_s=0.5))
-    np.testing.assert_array_equal(made.t, np.concatenate([t[45:455], t[545:955]]))
+    made = plan(TIMES, np.repeat([0.0, 1.0], 500), NONE_MISSING, ALL, Recipe(trim_s=0.5))
+    np.testing.assert_array_equal(made.t, np.concatenate([TIMES[45:455], TIMES[545:955]]))
     assert step_texts(made)[-1] == "180 samples cut off at the ends of parts"
-    kept = plan(t, None, NONE_MISSING, ("q", "tau"), Recipe(trim_s=0.0))
-    assert len(kept) == 1000
+    assert len(plan(TIMES, None, NONE_MISSING, ("q", "tau"), Recipe(trim_s=0.0))) == 1000
 
 
 @pytest.mark.parametrize(
@@ -227,10 +216,9 @@ def test_ends_may_be_cut_off():
     ],
 )
 def test_unsuitable_recording_is_rejected(changed, field, value, expected):
-    known = {"t": np.arange(1000) / RATE, "episode": None, "missing": NONE_MISSING, "names": ("q", "tau")}
-    known |= {"recipe": Recipe(), **changed}
+    known = {"t": TIMES, "episode": None, "missing": NONE_MISSING, "names": ("q", "tau"), "recipe": DEFAULTS}
     with pytest.raises(PreparationError) as caught:
-        plan(*(known[name] for name in ("t", "episode", "missing", "names", "recipe")))
+        plan(*(known | changed).values())
     assert (caught.value.field, caught.value.value) == (field, value)
     assert expected in caught.value.expected
 
@@ -351,11 +339,9 @@ def test_rejected_rows_leave_the_filter_unchanged(rows, message):
 
 
 def test_causal_plan_equals_the_stream_of_each_part():
-    t = np.arange(1000) / RATE
-    t[400:] += 5
+    t = TIMES + 5 * (np.arange(1000) >= 400)
     columns = select_columns(motion(t), ("q", "dq", "tau"))
-    made = plan(t, None, np.zeros(1000, dtype=bool), tuple(columns), CAUSAL_RECIPE)
-    found = made.apply(columns)
+    made, found = prepare(t, columns, CAUSAL_RECIPE)
     stream = causal_filter(1 / np.median(np.diff(t)), 1, CAUSAL_RECIPE)
     for index, part in enumerate((slice(0, 400), slice(400, 1000))):
         stream.reset()
@@ -370,7 +356,5 @@ def test_causal_plan_equals_the_stream_of_each_part():
     for name in ALL:
         assert np.sqrt(np.mean((found[name] - true[name]) ** 2)) < 0.05 * true[name].std()
     assert made.delay_s == pytest.approx(stream.delay_s)
-    assert (
-        made.steps[1]["text"]
-        == f"q, tau, dq low-passed at 4 Hz as in a live stream, with a delay of {made.delay_s:.3g} s"
-    )
+    filtered = "q, tau, dq low-passed at 4 Hz as in a live stream"
+    assert step_texts(made)[1] == f"{filtered}, with a delay of {made.delay_s:.3g} s"

@@ -9,6 +9,7 @@ from scipy.integrate import solve_ivp
 from lipcore.robots.dirt import MIN_SIMULATION_HZ, SCALED_AMOUNTS, Dirt, draw_coloured_noise, simulate_lugre
 from lipcore.robots.library import Robot, load_robot
 from lipcore.robots.simulation import FAST_SPEED, PERIOD_S, Course, Simulation, simulate
+from tests.lipcore.robots.test_simulation import assert_derivatives_match
 
 NO_DIRT = replace(Dirt().scaled(0.0), motion_hz=400.0)
 FINE_STREAM = Simulation(n_samples=2000, rate=MIN_SIMULATION_HZ, speed=FAST_SPEED, noise=0.0)
@@ -65,9 +66,8 @@ def test_zero_dirt_only_derives_motion_from_positions(robot: Robot) -> None:
 def test_every_part_changes_the_torque(robot: Robot, part: str) -> None:
     friction = part in ("stiction", "load", "position", "warmth")  # parts of friction
     without = replace(NO_DIRT, friction=0.3) if friction else NO_DIRT
-    less, more = (
-        simulate(robot, replace(FINE_STREAM, dirt=dirt), 1).tau for dirt in (without, replace(without, **{part: 0.3}))
-    )
+    dirts = without, replace(without, **{part: 0.3})
+    less, more = (simulate(robot, replace(FINE_STREAM, dirt=dirt), 1).tau for dirt in dirts)
     added = np.std(more - less) / np.std(less)
     assert 0.005 < added < 1.0
 
@@ -97,10 +97,7 @@ def test_periodic_motion_repeats_and_rests_occur(robot: Robot) -> None:
     assert 0.2 < np.mean(np.abs(stops.dq).max(1) < 1e-9) < 0.7
     courses: tuple[Course, ...] = ("periodic", "rests")
     for course in courses:
-        made = simulate(robot, replace(FINE_STREAM, course=course), 3)
-        for signal, derivative in ((made.q, made.dq), (made.dq, made.ddq)):
-            error = np.gradient(signal, 1 / MIN_SIMULATION_HZ, axis=0)[1:-1] - derivative[1:-1]
-            assert np.abs(error).max() < 0.02 * np.abs(derivative).max()
+        assert_derivatives_match(simulate(robot, replace(FINE_STREAM, course=course), 3), 0.02)
 
 
 def test_invalid_dirt_is_rejected(robot: Robot) -> None:

@@ -40,6 +40,7 @@ def robot(*parts: str) -> str:
     return f'<?xml version="1.0"?><robot name="arm">{"".join(parts)}</robot>'
 
 
+AB = link("a"), link("b")
 ARM = robot(link("base"), link("upper"), link("lower"), joint("j1", "base", "upper"), joint("j2", "upper", "lower"))
 
 
@@ -51,7 +52,7 @@ def test_joints_are_matched_in_any_order() -> None:
     assert straight.sha256 == crossed.sha256
     with pytest.raises(JointMismatchError, match=r"joint 'j2' is prismatic in the data, but 'j2' .* is revolute"):
         RigidBody.from_urdf(ARM, ("j1", "j2"), ("revolute", "prismatic"))
-    text = robot(link("a"), link("b"), joint("j", "a", "b", "continuous"))
+    text = robot(*AB, joint("j", "a", "b", "continuous"))
     assert RigidBody.from_urdf(text, ("j",), ("revolute",)).model.nq == 2
     body = RigidBody.from_urdf(ARM, ("shoulder", "elbow"), TWO_REVOLUTE, joints=("j1", "j2"))
     assert (body.joint_names, body.urdf_joints, body.matched) == (("shoulder", "elbow"), ("j1", "j2"), "list")
@@ -111,11 +112,11 @@ def test_mismatched_joint_list_is_shown(listed: tuple[str, ...]) -> None:
         ("<sdf/>", "root element is <sdf>, expected <robot>"),
         (robot(), "no joint that moves"),
         (robot(link("a"), joint("j", "a", "b")), "joint 'j' has the child 'b', expected a link"),
-        (robot(link("a"), link("b"), joint("j", "a", "b").replace("<limit", "<no")), "Pinocchio cannot read"),
+        (robot(*AB, joint("j", "a", "b").replace("<limit", "<no")), "Pinocchio cannot read"),
         (robot(link("a"), link("b"), link("c"), joint("j", "a", "b")), "no joint leads to the links 'a' and 'c'"),
         (robot(link("a"), link("a")), "two links are called 'a'"),
-        (robot(link("a"), link("b"), joint("j", "b", "b")), "lead to link 'b' form a closed loop"),
-        (robot(link("a"), link("b"), joint("j", "b", "b"), joint("k", "a", "a")), "closed loop"),
+        (robot(*AB, joint("j", "b", "b")), "lead to link 'b' form a closed loop"),
+        (robot(*AB, joint("j", "b", "b"), joint("k", "a", "a")), "closed loop"),
         (ARM.replace('axis xyz="0 1 0"', 'axis xyz="0 0 0"'), "axis xyz> of joint 'j1' is '0 0 0', of length 0"),
         (ARM.replace('axis xyz="0 1 0"', 'axis xyz="1e300 0 0"'), "expected 3 numbers of at most 10000"),
         (ARM.replace('ixx="0.1"', 'ixx="inf"'), "<inertia ixx> of link 'base' is 'inf', expected a number"),
@@ -126,11 +127,8 @@ def test_mismatched_joint_list_is_shown(listed: tuple[str, ...]) -> None:
             ARM.replace('"upper"', '"up&#10;2026 ERROR forged"'),
             "is called 'up.n2026 ERROR forged', expected a printable name",
         ),
-        (
-            robot(link("a"), link("b"), joint("j", "a", "b", "floating")),
-            "'j' is of type 'floating': expected a fixed base",
-        ),
-        (robot(link("a"), link("b"), joint("j", "a", "b", "spherical")), "'j' is of type 'spherical'"),
+        (robot(*AB, joint("j", "a", "b", "floating")), "'j' is of type 'floating': expected a fixed base"),
+        (robot(*AB, joint("j", "a", "b", "spherical")), "'j' is of type 'spherical'"),
         (robot(link("a"), link("b", -1), joint("j", "a", "b")), "'j' moves has mass -1 kg"),
         (
             ARM.replace('"0.1"', '"1e5"'),
@@ -169,17 +167,16 @@ def test_uploaded_text_is_never_written_to_stderr(capfd: pytest.CaptureFixture[s
 
 
 def test_branching_joints_are_rejected() -> None:
-    text = robot(link("a"), link("b"), link("c"), joint("left", "a", "b"), joint("right", "a", "c"))
-    with pytest.raises(
-        UrdfError, match="the joints branch: 'right' follows 'the base', not 'left'; expected one serial"
-    ):
+    text = robot(*AB, link("c"), joint("left", "a", "b"), joint("right", "a", "c"))
+    message = "the joints branch: 'right' follows 'the base', not 'left'; expected one serial"
+    with pytest.raises(UrdfError, match=message):
         RigidBody.from_urdf(text, ("left", "right"), TWO_REVOLUTE)
     assert RigidBody.from_urdf(text, ("left",), ("revolute",)).n_joints == 1
 
 
 def test_coupled_joints_are_rejected() -> None:
     text = robot(
-        *(link(name) for name in "abcd"),
+        *map(link, "abcd"),
         joint("j1", "a", "b"),
         joint("j2", "b", "c", extra='<mimic joint="j1"/>'),
         joint("j3", "c", "d"),
@@ -195,13 +192,8 @@ def test_coupled_joints_are_rejected() -> None:
 def test_only_rigid_body_estimators_take_a_robot() -> None:
     body = RigidBody.from_urdf(ARM, ("j1", "j2"), TWO_REVOLUTE)
     arm = arm_of_robot(body)
-    assert list(make_estimator("rigid-body", TWO_REVOLUTE, arm=arm).terms) == ["rigid_body", "friction"]
-    assert list(make_estimator("rigid-body+local", TWO_REVOLUTE, arm=arm).terms) == ["rigid_body", "local", "friction"]
-    assert list(make_estimator("rigid-body+lip-chain", TWO_REVOLUTE, arm=arm).terms) == [
-        "rigid_body",
-        "energy",
-        "friction",
-    ]
+    for name, terms in (("rigid-body", ()), ("rigid-body+local", ("local",)), ("rigid-body+lip-chain", ("energy",))):
+        assert list(make_estimator(name, TWO_REVOLUTE, arm=arm).terms) == ["rigid_body", *terms, "friction"]
     for name, given in (("rigid-body", None), ("lip-chain", arm)):
         with pytest.raises(ValueError, match=r"only rigid-body, .* need an arm"):
             make_estimator(name, TWO_REVOLUTE, arm=given)

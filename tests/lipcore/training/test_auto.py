@@ -6,20 +6,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.data.samples import Samples
+from lipcore import (
+    FitCancelledError,
+    FitOptions,
+    ModelFormatError,
+    NotPositiveDefiniteError,
+    Samples,
+    load,
+    save,
+    train,
+)
 from lipcore.data.splits import SplitError
 from lipcore.estimators.catalogue import MissingRobotError, check_estimator
-from lipcore.estimators.hyperparameters import FitCancelledError
-from lipcore.estimators.options import FitOptions
-from lipcore.files.manifest import ModelFormatError, read_manifest_bytes
-from lipcore.files.persistence import load, manifest_bytes, save
-from lipcore.posterior.linalg import NotPositiveDefiniteError
+from lipcore.files.manifest import read_manifest_bytes
+from lipcore.files.persistence import manifest_bytes
 from lipcore.robots.library import load_robot
 from lipcore.robots.simulation import Simulation, simulate
 from lipcore.robots.urdf import RigidBody
 from lipcore.training import auto, held_out
 from lipcore.training.held_out import hold_out
-from lipcore.training.train import train
 from tests import ROOT
 from tests.choosing import slow
 
@@ -38,23 +43,26 @@ def simulate_arm(rows=200, seed=3, speed=4.0):
 
 def add_disturbance(samples):
     """Add a torque that no state explains."""
-    return replace(
-        samples, tau=samples.tau + 0.003 * np.sin(2 * np.pi * samples.t[:, None] / np.array([5.0, 6.0, 7.0]))
-    )
+    disturbance = 0.003 * np.sin(2 * np.pi * samples.t[:, None] / np.array([5.0, 6.0, 7.0]))
+    return replace(samples, tau=samples.tau + disturbance)
+
+
+def as_one_recording(*parts):
+    """Return parts that follow one another at 10 Hz."""
+    samples = Samples.concatenate(list(parts))
+    return replace(samples, t=np.arange(len(samples)) / 10.0, episode=np.zeros(len(samples), np.int64))
 
 
 def with_fast_stretch():
     """Return slow motion with three seconds of fast motion in its middle."""
     slow, fast = simulate_arm(170, speed=1.5), simulate_arm(30, seed=4, speed=6.0)
-    parts = Samples.concatenate([slow.rows(slice(0, 85)), fast, slow.rows(slice(85, None))])
-    return replace(parts, t=np.arange(200) / 10.0, episode=np.zeros(200, np.int64))
+    return as_one_recording(slow.rows(slice(0, 85)), fast, slow.rows(slice(85, None)))
 
 
 def periodic(rows=400, period=5.03):
     """Return a motion of two harmonics that repeats."""
-    t = np.arange(rows) / 10.0
-    phase = 2 * np.pi / period * np.outer([1.0, 2.0], t)[:, :, None] + np.arange(3)
-    rate = (2 * np.pi / period * np.array([1.0, 2.0]))[:, None, None]
+    rate = 2 * np.pi / period * np.array([1.0, 2.0])[:, None, None]
+    phase = rate * np.arange(rows)[:, None] / 10.0 + np.arange(3)
     q, dq, ddq = np.sin(phase).sum(0), (rate * np.cos(phase)).sum(0), (-(rate**2) * np.sin(phase)).sum(0)
     return replace(simulate_arm(rows), q=q, dq=dq, ddq=ddq)
 
@@ -69,8 +77,7 @@ def auto_training():
 def test_rigid_arm_gets_the_rigid_body(auto_training):
     model, _ = auto_training
     found = model.selection
-    assert (found["asked"], found["chosen"]) == ("auto", "rigid-body")
-    assert model.estimator.name == "rigid-body"
+    assert (found["asked"], found["chosen"], model.estimator.name) == ("auto", "rigid-body", "rigid-body")
     assert [row["estimator"] for row in found["table"]] == NAMES
     best = max(row["log_density"] for row in found["table"])
     for row in found["table"]:
@@ -110,8 +117,7 @@ def test_flexible_estimator_fails_at_the_edge():
 
 def test_chosen_estimator_learns_all_samples(auto_training):
     model, _ = auto_training
-    samples = simulate_arm()
-    assert model.fit["samples_given"] == len(samples)
+    assert model.fit["samples_given"] == len(simulate_arm())
     assert "search_hops" in model.fit
     unseen = simulate_arm(seed=8)
     error = model.predict(unseen.q, unseen.dq, unseen.ddq).tau - unseen.tau
@@ -120,12 +126,20 @@ def test_chosen_estimator_learns_all_samples(auto_training):
 
 def test_progress_rises_and_names_the_estimator(auto_training):
     _, seen = auto_training
-    fractions = [each.fraction for each in seen]
-    assert fractions == sorted(fractions)
-    assert 0 <= fractions[0] <= fractions[-1] <= 1
+    for values in ([each.fraction for each in seen], [each.elapsed for each in seen]):
+        assert values == sorted(values)
+    assert 0 <= seen[0].fraction <= seen[-1].fraction <= 1
     assert [*dict.fromkeys(each.estimator for each in seen)] == NAMES
-    elapsed = [each.elapsed for each in seen]
-    assert elapsed == sorted(elapsed)
+
+
+@pytest.fixture
+def manifest(auto_training, tmp_path):
+    """Return the manifest of a saved choice, to change."""
+    return deepcopy(save(auto_training[0], tmp_path / "model"))
+
+
+def test_choice_is_saved(auto_training, manifest, tmp_path):
+    assert manifest["selection"] == load(tmp_path / "model").selection == auto_training[0].selection
 
 
 @pytest.mark.parametrize(
@@ -146,18 +160,13 @@ def test_progress_rises_and_names_the_estimator(auto_training):
         (lambda s: s["table"][0].update(error=""), r"selection.table\[0\].error is"),
     ],
 )
-def test_choice_is_saved_and_malformed_ones_are_rejected(auto_training, tmp_path, change, message):
-    manifest = save(auto_training[0], tmp_path / "model")
-    assert manifest["selection"] == load(tmp_path / "model").selection == auto_training[0].selection
-    manifest["selection"] = deepcopy(manifest["selection"])  # owned by the model
+def test_malformed_choice_is_rejected(manifest, change, message):
     change(manifest["selection"])
     with pytest.raises(ModelFormatError, match=message):
         read_manifest_bytes(manifest_bytes(manifest))
 
 
-def test_choice_of_an_earlier_release_is_read(auto_training, tmp_path):
-    manifest = save(auto_training[0], tmp_path / "model")
-    manifest["selection"] = deepcopy(manifest["selection"])
+def test_choice_of_an_earlier_release_is_read(manifest):
     for key in ("edge_rows", "edge_blocks"):
         del manifest["selection"]["held_out"][key]
     for row in manifest["selection"]["table"]:
@@ -182,13 +191,13 @@ def test_arm_with_springs_gets_a_chain():
 @pytest.mark.slow
 @pytest.mark.skipif(not REAL_ARMS.exists(), reason=f"no recordings at {REAL_ARMS}")
 def test_real_kuka_gets_the_arm_and_predicts_faster_motion():
+    joints, types = tuple(f"joint{number}" for number in range(1, 8)), {"episode": np.int64}
+    columns = ("t", "episode", "q", "dq", "ddq", "tau")
     with np.load(REAL_ARMS) as arms:
-        parts = [
-            {name: arms[f"kuka|{part}|{name}"].astype(float) for name in ("t", "episode", "q", "dq", "ddq", "tau")}
+        training, other = (
+            Samples(joints, *(arms[f"kuka|{part}|{name}"].astype(types.get(name, float)) for name in columns))
             for part in ("train", "other")
-        ]
-    names = tuple(f"joint{number}" for number in range(1, 8))
-    training, other = (Samples(names, **{**each, "episode": each["episode"].astype(np.int64)}) for each in parts)
+        )
     model = train(training, ("revolute",) * 7)
     assert model.estimator.name == "rigid-body+local", model.selection  # its motion repeats
     error = model.predict(other.q, other.dq, other.ddq).tau - other.tau
@@ -203,11 +212,11 @@ def test_failed_estimator_is_reported_and_others_continue(monkeypatch):
     model = train(simulate_arm(), TYPES, options=OPTIONS)
     assert model.selection["chosen"] == model.estimator.name == "lip-chain"
     assert model.selection["reason"] == "no other estimator was trained"
-    rows = {row["estimator"]: row for row in model.selection["table"]}
-    assert rows["rigid-body"]["error"] == "NotPositiveDefiniteError: nothing can be learnt"
-    assert rows["rigid-body"]["log_density"] is None
-    assert rows["rigid-body+local"]["error"] is not None
-    assert rows["lip-chain"]["error"] is None
+    arm, local, chain = (next(row for row in model.selection["table"] if row["estimator"] == name) for name in NAMES)
+    assert arm["error"] == "NotPositiveDefiniteError: nothing can be learnt"
+    assert arm["log_density"] is None
+    assert local["error"] is not None
+    assert chain["error"] is None
 
     monkeypatch.setattr(auto, "fit_estimator", lambda *given: (_ for _ in ()).throw(ValueError("neither")))
     with pytest.raises(NotPositiveDefiniteError, match="nothing can be"):
@@ -265,9 +274,7 @@ def test_leading_chain_restarts_the_search(monkeypatch, tmp_path):
 
 
 def test_unrepeated_motion_is_held_out():
-    once, again = simulate_arm(200, seed=5), periodic(400)
-    both = Samples.concatenate([replace(again, t=again.t), replace(once, t=once.t + 40.0)])
-    found = hold_out(replace(both, episode=np.zeros(len(both), np.int64)), TYPES)
+    found = hold_out(as_one_recording(periodic(400), simulate_arm(200, seed=5)), TYPES)
     assert not found.repeats
     assert (np.flatnonzero(found.parts.held_out) >= 400 - 30).all()
     assert not (found.parts.held_out & found.parts.train).any()
@@ -282,11 +289,8 @@ def test_fastest_block_is_held_out_at_the_edge():
 
 
 def test_repeated_edge_blocks_are_held_out_together():
-    first = with_fast_stretch()
-    twice = Samples.concatenate([first, first])
-    found = hold_out(replace(twice, t=np.arange(400) / 10.0, episode=np.zeros(400, np.int64)), TYPES)
-    assert found.repeats
-    assert found.edge_blocks == 2
+    found = hold_out(as_one_recording(with_fast_stretch(), with_fast_stretch()), TYPES)
+    assert (found.repeats, found.edge_blocks) == (True, 2)
     assert np.unique(np.flatnonzero(found.edge) // 20).tolist() == [4, 14]
 
 
@@ -302,16 +306,13 @@ def test_few_blocks_have_no_edge():
 
 
 def test_repeating_recording_is_recognised():
-    found = hold_out(periodic(), TYPES)
-    assert found.repeats
-    assert found.edge_blocks == 0
+    samples = periodic()
+    found = hold_out(samples, TYPES)
     held = np.flatnonzero(np.diff(found.parts.held_out.astype(int)) == 1)
-    assert found.blocks == 5 == len(held)
+    assert (found.repeats, found.edge_blocks, found.blocks, len(held)) == (True, 0, 5, 5)
     assert np.diff(held).min() > 60  # spread over the recording
-    noisy = periodic()
-    rng = np.random.default_rng(0)
-    noisy = replace(noisy, ddq=noisy.ddq + 0.1 * noisy.ddq.std(0) * rng.standard_normal(noisy.ddq.shape))
-    assert hold_out(noisy, TYPES).repeats
+    noise = 0.1 * samples.ddq.std(0) * np.random.default_rng(0).standard_normal(samples.ddq.shape)
+    assert hold_out(replace(samples, ddq=samples.ddq + noise), TYPES).repeats
     assert not hold_out(simulate_arm(), TYPES).repeats
 
 

@@ -17,24 +17,16 @@ TAU = np.stack([np.sin(TIME), 3 * np.cos(TIME)], axis=1)
 
 
 def held_out(edge=EDGE, seconds=TIME[-1] + 1) -> HeldOutSamples:
-    shape = (ROWS, JOINTS)
-    samples = Samples(
-        ("a", "b"), TIME, np.zeros(ROWS, np.int64), np.zeros(shape), np.zeros(shape), np.zeros(shape), TAU
-    )
-    rows = seconds > TIME
+    rest = np.zeros((3, ROWS, JOINTS))
+    samples, rows = Samples(("a", "b"), TIME, np.zeros(ROWS, np.int64), *rest, TAU), seconds > TIME
     return HeldOutSamples(samples.rows(rows), edge[rows])
 
 
-def predict_with_errors(
-    inside: float, edge: float, stated: float | None = None, seconds=TIME[-1] + 1, seed=0
-) -> TorqueDistribution:
+def predict_with_errors(inside, edge, stated=None, seconds=TIME[-1] + 1, seed=0) -> TorqueDistribution:
     """Return a prediction with these relative errors inside and at the edge; it states the first, or `stated`."""
     scale = np.random.default_rng(seed).normal(size=(ROWS, 1)) * TAU.std(axis=0)
-    mean = TAU + np.where(EDGE, edge, inside)[:, None] * scale
-    rows = seconds > TIME
-    return TorqueDistribution(
-        mean[rows], np.zeros((int(rows.sum()), JOINTS)), (inside if stated is None else stated) * TAU.std(axis=0)
-    )
+    mean = (TAU + np.where(EDGE, edge, inside)[:, None] * scale)[seconds > TIME]
+    return TorqueDistribution(mean, np.zeros_like(mean), (inside if stated is None else stated) * TAU.std(axis=0))
 
 
 CASES = {
@@ -75,34 +67,28 @@ def test_simplest_is_chosen_unless_another_is_surely_better(case):
 
 
 def test_simplest_is_chosen_without_evidence_at_the_edge():
-    better = {ARM: (0.3, 0.3), CHAIN: (0.1, 0.1)}
-    answers = {name: predict_with_errors(*each) for name, each in better.items()}
+    answers = {ARM: predict_with_errors(0.3, 0.3), CHAIN: predict_with_errors(0.1, 0.1)}
     assert choose_estimator(held_out(), answers)[0] == CHAIN
     no_edge = held_out(edge=np.zeros(ROWS, dtype=bool))
     chosen, reason = choose_estimator(no_edge, answers)
     assert chosen == ARM
     assert reason.endswith("no rows at the edge of the data could be held out")
     assert choose_estimator(no_edge, {ARM: answers[ARM], LOCAL: answers[ARM]})[0] == LOCAL
-    one_block = {name: predict_with_errors(*each, None, 0.9) for name, each in better.items()}
+    one_block = {ARM: predict_with_errors(0.3, 0.3, None, 0.9), CHAIN: predict_with_errors(0.1, 0.1, None, 0.9)}
     assert choose_estimator(held_out(np.ones(ROWS, dtype=bool), 0.9), one_block)[0] == ARM
 
 
 def test_edge_error_is_relative_to_all_rows():
-    held = held_out()
-    given = predict_with_errors(0.1, 0.5)
-    expected = np.mean(np.square(TAU - given.mean)[EDGE], axis=0) / TAU.var(axis=0)
-    assert held.edge_nmse(given) == pytest.approx(expected)
-    assert held.nmse(given) == pytest.approx(np.mean(np.square(TAU - given.mean), axis=0) / TAU.var(axis=0))
+    held, given = held_out(), predict_with_errors(0.1, 0.5)
+    error, variance = np.square(TAU - given.mean), TAU.var(axis=0)
+    assert held.edge_nmse(given) == pytest.approx(np.mean(error[EDGE], axis=0) / variance)
+    assert held.nmse(given) == pytest.approx(np.mean(error, axis=0) / variance)
     assert np.isnan(held_out(np.zeros(ROWS, dtype=bool)).edge_nmse(given)).all()
 
 
 def test_joint_without_torque_has_no_error():
     held = held_out()
-    tau = TAU.copy()
-    tau[:, 1] = 0.1
-    held = replace(held, samples=replace(held.samples, tau=tau))
+    held = replace(held, samples=replace(held.samples, tau=np.where([True, False], TAU, 0.1)))
     assert np.isfinite(held.nmse(predict_with_errors(0.1, 0.1))).tolist() == [True, False]
-    assert choose_estimator(held, {ARM: predict_with_errors(0.3, 0.3), CHAIN: predict_with_errors(0.1, 0.1)})[0] in {
-        ARM,
-        CHAIN,
-    }
+    answers = {ARM: predict_with_errors(0.3, 0.3), CHAIN: predict_with_errors(0.1, 0.1)}
+    assert choose_estimator(held, answers)[0] in {ARM, CHAIN}

@@ -6,9 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lipcore import FitOptions, Samples, TorquePrediction, train
 from lipcore.data.motion import Motion
-from lipcore.data.samples import Samples
-from lipcore.estimators.options import FitOptions
 from lipcore.estimators.task import Task
 from lipcore.kernels.local import LocalKernel
 from lipcore.model.selection import selection
@@ -17,7 +16,7 @@ from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
 from lipcore.training.correction import corrected_joints
 from lipcore.training.refit import refit, widen_intervals
-from lipcore.training.train import fit_model, train
+from lipcore.training.train import fit_model
 
 ARM, TYPES = "finger-edu", ("revolute",) * 3
 OPTIONS = FitOptions(posterior_samples=150, device="cpu", geometry="fixed", statistics="chosen")
@@ -27,16 +26,10 @@ PERIOD = 4.0
 NOISE = 5e-4
 
 
-def simulate_ripple(seconds=40.0, ripple=0.02, start=0.0, repeats=True, seed=0) -> Samples:
-    """Simulate a motion with or without period, with a ripple in one joint's torque."""
-    robot = load_robot(ARM)
-    t = start + np.arange(0.0, seconds, 0.05)
-    rates = (
-        2
-        * np.pi
-        / PERIOD
-        * (np.array([[1, 2, 3], [2, 1, 1]]) if repeats else np.array([[1, 1.6, 2.2], [2.3, 0.7, 1.3]]))
-    )
+def simulate_ripple(seconds=40.0, ripple=0.02, start=0.0, seed=0) -> Samples:
+    """Simulate a motion that repeats, with a ripple in one joint's torque."""
+    robot, t = load_robot(ARM), start + np.arange(0.0, seconds, 0.05)
+    rates = 2 * np.pi / PERIOD * np.array([[1, 2, 3], [2, 1, 1]])
     phases = rates * t[:, None, None] + np.array([[0.3, 1.0, 2.0], [0.7, 0.1, 0.5]])
     sizes = np.array([[0.5, 0.4, 0.3], [0.2, 0.3, 0.3]])
     q, dq = (sizes * np.sin(phases)).sum(1), (sizes * rates * np.cos(phases)).sum(1)
@@ -47,12 +40,19 @@ def simulate_ripple(seconds=40.0, ripple=0.02, start=0.0, repeats=True, seed=0) 
 
 
 def train_corrected(samples: Samples, estimator="rigid-body+local", **options):
-    robot = RigidBody.from_profile(ARM, samples.joint_names, TYPES)
-    return train(samples, TYPES, estimator, options=replace(OPTIONS, **options), robot=robot)
+    return train(samples, TYPES, estimator, options=replace(OPTIONS, **options), robot=make_task(samples).robot)
+
+
+def make_task(samples: Samples) -> Task:
+    return Task(samples, TYPES, OPTIONS, robot=RigidBody.from_profile(ARM, samples.joint_names, TYPES))
+
+
+def predict(model, samples: Samples) -> TorquePrediction:
+    return model.predict(samples.q, samples.dq, samples.ddq)
 
 
 def rmse_per_joint(model, samples: Samples) -> np.ndarray:
-    return np.sqrt(np.mean(np.square(model.predict(samples.q, samples.dq, samples.ddq).tau - samples.tau), axis=0))
+    return np.sqrt(np.mean(np.square(predict(model, samples).tau - samples.tau), axis=0))
 
 
 @pytest.fixture(scope="module")
@@ -65,36 +65,34 @@ def test_kernel_matches_its_docstring():
     rng, n = np.random.default_rng(0), 2
     x, y = (Motion(*rng.normal(0, 0.1, (3, rows, n))) for rows in (4, 3))
     params = {"local.log_scale": rng.normal(size=n), "local.log_lengthscales": rng.normal(size=4 * n)}
-    kernel = LocalKernel(n)
     inputs = [np.concatenate([each.q, each.dq, each.ddq, np.tanh(each.dq / 0.02)], axis=1) for each in (x, y)]
     lengths, expected = np.exp(params["local.log_lengthscales"]), np.zeros((4, n, 3, n))
     for k, m, i in np.ndindex(4, 3, n):
         distance = sum((inputs[0][k, d] - inputs[1][m, d]) ** 2 / lengths[d] ** 2 for d in range(4 * n))
         expected[k, i, m, i] = math.exp(params["local.log_scale"][i] - 0.5 * distance)
-    np.testing.assert_allclose(kernel.gram(params, x, y), expected.reshape(4 * n, 3 * n), rtol=1e-12)
+    np.testing.assert_allclose(LocalKernel(n).gram(params, x, y), expected.reshape(4 * n, 3 * n), rtol=1e-12)
 
 
 @pytest.mark.slow
 def test_repeated_error_is_corrected_only_where_seen(local_and_arm):
-    local, arm = local_and_arm
-    assert corrected_joints(local.fit) == [RIPPLED_JOINT]
-    assert local.fit[f"local_{RIPPLED_JOINT + 1}"] < 0.2
-    again = simulate_ripple(8.0, start=100.0, seed=1)
-    assert rmse_per_joint(local, again)[RIPPLED_JOINT] < 0.3 * rmse_per_joint(arm, again)[RIPPLED_JOINT]
+    fit = local_and_arm[0].fit
+    assert corrected_joints(fit) == [RIPPLED_JOINT]
+    assert fit[f"local_{RIPPLED_JOINT + 1}"] < 0.2
+    corrected, uncorrected = (rmse_per_joint(each, simulate_ripple(8.0, start=100.0, seed=1)) for each in local_and_arm)
+    assert corrected[RIPPLED_JOINT] < 0.3 * uncorrected[RIPPLED_JOINT]
     others = np.arange(3) != RIPPLED_JOINT
-    assert rmse_per_joint(local, again)[others] == pytest.approx(rmse_per_joint(arm, again)[others], rel=1e-6)
+    assert corrected[others] == pytest.approx(uncorrected[others], rel=1e-6)
     far = simulate_ripple(8.0, start=3.0)
     far = replace(far, q=far.q + 1.5, dq=-far.dq)
-    answers = [each.predict(far.q, far.dq, far.ddq) for each in local_and_arm]
-    np.testing.assert_allclose(answers[0].tau, answers[1].tau, rtol=0, atol=1e-6)
-    spreads = [np.hypot(each.tau_std, each.noise_std) for each in answers]
-    assert (spreads[0] > 0.98 * spreads[1]).all()
+    found, expected = (predict(each, far) for each in local_and_arm)
+    np.testing.assert_allclose(found.tau, expected.tau, rtol=0, atol=1e-6)
+    spread, other = (np.hypot(each.tau_std, each.noise_std) for each in (found, expected))
+    assert (spread > 0.98 * other).all()
 
 
 def test_corrected_intervals_keep_their_coverage(local_and_arm):
     again = simulate_ripple(8.0, start=100.0, seed=1)
-    held = local_and_arm[0].predict(again.q, again.dq, again.ddq).interval.contains(again.tau).mean(axis=0)
-    assert (held > 0.9).all()
+    assert (predict(local_and_arm[0], again).interval.contains(again.tau).mean(axis=0) > 0.9).all()
 
 
 def test_correction_leaves_the_arm_unchanged(local_and_arm):
@@ -104,13 +102,11 @@ def test_correction_leaves_the_arm_unchanged(local_and_arm):
 
 @pytest.mark.slow
 def test_pass_over_all_rows_changes_only_the_arm(local_and_arm):
-    samples, again = simulate_ripple(), simulate_ripple(8.0, start=100.0, seed=1)
-    local = train_corrected(samples, statistics="all")
+    again, (chosen, arm) = simulate_ripple(8.0, start=100.0, seed=1), local_and_arm
+    local = train_corrected(simulate_ripple(), statistics="all")
     outputs = len(local.posterior.basis.outputs)
-    np.testing.assert_allclose(
-        local.posterior.weights[:outputs], local_and_arm[0].posterior.weights[:outputs], rtol=1e-6
-    )
-    assert rmse_per_joint(local, again)[RIPPLED_JOINT] < 0.3 * rmse_per_joint(local_and_arm[1], again)[RIPPLED_JOINT]
+    np.testing.assert_allclose(local.posterior.weights[:outputs], chosen.posterior.weights[:outputs], rtol=1e-6)
+    assert rmse_per_joint(local, again)[RIPPLED_JOINT] < 0.3 * rmse_per_joint(arm, again)[RIPPLED_JOINT]
 
 
 @pytest.mark.slow
@@ -119,7 +115,7 @@ def test_no_correction_without_residual_or_time(given):
     samples = simulate_ripple(**given)
     local, arm = train_corrected(samples), train_corrected(samples, "rigid-body")
     assert corrected_joints(local.fit) == []
-    np.testing.assert_allclose(*(each.predict(samples.q, samples.dq, samples.ddq).tau for each in (local, arm)))
+    np.testing.assert_allclose(predict(local, samples).tau, predict(arm, samples).tau)
 
 
 @pytest.mark.slow
@@ -133,15 +129,13 @@ def test_lasting_unrepeated_error_is_not_learnt():
 @pytest.mark.slow
 def test_refit_keeps_corrected_joints_and_widened_intervals():
     samples = simulate_ripple()
-    robot = RigidBody.from_profile(ARM, samples.joint_names, TYPES)
-    task = Task(samples, TYPES, OPTIONS, robot=robot)
+    task, rest = make_task(samples), samples.rows(slice(620, None))
     part = fit_model(task.on(samples.rows(slice(600))), "rigid-body+local")
-    rest = samples.rows(slice(620, None))
     shifted = replace(rest, tau=rest.tau + np.array([0.0, 0.0, 0.05]))
     wider = widen_intervals(part, shifted)
     whole = refit(wider, task)
     assert corrected_joints(whole.fit) == corrected_joints(part.fit) == [RIPPLED_JOINT]
-    assert wider.predict(rest.q, rest.dq, rest.ddq).interval.contains(shifted.tau).mean(axis=0)[2] >= 0.95
+    assert predict(wider, rest).interval.contains(shifted.tau).mean(axis=0)[2] >= 0.95
     assert whole.fit["widened_3"] == wider.fit["widened_3"] > 2
     assert whole.scale[2] > 2 > refit(part, task).scale[2]
 
@@ -149,11 +143,10 @@ def test_refit_keeps_corrected_joints_and_widened_intervals():
 @pytest.mark.slow
 def test_refit_of_auto_adds_a_correction():
     samples = simulate_ripple()
-    task = Task(samples, TYPES, OPTIONS, robot=RigidBody.from_profile(ARM, samples.joint_names, TYPES))
+    task = make_task(samples)
     part = fit_model(task.on(samples.rows(slice(200))), "rigid-body")
     assert refit(part, task).estimator.name == "rigid-body"  # as requested
-    part = replace(part, selection=selection("rigid-body", "it is the simplest", []))
-    whole = refit(part, task)
+    whole = refit(replace(part, selection=selection("rigid-body", "it is the simplest", [])), task)
     assert whole.estimator.name == whole.selection["chosen"] == "rigid-body+local"
     assert whole.selection["reason"].startswith(
         "rigid-body+local replaces rigid-body: it is better on all rows; before"

@@ -5,49 +5,41 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lipcore.estimators.hyperparameters import FitCancelledError
-from lipcore.estimators.options import FitOptions
+from lipcore import FitCancelledError
 from lipcore.estimators.task import Task
 from lipcore.model.selection import selection
 from lipcore.model.sibling import arm_of_sibling
-from lipcore.online.batch import Rows
 from lipcore.online.learner import OnlineModel
 from lipcore.robots.library import load_robot
-from lipcore.robots.simulation import Simulation, inverse_dynamics, simulate
+from lipcore.robots.simulation import inverse_dynamics
 from lipcore.robots.urdf import RigidBody
 from lipcore.training.refit import refit
 from lipcore.training.train import fit_model
 from tests.choosing import slow
+from tests.lipcore.arm_oracles import as_rows
+from tests.lipcore.training.test_auto import ARM, OPTIONS, TYPES, simulate_arm
 
-ARM, TYPES, CUT = "finger-edu", ("revolute",) * 3, 140
-OPTIONS = FitOptions(
-    hyperparameter_samples=30, posterior_samples=100, max_iterations=12, starts=1, device="cpu", search_seconds=0.5
-)
-
-
-def simulate_motion(seed=3):
-    """Simulate an arm whose joints all move, with friction and noise."""
-    return simulate(load_robot(ARM), Simulation(200, rate=10.0, speed=4.0, noise=0.0005, coulomb=0.005), seed)
+CUT = 140
 
 
 def simulate_resting_joint():
-    """Simulate the same arm, whose last joint hardly moves before row CUT."""
-    samples, share = simulate_motion(), np.ones((200, 3))
+    """Simulate the arm, whose last joint hardly moves before row CUT."""
+    samples, share = simulate_arm(), np.ones((200, 3))
     share[:CUT, 2] = 0.01
-    motion = [share * each for each in (samples.q, samples.dq, samples.ddq)]
-    tau = inverse_dynamics(load_robot(ARM), *motion) + 0.0005 * np.random.default_rng(0).standard_normal((200, 3))
-    return replace(samples, q=motion[0], dq=motion[1], ddq=motion[2], tau=tau)
+    q, dq, ddq = (share * each for each in (samples.q, samples.dq, samples.ddq))
+    noise = 0.0005 * np.random.default_rng(0).standard_normal((200, 3))
+    return replace(samples, q=q, dq=dq, ddq=ddq, tau=inverse_dynamics(load_robot(ARM), q, dq, ddq) + noise)
 
 
 def simulate_unseen():
     """Simulate another motion without friction and noise."""
-    samples = simulate_motion(8)
+    samples = simulate_arm(seed=8)
     return replace(samples, tau=inverse_dynamics(load_robot(ARM), samples.q, samples.dq, samples.ddq))
 
 
-def fit_first_part(samples, estimator, **given):
+def fit_first_part(samples, estimator, options=OPTIONS, **given):
     """Return a task of all samples, and a model of the first CUT of them."""
-    task = Task(samples, TYPES, OPTIONS, **given)
+    task = Task(samples, TYPES, options, **given)
     return task, fit_model(task.on(samples.rows(slice(CUT))), estimator)
 
 
@@ -73,13 +65,13 @@ def test_refit_learns_unseen_rows(estimator):
 
 @pytest.mark.slow
 def test_refit_does_not_search(monkeypatch):
-    task, part = fit_first_part(simulate_motion(), "rigid-body")
+    task, part = fit_first_part(simulate_arm(), "rigid-body")
     monkeypatch.setattr("lipcore.arm.learning.search", lambda *_given: pytest.fail("a search began"))
     refit(part, task)
 
 
 def test_refit_keeps_the_hyperparameters_of_a_chain():
-    task, part = fit_first_part(simulate_motion(), "lip-chain")
+    task, part = fit_first_part(simulate_arm(), "lip-chain")
     whole = refit(part, task)
     for name, value in part.posterior.params.items():
         np.testing.assert_array_equal(whole.posterior.params[name], value)
@@ -87,19 +79,18 @@ def test_refit_keeps_the_hyperparameters_of_a_chain():
 
 @pytest.mark.parametrize("geometry", ["fixed", "calibrate"])
 def test_refit_stays_around_the_robot(geometry):
-    samples = simulate_motion()
+    samples = simulate_arm()
     robot = RigidBody.from_profile(ARM, samples.joint_names, TYPES)
-    task = Task(samples, TYPES, replace(OPTIONS, geometry=geometry), robot=robot)
-    part = fit_model(task.on(samples.rows(slice(CUT))), "rigid-body")
+    task, part = fit_first_part(samples, "rigid-body", replace(OPTIONS, geometry=geometry), robot=robot)
     whole = refit(part, task)
     assert whole.robot is robot
     assert whole.arm.mode == geometry
-    assert (nmse(whole, simulate_motion(8)) < 0.05).all()
+    assert (nmse(whole, simulate_arm(seed=8)) < 0.05).all()
 
 
 @pytest.mark.slow
 def test_refit_expects_the_arm_of_its_sibling():
-    unit = fit_model(Task(simulate_motion(5), TYPES, OPTIONS), "rigid-body")
+    unit = fit_model(Task(simulate_arm(seed=5), TYPES, OPTIONS), "rigid-body")
     task, part = fit_first_part(simulate_resting_joint(), "rigid-body", sibling=arm_of_sibling(unit))
     whole = refit(part, task)
     assert whole.arm.mode == "calibrate"
@@ -108,16 +99,14 @@ def test_refit_expects_the_arm_of_its_sibling():
 
 @pytest.mark.slow
 def test_refit_follows_an_online_model():
-    task, part = fit_first_part(simulate_motion(), "rigid-body")
-    more = simulate_motion(6)
-    rows = Rows(more.t, more.q, more.dq, more.ddq, more.tau, np.zeros(200, np.uint8))
-    online = OnlineModel.start(part).learn(rows).model()
-    assert (nmse(refit(online, task), simulate_motion(8)) < 0.05).all()
+    task, part = fit_first_part(simulate_arm(), "rigid-body")
+    online = OnlineModel.start(part).learn(as_rows(simulate_arm(seed=6), 0.0)).model()
+    assert (nmse(refit(online, task), simulate_arm(seed=8)) < 0.05).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["rigid-body", "lip-chain"])
 def test_refit_can_be_cancelled(estimator):
-    task, part = fit_first_part(simulate_motion(), estimator)
+    task, part = fit_first_part(simulate_arm(), estimator)
     with pytest.raises(FitCancelledError):
         refit(part, replace(task, cancelled=lambda: True))

@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.arms import another_unit
 from lipcore import FitOptions, Samples, TorqueModel, load, save, train
-from lipcore.data.metrics import evaluate
+from lipcore.data.metrics import Metrics, evaluate
 from lipcore.data.motion import Motion
 from lipcore.estimators.base import BaseMismatchError, RobotKind, check_base
 from lipcore.kernels.arm import ArmKernel
@@ -36,72 +36,53 @@ def base() -> TorqueModel:
     return train_from_geometry(GEOMETRY, ROBOT, simulate_unit(ROBOT, 1, 300), OPTIONS)
 
 
-@pytest.fixture(scope="module")
-def few_samples() -> Samples:
-    return simulate_unit(SECOND_UNIT, 3, FEW_ROWS)
-
-
-@pytest.fixture(scope="module")
-def unseen() -> Samples:
-    return simulate_unit(SECOND_UNIT, 4, 200)
+def evaluate_on(model: TorqueModel, samples: Samples) -> Metrics:
+    return evaluate(samples.tau, *model.predict(samples.q, samples.dq, samples.ddq).interval)
 
 
 def nmse(model: TorqueModel, samples: Samples) -> np.ndarray:
-    return np.asarray(evaluate(samples.tau, *model.predict(samples.q, samples.dq, samples.ddq).interval).nmse)
+    return np.asarray(evaluate_on(model, samples).nmse)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("estimator", ["rigid-body", slow("rigid-body+lip-chain"), slow("auto")])
-def test_few_samples_of_a_second_unit_suffice(
-    estimator: str, base: TorqueModel, few_samples: Samples, unseen: Samples
-) -> None:
-    found = train(few_samples, ROBOT.joint_types, estimator, OPTIONS, base=base)
-    alone = train_from_geometry(
-        GEOMETRY, SECOND_UNIT, few_samples, OPTIONS
-    )  # the geometry is known, the masses are not
-    long = train_from_geometry(GEOMETRY, SECOND_UNIT, simulate_unit(SECOND_UNIT, 3, MANY_ROWS), OPTIONS)
-    without_noise = simulate_unit(SECOND_UNIT, 4, 200, noise=0.0)
+def test_few_samples_of_a_second_unit_suffice(estimator: str, base: TorqueModel) -> None:
+    few, many = (simulate_unit(SECOND_UNIT, 3, size) for size in (FEW_ROWS, MANY_ROWS))
+    unseen, without_noise = (simulate_unit(SECOND_UNIT, 4, 200, noise) for noise in (NOISE, 0.0))
+    found = train(few, ROBOT.joint_types, estimator, OPTIONS, base=base)
+    # the geometry is known, the masses are not
+    alone, long = (train_from_geometry(GEOMETRY, SECOND_UNIT, samples, OPTIONS) for samples in (few, many))
     for other in (alone, base):
         assert nmse(found, without_noise).mean() < 0.5 * nmse(other, without_noise).mean()
     assert (nmse(found, unseen) < 2 * nmse(long, unseen)).all()
-    answer = found.predict(unseen.q, unseen.dq, unseen.ddq)
-    assert (evaluate(unseen.tau, *answer.interval).coverage > 0.85).all()
+    assert (evaluate_on(found, unseen).coverage > 0.85).all()
     assert found.fit["geometry"] == "calibrate"
 
 
-def test_prior_is_the_other_unit(base: TorqueModel, unseen: Samples) -> None:
+def test_prior_is_the_other_unit(base: TorqueModel) -> None:
     """The expected torque is the other unit's by Pinocchio; its spread matches the difference of units."""
-    motion, kernel = unseen.motion(), ArmKernel(arm_of_sibling(base))
+    unseen, kernel = simulate_unit(SECOND_UNIT, 4, 200), ArmKernel(arm_of_sibling(base))
+    motion = unseen.motion()
     true, second = (inverse_dynamics(each, unseen.q, unseen.dq, unseen.ddq) for each in (ROBOT, SECOND_UNIT))
-    mean = kernel.prior_weights()
-    assert mean is not None
-    off = kernel.torque(mean, motion) - true
-    assert (np.sqrt(np.mean(off**2, axis=0)) < 0.05 * true.std(axis=0)).all()
+    off = kernel.torque(kernel.prior_weights(), motion) - true
     features, variance = kernel.features(motion), kernel.variances(kernel.initial(motion, unseen.tau))
     std = np.sqrt(np.square(features) @ variance)
-    assert (np.sqrt(np.mean(std**2, axis=0)) < 0.5 * true.std(axis=0)).all()
+    for size, share in ((off, 0.05), (std, 0.5)):
+        assert (np.sqrt(np.mean(size**2, axis=0)) < share * true.std(axis=0)).all()
     assert (np.mean(np.abs(second - true - off) < 2 * std, axis=0) > 0.9).all()
 
 
 def test_joint_order_is_kept() -> None:
     base = reversed_pendulum_model("calibrate", OPTIONS)
     expected, queries = arm_of_sibling(base), Motion.from_arrays(*random_motions(2, 3).transpose(1, 0, 2))
-    term = base.estimator.terms["rigid_body"]
-    torque = base.posterior.predict(queries, term).mean
+    torque = base.posterior.predict(queries, base.estimator.terms["rigid_body"]).mean
     np.testing.assert_allclose(ArmKernel(expected).mean(queries), torque, atol=0.02 * np.abs(torque).max())
 
 
-def test_transferred_version_keeps_its_prior(base: TorqueModel, few_samples: Samples, tmp_path: Path) -> None:
-    found = train(few_samples, ROBOT.joint_types, "rigid-body", OPTIONS, base=base)
-    save(found, tmp_path / "second")
-    again = load(tmp_path / "second")
-    np.testing.assert_allclose(
-        again.predict(few_samples.q, few_samples.dq, few_samples.ddq).tau,
-        found.predict(few_samples.q, few_samples.dq, few_samples.ddq).tau,
-        rtol=0,
-        atol=1e-6,
-    )
-    kept, expected = arm_as_expected(again.arm), arm_of_sibling(base)
+def test_transferred_version_keeps_its_prior(base: TorqueModel, tmp_path: Path) -> None:
+    few = simulate_unit(SECOND_UNIT, 3, FEW_ROWS)
+    save(train(few, ROBOT.joint_types, "rigid-body", OPTIONS, base=base), tmp_path / "second")
+    kept, expected = arm_as_expected(load(tmp_path / "second").arm), arm_of_sibling(base)
     for name in ("rotation", "translation"):
         np.testing.assert_allclose(getattr(kept.geometry, name), getattr(expected.geometry, name), atol=1e-3)
     for name in ("centre", "rotor", "widths"):
@@ -147,7 +128,7 @@ def test_mismatched_base_is_rejected(given: dict, field: str, message: str) -> N
     assert message in str(refused.value)
 
 
-def test_training_rejects_a_base_of_another_robot(base: TorqueModel, few_samples: Samples) -> None:
-    other = replace(few_samples, joint_names=("x", "y", "z"))
+def test_training_rejects_a_base_of_another_robot(base: TorqueModel) -> None:
+    other = replace(simulate_unit(SECOND_UNIT, 3, FEW_ROWS), joint_names=("x", "y", "z"))
     with pytest.raises(BaseMismatchError, match="joint_names of the data, x, y, z; it has joint1, joint2, joint3"):
         train(other, ROBOT.joint_types, "rigid-body", OPTIONS, base=base)
